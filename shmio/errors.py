@@ -1,0 +1,72 @@
+"""Every error shmio raises on purpose, with one root.
+
+::
+
+    ShmioError
+    ├── ConfigError        the configuration is wrong; names the key
+    ├── LayoutError        a data-block source is wrong; carries diagnostics with file, line, column
+    ├── ValueRangeError    a value does not fit its register's type
+    ├── PathError          no such source or register
+    ├── SegmentError       the shared memory cannot be used
+    │   ├── NotRunningError      no running instance of that name
+    │   ├── AlreadyRunningError  another supervisor holds the instance
+    │   └── FormatError          the segment's format is not one this version knows
+    ├── QualityError       the value exists but is not good
+    ├── ConnectorError     the device did not answer as it should; carries a reason code
+    └── ControlError       the supervisor refused or did not answer
+
+The command-line tools print the message of any of these as one line and exit with status 1.
+"""
+
+from __future__ import annotations
+
+
+class ShmioError(Exception):
+    """Root of all errors that shmio raises on purpose."""
+
+
+class ConfigError(ShmioError):
+    """The configuration cannot be used; the message names the full key and the remedy."""
+
+
+class LayoutError(ShmioError):
+    """A layout source cannot be compiled; ``str()`` is one line for each diagnostic."""
+
+
+class ValueRangeError(ShmioError, ValueError):
+    """A value does not fit the type of its register."""
+
+
+class PathError(ShmioError, LookupError):
+    """No source or register has this path."""
+
+
+class SegmentError(ShmioError):
+    """The shared-memory segment cannot be created, opened or used."""
+
+
+class NotRunningError(SegmentError):
+    """No running instance has this name."""
+
+
+class AlreadyRunningError(SegmentError):
+    """Another supervisor holds this instance; the message has its pid."""
+
+
+class FormatError(SegmentError):
+    """The segment's magic, ABI version or structure is not one this version knows."""
+
+
+class QualityError(ShmioError):
+    """The register has no good value at present; the message gives the reason."""
+
+
+class ConnectorError(ShmioError):
+    """The device is absent or did not answer as the protocol demands.
+
+    The base loop drops the connection on any of these. ``str()`` becomes the frame's reason text.
+    """
+
+
+class ControlError(ShmioError):
+    """The supervisor refused a control request or did not answer it."""

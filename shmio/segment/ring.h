@@ -1,0 +1,239 @@
+/* The shared-memory mechanisms of shmio: frame ring, cell, doorbell.
+ *
+ * Pure C11, no Python: _atomics.c wraps it, tests/native/ exercises it under the sanitizers. The bytes are described in
+ * docs/reference/segment-format.md; this file is their reference implementation.
+ *
+ * Every word that two processes may touch at once is accessed atomically, so there is no data race by the C11 rules. The
+ * seqlock follows Boehm, "Can seqlocks get along with programming language memory models?", MSPC 2012, section 4.
+ */
+#ifndef SHMIO_RING_H
+#define SHMIO_RING_H
+
+#include <errno.h>
+#include <linux/futex.h>
+#include <stdatomic.h>
+#include <stdbool.h>
+#include <stdint.h>
+#include <string.h>
+#include <sys/syscall.h>
+#include <time.h>
+#include <unistd.h>
+
+#define RING_HEADER_SIZE 128u
+#define SLOT_HEADER_SIZE 64u
+#define REASON_SIZE 128u
+#define RAW_OFFSET (SLOT_HEADER_SIZE + REASON_SIZE)
+#define MAX_SLOTS (1u << 24)
+#define MAX_FRAME_SIZE (1u << 26)
+#define READ_ATTEMPTS 64
+
+#define FLAG_EFFECTIVE 1u /* the slot has an effective image that differs from raw */
+
+typedef _Atomic uint64_t a64;
+typedef _Atomic uint32_t a32;
+_Static_assert(sizeof(a64) == 8 && sizeof(a32) == 4, "atomics must have the size of what they hold");
+_Static_assert(ATOMIC_LLONG_LOCK_FREE == 2 && ATOMIC_INT_LOCK_FREE == 2, "atomics in shared memory must be lock-free");
+
+/* First line: fixed when the segment is built. Second line: the writer's. */
+typedef struct {
+    uint32_t slot_count; /* a power of two */
+    uint32_t slot_stride;
+    uint32_t frame_size; /* bytes of one image */
+    uint32_t status_size;
+    uint32_t raw_offset; /* within a slot; RAW_OFFSET */
+    uint32_t effective_offset;
+    uint32_t status_offset;
+    uint32_t reserved0;
+    int64_t period_ns;
+    int64_t stale_ns;
+    uint64_t reserved1[2];
+    a64 head;     /* number of the last whole frame; 0: none yet */
+    a32 doorbell; /* futex word: bumped after every frame */
+    a32 incarnation;
+    uint64_t reserved2[6];
+} ring_header;
+_Static_assert(sizeof(ring_header) == RING_HEADER_SIZE, "ring header");
+
+typedef struct {
+    a64 sequence; /* 2*frame+1 while frame is being written, 2*frame+2 when whole */
+    a64 words[7]; /* slot_info, as words */
+} slot_header;
+_Static_assert(sizeof(slot_header) == SLOT_HEADER_SIZE, "slot header");
+
+typedef struct {
+    uint64_t cycle;
+    int64_t publish_ns; /* CLOCK_MONOTONIC */
+    int64_t clock_ns;   /* the instance's clock, since its start */
+    int64_t source_ns;  /* UTC, as good as the source knows it */
+    uint32_t incarnation;
+    uint8_t quality;
+    uint8_t provenance;
+    uint16_t flags;
+    uint16_t reason_size;
+    uint16_t reserved0;
+    uint32_t reserved1;
+    uint64_t event; /* number of the last event before this frame */
+} slot_info;
+_Static_assert(sizeof(slot_info) == SLOT_HEADER_SIZE - 8, "slot info");
+
+/* A checked view of one ring: geometry copied out of shared memory once, so that no later change of it can lead outside. */
+typedef struct {
+    uint8_t *base;
+    uint32_t slot_count, slot_stride, frame_size, effective_offset;
+} ring_view;
+
+static inline uint64_t align8(uint64_t size) { return (size + 7u) & ~(uint64_t)7u; }
+
+static inline ring_header *ring_head(const ring_view *ring) { return (ring_header *)(void *)ring->base; }
+
+static inline uint8_t *ring_slot(const ring_view *ring, uint64_t frame)
+{
+    return ring->base + RING_HEADER_SIZE + (uint64_t)ring->slot_stride * (frame & (ring->slot_count - 1));
+}
+
+/* NULL when the ring's header is sound within `size` bytes, else what is wrong with it. */
+static inline const char *ring_open(ring_view *ring, uint8_t *base, uint64_t size)
+{
+    if (((uintptr_t)base & 7u) != 0) return "ring is not aligned to 8 bytes";
+    if (size < RING_HEADER_SIZE) return "ring is shorter than its header";
+    ring_header header;
+    memcpy(&header, base, offsetof(ring_header, head));
+    if (header.slot_count < 4 || header.slot_count > MAX_SLOTS || (header.slot_count & (header.slot_count - 1)) != 0)
+        return "slot count is not a power of two in 4..2^24";
+    if (header.frame_size == 0 || header.frame_size > MAX_FRAME_SIZE) return "frame size out of range";
+    if (header.raw_offset != RAW_OFFSET || (header.effective_offset & 7u) != 0 || (header.slot_stride & 7u) != 0)
+        return "slot offsets are wrong";
+    uint64_t image = align8(header.frame_size);
+    if (header.effective_offset < RAW_OFFSET + image || header.slot_stride < header.effective_offset + image)
+        return "images overlap or do not fit in a slot";
+    if (RING_HEADER_SIZE + (uint64_t)header.slot_count * header.slot_stride > size) return "slots do not fit in the section";
+    *ring = (ring_view){base, header.slot_count, header.slot_stride, header.frame_size, header.effective_offset};
+    return NULL;
+}
+
+/* Copies to and from shared memory, in relaxed 64-bit words; the last word may be partial on the private side only. */
+static inline void words_store(uint8_t *shared, const uint8_t *data, size_t size)
+{
+    a64 *words = (a64 *)(void *)shared;
+    size_t whole = size / 8;
+    for (size_t i = 0; i < whole; i++) {
+        uint64_t word;
+        memcpy(&word, data + 8 * i, 8);
+        atomic_store_explicit(&words[i], word, memory_order_relaxed);
+    }
+    if (size % 8) {
+        uint64_t word = 0;
+        memcpy(&word, data + 8 * whole, size % 8);
+        atomic_store_explicit(&words[whole], word, memory_order_relaxed);
+    }
+}
+
+static inline void words_load(uint8_t *data, const uint8_t *shared, size_t size)
+{
+    const a64 *words = (const a64 *)(const void *)shared;
+    size_t whole = size / 8;
+    for (size_t i = 0; i < whole; i++) {
+        uint64_t word = atomic_load_explicit(&words[i], memory_order_relaxed);
+        memcpy(data + 8 * i, &word, 8);
+    }
+    if (size % 8) {
+        uint64_t word = atomic_load_explicit(&words[whole], memory_order_relaxed);
+        memcpy(data + 8 * whole, &word, size % 8);
+    }
+}
+
+/* Wakes everyone who waits on this word. Waiters may hold a read-only mapping, so they leave no trace to look for. */
+static inline void doorbell_ring(a32 *word)
+{
+    /* release: a waiter that sees the new value sees all that was written before the bell. */
+    atomic_fetch_add_explicit(word, 1, memory_order_release);
+    syscall(SYS_futex, word, FUTEX_WAKE, INT32_MAX, NULL, NULL, 0);
+}
+
+/* Waits until the word differs from `seen` or the time is over (negative: for ever); 0, or errno (EINTR, ETIMEDOUT). */
+static inline int doorbell_wait(const a32 *word, uint32_t seen, int64_t timeout_ns)
+{
+    if (atomic_load_explicit(word, memory_order_acquire) != seen) return 0;
+    struct timespec limit = {timeout_ns / 1000000000, timeout_ns % 1000000000};
+    long result = syscall(SYS_futex, word, FUTEX_WAIT, seen, timeout_ns < 0 ? NULL : &limit, NULL, 0);
+    return result == 0 || errno == EAGAIN ? 0 : errno;
+}
+
+/* One writer only. `effective` may be NULL: what consumers see is then raw. Returns the frame's number. */
+static inline uint64_t ring_publish(const ring_view *ring, slot_info info, const uint8_t *reason, const uint8_t *raw,
+                                    const uint8_t *effective)
+{
+    ring_header *header = ring_head(ring);
+    uint64_t frame = atomic_load_explicit(&header->head, memory_order_relaxed) + 1; /* ours alone to write */
+    uint8_t *base = ring_slot(ring, frame);
+    slot_header *slot = (slot_header *)(void *)base;
+
+    atomic_store_explicit(&slot->sequence, 2 * frame + 1, memory_order_relaxed);
+    /* Pairs with the acquire fence in ring_read: a reader that saw any word below also sees the odd sequence. */
+    atomic_thread_fence(memory_order_release);
+    info.flags = (uint16_t)(effective ? info.flags | FLAG_EFFECTIVE : info.flags & ~FLAG_EFFECTIVE);
+    words_store((uint8_t *)slot->words, (const uint8_t *)&info, sizeof info);
+    if (info.reason_size) words_store(base + SLOT_HEADER_SIZE, reason, info.reason_size);
+    words_store(base + RAW_OFFSET, raw, ring->frame_size);
+    if (effective) words_store(base + ring->effective_offset, effective, ring->frame_size);
+    /* Pairs with the acquire load of the sequence in ring_read: who sees it even sees the whole frame. */
+    atomic_store_explicit(&slot->sequence, 2 * frame + 2, memory_order_release);
+    /* Pairs with the acquire load of head in every reader: the slot of a frame up to head was whole. */
+    atomic_store_explicit(&header->head, frame, memory_order_release);
+    doorbell_ring(&header->doorbell);
+    return frame;
+}
+
+/* Copies one frame; false when the slot does not hold it (overwritten, or being overwritten). `reason` has REASON_SIZE bytes. */
+static inline bool ring_read(const ring_view *ring, uint64_t frame, slot_info *info, uint8_t *reason, uint8_t *raw,
+                             uint8_t *effective)
+{
+    const uint8_t *base = ring_slot(ring, frame);
+    const slot_header *slot = (const slot_header *)(const void *)base;
+    uint64_t whole = 2 * frame + 2;
+    if (atomic_load_explicit(&slot->sequence, memory_order_acquire) != whole) return false;
+    words_load((uint8_t *)info, (const uint8_t *)slot->words, sizeof *info);
+    if (info->reason_size > REASON_SIZE) info->reason_size = REASON_SIZE; /* torn or hostile; checked below */
+    if (info->reason_size) words_load(reason, base + SLOT_HEADER_SIZE, info->reason_size);
+    words_load(raw, base + RAW_OFFSET, ring->frame_size);
+    if (info->flags & FLAG_EFFECTIVE) words_load(effective, base + ring->effective_offset, ring->frame_size);
+    /* Pairs with the release fence in ring_publish. */
+    atomic_thread_fence(memory_order_acquire);
+    return atomic_load_explicit(&slot->sequence, memory_order_relaxed) == whole;
+}
+
+/* The newest frame's number, or 0: no frame yet, or (after READ_ATTEMPTS laps of the whole ring) no stable one. */
+static inline uint64_t ring_latest(const ring_view *ring, slot_info *info, uint8_t *reason, uint8_t *raw, uint8_t *effective)
+{
+    for (int attempt = 0; attempt < READ_ATTEMPTS; attempt++) {
+        uint64_t frame = atomic_load_explicit(&ring_head(ring)->head, memory_order_acquire);
+        if (frame == 0 || ring_read(ring, frame, info, reason, raw, effective)) return frame;
+    }
+    return 0;
+}
+
+/* A cell: a sequence word, then bytes that have one writer and are read whole. */
+static inline void cell_write(uint8_t *cell, const uint8_t *data, size_t size)
+{
+    a64 *sequence = (a64 *)(void *)cell;
+    uint64_t odd = atomic_load_explicit(sequence, memory_order_relaxed) | 1u; /* a predecessor may have died half-way */
+    atomic_store_explicit(sequence, odd, memory_order_relaxed);
+    atomic_thread_fence(memory_order_release); /* pairs with the fence in cell_read */
+    words_store(cell + 8, data, size);
+    atomic_store_explicit(sequence, odd + 1, memory_order_release); /* pairs with the first load in cell_read */
+}
+
+static inline bool cell_read(const uint8_t *cell, uint8_t *data, size_t size)
+{
+    const a64 *sequence = (const a64 *)(const void *)cell;
+    for (int attempt = 0; attempt < READ_ATTEMPTS; attempt++) {
+        uint64_t before = atomic_load_explicit(sequence, memory_order_acquire);
+        if (before & 1u) continue;
+        words_load(data, cell + 8, size);
+        atomic_thread_fence(memory_order_acquire);
+        if (atomic_load_explicit(sequence, memory_order_relaxed) == before) return true;
+    }
+    return false;
+}
+
+#endif
