@@ -1,0 +1,7 @@
+"""``supervisor.toml``: read, checked, resolved (architecture: *Config*)."""
+
+from shmio.config.address import Address
+from shmio.config.model import Config, Emulator, Grpc, Instance, Source, Tls
+from shmio.config.read import load
+
+__all__ = ["Address", "Config", "Emulator", "Grpc", "Instance", "Source", "Tls", "load"]

@@ -1,0 +1,96 @@
+"""The sections of ``supervisor.toml`` as types; what each key means is in docs/reference/config.md."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from msgspec import Meta, Struct
+
+Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}\Z")]
+Milliseconds = Annotated[float, Meta(gt=0, le=3_600_000)]
+Text = Annotated[str, Meta(min_length=1)]
+
+
+class Section(Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+    """A table of the file: unknown keys are refused."""
+
+
+class Instance(Section):
+    """``[instance]``: what holds for all processes."""
+
+    name: Name
+    log_dir: Text = "logs"
+    group: Text | None = None
+    ring_mb: Annotated[float, Meta(gt=0, le=65536)] = 64.0
+
+
+class Source(Section):
+    """``[[source]]``: a producer of registers. ``options`` are the connector's own keys, inline over ``properties``."""
+
+    name: Name
+    connector: Text
+    layout: Text | None = None
+    properties: Text | None = None
+    period_ms: Annotated[float, Meta(ge=0.1, le=3_600_000)] = 20.0
+    stale_ms: Milliseconds | None = None
+    writable: list[Text] = []
+    armed: bool = False
+    options: dict[str, Any] = {}
+
+    @property
+    def period_ns(self) -> int:
+        """Time between two cycles."""
+        return round(self.period_ms * 1_000_000)
+
+    @property
+    def stale_ns(self) -> int:
+        """Age from which a frame is bad: as configured, else 5 periods and at least 500 ms."""
+        return round(1_000_000 * (self.stale_ms or max(5 * self.period_ms, 500.0)))
+
+
+class Emulator(Section):
+    """``[[emulator]]``: a process that plays a controller."""
+
+    name: Name
+    kind: Text
+    layout: Text
+    program: Text
+    listen: Text
+    insecure: bool = False
+
+
+class Tls(Section):
+    """PEM files of the endpoint; with ``client_ca`` clients must show a certificate of it."""
+
+    certificate: Text
+    key: Text
+    client_ca: Text | None = None
+
+
+class Grpc(Section):
+    """``[grpc]``: the endpoint that serves remote programs."""
+
+    listen: Annotated[list[Text], Meta(min_length=1)]
+    default_source: Text | None = None
+    insecure: bool = False
+    tls: Tls | None = None
+
+
+class Config(Section):
+    """The whole file, with the folder that its paths are relative to."""
+
+    instance: Instance
+    source: list[Source] = []
+    emulator: list[Emulator] = []
+    grpc: Grpc | None = None
+    folder: str = "."
+
+    def path(self, text: str) -> Path:
+        """A path of the file as an absolute one."""
+        return (Path(self.folder) / text).resolve()
+
+    @property
+    def log_dir(self) -> Path:
+        """Folder of the log files."""
+        return self.path(self.instance.log_dir)

@@ -1,0 +1,145 @@
+"""From the file to a checked :class:`Config`; every message names the file, the full key and the remedy."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from shmio.config.address import Address
+from shmio.config.model import Config, Emulator, Grpc, Instance, Section, Source, Tls
+from shmio.config.properties import read_properties
+from shmio.errors import ConfigError
+
+RESERVED_SOURCES = frozenset({"simlog", "model", "shmio"})
+SECTION_PROCESSES = frozenset({"grpc", "mqtt", "recorder", "web"})
+MAX_FILE_BYTES = 1 << 20
+
+_TABLES: dict[str, type[Section]] = {
+    "": Config,
+    "instance": Instance,
+    "source": Source,
+    "emulator": Emulator,
+    "grpc": Grpc,
+    "grpc.tls": Tls,
+}
+
+
+def load(file: Path) -> Config:
+    """Read, check and resolve a ``supervisor.toml``.
+
+    Raises ConfigError: no such file, not TOML, unknown key, wrong type, a rule of the contract broken.
+    """
+    try:
+        with file.open("rb") as stream:
+            data = stream.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(f"{file}: {error.strerror}; write one with shmio-supervisor init") from None
+    if len(data) > MAX_FILE_BYTES:
+        raise ConfigError(f"{file}: larger than {MAX_FILE_BYTES} bytes")
+    try:
+        tables = tomllib.loads(data.decode("utf-8"))
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{file}: not UTF-8 at byte {error.start}") from None
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigError(f"{file}: not TOML: {error}") from None
+    try:
+        return _resolve(tables, file.resolve().parent)
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {error}") from None
+
+
+def _resolve(tables: dict[str, Any], folder: Path) -> Config:
+    if "folder" in tables:
+        raise ConfigError(_unknown("folder", ""))
+    sources = tables.get("source", [])
+    if isinstance(sources, list):
+        tables = {**tables, "source": [_with_options(source, i, folder) for i, source in enumerate(sources)]}
+    config = _convert({**tables, "folder": str(folder)})
+    _check_names(config)
+    _check_listening(config)
+    return config
+
+
+def _with_options(source: Any, index: int, folder: Path) -> Any:
+    """Move the connector's own keys to ``options``; they are checked by the connector, which knows them."""
+    if not isinstance(source, dict):
+        return source
+    common = set(Source.__struct_fields__) - {"options"}
+    inline = {key: value for key, value in source.items() if key not in common}
+    properties = source.get("properties")
+    read = read_properties(folder / properties, f"source[{index}]") if isinstance(properties, str) else {}
+    return {key: source[key] for key in source if key in common} | {"options": read | inline}
+
+
+def _convert(tables: dict[str, Any]) -> Config:
+    try:
+        return msgspec.convert(tables, Config)
+    except msgspec.ValidationError as error:
+        message, _, at = str(error).partition(" - at `$")
+        path = at.rstrip("`").lstrip(".")
+        field = re.search(r"(?:unknown field|missing required field) `([^`]*)`", message)
+        if field is None:
+            raise ConfigError(f"{path}: {message[:1].lower()}{message[1:]}") from None
+        key = f"{path}.{field[1]}" if path else field[1]
+        unknown = "unknown" in message
+        raise ConfigError(_unknown(key, path) if unknown else f"{key}: this key is needed") from None
+
+
+def _unknown(key: str, table: str) -> str:
+    known = _TABLES.get(re.sub(r"\[[^]]*\]", "", table))
+    names = [name for name in known.__struct_fields__ if name not in ("folder", "options")] if known else []
+    near = difflib.get_close_matches(key.rpartition(".")[2], names, 1)
+    return f"{key}: unknown key" + (f"; did you mean {near[0]}?" if near else f"; known here: {', '.join(names)}")
+
+
+def unknown_option(index: int, key: str, known: list[str]) -> str:
+    """Message for a key of ``source[index]`` that neither the contract nor the connector knows."""
+    near = difflib.get_close_matches(key, [*known, *(f for f in Source.__struct_fields__ if f != "options")], 1)
+    hint = f"did you mean {near[0]}?" if near else f"the connector knows: {', '.join(known)}"
+    return f"source[{index}].{key}: unknown key; {hint}"
+
+
+def _check_names(config: Config) -> None:
+    seen: dict[str, str] = {}
+    for table in ("source", "emulator"):
+        for index, section in enumerate(getattr(config, table)):
+            key = f"{table}[{index}].name"
+            folded = section.name.lower()
+            if folded in RESERVED_SOURCES:
+                raise ConfigError(f"{key}: {section.name!r} is reserved")
+            if folded in SECTION_PROCESSES:
+                raise ConfigError(f"{key}: {section.name!r} is the name of a section's process")
+            if folded in seen:
+                raise ConfigError(
+                    f"{key}: {section.name!r} is already the name of {seen[folded]} (case does not count)"
+                )
+            seen[folded] = f"{table}[{index}]"
+    if config.grpc and config.grpc.default_source is not None:
+        names = [source.name for source in config.source]
+        if config.grpc.default_source not in names:
+            raise ConfigError(
+                f"grpc.default_source: no source {config.grpc.default_source!r}; there are: {', '.join(names)}"
+            )
+
+
+def _check_listening(config: Config) -> None:
+    for index, emulator in enumerate(config.emulator):
+        _check_address(f"emulator[{index}].listen", emulator.listen, emulator.insecure, "insecure = true beside it")
+    if config.grpc:
+        safe = config.grpc.insecure or config.grpc.tls is not None
+        for index, text in enumerate(config.grpc.listen):
+            _check_address(f"grpc.listen[{index}]", text, safe, "a [grpc.tls] table, or insecure = true beside it")
+
+
+def _check_address(key: str, text: str, safe: bool, remedy: str) -> None:
+    try:
+        address = Address.parse(text)
+    except ConfigError as error:
+        raise ConfigError(f"{key}: {error}") from None
+    if not address.loopback and not safe:
+        raise ConfigError(f"{key}: {text} can be reached from other hosts in plain text; that needs {remedy}")

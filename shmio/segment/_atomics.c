@@ -1,0 +1,426 @@
+/* Python binding of ring.h (limited API: one build serves CPython 3.11 and later).
+ *
+ * Everything here runs under the GIL except the wait on a doorbell. A Ring keeps its buffer exported, so the mapping
+ * cannot be closed under it.
+ */
+#include <Python.h>
+#include <stddef.h>
+#include <stdlib.h>
+
+#include "ring.h"
+
+/* ---- Ring ---------------------------------------------------------------------------------------------------------- */
+
+typedef struct {
+    PyObject_HEAD
+    Py_buffer buffer;
+    ring_view ring;
+    uint8_t *scratch; /* one effective image, so that it is allocated for Python only when there is one */
+    uint32_t incarnation;
+} Ring;
+
+static void Ring_dealloc(Ring *self)
+{
+    PyTypeObject *type = Py_TYPE((PyObject *)self);
+    if (self->buffer.obj) PyBuffer_Release(&self->buffer);
+    free(self->scratch);
+    ((freefunc)PyType_GetSlot(type, Py_tp_free))(self);
+    Py_DECREF(type);
+}
+
+static int Ring_init(Ring *self, PyObject *args, PyObject *kwargs)
+{
+    static char *names[] = {"buffer", "offset", "size", NULL};
+    PyObject *object;
+    Py_ssize_t offset, size;
+    if (self->buffer.obj) {
+        PyErr_SetString(PyExc_TypeError, "a Ring is opened once");
+        return -1;
+    }
+    if (!PyArg_ParseTupleAndKeywords(args, kwargs, "Onn", names, &object, &offset, &size)) return -1;
+    if (PyObject_GetBuffer(object, &self->buffer, PyBUF_SIMPLE) < 0) return -1;
+    if (offset < 0 || size < 0 || offset > self->buffer.len || size > self->buffer.len - offset) {
+        PyErr_SetString(PyExc_ValueError, "ring lies outside the buffer");
+        return -1;
+    }
+    const char *wrong = ring_open(&self->ring, (uint8_t *)self->buffer.buf + offset, (uint64_t)size);
+    if (wrong) {
+        PyErr_SetString(PyExc_ValueError, wrong);
+        return -1;
+    }
+    self->scratch = malloc(align8(self->ring.frame_size));
+    if (!self->scratch) {
+        PyErr_NoMemory();
+        return -1;
+    }
+    return 0;
+}
+
+static bool Ring_ready(Ring *self)
+{
+    if (self->scratch) return true;
+    PyErr_SetString(PyExc_ValueError, "the ring is not open");
+    return false;
+}
+
+static bool Ring_writable(Ring *self)
+{
+    if (!Ring_ready(self)) return false;
+    if (!self->buffer.readonly) return true;
+    PyErr_SetString(PyExc_TypeError, "the segment is mapped read-only");
+    return false;
+}
+
+static PyObject *Ring_begin(Ring *self, PyObject *unused)
+{
+    (void)unused;
+    if (!Ring_writable(self)) return NULL;
+    /* Only the one writer changes it; readers see it in frames. */
+    self->incarnation = atomic_fetch_add_explicit(&ring_head(&self->ring)->incarnation, 1, memory_order_relaxed) + 1;
+    return PyLong_FromUnsignedLong(self->incarnation);
+}
+
+static PyObject *Ring_publish(Ring *self, PyObject *args)
+{
+    Py_buffer raw, reason, effective = {0};
+    PyObject *effective_object, *result = NULL;
+    slot_info info = {0};
+    unsigned long long cycle;
+    long long publish_ns, clock_ns, source_ns;
+    if (!PyArg_ParseTuple(args, "y*OKLLLBBy*", &raw, &effective_object, &cycle, &publish_ns, &clock_ns, &source_ns,
+                          &info.quality, &info.provenance, &reason))
+        return NULL;
+    if (effective_object != Py_None && PyObject_GetBuffer(effective_object, &effective, PyBUF_SIMPLE) < 0) goto done;
+    if (!Ring_writable(self)) goto done;
+    if (self->incarnation == 0) {
+        PyErr_SetString(PyExc_ValueError, "begin() comes before the first publish()");
+        goto done;
+    }
+    if (raw.len != self->ring.frame_size || (effective.obj && effective.len != self->ring.frame_size)) {
+        PyErr_Format(PyExc_ValueError, "a frame of this ring has %u bytes", self->ring.frame_size);
+        goto done;
+    }
+    info.cycle = cycle;
+    info.publish_ns = publish_ns;
+    info.clock_ns = clock_ns;
+    info.source_ns = source_ns;
+    info.incarnation = self->incarnation;
+    info.reason_size = (uint16_t)(reason.len < (Py_ssize_t)REASON_SIZE ? reason.len : (Py_ssize_t)REASON_SIZE);
+    result = PyLong_FromUnsignedLongLong(ring_publish(&self->ring, info, reason.buf, raw.buf, effective.buf));
+done:
+    if (effective.obj) PyBuffer_Release(&effective);
+    PyBuffer_Release(&reason);
+    PyBuffer_Release(&raw);
+    return result;
+}
+
+static PyObject *Ring_head(Ring *self, PyObject *unused)
+{
+    (void)unused;
+    if (!Ring_ready(self)) return NULL;
+    return PyLong_FromUnsignedLongLong(atomic_load_explicit(&ring_head(&self->ring)->head, memory_order_acquire));
+}
+
+/* (frame, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance, event, reason, raw, effective) */
+static PyObject *Ring_copy(Ring *self, bool latest, uint64_t frame)
+{
+    slot_info info;
+    uint8_t reason[REASON_SIZE];
+    PyObject *raw = PyBytes_FromStringAndSize(NULL, self->ring.frame_size);
+    if (!raw) return NULL;
+    uint8_t *data = (uint8_t *)PyBytes_AsString(raw);
+    if (latest)
+        frame = ring_latest(&self->ring, &info, reason, data, self->scratch);
+    else if (!ring_read(&self->ring, frame, &info, reason, data, self->scratch))
+        frame = 0;
+    if (frame == 0) {
+        Py_DECREF(raw);
+        Py_RETURN_NONE;
+    }
+    PyObject *effective;
+    if (info.flags & FLAG_EFFECTIVE) {
+        effective = PyBytes_FromStringAndSize((const char *)self->scratch, self->ring.frame_size);
+        if (!effective) {
+            Py_DECREF(raw);
+            return NULL;
+        }
+    } else {
+        Py_INCREF(Py_None);
+        effective = Py_None;
+    }
+    PyObject *text = PyUnicode_DecodeUTF8((const char *)reason, info.reason_size, "replace");
+    if (!text) {
+        Py_DECREF(raw);
+        Py_DECREF(effective);
+        return NULL;
+    }
+    return Py_BuildValue("KKLLLIBBKNNN", (unsigned long long)frame, (unsigned long long)info.cycle,
+                         (long long)info.publish_ns, (long long)info.clock_ns, (long long)info.source_ns,
+                         (unsigned int)info.incarnation, info.quality, info.provenance, (unsigned long long)info.event,
+                         text, raw, effective);
+}
+
+static PyObject *Ring_latest(Ring *self, PyObject *unused)
+{
+    (void)unused;
+    return Ring_ready(self) ? Ring_copy(self, true, 0) : NULL;
+}
+
+static PyObject *Ring_read(Ring *self, PyObject *number)
+{
+    if (!Ring_ready(self)) return NULL;
+    unsigned long long frame = PyLong_AsUnsignedLongLong(number);
+    if (PyErr_Occurred()) return NULL;
+    if (frame == 0 || frame > UINT64_MAX / 2 - 1) Py_RETURN_NONE;
+    return Ring_copy(self, false, frame);
+}
+
+static PyObject *Ring_doorbell(Ring *self, PyObject *unused)
+{
+    (void)unused;
+    if (!Ring_ready(self)) return NULL;
+    return PyLong_FromUnsignedLong(atomic_load_explicit(&ring_head(&self->ring)->doorbell, memory_order_acquire));
+}
+
+/* Waits with the GIL released; returns the word's value, after a signal too (its Python handler has then run). */
+static PyObject *wait_on(const a32 *word, unsigned int seen, long long timeout_ns)
+{
+    int error;
+    Py_BEGIN_ALLOW_THREADS
+    error = doorbell_wait(word, seen, timeout_ns);
+    Py_END_ALLOW_THREADS
+    if (error == EINTR && PyErr_CheckSignals() < 0) return NULL;
+    if (error && error != EINTR && error != ETIMEDOUT) {
+        errno = error;
+        return PyErr_SetFromErrno(PyExc_OSError);
+    }
+    return PyLong_FromUnsignedLong(atomic_load_explicit(word, memory_order_acquire));
+}
+
+static PyObject *Ring_wait(Ring *self, PyObject *args)
+{
+    unsigned int seen;
+    long long timeout_ns;
+    if (!PyArg_ParseTuple(args, "IL", &seen, &timeout_ns)) return NULL;
+    return Ring_ready(self) ? wait_on(&ring_head(&self->ring)->doorbell, seen, timeout_ns) : NULL;
+}
+
+static PyObject *Ring_get(Ring *self, void *field)
+{
+    if (!Ring_ready(self)) return NULL;
+    const uint8_t *at = self->ring.base + (uintptr_t)field;
+    if ((uintptr_t)field < offsetof(ring_header, period_ns)) return PyLong_FromUnsignedLong(*(const uint32_t *)(const void *)at);
+    return PyLong_FromLongLong(*(const int64_t *)(const void *)at);
+}
+
+#define FIELD(name, doc) {#name, (getter)Ring_get, NULL, doc, (void *)offsetof(ring_header, name)}
+static PyGetSetDef Ring_fields[] = {
+    FIELD(slot_count, "Frames that the ring holds."),
+    FIELD(frame_size, "Bytes of one image."),
+    FIELD(period_ns, "Time between two cycles of the source."),
+    FIELD(stale_ns, "Age from which a frame is no longer good."),
+    {0},
+};
+
+#define METHOD(type, name, flags, doc) {#name, (PyCFunction)(void (*)(void))type##_##name, flags, doc}
+static PyMethodDef Ring_methods[] = {
+    METHOD(Ring, begin, METH_NOARGS, "Take the writer's part: a new incarnation."),
+    METHOD(Ring, publish, METH_VARARGS, "Write the next frame and wake all who wait."),
+    METHOD(Ring, head, METH_NOARGS, "Number of the newest whole frame; 0: none yet."),
+    METHOD(Ring, latest, METH_NOARGS, "A validated copy of the newest frame, or None."),
+    METHOD(Ring, read, METH_O, "A validated copy of one frame, or None when it is not in the ring."),
+    METHOD(Ring, doorbell, METH_NOARGS, "Value of the futex word; read it before looking for news."),
+    METHOD(Ring, wait, METH_VARARGS, "Wait until the doorbell differs from `seen`, at most `timeout_ns`."),
+    {0},
+};
+
+static PyType_Slot Ring_slots[] = {
+    {Py_tp_doc, "One frame ring in a mapped segment."},
+    {Py_tp_init, Ring_init},
+    {Py_tp_dealloc, Ring_dealloc},
+    {Py_tp_methods, Ring_methods},
+    {Py_tp_getset, Ring_fields},
+    {0, NULL},
+};
+static PyType_Spec Ring_spec = {"shmio.segment._atomics.Ring", sizeof(Ring), 0, Py_TPFLAGS_DEFAULT, Ring_slots};
+
+/* ---- words and cells ----------------------------------------------------------------------------------------------- */
+
+/* The aligned place of `size` bytes in a buffer, or NULL with an exception. */
+static uint8_t *place(const Py_buffer *buffer, Py_ssize_t offset, Py_ssize_t size, Py_ssize_t alignment)
+{
+    if (offset < 0 || size < 0 || size > buffer->len || offset > buffer->len - size) {
+        PyErr_SetString(PyExc_ValueError, "outside the buffer");
+        return NULL;
+    }
+    uint8_t *at = (uint8_t *)buffer->buf + offset;
+    if ((uintptr_t)at % (uintptr_t)alignment) {
+        PyErr_SetString(PyExc_ValueError, "not aligned");
+        return NULL;
+    }
+    return at;
+}
+
+static PyObject *atomics_load64(PyObject *module, PyObject *args)
+{
+    (void)module;
+    Py_buffer buffer;
+    Py_ssize_t offset;
+    if (!PyArg_ParseTuple(args, "y*n", &buffer, &offset)) return NULL;
+    a64 *at = (a64 *)(void *)place(&buffer, offset, 8, 8);
+    uint64_t value = at ? atomic_load_explicit(at, memory_order_acquire) : 0;
+    PyBuffer_Release(&buffer);
+    return at ? PyLong_FromUnsignedLongLong(value) : NULL;
+}
+
+static PyObject *atomics_store64(PyObject *module, PyObject *args)
+{
+    (void)module;
+    Py_buffer buffer;
+    Py_ssize_t offset;
+    unsigned long long value;
+    if (!PyArg_ParseTuple(args, "w*nK", &buffer, &offset, &value)) return NULL;
+    a64 *at = (a64 *)(void *)place(&buffer, offset, 8, 8);
+    if (at) atomic_store_explicit(at, value, memory_order_release); /* pairs with load64 */
+    PyBuffer_Release(&buffer);
+    if (!at) return NULL;
+    Py_RETURN_NONE;
+}
+
+static PyObject *atomics_cell_write(PyObject *module, PyObject *args)
+{
+    (void)module;
+    Py_buffer buffer, data;
+    Py_ssize_t offset;
+    if (!PyArg_ParseTuple(args, "w*ny*", &buffer, &offset, &data)) return NULL;
+    uint8_t *cell = data.len < PY_SSIZE_T_MAX - 16 ? place(&buffer, offset, 8 + (Py_ssize_t)align8((uint64_t)data.len), 8) : NULL;
+    if (cell) cell_write(cell, data.buf, (size_t)data.len);
+    PyBuffer_Release(&buffer);
+    PyBuffer_Release(&data);
+    if (!cell) return PyErr_Occurred() ? NULL : PyErr_NoMemory();
+    Py_RETURN_NONE;
+}
+
+static PyObject *atomics_cell_read(PyObject *module, PyObject *args)
+{
+    (void)module;
+    Py_buffer buffer;
+    Py_ssize_t offset, size;
+    if (!PyArg_ParseTuple(args, "y*nn", &buffer, &offset, &size)) return NULL;
+    PyObject *data = NULL;
+    uint8_t *cell = NULL;
+    if (size < 0 || size > buffer.len)
+        PyErr_SetString(PyExc_ValueError, "outside the buffer");
+    else
+        cell = place(&buffer, offset, 8 + (Py_ssize_t)align8((uint64_t)size), 8);
+    if (cell && (data = PyBytes_FromStringAndSize(NULL, size)) != NULL &&
+        !cell_read(cell, (uint8_t *)PyBytes_AsString(data), (size_t)size)) {
+        Py_DECREF(data);
+        Py_INCREF(Py_None);
+        data = Py_None;
+    }
+    PyBuffer_Release(&buffer);
+    return data;
+}
+
+/* ---- changed registers --------------------------------------------------------------------------------------------- */
+
+#define CHUNK 64u
+
+typedef struct {
+    uint32_t offset;
+    uint32_t size;
+    uint32_t mask; /* of the one byte, for a BOOL; 0: all bytes count */
+} scan_entry;
+
+static bool entry_changed(const scan_entry *entry, const uint8_t *old, const uint8_t *new, const uint8_t *dirty)
+{
+    uint32_t last = (entry->offset + entry->size - 1) / CHUNK;
+    for (uint32_t chunk = entry->offset / CHUNK; !dirty[chunk]; chunk++)
+        if (chunk == last) return false;
+    if (entry->mask) return ((old[entry->offset] ^ new[entry->offset]) & entry->mask) != 0;
+    return memcmp(old + entry->offset, new + entry->offset, entry->size) != 0;
+}
+
+static PyObject *atomics_changed(PyObject *module, PyObject *args)
+{
+    (void)module;
+    Py_buffer old, new, table;
+    PyObject *result = NULL;
+    uint8_t stack[1024], *dirty = stack;
+    if (!PyArg_ParseTuple(args, "y*y*y*", &old, &new, &table)) return NULL;
+    const scan_entry *entries = table.buf;
+    Py_ssize_t count = table.len / (Py_ssize_t)sizeof *entries;
+    if (old.len != new.len || table.len % (Py_ssize_t)sizeof *entries || (uintptr_t)table.buf % 4) {
+        PyErr_SetString(PyExc_ValueError, "two images of one size and a table of (offset, size, mask) are needed");
+        goto done;
+    }
+    result = PyList_New(0);
+    if (!result || memcmp(old.buf, new.buf, (size_t)old.len) == 0) goto done;
+    size_t chunks = ((size_t)old.len + CHUNK - 1) / CHUNK;
+    if (chunks > sizeof stack && !(dirty = malloc(chunks))) {
+        Py_CLEAR(result);
+        PyErr_NoMemory();
+        goto done;
+    }
+    for (size_t chunk = 0; chunk < chunks; chunk++) {
+        size_t at = chunk * CHUNK, rest = (size_t)old.len - at;
+        dirty[chunk] = memcmp((uint8_t *)old.buf + at, (uint8_t *)new.buf + at, rest < CHUNK ? rest : CHUNK) != 0;
+    }
+    for (Py_ssize_t i = 0; i < count; i++) {
+        const scan_entry *entry = &entries[i];
+        if (entry->size == 0 || (uint64_t)entry->offset + entry->size > (uint64_t)old.len) {
+            PyErr_Format(PyExc_ValueError, "entry %zd lies outside the image", i);
+            Py_CLEAR(result);
+            break;
+        }
+        if (!entry_changed(entry, old.buf, new.buf, dirty)) continue;
+        PyObject *index = PyLong_FromSsize_t(i);
+        if (!index || PyList_Append(result, index) < 0) {
+            Py_XDECREF(index);
+            Py_CLEAR(result);
+            break;
+        }
+        Py_DECREF(index);
+    }
+    if (dirty != stack) free(dirty);
+done:
+    PyBuffer_Release(&old);
+    PyBuffer_Release(&new);
+    PyBuffer_Release(&table);
+    return result;
+}
+
+/* ---- module -------------------------------------------------------------------------------------------------------- */
+
+static PyMethodDef functions[] = {
+    METHOD(atomics, load64, METH_VARARGS, "Acquire load of an aligned 64-bit word."),
+    METHOD(atomics, store64, METH_VARARGS, "Release store of an aligned 64-bit word."),
+    METHOD(atomics, cell_write, METH_VARARGS, "Write a cell; one writer."),
+    METHOD(atomics, cell_read, METH_VARARGS, "A consistent copy of a cell, or None while it is being written."),
+    METHOD(atomics, changed, METH_VARARGS, "Indices of the table's entries whose bytes differ between two images."),
+    {0},
+};
+
+static int module_exec(PyObject *module)
+{
+    PyObject *type = PyType_FromModuleAndSpec(module, &Ring_spec, NULL);
+    if (!type) return -1;
+    int result = PyModule_AddObjectRef(module, "Ring", type);
+    Py_DECREF(type);
+    if (result < 0) return -1;
+    return PyModule_AddIntConstant(module, "RING_HEADER_SIZE", RING_HEADER_SIZE) < 0 ||
+                   PyModule_AddIntConstant(module, "RAW_OFFSET", RAW_OFFSET) < 0 ||
+                   PyModule_AddIntConstant(module, "REASON_SIZE", REASON_SIZE) < 0
+               ? -1
+               : 0;
+}
+
+static PyModuleDef_Slot module_slots[] = {{Py_mod_exec, module_exec}, {0, NULL}};
+
+static struct PyModuleDef definition = {
+    PyModuleDef_HEAD_INIT, "shmio.segment._atomics", "Atomics for the shared-memory segment.", 0, functions, module_slots,
+    NULL, NULL, NULL};
+
+PyMODINIT_FUNC PyInit__atomics(void);
+PyMODINIT_FUNC PyInit__atomics(void) { return PyModuleDef_Init(&definition); }
