@@ -1,7 +1,8 @@
 """Types of the C extension; see _atomics.c and ring.h."""
 
-from typing_extensions import Buffer
 from typing import TypeAlias, final
+
+from typing_extensions import Buffer
 
 RING_HEADER_SIZE: int
 RAW_OFFSET: int

@@ -1,0 +1,70 @@
+"""A frame: a consistent image of a whole block at one cycle."""
+
+from __future__ import annotations
+
+import time
+from enum import IntEnum
+from typing import NamedTuple
+
+
+class Quality(IntEnum):
+    """Trust in a value, as OPC UA means it (OPC 10000-8, section 6.3). Zeroed memory is bad."""
+
+    BAD = 0
+    UNCERTAIN = 1
+    GOOD = 2
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
+class Provenance(IntEnum):
+    """Where a value comes from."""
+
+    LIVE = 0
+    SIMULATED = 1
+    REPLAYED = 2
+    INJECTED = 3
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
+class Frame(NamedTuple):
+    """A validated copy of one frame of a block. All times are in ns.
+
+    ``raw`` is what the source delivered, in its own byte order; ``effective`` is what consumers see, None while it
+    equals raw. ``publish_ns`` is CLOCK_MONOTONIC, ``clock_ns`` the instance's clock since its start, ``source_ns``
+    UTC. ``cycle`` counts the periods of the source's schedule, so frames of two incarnations of the source's process
+    are told apart from frames that a reader lost.
+    """
+
+    number: int
+    cycle: int
+    publish_ns: int
+    clock_ns: int
+    source_ns: int
+    incarnation: int
+    quality: Quality
+    provenance: Provenance
+    event: int
+    reason: str
+    raw: bytes
+    effective: bytes | None
+
+    @property
+    def image(self) -> bytes:
+        """What consumers see: effective if there is one, else raw."""
+        return self.raw if self.effective is None else self.effective
+
+    def age_ns(self, now_ns: int | None = None) -> int:
+        """Time since the frame was published."""
+        return (time.monotonic_ns() if now_ns is None else now_ns) - self.publish_ns
+
+    def assess(self, stale_ns: int, now_ns: int | None = None) -> tuple[Quality, str]:
+        """Quality and reason as of now: a frame that is too old is never good."""
+        if self.quality is not Quality.BAD:
+            age_ns = self.age_ns(now_ns)
+            if age_ns > stale_ns:
+                return Quality.BAD, f"stale: no frame for {age_ns / 1e9:.1f} s"
+        return self.quality, self.reason

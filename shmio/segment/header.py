@@ -1,0 +1,182 @@
+"""The fixed header of a segment and its section table (docs/reference/segment-format.md)."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+from shmio import __version__
+from shmio.errors import FormatError
+from shmio.segment import _atomics
+
+MAGIC: Final = int.from_bytes(b"SHMIOSEG", "little")
+ABI_VERSION: Final = 1
+HEADER_SIZE: Final = 4096
+SECTION_SIZE: Final = 128
+SLOT_SIZE: Final = 512
+MAX_SECTIONS: Final = 1024
+MAX_PROCESSES: Final = 256
+
+# Offsets of what changes while the segment lives.
+GENERATION_OFFSET: Final = 48  # u32 generation, u32 section count: one word, so that they move together
+HEARTBEAT_OFFSET: Final = 504
+SUPERVISOR_CELL: Final = 512
+
+_HEADER: Final = struct.Struct("<QIIQQqqII QII QIII 4x 16s64s32s256s")
+_SECTION: Final = struct.Struct("<IIQQII64s32s")
+_SUPERVISOR: Final = struct.Struct("<II")
+
+
+class State(IntEnum):
+    """State of an instance."""
+
+    STARTING = 0
+    RUNNING = 1
+    DEGRADED = 2
+    STOPPING = 3
+    STOPPED = 4
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
+class SectionKind(IntEnum):
+    """What a section holds; unknown kinds are passed over."""
+
+    LAYOUT = 1
+    FRAMES = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """The header's fixed fields. Offsets and sizes in bytes, times in ns."""
+
+    epoch: int
+    size: int
+    started_utc_ns: int
+    started_ns: int
+    sections_offset: int
+    section_capacity: int
+    processes_offset: int
+    process_capacity: int
+    mode: str
+    instance: str
+    version: str
+    control: str
+
+    def write(self, memory: memoryview) -> None:
+        """Write all but the magic, which :func:`finish` writes last."""
+        packed = _HEADER.pack(
+            0, ABI_VERSION, HEADER_SIZE, self.epoch, self.size, self.started_utc_ns, self.started_ns,
+            0, 0,  # generation and section count, see write_section
+            self.sections_offset, self.section_capacity, SECTION_SIZE,
+            self.processes_offset, self.process_capacity, SLOT_SIZE, 0,
+            self.mode.encode(), self.instance.encode(), self.version.encode(), self.control.encode(),
+        )  # fmt: skip
+        memory[: len(packed)] = packed
+
+    @classmethod
+    def read(cls, memory: memoryview, name: str) -> Header:
+        """Read and check; FormatError names what this version does not know."""
+        if len(memory) < HEADER_SIZE or _atomics.load64(memory, 0) != MAGIC:
+            raise FormatError(f"{name} is not a whole shmio segment")
+        # fmt: off
+        (_, abi, header_size, epoch, size, utc_ns, started_ns, _, _, sections, section_capacity, section_size,
+         processes, process_capacity, slot_size, _, mode, instance, version, control) = _HEADER.unpack_from(memory)
+        # fmt: on
+        if abi != ABI_VERSION:
+            raise FormatError(
+                f"{name} has segment ABI {abi} (written by shmio {text(version)}), this shmio {__version__} knows "
+                f"ABI {ABI_VERSION}: use one version for both"
+            )
+        sound = (
+            header_size == HEADER_SIZE
+            and section_size == SECTION_SIZE
+            and slot_size == SLOT_SIZE
+            and section_capacity <= MAX_SECTIONS
+            and process_capacity <= MAX_PROCESSES
+            and sections % 8 == 0
+            and processes % 64 == 0
+            and HEADER_SIZE <= sections <= len(memory) - section_capacity * SECTION_SIZE
+            and HEADER_SIZE <= processes <= len(memory) - process_capacity * SLOT_SIZE
+        )
+        if not sound:
+            raise FormatError(f"{name}: the header contradicts itself")
+        return cls(
+            epoch, size, utc_ns, started_ns, sections, section_capacity, processes, process_capacity,
+            text(mode), text(instance), text(version), text(control),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class SectionEntry:
+    """One line of the section table. ``layout``: index of the layout's section, for FRAMES."""
+
+    kind: int
+    retired: bool
+    offset: int
+    size: int
+    layout: int
+    name: str
+    digest: bytes
+
+
+def write_section(memory: memoryview, header: Header, entry: SectionEntry) -> int:
+    """Append an entry; its index. The entry is whole before generation and count show it."""
+    generation, count = _counts(memory)
+    if count >= header.section_capacity:
+        raise FormatError("the section table is full")
+    packed = _SECTION.pack(
+        entry.kind, int(entry.retired), entry.offset, entry.size, entry.layout, 0, entry.name.encode(), entry.digest
+    )
+    at = header.sections_offset + count * SECTION_SIZE
+    memory[at : at + len(packed)] = packed
+    _atomics.store64(memory, GENERATION_OFFSET, (count + 1) << 32 | generation + 1)
+    return count
+
+
+def read_sections(memory: memoryview, header: Header, name: str) -> list[SectionEntry]:
+    """All entries, checked to lie within the object."""
+    _, count = _counts(memory)
+    if count > header.section_capacity:
+        raise FormatError(f"{name}: more sections than the table holds")
+    entries = []
+    for index in range(count):
+        kind, flags, offset, size, layout, _, label, digest = _SECTION.unpack_from(
+            memory, header.sections_offset + index * SECTION_SIZE
+        )
+        if offset % 64 or offset > len(memory) or size > len(memory) - offset:
+            raise FormatError(f"{name}: section {index} lies outside the segment")
+        entries.append(SectionEntry(kind, bool(flags & 1), offset, size, layout, text(label), digest))
+    return entries
+
+
+def finish(memory: memoryview) -> None:
+    """Write the magic: from now on the segment can be opened."""
+    _atomics.store64(memory, 0, MAGIC)
+
+
+def write_supervisor(memory: memoryview, pid: int, state: State) -> None:
+    """Tell who supervises, and the instance's state."""
+    _atomics.cell_write(memory, SUPERVISOR_CELL, _SUPERVISOR.pack(pid, state))
+
+
+def read_supervisor(memory: memoryview) -> tuple[int, State]:
+    """(pid, state) as the supervisor last wrote them."""
+    data = _atomics.cell_read(memory, SUPERVISOR_CELL, _SUPERVISOR.size)
+    if data is None:
+        return 0, State.STARTING
+    pid, state = _SUPERVISOR.unpack(data)
+    return pid, State(state) if state <= State.STOPPED else State.STOPPED
+
+
+def text(field: bytes) -> str:
+    """A zero-padded UTF-8 field."""
+    return field.split(b"\0", 1)[0].decode("utf-8", "replace")
+
+
+def _counts(memory: memoryview) -> tuple[int, int]:
+    word = _atomics.load64(memory, GENERATION_OFFSET)
+    return word & 0xFFFFFFFF, word >> 32

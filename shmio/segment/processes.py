@@ -1,0 +1,194 @@
+"""The process table: who runs, since when, how it fares. Written by supervisor and workers, read by anybody.
+
+A slot has three parts, each with one writer: name and kind (fixed), the supervisor's cell, and the worker's heartbeat
+and cell. The worker holds an OS lock on its slot for life, so a dead owner is known for certain.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+from shmio.segment import _atomics
+from shmio.segment.header import HEARTBEAT_OFFSET, SLOT_SIZE, Header, text
+from shmio.segment.shm import SharedObject
+
+SUPERVISOR_LOCK: Final = 0  # lock byte of the instance; slot i has byte i + 1
+
+_FIXED: Final = struct.Struct("<64s16s")
+_SUPERVISED_AT: Final = 128
+_SUPERVISED: Final = struct.Struct("<IIq104s")
+_HEARTBEAT_AT: Final = 256
+_REPORT_AT: Final = 264
+_REPORT: Final = struct.Struct("<IIq8Q160s")
+
+COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
+    "source": ("polls", "overruns", "failures", "connects", "round_trip_us", "rate_mhz"),
+    "emulator": ("steps", "overruns", "connections", "requests"),
+    "grpc": ("streams", "messages", "dropped"),
+}
+"""Names of a worker's counters by its kind, in the order of their slots (at most 8)."""
+
+
+class Phase(IntEnum):
+    """State of a process as its supervisor sees it."""
+
+    STOPPED = 0
+    STARTING = 1
+    RUNNING = 2
+    BACKOFF = 3
+    FATAL = 4
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
+class Activity(IntEnum):
+    """State of a worker as it reports it."""
+
+    NONE = 0
+    STARTING = 1
+    RUNNING = 2
+    STOPPING = 3
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessSpec:
+    """A process the instance has a slot for. ``kind``: source, emulator, grpc."""
+
+    name: str
+    kind: str
+
+
+@dataclass(frozen=True, slots=True)
+class Supervised:
+    """The supervisor's part: ``note`` says why the process is not running."""
+
+    phase: Phase = Phase.STOPPED
+    restarts: int = 0
+    spawned_ns: int = 0
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """The worker's part. ``counters`` are named by :data:`COUNTERS`; ``note`` says what is wrong at present."""
+
+    pid: int = 0
+    activity: Activity = Activity.NONE
+    started_ns: int = 0
+    counters: tuple[int, ...] = ()
+    note: str = ""
+
+
+class ProcessSlot:
+    """One process's line of the table."""
+
+    def __init__(self, shared: SharedObject, memory: memoryview, index: int, offset: int) -> None:
+        self._shared = shared
+        self._memory = memory
+        self._offset = offset
+        self._lock = index + 1
+        name, kind = _FIXED.unpack_from(memory, offset)
+        self.name = text(name)
+        self.kind = text(kind)
+
+    @property
+    def supervised(self) -> Supervised:
+        """What the supervisor last wrote."""
+        data = _atomics.cell_read(self._memory, self._offset + _SUPERVISED_AT, _SUPERVISED.size)
+        if data is None:
+            return Supervised()
+        phase, restarts, spawned_ns, note = _SUPERVISED.unpack(data)
+        return Supervised(Phase(min(phase, Phase.FATAL)), restarts, spawned_ns, text(note))
+
+    @supervised.setter
+    def supervised(self, value: Supervised) -> None:
+        data = _SUPERVISED.pack(value.phase, value.restarts, value.spawned_ns, cut(value.note, 103))
+        _atomics.cell_write(self._memory, self._offset + _SUPERVISED_AT, data)
+
+    @property
+    def report(self) -> Report:
+        """What the worker last wrote; its predecessor's until a new one has started."""
+        data = _atomics.cell_read(self._memory, self._offset + _REPORT_AT, _REPORT.size)
+        if data is None:
+            return Report()
+        pid, activity, started_ns, *counters, note = _REPORT.unpack(data)
+        return Report(pid, Activity(min(activity, Activity.STOPPING)), started_ns, tuple(counters), text(note))
+
+    @report.setter
+    def report(self, value: Report) -> None:
+        counters = (*value.counters, *(0,) * (8 - len(value.counters)))
+        data = _REPORT.pack(value.pid, value.activity, value.started_ns, *counters, cut(value.note, 159))
+        _atomics.cell_write(self._memory, self._offset + _REPORT_AT, data)
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """The worker's counters by name."""
+        return dict(zip(COUNTERS.get(self.kind, ()), self.report.counters, strict=False))
+
+    @property
+    def heartbeat_ns(self) -> int:
+        """CLOCK_MONOTONIC of the worker's last beat; 0 before the first."""
+        return _atomics.load64(self._memory, self._offset + _HEARTBEAT_AT)
+
+    def beat(self) -> None:
+        """Tell that the worker makes progress."""
+        _atomics.store64(self._memory, self._offset + _HEARTBEAT_AT, time.monotonic_ns())
+
+    def take(self) -> bool:
+        """Take the role's lock for life; False while another process holds it."""
+        return self._shared.try_lock(self._lock)
+
+    def alive(self) -> bool:
+        """Whether some process holds the role's lock."""
+        return self._shared.locked(self._lock)
+
+
+class ProcessTable(Sequence[ProcessSlot]):
+    """All slots, in the order of the configuration."""
+
+    def __init__(self, shared: SharedObject, memory: memoryview, header: Header) -> None:
+        slots = (
+            ProcessSlot(shared, memory, i, header.processes_offset + i * SLOT_SIZE)
+            for i in range(header.process_capacity)
+        )
+        self._slots = [slot for slot in slots if slot.name]
+
+    @staticmethod
+    def write(memory: memoryview, header: Header, specs: Sequence[ProcessSpec]) -> None:
+        """Name the slots of a new segment."""
+        for index, spec in enumerate(specs):
+            _FIXED.pack_into(
+                memory, header.processes_offset + index * SLOT_SIZE, spec.name.encode(), spec.kind.encode()
+            )
+
+    def __getitem__(self, index: int) -> ProcessSlot:  # type: ignore[override]  # no slices
+        return self._slots[index]
+
+    def __len__(self) -> int:
+        return len(self._slots)
+
+    def __iter__(self) -> Iterator[ProcessSlot]:
+        return iter(self._slots)
+
+    def find(self, name: str) -> ProcessSlot:
+        """The slot of this name; KeyError."""
+        for slot in self._slots:
+            if slot.name == name:
+                return slot
+        raise KeyError(name)
+
+
+def supervisor_beat(memory: memoryview) -> None:
+    """The supervisor's own heartbeat."""
+    _atomics.store64(memory, HEARTBEAT_OFFSET, time.monotonic_ns())
+
+
+def cut(message: str, size: int) -> bytes:
+    """At most ``size`` bytes of UTF-8, whole characters only."""
+    return message.encode()[:size].decode("utf-8", "ignore").encode()

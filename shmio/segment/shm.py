@@ -1,0 +1,148 @@
+"""One POSIX shared-memory object: create, open, lock, map, unlink. Linux only.
+
+posix-ipc opens the object (not ``multiprocessing.shared_memory``, whose resource tracker unlinks a live segment when a
+process that merely attached ends).
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import grp
+import mmap
+import os
+import struct
+from contextlib import suppress
+from pathlib import Path
+
+import posix_ipc
+
+from shmio.errors import SegmentError
+
+DIRECTORY = Path("/dev/shm")  # noqa: S108  where Linux keeps POSIX shared memory, shm_overview(7)
+_FLOCK = "@hhqqi4x"  # struct flock of 64-bit Linux: type, whence, start, length, pid
+
+
+class SharedObject:
+    """An open shared-memory object with its mapping and its byte locks.
+
+    The locks are *open file description* locks (fcntl(2)): the kernel releases them when the holder dies, however it
+    dies, and they belong to this object, not to the process, so that two of them in one process exclude each other.
+    """
+
+    def __init__(self, name: str, fd: int, *, writable: bool) -> None:
+        self.name = name
+        self.writable = writable
+        self.inode = os.fstat(fd).st_ino
+        self._fd = fd
+        self._map: mmap.mmap | None = None
+
+    @classmethod
+    def create(cls, name: str, group: str | None = None) -> SharedObject:
+        """Create the object, empty; FileExistsError when there is one. Mode 0600, or 0640 with a group."""
+        try:
+            memory = posix_ipc.SharedMemory(f"/{name}", posix_ipc.O_CREX, mode=0o600)
+        except posix_ipc.ExistentialError:
+            raise FileExistsError(name) from None
+        except OSError as error:
+            raise SegmentError(f"cannot create shared memory {name}: {error.strerror}") from None
+        shared = cls(name, memory.fd, writable=True)
+        if group is not None:
+            try:
+                os.fchown(memory.fd, -1, grp.getgrnam(group).gr_gid)
+                os.fchmod(memory.fd, 0o640)
+            except (KeyError, OSError) as error:
+                shared.close()
+                unlink(name)
+                reason = "no such group" if isinstance(error, KeyError) else error.strerror
+                raise SegmentError(f"instance.group: cannot give the segment to group {group!r}: {reason}") from None
+        return shared
+
+    @classmethod
+    def open(cls, name: str, *, writable: bool = False) -> SharedObject:
+        """Open an existing object; FileNotFoundError when there is none."""
+        try:
+            memory = posix_ipc.SharedMemory(f"/{name}", 0, read_only=not writable)
+        except posix_ipc.ExistentialError:
+            raise FileNotFoundError(name) from None
+        except (posix_ipc.PermissionsError, PermissionError):
+            raise SegmentError(
+                f"no permission to open segment {name}: it belongs to another user; see instance.group"
+            ) from None
+        except (posix_ipc.Error, OSError, ValueError) as error:
+            raise SegmentError(f"cannot open shared memory {name}: {error}") from None
+        return cls(name, memory.fd, writable=writable)
+
+    def allocate(self, size: int) -> None:
+        """Reserve all pages now, so that a full file system is an error here and not a SIGBUS later."""
+        try:
+            os.posix_fallocate(self._fd, 0, size)
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOMEM):
+                raise
+            free = os.statvfs(DIRECTORY)
+            raise SegmentError(
+                f"{DIRECTORY} has no room for the segment: {size / 1e6:.1f} MB needed, "
+                f"{free.f_bavail * free.f_frsize / 1e6:.1f} MB free; enlarge it (docker: --shm-size) "
+                "or lower instance.ring_mb"
+            ) from None
+
+    @property
+    def size(self) -> int:
+        """Bytes of the object at present."""
+        return os.fstat(self._fd).st_size
+
+    def map(self) -> mmap.mmap:
+        """The whole object as memory: read-only unless opened writable. The same mapping at each call."""
+        if self._map is None:
+            access = mmap.PROT_READ | (mmap.PROT_WRITE if self.writable else 0)
+            self._map = mmap.mmap(self._fd, self.size, mmap.MAP_SHARED, access)
+        return self._map
+
+    def try_lock(self, byte: int) -> bool:
+        """Take the write lock on one byte for the life of this object; False when another holds it."""
+        try:
+            fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, struct.pack(_FLOCK, fcntl.F_WRLCK, os.SEEK_SET, byte, 1, 0))
+        except OSError as error:
+            if error.errno in (errno.EAGAIN, errno.EACCES):
+                return False
+            raise
+        return True
+
+    def locked(self, byte: int) -> bool:
+        """Whether another holder has the byte; works on a read-only object (a read lock would conflict too)."""
+        query = struct.pack(_FLOCK, fcntl.F_RDLCK, os.SEEK_SET, byte, 1, 0)
+        answer = fcntl.fcntl(self._fd, fcntl.F_OFD_GETLK, query)
+        kind: int = struct.unpack(_FLOCK, answer)[0]
+        return kind != fcntl.F_UNLCK
+
+    def current(self) -> bool:
+        """Whether the name still leads to this object (and not to none, or to a successor)."""
+        try:
+            return (DIRECTORY / self.name).stat().st_ino == self.inode
+        except FileNotFoundError:
+            return False
+
+    def close(self) -> None:
+        """Give up mapping, descriptor and locks. A view still held keeps the mapping, not the locks."""
+        if self._fd < 0:
+            return
+        if self._map is not None:
+            with suppress(BufferError):  # somebody holds a view; the mapping goes with it
+                self._map.close()
+            self._map = None
+        os.close(self._fd)
+        self._fd = -1
+
+
+def unlink(name: str) -> None:
+    """Remove the name; nothing happens when it is gone already."""
+    try:
+        posix_ipc.unlink_shared_memory(f"/{name}")
+    except posix_ipc.ExistentialError:
+        return
+
+
+def names(prefix: str) -> list[str]:
+    """Names of the shared-memory objects that begin with ``prefix``."""
+    return sorted(entry.name for entry in DIRECTORY.iterdir() if entry.name.startswith(prefix))
