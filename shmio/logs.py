@@ -1,0 +1,75 @@
+"""Log lines that name process and source, in files that rotate.
+
+One line an event, fields in fixed order, extra fields as ``key=value``::
+
+    2026-11-21T05:20:01.123456Z INFO    cell[1234] connected pdu=960 jobs=8
+"""
+
+from __future__ import annotations
+
+import logging
+import logging.handlers
+import os
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+
+from shmio.errors import ConfigError
+
+MAX_FILE_BYTES = 5_000_000
+KEPT_FILES = 3
+
+
+class LineFormatter(logging.Formatter):
+    """Formats a record as one line; a traceback follows indented. Control characters are escaped."""
+
+    def __init__(self, process: str) -> None:
+        super().__init__()
+        self._process = f"{process}[{os.getpid()}]"
+
+    def format(self, record: logging.LogRecord) -> str:
+        """One record as text."""
+        stamp = datetime.fromtimestamp(record.created, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+        fields = getattr(record, "fields", {})
+        message = _escape(" ".join([record.getMessage(), *(f"{key}={value}" for key, value in fields.items())]))
+        line = f"{stamp} {record.levelname:<7} {self._process} {message}"
+        if record.exc_info:
+            line += "\n    " + self.formatException(record.exc_info).replace("\n", "\n    ")
+        return line
+
+
+def setup(file: Path, process: str, *, console: bool = False) -> logging.Logger:
+    """Send this process's records to ``file``, rotated at 5 MB with 3 kept; with ``console`` to standard error too.
+
+    Returns the logger named ``shmio``. ConfigError when the file cannot be written.
+    """
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        handlers: list[logging.Handler] = [
+            logging.handlers.RotatingFileHandler(file, maxBytes=MAX_FILE_BYTES, backupCount=KEPT_FILES - 1)
+        ]
+    except OSError as error:
+        raise ConfigError(f"instance.log_dir: cannot write {file}: {error.strerror}") from None
+    if console:
+        handlers.append(logging.StreamHandler(sys.stderr))
+    root = logging.getLogger()
+    for old in root.handlers[:]:
+        root.removeHandler(old)
+        old.close()
+    for handler in handlers:
+        handler.setFormatter(LineFormatter(process))
+        root.addHandler(handler)
+    root.setLevel(logging.INFO)
+    logging.captureWarnings(True)
+    logging.raiseExceptions = False  # a full disk must not stop the process that logs
+    return logging.getLogger("shmio")
+
+
+def fields(**values: object) -> dict[str, dict[str, object]]:
+    """Extra fields of a record: ``log.info("connected", extra=fields(pdu=960))``."""
+    return {"fields": values}
+
+
+def _escape(message: str) -> str:
+    """Keep text from devices on one line."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)

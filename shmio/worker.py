@@ -1,0 +1,123 @@
+"""What every child process does: read its spec, attach, hold its role, log, beat, stop when told.
+
+A worker's ``__main__`` is one line: ``raise SystemExit(worker.main(run))`` with ``run(worker)`` as its work.
+Exit status: 0 stopped as told; 1 failed, start it again; 2 it can never work as configured.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from shmio import logs
+from shmio.errors import ConfigError, LayoutError, SegmentError, ShmioError
+from shmio.segment import Activity, Report, Segment
+
+BEAT_S = 0.2
+ROLE_WAIT_S = 10.0
+MAX_SPEC_BYTES = 1 << 22
+
+
+class Worker:
+    """A child process in its role. Use from the main thread, except ``stopping`` and ``beat``."""
+
+    def __init__(self, spec: dict[str, Any]) -> None:
+        self.name: str = spec["name"]
+        self.kind: str = spec["kind"]
+        self.config: dict[str, Any] = spec["config"]
+        self.stopping = threading.Event()
+        self.log = logs.setup(Path(spec["log_file"]), self.name)
+        self.segment = Segment.open(spec["instance"], writable=True)
+        if self.segment.header.epoch != spec["epoch"]:
+            raise SegmentError(f"the segment of instance {spec['instance']!r} is another run's; this process ends")
+        self.slot = self.segment.processes.find(self.name)
+        self._take_role()
+        self._report = Report(os.getpid(), Activity.STARTING, time.monotonic_ns())
+        self.slot.report = self._report
+        self.slot.beat()
+
+    def _take_role(self) -> None:
+        """Wait for a predecessor to be gone: the kernel frees its lock at the moment of its death."""
+        deadline = time.monotonic() + ROLE_WAIT_S
+        while not self.slot.take():
+            if time.monotonic() > deadline:
+                raise SegmentError(f"role {self.name} is still held by pid {self.slot.report.pid}")
+            time.sleep(0.02)
+
+    def running(self) -> None:
+        """Tell that start-up is over."""
+        self.report(activity=Activity.RUNNING)
+        self.log.info("running")
+
+    def report(
+        self,
+        counters: tuple[int, ...] | None = None,
+        note: str | None = None,
+        activity: Activity | None = None,
+    ) -> None:
+        """Write what is given into the process table, and beat."""
+        old = self._report
+        self._report = Report(
+            old.pid,
+            old.activity if activity is None else activity,
+            old.started_ns,
+            old.counters if counters is None else counters,
+            old.note if note is None else note,
+        )
+        if self._report != old:
+            self.slot.report = self._report
+        self.slot.beat()
+
+    def stop(self, *_: object) -> None:
+        """Ask the work to end; the handler of SIGTERM."""
+        self.stopping.set()
+
+
+def main(run: Callable[[Worker], None]) -> int:
+    """Run a worker to its end; the exit status of the process."""
+    worker = None
+    try:
+        worker = Worker(_read_spec())
+        signal.signal(signal.SIGTERM, worker.stop)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the supervisor's
+        run(worker)
+        worker.report(activity=Activity.STOPPING)
+        worker.log.info("stopped")
+    except ShmioError as error:
+        _tell(worker, str(error))
+        return 2 if isinstance(error, (ConfigError, LayoutError)) else 1
+    except Exception:
+        logging.getLogger("shmio").exception("failed")
+        raise
+    return 0
+
+
+def _tell(worker: Worker | None, message: str) -> None:
+    """Leave the reason where people look: the log and the process table."""
+    if worker is None:
+        sys.stderr.write(message + "\n")
+    else:
+        worker.log.error(message)
+        worker.report(note=message)
+
+
+def _read_spec() -> dict[str, Any]:
+    if sys.stdin.isatty():
+        raise ConfigError("this module is a worker: shmio-supervisor starts it")
+    try:
+        spec = json.loads(sys.stdin.buffer.read(MAX_SPEC_BYTES))
+        sys.stdin.close()
+    except ValueError:
+        raise ConfigError("no process description on standard input; shmio-supervisor starts workers") from None
+    missing = {"instance", "epoch", "name", "kind", "log_file", "config"} - set(spec)
+    if missing:
+        raise ConfigError(f"the process description lacks {', '.join(sorted(missing))}")
+    return dict(spec)
