@@ -12,7 +12,7 @@ Milliseconds = Annotated[float, Meta(gt=0, le=3_600_000)]
 Text = Annotated[str, Meta(min_length=1)]
 
 
-class Section(Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
+class Section(Struct, forbid_unknown_fields=True, kw_only=True):
     """A table of the file: unknown keys are refused."""
 
 

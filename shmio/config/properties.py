@@ -12,8 +12,8 @@ MAX_FILE_BYTES = 64 << 10
 def read_properties(file: Path, key: str) -> dict[str, str]:
     """Read a properties file as text values; ``key`` is the section that names it, for messages.
 
-    Blank lines, ``[section]`` lines and lines that begin with ``#``, ``;`` or ``!`` are passed over. ConfigError: no such
-    file, not text, a line that is neither, the same key twice.
+    Blank lines, ``[section]`` lines and lines that begin with ``#``, ``;`` or ``!`` are passed over. ConfigError: no
+    such file, not text, a line that is neither, the same key twice.
     """
     try:
         with file.open("rb") as stream:

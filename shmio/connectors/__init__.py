@@ -1,0 +1,1 @@
+"""Connectors: one class for each protocol, one loop for all, a process for each source."""

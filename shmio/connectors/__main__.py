@@ -1,0 +1,96 @@
+"""The process of one source."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+
+from shmio import worker
+from shmio.connectors import registry
+from shmio.connectors.base import SourceLoop
+from shmio.connectors.schedule import Schedule
+from shmio.errors import ConnectorError
+from shmio.worker import BEAT_S, Worker
+
+HANG_MARGIN_S = 2.0
+
+
+class WallClock:
+    """The loop's clock in a live instance."""
+
+    def __init__(self, stopping: threading.Event) -> None:
+        self._stopping = stopping
+
+    def now_ns(self) -> int:
+        """CLOCK_MONOTONIC."""
+        return time.monotonic_ns()
+
+    def wait_ns(self, duration_ns: int) -> bool:
+        """Wait; True as soon as the process is to stop."""
+        return self._stopping.wait(duration_ns / 1e9) if duration_ns > 0 else self._stopping.is_set()
+
+
+def run(worker: Worker) -> None:
+    """Poll in a thread of its own; this one reports. A device that blocks the one cannot hold up the other."""
+    segment = worker.segment
+    writer = segment.writer(worker.name)
+    block = writer.block
+    connector_class = registry.load(worker.config["connector"])
+    options = registry.convert_options(worker.config["connector"], worker.config["options"])
+    connector = connector_class(options, block.layout)
+    schedule = Schedule(segment.header.started_ns, block.period_ns)
+    loop = SourceLoop(connector, writer, schedule, WallClock(worker.stopping))
+    thread = threading.Thread(target=_poll, args=(loop,), name="poll", daemon=True)
+    thread.start()
+    worker.running()
+    rate = _Rate()
+    while not worker.stopping.wait(BEAT_S):
+        if not thread.is_alive():
+            raise ConnectorError("the poll loop ended by itself; its traceback is in the log")
+        busy_s = _busy_s(loop.counters.busy_since_ns)
+        if busy_s > connector.timeout_s + HANG_MARGIN_S:
+            continue  # no beat: the supervisor replaces a process whose device call does not return
+        counters = loop.counters
+        worker.report(
+            (
+                counters.polls,
+                counters.overruns,
+                counters.failures,
+                counters.connects,
+                counters.round_trip_us,
+                rate.update_mhz(counters.polls),
+            ),
+            note=loop.note,
+        )
+    thread.join(timeout=1.0)
+
+
+def _poll(loop: SourceLoop) -> None:
+    try:
+        loop.run()
+    except Exception:
+        logging.getLogger("shmio").exception("the poll loop failed")
+
+
+def _busy_s(since_ns: int) -> float:
+    return (time.monotonic_ns() - since_ns) / 1e9 if since_ns else 0.0
+
+
+class _Rate:
+    """Polls per 1000 s over the last second or so."""
+
+    def __init__(self) -> None:
+        self._marks: list[tuple[float, int]] = []
+
+    def update_mhz(self, polls: int) -> int:
+        now = time.monotonic()
+        self._marks.append((now, polls))
+        while len(self._marks) > 2 and now - self._marks[1][0] >= 1.0:
+            self._marks.pop(0)
+        since, before = self._marks[0]
+        return round(1000 * (polls - before) / (now - since)) if now > since else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(worker.main(run))

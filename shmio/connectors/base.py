@@ -1,0 +1,166 @@
+"""What a connector is, and the loop that runs one.
+
+The loop owns time, quality and recovery, so that every connector behaves alike: an absolute schedule, overruns
+counted, one bad frame when quality changes, the connection dropped on any error, back-off, recovery without a restart.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+import msgspec
+
+from shmio.connectors.schedule import Backoff, Schedule
+from shmio.errors import ConnectorError
+from shmio.layout.model import Layout
+from shmio.logs import fields
+from shmio.segment import BlockWriter, Quality
+
+log = logging.getLogger("shmio.source")
+
+
+class Connector(ABC):
+    """One device's protocol. All hooks run in one thread; none may block longer than ``timeout_s``.
+
+    After a hook has raised, the loop calls :meth:`close` and later :meth:`connect` again: a late reply must never be
+    taken for the next one.
+    """
+
+    Options: ClassVar[type[msgspec.Struct]]
+    """The connector's own keys of ``[[source]]``; refuses unknown ones."""
+
+    @abstractmethod
+    def __init__(self, options: Any, layout: Layout) -> None:
+        """``options`` is an instance of ``Options``. ConfigError when layout and options do not go together."""
+
+    @property
+    @abstractmethod
+    def timeout_s(self) -> float:
+        """The longest time that any hook blocks."""
+
+    @abstractmethod
+    def connect(self) -> None:
+        """Reach the device; ConnectorError says why not, in words for the person at the cell."""
+
+    @abstractmethod
+    def read(self) -> bytes:
+        """One image of the whole block, ``layout.size`` bytes; ConnectorError, never a part or an old one."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Drop the connection; allowed at any time, more than once."""
+
+    def describe(self) -> str:
+        """What was agreed with the device, for the log."""
+        return ""
+
+
+class Clock(Protocol):
+    """Time as the loop sees it; tests bring their own."""
+
+    def now_ns(self) -> int:
+        """CLOCK_MONOTONIC."""
+
+    def wait_ns(self, duration_ns: int) -> bool:
+        """Wait; True as soon as the loop is to stop."""
+
+
+@dataclass(slots=True)
+class Counters:
+    """What ``status`` shows of a source; one writer, the loop."""
+
+    polls: int = 0
+    overruns: int = 0
+    failures: int = 0
+    connects: int = 0
+    round_trip_us: int = 0
+    busy_since_ns: int = 0
+    """When the hook that runs now was called; 0 between hooks."""
+
+
+class SourceLoop:
+    """Polls one connector on schedule and publishes every frame."""
+
+    def __init__(self, connector: Connector, writer: BlockWriter, schedule: Schedule, clock: Clock) -> None:
+        self._connector = connector
+        self._writer = writer
+        self._schedule = schedule
+        self._clock = clock
+        self._backoff = Backoff()
+        self._connected = False
+        self._reason: str | None = None  # of the bad frame that stands, None while good
+        last = writer.block.latest()
+        self._raw = last.raw if last else bytes(writer.block.layout.size)
+        self.counters = Counters()
+        self.note = ""
+
+    def run(self) -> None:
+        """Poll until the clock says stop; then tell the readers."""
+        try:
+            while True:
+                due = self._schedule.next(self._clock.now_ns())
+                self.counters.overruns += due.skipped
+                if self._clock.wait_ns(due.due_ns - self._clock.now_ns()) or not self.poll(due.cycle):
+                    break
+        finally:
+            self._connector.close()
+            self._bad(self._schedule.next(self._clock.now_ns()).cycle, "the source was stopped")
+
+    def poll(self, cycle: int) -> bool:
+        """One cycle: connect if need be, read, publish. False: told to stop while backing off."""
+        try:
+            if not self._connected:
+                self._connect()
+            began_ns = time.perf_counter_ns()
+            raw = self._timed_read()
+            self.counters.round_trip_us = (time.perf_counter_ns() - began_ns) // 1000
+        except ConnectorError as error:
+            return self._fail(cycle, str(error))
+        self._raw = raw
+        self._writer.publish(raw, cycle=cycle)
+        self.counters.polls += 1
+        if self._reason is not None:
+            log.info("quality good", extra=fields(cycle=cycle))
+            self._reason = None
+        self.note = ""
+        self._backoff.reset()
+        return True
+
+    def _connect(self) -> None:
+        self.counters.busy_since_ns = self._clock.now_ns()
+        try:
+            self._connector.connect()
+        finally:
+            self.counters.busy_since_ns = 0
+        self._connected = True
+        self.counters.connects += 1
+        log.info("connected %s", self._connector.describe())
+
+    def _timed_read(self) -> bytes:
+        self.counters.busy_since_ns = self._clock.now_ns()
+        try:
+            return self._connector.read()
+        finally:
+            self.counters.busy_since_ns = 0
+
+    def _fail(self, cycle: int, reason: str) -> bool:
+        self.counters.failures += 1
+        self._connected = False
+        self._connector.close()
+        self._bad(cycle, reason)
+        stop = self._clock.wait_ns(round(self._backoff.next_s() * 1e9))
+        self._schedule.restart()
+        return not stop
+
+    def _bad(self, cycle: int, reason: str) -> None:
+        """Publish one bad frame for each new reason, with the last bytes known."""
+        self.note = reason
+        if reason == self._reason:
+            return
+        self._reason = reason
+        log.warning("quality bad: %s", reason, extra=fields(cycle=cycle))
+        self._writer.publish(self._raw, cycle=cycle, quality=Quality.BAD, reason=reason)
