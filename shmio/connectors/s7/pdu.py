@@ -1,0 +1,230 @@
+"""The bytes of S7 over ISO-on-TCP: building requests, checking answers. No I/O.
+
+A frame is ``TPKT | COTP | S7``: RFC 1006, section 6 (TPKT: version 3, length of the whole), ISO 8073 class 0
+(COTP: CR and CC open, DT carries data), and the S7 job (ROSCTR 1), which a controller answers with Ack-Data (3),
+or with a bare Ack (2) that holds an error. S7 has no public standard; names follow Wireshark's dissector.
+
+Requests come from python-snap7's encoders. Its answer parsing is not used: it is many times slower than one
+``struct`` call a frame, and does not hold an answer against what was asked. Nor is its connection: it waits for
+each piece with a time-out of its own, so that a peer that drips bytes is never late.
+
+Every function here raises ConnectorError, and nothing else, on whatever bytes it is given.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import NamedTuple
+
+from snap7.datatypes import S7Area, S7WordLen
+from snap7.error import S7_PROTOCOL_ERROR_CODES
+from snap7.s7protocol import S7_RETURN_CODES, S7Protocol
+
+from shmio.errors import ConnectorError
+
+FRAME_OVERHEAD = 7  # TPKT 4, COTP DT 3
+READ_OVERHEAD = 18  # of an answer to a read within its PDU: header 12, parameters 2, item header 4
+READ_REQUEST_SIZE = 31
+REFERENCE_OFFSET = 11  # of the PDU reference in a frame
+MAX_BLOCK_SIZE = 65536  # of a standard data block; also, one byte a read, the number of references there are
+
+WANTED_JOBS = 8
+WANTED_PDU_SIZE = 960
+MIN_PDU_SIZE = 64  # the smallest known controllers grant 240; less than this is not one
+DEFAULT_TPDU_SIZE = 65531  # if the peer names none: RFC 1006, section 5
+_TPDU_SIZE_CODE = 0x0A  # 2 ** 10
+
+_TPKT = struct.Struct(">BxH")
+_HEADER = struct.Struct(">BxH BBB BB2xHHH")  # up to what all S7 PDUs share
+_ITEM = struct.Struct(">BB BBH")
+_HEADER_END = 19
+_ITEM_END = 25
+_COTP_CR, _COTP_CC, _COTP_DR, _COTP_DT = 0xE0, 0xD0, 0x80, 0xF0
+_ACK, _ACK_DATA = 2, 3
+_READ, _SETUP = 0x04, 0xF0
+ITEM_OK = 0xFF
+_BITS, _OCTETS = 0x04, 0x09  # transport sizes: whether an item's length counts bits or bytes
+
+_ACCESS_REMEDY = (
+    "access denied: PUT/GET is disabled, or the protection level or an optimized block forbids it; enable "
+    "'Permit access with PUT/GET communication from remote partner' and 'Full access' in the CPU's protection "
+    "settings, and clear 'Optimized block access' in the block's attributes"
+)
+
+
+class Session(NamedTuple):
+    """What the controller granted."""
+
+    pdu_size: int
+    """Bytes of the largest S7 PDU, header included."""
+    jobs: int
+    """Requests that may be under way at once."""
+
+
+class ReadAnswer(NamedTuple):
+    """An answer to a read of one item."""
+
+    reference: int
+    code: int
+    """The item's return code; without ITEM_OK there is no data."""
+    data: memoryview
+
+
+# -- frames ------------------------------------------------------------------------------------------------------------
+
+
+def frame_length(head: memoryview, longest: int) -> int:
+    """Length in bytes of the frame that begins with these four or more bytes; at most ``longest``."""
+    version, length = _TPKT.unpack_from(head)
+    if version != 3:
+        raise ConnectorError(f"the peer is not an S7 controller: it sent {bytes(head[:8])!r}, which is not ISO-on-TCP")
+    if not FRAME_OVERHEAD <= length <= longest:
+        raise ConnectorError(f"frame of {length} bytes, expected {FRAME_OVERHEAD} to {longest}")
+    return int(length)
+
+
+def _frame(payload: bytes) -> bytes:
+    return _TPKT.pack(3, 4 + len(payload)) + payload
+
+
+def _data_frame(pdu: bytes) -> bytes:
+    return _frame(b"\x02\xf0\x80" + pdu)  # header length, DT, end of the message
+
+
+def _check_data_header(frame: memoryview) -> tuple[int, int]:
+    """Check all headers of an answer; its reference and the length of its data part, which follows the parameters."""
+    if len(frame) < _HEADER_END:
+        _check_cotp(frame)
+        raise ConnectorError(f"answer of {len(frame)} bytes is too short")
+    fields = _HEADER.unpack_from(frame)
+    _, _, cotp_length, cotp_type, cotp_end, protocol, kind, reference, parameter_length, data_length = fields
+    if (cotp_length, cotp_type, cotp_end) != (2, _COTP_DT, 0x80):
+        _check_cotp(frame)
+        # With the TPDU size agreed on, no answer needs more than one TPDU.
+        raise ConnectorError("answer in several parts, though one holds it")
+    if protocol != 0x32:
+        raise ConnectorError(f"the peer does not speak S7 (protocol 0x{protocol:02X}, expected 0x32)")
+    error = frame[17] << 8 | frame[18]
+    if kind not in {_ACK, _ACK_DATA}:
+        raise ConnectorError(f"not an answer: ROSCTR {kind}")
+    if error:
+        raise ConnectorError(_explain_error(error))
+    if kind != _ACK_DATA:
+        raise ConnectorError("answer without data")
+    if _HEADER_END + parameter_length + data_length != len(frame):
+        raise ConnectorError(
+            f"answer of {len(frame)} bytes names {parameter_length} of parameters and {data_length} of data"
+        )
+    return reference, data_length
+
+
+def _check_cotp(frame: memoryview) -> None:
+    kind = frame[5]
+    if kind == _COTP_DR:
+        raise ConnectorError("the controller ended the session")
+    if kind != _COTP_DT:
+        raise ConnectorError(f"unexpected COTP TPDU 0x{kind:02X}")
+
+
+def _explain_error(error: int) -> str:
+    if error == 0x8104:  # what S7-1200 and S7-1500 answer to all jobs with PUT/GET off, and for optimized blocks
+        return f"{_ACCESS_REMEDY} (error 0x8104)"
+    known = S7_PROTOCOL_ERROR_CODES.get(error)
+    return f"the controller refused the request: {known or 'no text known'} (error 0x{error:04X})"
+
+
+def explain_item(code: int, db_number: int, size: int) -> str:
+    """Say what an item's return code means for a read of this block of ``size`` bytes, and what to do about it."""
+    where = f"(item code 0x{code:02X})"
+    if code in {0x05, 0x0A}:
+        return (
+            f"DB{db_number} is shorter than {size} bytes or does not exist {where}; on an S7-1200 or S7-1500 also: "
+            "the block is optimized, clear 'Optimized block access' in its attributes"
+        )
+    if code == 0x03:
+        return f"DB{db_number}: {_ACCESS_REMEDY} {where}"
+    return f"DB{db_number} cannot be read: {S7_RETURN_CODES.get(code, 'no text known')} {where}"
+
+
+# -- session -----------------------------------------------------------------------------------------------------------
+
+
+def connect_request(rack: int, slot: int) -> bytes:
+    """Build the COTP connection request to a CPU; the called TSAP is (programming device, rack and slot)."""
+    tsaps = struct.pack(">BBH BBBB BBB", 0xC1, 2, 0x0100, 0xC2, 2, 0x01, rack << 5 | slot, 0xC0, 1, _TPDU_SIZE_CODE)
+    head = struct.pack(">BBHHB", 6 + len(tsaps), _COTP_CR, 0, 1, 0)
+    return _frame(head + tsaps)
+
+
+def parse_connect_confirm(frame: memoryview) -> int:
+    """Check the answer to a connection request; the largest TPDU in bytes."""
+    if frame[5] == _COTP_DR:
+        raise ConnectorError("the controller refused the session")
+    if frame[5] != _COTP_CC or len(frame) < 11:
+        raise ConnectorError(f"the peer is not an S7 controller: it answered COTP TPDU 0x{frame[5]:02X} to the request")
+    if frame[4] != len(frame) - 5:
+        raise ConnectorError("connection confirm of a wrong length")
+    position = 11
+    while position + 2 < len(frame):
+        code, length = frame[position], frame[position + 1]
+        if code == 0xC0 and length == 1:
+            exponent = frame[position + 2]
+            if not 7 <= exponent <= 16:
+                raise ConnectorError(f"TPDU size code {exponent} is not one")
+            return int(min(1 << exponent, DEFAULT_TPDU_SIZE))
+        position += 2 + length
+    return DEFAULT_TPDU_SIZE
+
+
+def setup_request(reference: int, jobs: int, pdu_size: int) -> bytes:
+    """Build "setup communication": asks for so many jobs in parallel, and for PDUs of this size in bytes."""
+    encoder = S7Protocol()
+    encoder.sequence = (reference - 1) & 0xFFFF
+    return _data_frame(encoder.build_setup_communication_request(jobs, jobs, pdu_size))
+
+
+def parse_setup_answer(frame: memoryview, reference: int, asked: Session) -> Session:
+    """Check what the controller grants; it is never more than was asked."""
+    answered, data_length = _check_data_header(frame)
+    if answered != reference:
+        raise ConnectorError(f"answer to a request that was not made (reference {answered})")
+    if len(frame) != _HEADER_END + 8 or data_length or frame[_HEADER_END] != _SETUP:
+        raise ConnectorError("not an answer to 'setup communication'")
+    calling, called, pdu_size = struct.unpack_from(">HHH", frame, _HEADER_END + 2)
+    if pdu_size < MIN_PDU_SIZE:
+        raise ConnectorError(f"the controller grants PDUs of only {pdu_size} bytes")
+    return Session(min(pdu_size, asked.pdu_size), max(1, min(calling, called, asked.jobs)))
+
+
+# -- reading -----------------------------------------------------------------------------------------------------------
+
+
+def read_request(db_number: int, start: int, size: int) -> bytes:
+    """Build a read of ``size`` bytes at byte ``start``; the PDU reference is left to the caller to fill in."""
+    frame = _data_frame(S7Protocol().build_read_request(S7Area.DB, db_number, start, S7WordLen.BYTE, size))
+    if len(frame) != READ_REQUEST_SIZE:
+        raise AssertionError("python-snap7 encodes read requests in another way than shmio knows")
+    return frame
+
+
+def parse_read_answer(frame: memoryview) -> ReadAnswer:
+    """Check an answer to a read of one item of bytes; ``data`` is a view of the frame."""
+    reference, data_length = _check_data_header(frame)
+    if len(frame) < _HEADER_END + 3:
+        raise ConnectorError(f"answer of {len(frame)} bytes is too short for a read")
+    if frame[_HEADER_END] != _READ or frame[_HEADER_END + 1] != 1 or data_length != len(frame) - _HEADER_END - 2:
+        raise ConnectorError("not an answer to a read of one item")
+    code = frame[_HEADER_END + 2]
+    if code != ITEM_OK:
+        return ReadAnswer(reference, code, frame[:0])
+    if len(frame) < _ITEM_END:
+        raise ConnectorError(f"answer of {len(frame)} bytes is too short for data")
+    _, _, _, transport, length = _ITEM.unpack_from(frame, _HEADER_END)
+    if transport == _BITS and not length & 7:
+        length >>= 3
+    elif transport != _OCTETS:
+        raise ConnectorError(f"data of transport size 0x{transport:02X}, length {length}; bytes were asked for")
+    # Some servers pad an odd length, though only items that others follow need it.
+    if len(frame) - _ITEM_END not in {length, length + (length & 1)}:
+        raise ConnectorError(f"answer with {len(frame) - _ITEM_END} bytes of data names {length}")
+    return ReadAnswer(reference, code, frame[_ITEM_END : _ITEM_END + length])

@@ -1,0 +1,110 @@
+"""An emulated controller: a program that runs in cycles, and a server that lets clients at its block."""
+
+from __future__ import annotations
+
+import threading
+import time
+from types import TracebackType
+from typing import Self
+
+from snap7.server import CPUState
+
+from shmio.config.address import Address
+from shmio.emulators.programs import program
+from shmio.emulators.s7 import S7Server
+from shmio.errors import ConfigError
+from shmio.layout.model import Layout
+
+
+class Emulator:
+    """Runs a program on one data block and serves that block over S7. Use ``with``, or ``start`` and ``stop``, once.
+
+    The program's cycles follow an absolute schedule, so they do not drift; cycles that come too late are left out and
+    counted. Clients read and write between cycles, never within one. A client that stops the emulated CPU stops the
+    program, whose time then stands still, but not the server, as with a real one.
+    """
+
+    def __init__(
+        self, layout: Layout, program_name: str, listen: Address, *, db_number: int | None = None, max_clients: int = 16
+    ) -> None:
+        """Prepare to serve the block as DB ``db_number``, by default the layout's own.
+
+        ConfigError: no such program, the layout does not suit it, or there is no number.
+        """
+        number = db_number if db_number is not None else layout.number
+        if number is None:
+            raise ConfigError(f"dbNumber: the layout {layout.name!r} names no number; give one")
+        self._program = program(program_name, layout)
+        self._period_s = self._program.period_ms / 1000
+        self._frame = bytearray(layout.size)
+        self._server = S7Server(listen, max_clients=max_clients)
+        self._server.add_block(number, self._frame)
+        self._thread = threading.Thread(target=self._run, name=f"program-{program_name}", daemon=True)
+        self._stopping = threading.Event()
+        self._failure: Exception | None = None
+        self._cycles = 0
+        self._overruns = 0
+
+    @property
+    def address(self) -> Address:
+        """Where the server listens; ShmioError unless started."""
+        return self._server.address
+
+    @property
+    def cycles(self) -> int:
+        """Cycles run."""
+        return self._cycles
+
+    @property
+    def overruns(self) -> int:
+        """Cycles left out because the one before took too long."""
+        return self._overruns
+
+    @property
+    def failure(self) -> Exception | None:
+        """What ended the program, if anything did; whoever runs an emulator looks at it now and then."""
+        return self._failure
+
+    def start(self) -> None:
+        """Run the first cycle, listen, and go on in threads; EndpointError if the address cannot be had."""
+        self._step(0)
+        self._server.start()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop listening and running; returns when all threads have ended."""
+        self._stopping.set()
+        self._server.stop()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def _step(self, cycle: int) -> None:
+        with self._server.lock:
+            self._program.step(cycle * self._period_s, self._frame)
+        self._cycles += 1
+
+    def _run(self) -> None:
+        begun_s = time.monotonic()
+        tick = cycle = 0
+        try:
+            while True:
+                elapsed = int((time.monotonic() - begun_s) / self._period_s)
+                missed = max(0, elapsed - tick - 1)
+                tick += missed + 1
+                if self._stopping.wait(begun_s + tick * self._period_s - time.monotonic()):
+                    return
+                if self._server.cpu_state == CPUState.RUN:
+                    self._overruns += missed
+                    cycle += missed + 1
+                    self._step(cycle)
+        except Exception as error:  # noqa: BLE001 - a program's defect is its runner's to report
+            self._failure = error
