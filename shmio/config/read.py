@@ -62,6 +62,11 @@ def _resolve(tables: dict[str, Any], folder: Path) -> Config:
     config = _convert({**tables, "folder": str(folder)})
     _check_names(config)
     _check_listening(config)
+    if config.grpc and config.grpc.tls:
+        tls = config.grpc.tls
+        for field in ("certificate", "key", "client_ca"):
+            if name := getattr(tls, field):
+                setattr(tls, field, str(config.path(name)))
     return config
 
 

@@ -1,0 +1,1 @@
+"""Endpoints: what serves the segment to remote programs, a process for each."""

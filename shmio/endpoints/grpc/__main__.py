@@ -1,0 +1,66 @@
+"""The process of the gRPC endpoint."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+
+import msgspec
+
+from shmio import worker
+from shmio.config import Address, Grpc
+from shmio.endpoints.grpc.feed import Feed
+from shmio.endpoints.grpc.server import Server
+from shmio.endpoints.grpc.simlog_v1 import SimlogV1
+from shmio.logs import fields
+from shmio.worker import BEAT_S, Worker
+
+
+def run(worker: Worker) -> None:
+    """Serve until told to stop."""
+    asyncio.run(_serve(worker))
+
+
+async def _serve(worker: Worker) -> None:
+    loop = asyncio.get_running_loop()
+    stopping = asyncio.Event()
+    loop.add_signal_handler(signal.SIGTERM, stopping.set)
+    config = msgspec.convert(worker.config, Grpc)
+    tasks: set[asyncio.Task[None]] = set()
+
+    def on_quality(source: str, good: bool) -> None:
+        worker.log.info("source %s", "good" if good else "bad", extra=fields(source=source))
+        task = loop.create_task(server.set_source(source, good))
+        tasks.add(task)
+        task.add_done_callback(tasks.discard)
+
+    blocks = worker.segment.blocks
+    default = config.default_source or (next(iter(blocks)) if len(blocks) == 1 else None)
+    feeds = {name: Feed(block, loop, on_quality) for name, block in blocks.items()}
+    service = SimlogV1(feeds, default)
+    server = Server(service)
+    for source in feeds:
+        await server.set_source(source, False)
+    for feed in feeds.values():
+        feed.start()
+    addresses = [Address.parse(text) for text in config.listen]
+    ports = await server.start(addresses, config.tls)
+    served = ", ".join(str(Address(address.host, port)) for address, port in zip(addresses, ports, strict=True))
+    worker.log.info("serving %s", served)
+    worker.running()
+    while not stopping.is_set():
+        if not all(feed.alive for feed in feeds.values()):
+            raise RuntimeError("a feed ended; the endpoint starts anew")
+        streams, dropped = service.counters
+        worker.report((streams, sum(feed.messages for feed in feeds.values()), dropped))
+        try:
+            await asyncio.wait_for(stopping.wait(), BEAT_S)
+        except TimeoutError:
+            continue
+    for feed in feeds.values():
+        feed.stop()
+    await server.stop()
+
+
+if __name__ == "__main__":
+    raise SystemExit(worker.main(run))

@@ -1,0 +1,163 @@
+"""Follows one block in a thread: one change scan for each frame, one encoding for each change, whoever listens."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import struct
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Protocol
+
+from shmio.layout.model import Register
+from shmio.segment import Block, Frame, Quality
+from shmio.segment._atomics import changed
+
+log = logging.getLogger("shmio.grpc")
+
+CATCH_UP_FRAMES = 32
+"""A feed that is further behind than this goes on with the newest frame: what it skips is conflated, not lost."""
+
+_ENTRY = struct.Struct("=III")
+
+
+class Listener(Protocol):
+    """One stream; called in the event loop's thread."""
+
+    since: int
+    """Frame whose value the stream already has."""
+
+    def deliver(self, message: bytes) -> None:
+        """Take one message for this stream."""
+
+
+class Channel:
+    """One register as somebody listens to it: how a frame becomes a message, and who gets it."""
+
+    def __init__(self, register: Register, encode: Callable[[Frame], bytes | None]) -> None:
+        self.register = register
+        self.encode = encode
+        self.listeners: set[Listener] = set()
+
+
+class _Table(NamedTuple):
+    channels: tuple[Channel, ...]
+    scan: bytes
+
+
+class Feed:
+    """Delivers the changes of one block's registers to listeners while quality is good.
+
+    On recovery from bad quality every register is delivered again. ``listen`` and ``leave`` belong to the event loop's
+    thread; the thread of the feed only reads the table that they replace.
+    """
+
+    def __init__(self, block: Block, loop: asyncio.AbstractEventLoop, on_quality: Callable[[str, bool], None]) -> None:
+        self.block = block
+        self.messages = 0
+        self._loop = loop
+        self._on_quality = on_quality
+        self._channels: dict[Register, Channel] = {}
+        self._table = _Table((), b"")
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"feed-{block.source}", daemon=True)
+
+    @property
+    def alive(self) -> bool:
+        """Whether the block is being followed."""
+        return self._thread.is_alive()
+
+    def start(self) -> None:
+        """Begin to follow the block."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread; at most one wait of it later."""
+        self._stopping.set()
+        self._thread.join(2.0)
+
+    def listen(self, register: Register, encode: Callable[[Frame], bytes | None], listener: Listener) -> None:
+        """Join a register's listeners; the current value, if it is good, is delivered at once."""
+        channel = self._channels.get(register)
+        if channel is None:
+            channel = self._channels[register] = Channel(register, encode)
+            self._rebuild()
+        frame = self.block.latest()
+        listener.since = 0
+        if frame is not None and frame.assess(self.block.stale_ns)[0] is not Quality.BAD:
+            listener.since = frame.number
+            message = channel.encode(frame)
+            if message is not None:
+                listener.deliver(message)
+        channel.listeners.add(listener)
+
+    def leave(self, register: Register, listener: Listener) -> None:
+        """Leave; the last listener takes the channel with it."""
+        channel = self._channels[register]
+        channel.listeners.discard(listener)
+        if not channel.listeners:
+            del self._channels[register]
+            self._rebuild()
+
+    def _rebuild(self) -> None:
+        channels = tuple(self._channels.values())
+        entries = (
+            _ENTRY.pack(c.register.offset, c.register.size, 0 if c.register.bit is None else 1 << c.register.bit)
+            for c in channels
+        )
+        self._table = _Table(channels, b"".join(entries))
+
+    # ---- the feed's own thread ---------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            self._follow()
+        except Exception:
+            log.exception("the feed of %s failed", self.block.source)
+
+    def _follow(self) -> None:
+        block = self.block
+        newest = block.latest()
+        cursor = block.cursor(after=newest.number - 1 if newest else 0)
+        shown: bytes | None = None  # the image that listeners have seen; None while quality is bad
+        while not self._stopping.is_set():
+            if cursor.behind > CATCH_UP_FRAMES:
+                cursor = block.cursor(after=block.ring.head() - 1)
+            frame = cursor.next(timeout_s=min(0.5, block.stale_ns / 1e9))
+            if frame is None:
+                frame = block.latest()
+                good = frame is not None and frame.assess(block.stale_ns)[0] is not Quality.BAD
+                if shown is not None and not good:
+                    shown = None
+                    self._tell(False)
+                continue
+            if frame.quality is Quality.BAD or frame.age_ns(time.monotonic_ns()) > block.stale_ns:
+                if shown is not None:
+                    self._tell(False)
+                shown = None
+                continue
+            recovered = shown is None
+            table = self._table
+            if recovered:
+                self._tell(True)
+                news: Sequence[Channel] = table.channels
+            else:
+                assert shown is not None  # noqa: S101  for the type checker
+                news = [table.channels[i] for i in changed(shown, frame.image, table.scan)]
+            shown = frame.image
+            batch = [(channel, message) for channel in news if (message := channel.encode(frame)) is not None]
+            if batch:
+                self.messages += len(batch)
+                self._loop.call_soon_threadsafe(_deliver, frame.number, batch)
+
+    def _tell(self, good: bool) -> None:
+        self._loop.call_soon_threadsafe(self._on_quality, self.block.source, good)
+
+
+def _deliver(frame: int, batch: list[tuple[Channel, bytes]]) -> None:
+    """Hand a frame's messages to all who have not seen that frame yet."""
+    for channel, message in batch:
+        for listener in channel.listeners:
+            if frame > listener.since:
+                listener.deliver(message)

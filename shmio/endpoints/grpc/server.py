@@ -1,0 +1,103 @@
+"""The server: listening addresses, TLS, limits, health and reflection."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import grpc
+from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
+
+from shmio.config import Address, Tls
+from shmio.endpoints.grpc.simlog_v1 import SimlogV1
+from shmio.errors import ConfigError, EndpointError
+from shmio.wire import simlog_v1_pb2
+
+MAX_REQUEST_BYTES = 1 << 20
+MAX_CALLS = 4096
+
+_SERVING = health_pb2.HealthCheckResponse.SERVING
+_NOT_SERVING = health_pb2.HealthCheckResponse.NOT_SERVING
+_OPTIONS = [
+    ("grpc.so_reuseport", 0),  # else a second server would take the same port in silence
+    ("grpc.max_receive_message_length", MAX_REQUEST_BYTES),
+    # A client whose host vanished is noticed within half a minute.
+    ("grpc.keepalive_time_ms", 20_000),
+    ("grpc.keepalive_timeout_ms", 10_000),
+    ("grpc.http2.min_recv_ping_interval_without_data_ms", 5_000),
+]
+
+
+class Server:
+    """All services on each of the addresses."""
+
+    def __init__(self, simlog: SimlogV1) -> None:
+        self._health = health.aio.HealthServicer()
+        self._server = grpc.aio.server(options=_OPTIONS, maximum_concurrent_rpcs=MAX_CALLS)
+        self._services = [simlog_v1_pb2.DESCRIPTOR.services_by_name["SimlogAPI"].full_name]
+        self._server.add_generic_rpc_handlers((_simlog_v1_handlers(simlog, self._services[0]),))
+        health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
+        names = [*self._services, health.SERVICE_NAME, reflection.SERVICE_NAME]
+        reflection.enable_server_reflection(names, self._server)
+
+    async def start(self, addresses: list[Address], tls: Tls | None) -> list[int]:
+        """Listen on all addresses; the ports, for those that were 0. EndpointError names the address in the way."""
+        credentials = _credentials(tls) if tls else None
+        ports = []
+        for address in addresses:
+            try:
+                if credentials:
+                    ports.append(self._server.add_secure_port(str(address), credentials))
+                else:
+                    ports.append(self._server.add_insecure_port(str(address)))
+            except RuntimeError:
+                raise EndpointError(
+                    f"grpc.listen: cannot listen on {address}: another program has it, or this host has no such address"
+                ) from None
+        await self._server.start()
+        for service in ["", *self._services]:
+            await self._health.set(service, _SERVING)
+        return ports
+
+    async def set_source(self, source: str, good: bool) -> None:
+        """Show a source's quality as the health of ``source.<name>``."""
+        await self._health.set(f"source.{source}", _SERVING if good else _NOT_SERVING)
+
+    async def stop(self) -> None:
+        """Say so, end all streams, close."""
+        await self._health.enter_graceful_shutdown()
+        await self._server.stop(grace=0.2)
+
+
+def _simlog_v1_handlers(simlog: SimlogV1, service: str) -> grpc.GenericRpcHandler:
+    """The service's handlers, with Subscribe's messages passed on as the bytes they are."""
+    descriptor = simlog_v1_pb2.DESCRIPTOR.services_by_name["SimlogAPI"]
+    handlers = {}
+    for method in descriptor.methods:
+        request: Any = getattr(simlog_v1_pb2, method.input_type.name, None)
+        response: Any = getattr(simlog_v1_pb2, method.output_type.name, None)
+        make = {
+            (False, False): grpc.unary_unary_rpc_method_handler,
+            (False, True): grpc.unary_stream_rpc_method_handler,
+            (True, False): grpc.stream_unary_rpc_method_handler,
+        }[method.client_streaming, method.server_streaming]
+        shared = method.name == "Subscribe"
+        handlers[method.name] = make(
+            getattr(simlog, method.name),
+            request_deserializer=request and request.FromString,
+            response_serializer=None if shared or response is None else response.SerializeToString,
+        )
+    return grpc.method_handlers_generic_handler(service, handlers)
+
+
+def _credentials(tls: Tls) -> grpc.ServerCredentials:
+    def read(key: str, name: str) -> bytes:
+        try:
+            return Path(name).read_bytes()
+        except OSError as error:
+            raise ConfigError(f"grpc.tls.{key}: {name}: {error.strerror}") from None
+
+    pair = (read("key", tls.key), read("certificate", tls.certificate))
+    ca = read("client_ca", tls.client_ca) if tls.client_ca else None
+    return grpc.ssl_server_credentials([pair], root_certificates=ca, require_client_auth=ca is not None)

@@ -1,0 +1,118 @@
+"""SimlogAPI version 1, package ``simulation.server``: GetTopic and Subscribe.
+
+The other calls are answered with UNIMPLEMENTED by the generated base class.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable, Mapping
+from typing import Any
+
+import grpc
+
+from shmio.endpoints.grpc.feed import Feed
+from shmio.endpoints.grpc.queue import ConflatingQueue
+from shmio.errors import PathError
+from shmio.layout.codec import codec
+from shmio.layout.model import Layout, Register
+from shmio.layout.text import to_text, wire_type
+from shmio.layout.topic import Topic, find, parse_topic
+from shmio.segment import Frame
+from shmio.wire import simlog_v1_pb2 as wire
+from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIServicer
+
+QUEUE_BOUND = 256
+
+Context = grpc.aio.ServicerContext[Any, Any]
+
+
+class SimlogV1(SimlogAPIServicer):
+    """Serves the registers of all sources as text values."""
+
+    def __init__(self, feeds: Mapping[str, Feed], default_source: str | None) -> None:
+        self._feeds = feeds
+        self._default = default_source
+        self._streams: set[_Stream] = set()
+        self._dropped = 0
+
+    @property
+    def counters(self) -> tuple[int, int]:
+        """Streams open, messages dropped on slow ones."""
+        return len(self._streams), self._dropped + sum(stream.dropped for stream in self._streams)
+
+    async def GetTopic(self, request: wire.TopicDescriptor, context: Context) -> wire.TopicDescriptor:  # noqa: N802
+        """Tell a topic's type; NOT_FOUND, INVALID_ARGUMENT for a structure."""
+        _, register = await self._resolve(request.path, context)
+        return wire.TopicDescriptor(path=request.path, msgType=wire_type(register))
+
+    async def Subscribe(self, request: wire.TopicDescriptor, context: Context) -> AsyncIterator[bytes]:  # noqa: N802
+        """Stream a topic's values: the current one if it is good, then every change.
+
+        While quality is bad nothing is sent; on recovery the value is sent again. A slow client loses
+        the oldest values.
+        """
+        topic, register = await self._resolve(request.path, context)
+        if topic.direction == "in":
+            await context.abort(
+                grpc.StatusCode.UNIMPLEMENTED,
+                f"{request.path}: this version serves what comes out of sources; use /out",
+            )
+        feed = self._feeds[topic.source]
+        stream = _Stream()
+        self._streams.add(stream)
+        feed.listen(register, encoder(register, feed.block.layout), stream)
+        try:
+            while True:
+                yield await stream.pop()
+        finally:
+            feed.leave(register, stream)
+            self._streams.discard(stream)
+            self._dropped += stream.dropped
+
+    async def _resolve(self, path: str, context: Context) -> tuple[Topic, Register]:
+        try:
+            topic = parse_topic(path, self._feeds, self._default)
+            feed = self._feeds.get(topic.source)
+            if feed is None:
+                raise PathError(f"{path}: {topic.source} is reserved, and this version serves nothing there")
+            layout = feed.block.layout
+            if layout.members(topic.path) or not topic.path:
+                await context.abort(
+                    grpc.StatusCode.INVALID_ARGUMENT, f"{path}: a structure; version 1 serves single registers"
+                )
+            return topic, find(layout, topic.path)
+        except PathError as error:
+            await context.abort(grpc.StatusCode.NOT_FOUND, str(error))
+            raise  # abort never returns
+
+
+class _Stream(ConflatingQueue):
+    """One Subscribe call, as a feed's listener."""
+
+    def __init__(self) -> None:
+        super().__init__(QUEUE_BOUND)
+        self.since = 0
+
+    def deliver(self, message: bytes) -> None:
+        self.push(message)
+
+
+def encoder(register: Register, layout: Layout) -> Callable[[Frame], bytes | None]:
+    """A function from a frame to the register's ROSMessage, serialised; None where the bytes hold no value.
+
+    Fields of a protobuf message may be concatenated, so what never changes is encoded once.
+    """
+    kind = wire.ROSMessage(type=wire_type(register)).SerializeToString()
+    decode = codec(register, layout.byte_order).decode
+
+    def encode(frame: Frame) -> bytes | None:
+        value = decode(frame.image)
+        if value is None:
+            return None
+        stamp = wire.time(sec=frame.clock_ns // 1_000_000_000, nsec=frame.clock_ns)
+        body = wire.ROSMessage(
+            value=to_text(value, register), timeStamp=wire.Header(seq=frame.number & 0xFFFFFFFF, stamp=stamp)
+        )
+        return kind + body.SerializeToString()
+
+    return encode
