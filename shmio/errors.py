@@ -13,12 +13,19 @@
     │   └── FormatError          the segment's format is not one this version knows
     ├── QualityError       the value exists but is not good
     ├── ConnectorError     the device did not answer as it should; carries a reason code
+    ├── EndpointError      an address cannot be served
     └── ControlError       the supervisor refused or did not answer
 
 The command-line tools print the message of any of these as one line and exit with status 1.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from shmio.layout.model import Diagnostic
 
 
 class ShmioError(Exception):
@@ -30,7 +37,18 @@ class ConfigError(ShmioError):
 
 
 class LayoutError(ShmioError):
-    """A layout source cannot be compiled; ``str()`` is one line for each diagnostic."""
+    """A layout source cannot be compiled; ``str()`` is one line for each diagnostic.
+
+    ``diagnostics`` holds them as objects with file, line and column, warnings included; it is empty when the
+    error is not about a source text.
+    """
+
+    def __init__(self, message: str, diagnostics: Sequence[Diagnostic] = ()) -> None:
+        super().__init__(message)
+        self.diagnostics = tuple(diagnostics)
+
+    def __reduce__(self) -> tuple[type[LayoutError], tuple[str, tuple[Diagnostic, ...]]]:
+        return type(self), (str(self), self.diagnostics)
 
 
 class ValueRangeError(ShmioError, ValueError):
@@ -66,6 +84,10 @@ class ConnectorError(ShmioError):
 
     The base loop drops the connection on any of these. ``str()`` becomes the frame's reason text.
     """
+
+
+class EndpointError(ShmioError):
+    """An address cannot be listened on, or its TLS files cannot be used."""
 
 
 class ControlError(ShmioError):

@@ -1,0 +1,141 @@
+"""The JSON form of a layout: what ``shmio-layout --json`` prints and what segments and recordings hold.
+
+Reading trusts nothing: types are checked strictly, then everything that can be computed is computed again.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from typing import Annotated
+
+import msgspec
+
+from shmio.errors import LayoutError, PathError
+from shmio.layout.model import (
+    MAX_BLOCK_BYTES,
+    MAX_DIMENSIONS,
+    MAX_ELEMENTS,
+    MAX_REGISTERS,
+    ByteOrder,
+    Dims,
+    Layout,
+    Register,
+    array_size,
+)
+from shmio.layout.topic import MAX_TOPIC, canonical_path
+from shmio.layout.types import ALIASES, element_type
+
+MAX_JSON_BYTES = 128 << 20
+
+_Bound = Annotated[int, msgspec.Meta(ge=-(1 << 31), lt=1 << 31)]
+_Size = Annotated[int, msgspec.Meta(ge=0, le=MAX_BLOCK_BYTES)]
+
+
+class _Register(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    path: Annotated[str, msgspec.Meta(min_length=1, max_length=MAX_TOPIC)]
+    type: str
+    dims: Annotated[list[tuple[_Bound, _Bound]], msgspec.Meta(min_length=1, max_length=MAX_DIMENSIONS)] | None
+    offset: _Size
+    bit: Annotated[int, msgspec.Meta(ge=0, le=7)] | None
+    size: _Size
+    count: Annotated[int, msgspec.Meta(ge=1, le=MAX_ELEMENTS)]
+    comment: str
+    initial: str | None
+
+
+class _Layout(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    name: str
+    number: Annotated[int, msgspec.Meta(ge=0, le=0xFFFF)] | None
+    size: _Size
+    optimized: bool
+    registers: Annotated[list[_Register], msgspec.Meta(max_length=MAX_REGISTERS)]
+    byte_order: ByteOrder = "big"
+
+
+def describe(layout: Layout) -> dict[str, object]:
+    """Return the layout as the object of the public contract: JSON types, without ``byte_order``."""
+    return {
+        "name": layout.name,
+        "number": layout.number,
+        "size": layout.size,
+        "optimized": layout.optimized,
+        "registers": [_describe_register(register) for register in layout.registers],
+    }
+
+
+def _describe_register(register: Register) -> Mapping[str, object]:
+    return {
+        "path": register.path,
+        "type": register.type,
+        "dims": [list(bounds) for bounds in register.dims] or None,
+        "offset": register.offset,
+        "bit": register.bit,
+        "size": register.size,
+        "count": register.count,
+        "comment": register.comment,
+        "initial": register.initial,
+    }
+
+
+def dump(layout: Layout) -> bytes:
+    """Return the canonical JSON: keys in fixed order, no white space, UTF-8."""
+    document = describe(layout) | {"byte_order": layout.byte_order}
+    return json.dumps(document, ensure_ascii=False, separators=(",", ":")).encode()
+
+
+def load(data: bytes) -> Layout:
+    """Read and validate a layout's JSON.
+
+    Raises LayoutError: anything is not as ``dump`` would write it for a possible layout.
+    """
+    if len(data) > MAX_JSON_BYTES:
+        raise LayoutError(f"layout: larger than {MAX_JSON_BYTES} bytes")
+    try:
+        document = msgspec.json.decode(data, type=_Layout)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise LayoutError(f"layout: {error}") from None
+    registers: list[Register] = []
+    seen: set[str] = set()
+    end_bits = elements = 0
+    for item in document.registers:
+        register = _register(item)
+        if register.path in seen:
+            raise LayoutError(f"layout: two registers have the path {register.path!r}")
+        first = register.offset * 8 + (register.bit or 0)
+        if first < end_bits:
+            raise LayoutError(f"layout: {register.path!r} overlaps the register before it")
+        alone = register.bit is not None and not register.dims
+        end_bits = first + (1 if alone else register.size * 8)
+        elements += register.count
+        seen.add(register.path)
+        registers.append(register)
+    if end_bits > document.size * 8 or elements > MAX_ELEMENTS:
+        raise LayoutError(f"layout: the registers do not fit the block of {document.size} bytes")
+    return Layout(
+        document.name, document.number, document.size, document.optimized, tuple(registers), document.byte_order
+    )
+
+
+def _register(item: _Register) -> Register:
+    element = element_type(item.type)
+    if element is None or element.name != item.type or item.type in ALIASES:
+        raise LayoutError(f"layout: {item.path!r} has the unknown type {item.type!r}")
+    dims: Dims = tuple(item.dims or ())
+    if any(low > high for low, high in dims):
+        raise LayoutError(f"layout: {item.path!r} has inverted bounds")
+    shape = tuple(high - low + 1 for low, high in dims)
+    if item.count != math.prod(shape) or item.size != array_size(element, shape):
+        raise LayoutError(f"layout: {item.path!r} has a size or count that is not its type's")
+    if (item.bit is None) != (element.base != "BOOL") or (dims and item.bit):
+        raise LayoutError(f"layout: {item.path!r} has a bit that is not its type's")
+    try:
+        canonical = canonical_path(item.path) == item.path
+    except PathError:
+        canonical = False
+    if not canonical:
+        raise LayoutError(f"layout: {item.path!r} is not a path in its canonical form")
+    return Register(
+        item.path, item.type, dims, item.offset, item.bit, item.size, item.count, item.comment, item.initial
+    )

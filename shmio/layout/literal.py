@@ -1,0 +1,270 @@
+"""S7 literals to values: initial values in a source, and what a user types.
+
+``16#FF``, ``INT#-5``, ``1.5e3``, ``TRUE``, ``T#1h30m``, ``S5T#10s``, ``D#2024-02-29``, ``TOD#12:00:00``,
+``DT#2024-02-29-12:00:00``, ``'text$N'``, ``WSTRING#'…'``, and arrays ``[1, 2, 5(0)]`` of any of these.
+Values come in the Python form that ``scalar.py`` tabulates.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from fractions import Fraction
+
+from shmio.errors import ValueRangeError
+from shmio.layout import calendar
+from shmio.layout.codec import Value, nest
+from shmio.layout.model import ByteOrder, Register
+from shmio.layout.scalar import Scalar, brief, scalar_codec
+from shmio.layout.types import ElementType
+
+MAX_LITERAL = 100  # characters of anything but text
+
+_INTEGER = re.compile(r"([+-]?)(?:(2|8|16)#)?([0-9A-Fa-f]+(?:_[0-9A-Fa-f]+)*)")
+_REAL = re.compile(r"[+-]?[0-9]+(?:_[0-9]+)*(?:\.[0-9]+(?:_[0-9]+)*)?(?:[eE][+-]?[0-9]+)?")
+_DURATION_PART = re.compile(r"([0-9]+(?:\.[0-9]+)?)(d|h|ms|us|ns|m|s)_?", re.IGNORECASE)
+_CLOCK = re.compile(r"([0-9]{1,2}):([0-9]{1,2})(?::([0-9]{1,2})(?:\.([0-9]{1,9}))?)?")
+_REPEAT = re.compile(r"([0-9]{1,10})\s*\((.*)\)", re.DOTALL)
+_ESCAPE = re.compile(r"\$(?:([LlNnPpRrTt$'])|([0-9A-Fa-f]{4})|([0-9A-Fa-f]{2}))")
+_ESCAPED = {"L": "\n", "N": "\r\n", "P": "\f", "R": "\r", "T": "\t", "$": "$", "'": "'"}
+
+_NS = {
+    "d": calendar.NS_PER_DAY,
+    "h": 3600 * calendar.NS_PER_SECOND,
+    "m": 60 * calendar.NS_PER_SECOND,
+    "s": calendar.NS_PER_SECOND,
+    "ms": calendar.NS_PER_MS,
+    "us": 1000,
+    "ns": 1,
+}
+_SIGNED_BITS = {"SINT": 8, "INT": 16, "DINT": 32, "LINT": 64}
+_UNIT_NS = {
+    **dict.fromkeys(("TIME", "S5TIME", "TIME_OF_DAY"), calendar.NS_PER_MS),
+    **dict.fromkeys(("LTIME", "LTOD"), 1),
+}
+_INTEGERS = frozenset(
+    ["BYTE", "WORD", "DWORD", "LWORD", "SINT", "USINT", "INT", "UINT", "DINT", "UDINT", "LINT", "ULINT"]
+)
+_DURATIONS = frozenset({"TIME", "LTIME", "S5TIME"})
+_MOMENTS = frozenset({"DATE", "DATE_AND_TIME", "LDT", "DTL"})
+_PREFIXES = {
+    **dict.fromkeys(_INTEGERS, _INTEGERS | {"B", "W", "DW", "LW", "L"}),
+    "BOOL": frozenset({"BOOL"}),
+    "REAL": frozenset({"REAL", "LREAL"}),
+    "LREAL": frozenset({"REAL", "LREAL"}),
+    **dict.fromkeys(_DURATIONS, frozenset({"T", "TIME", "LT", "LTIME", "S5T", "S5TIME"})),
+    **dict.fromkeys(("TIME_OF_DAY", "LTOD"), frozenset({"TOD", "TIME_OF_DAY", "LTOD", "LTIME_OF_DAY"})),
+    **dict.fromkeys(_MOMENTS, frozenset({"D", "DATE", "DT", "DATE_AND_TIME", "LDT", "DATE_AND_LTIME", "DTL"})),
+    **dict.fromkeys(("CHAR", "WCHAR", "STRING", "WSTRING"), frozenset({"CHAR", "WCHAR", "STRING", "WSTRING"})),
+}
+_DEFAULTS = {
+    "BOOL": "FALSE",
+    "REAL": "0.0",
+    "LREAL": "0.0",
+    "TIME": "T#0ms",
+    "LTIME": "LT#0ns",
+    "S5TIME": "S5T#0ms",
+    "TIME_OF_DAY": "TOD#00:00:00",
+    "LTOD": "LTOD#00:00:00",
+    "DATE": "D#1990-01-01",
+    "DATE_AND_TIME": "DT#1990-01-01-00:00:00",
+    "LDT": "LDT#1970-01-01-00:00:00",
+    "DTL": "DTL#1970-01-01-00:00:00",
+    "CHAR": "' '",
+    "WCHAR": "WCHAR#' '",
+    "STRING": "''",
+    "WSTRING": "WSTRING#''",
+    "POINTER": "00" * 6,
+    "ANY": "00" * 10,
+}
+
+
+def default_text(element: ElementType) -> str:
+    """Return the literal of a type's value when a source gives none."""
+    return _DEFAULTS.get(element.base, "0")
+
+
+def parse_literal(text: str, register: Register, byte_order: ByteOrder = "big") -> Value:
+    """Return the value of a literal for this register; array elements it leaves out have the default.
+
+    Raises ValueRangeError: no literal of the register's type, or out of its range.
+    """
+    if not register.dims:
+        return scalar_literal(text, register.element, byte_order)
+    default = scalar_literal(default_text(register.element), register.element, byte_order)
+    flat: list[Value] = [default] * register.count
+    for start, count, item in split_array(text, register.shape):
+        flat[start : start + count] = [scalar_literal(item, register.element, byte_order)] * count
+    return nest(flat, register.shape)
+
+
+def scalar_literal(text: str, element: ElementType, byte_order: ByteOrder = "big") -> Scalar:
+    """Return the value of one literal.
+
+    Raises ValueRangeError: no literal of the type, or out of its range.
+    """
+    text = text.strip()
+    value = _read(text, element)
+    if value is None:
+        raise ValueRangeError(
+            f"{element.name}: expected a literal such as {default_text(element)}, found {brief(text)}"
+        )
+    if element.base != "BOOL":
+        scalar_codec(element, byte_order).encode(value)  # the range
+    return value
+
+
+def _read(text: str, element: ElementType) -> Scalar:
+    base = element.base
+    if text.endswith("'"):
+        return _text(text, element)
+    if len(text) > MAX_LITERAL:
+        return None
+    prefix, separator, rest = text.partition("#")
+    if separator and prefix.upper() in _PREFIXES.get(base, ()):
+        text = rest
+    if base == "BOOL":
+        return {"TRUE": True, "1": True, "2#1": True, "16#1": True}.get(
+            text.upper(), False if text.upper() in ("FALSE", "0", "2#0", "16#0") else None
+        )
+    if base in _INTEGERS:
+        return _integer(text, _SIGNED_BITS.get(base))
+    if base in ("REAL", "LREAL"):
+        return float(text.replace("_", "")) if _REAL.fullmatch(text) else None
+    if base in _MOMENTS:
+        ns = calendar.parse_moment(text)
+        if ns is None:
+            return None
+        return text if base == "DATE" and len(text) == 10 else _moment(ns, base)
+    if base in _UNIT_NS:
+        if (plain := _integer(text, None)) is not None:
+            return plain
+        ns = _duration(text) if base in _DURATIONS else _clock(text)
+        return None if ns is None or ns % _UNIT_NS[base] else ns // _UNIT_NS[base]
+    return text if base in ("POINTER", "ANY") else None
+
+
+def _integer(text: str, signed_bits: int | None) -> int | None:
+    match = _INTEGER.fullmatch(text)
+    if match is None:
+        return None
+    try:
+        value = int(match[3].replace("_", ""), int(match[2] or 10))
+    except ValueError:
+        return None
+    if match[2] and not match[1] and signed_bits and value >> signed_bits - 1 == 1:
+        value -= 1 << signed_bits  # a bit pattern: INT#16#FFFF is -1
+    return -value if match[1] == "-" else value
+
+
+def _duration(text: str) -> int | None:
+    """Return nanoseconds, None for no duration or one finer than that."""
+    sign = -1 if text.startswith("-") else 1
+    text = text.lstrip("+-")
+    total, position = Fraction(0), 0
+    while position < len(text):
+        part = _DURATION_PART.match(text, position)
+        if part is None:
+            return None
+        total += Fraction(part[1]) * _NS[part[2].lower()]
+        position = part.end()
+    return sign * total.numerator if text and total.denominator == 1 else None
+
+
+def _clock(text: str) -> int | None:
+    match = _CLOCK.fullmatch(text)
+    if match is None:
+        return None
+    hour, minute, second = (int(match[group] or 0) for group in (1, 2, 3))
+    if hour > 23 or minute > 59 or second > 59:
+        return None
+    return ((hour * 60 + minute) * 60 + second) * calendar.NS_PER_SECOND + int((match[4] or "").ljust(9, "0"))
+
+
+def _moment(ns: int, base: str) -> str:
+    if base == "DATE":
+        return calendar.format_day(ns // calendar.NS_PER_DAY)
+    digits = 3 if base == "DATE_AND_TIME" and ns % calendar.NS_PER_MS == 0 else 9
+    return calendar.format_moment(ns, digits)
+
+
+def _text(text: str, element: ElementType) -> str | None:
+    prefix, separator, rest = text.partition("#'")
+    if separator and prefix.upper() in _PREFIXES.get(element.base, ()):
+        text = f"'{rest}"
+    if len(text) < 2 or text[0] != "'" or element.base not in ("CHAR", "WCHAR", "STRING", "WSTRING"):
+        return None
+    wide = element.base.startswith("W")
+
+    def unescape(match: re.Match[str]) -> str:
+        if match[1]:
+            return _ESCAPED[match[1].upper()]
+        if match[2]:
+            return chr(int(match[2], 16)) if wide else chr(int(match[2][:2], 16)) + match[2][2:]
+        return chr(int(match[3], 16))
+
+    return _ESCAPE.sub(unescape, text[1:-1])
+
+
+def split_array(text: str, shape: tuple[int, ...]) -> list[tuple[int, int, str]]:
+    """Return (first element, number, text) of each value in an array literal, in order.
+
+    ``[1, 2, 3(0)]``, the same without brackets, and rows in brackets of their own. What is beyond the array's
+    end is left out.
+    """
+    runs: list[tuple[int, int, str]] = []
+    _fill(text, shape, 0, runs)
+    return runs
+
+
+def _fill(text: str, shape: tuple[int, ...], start: int, runs: list[tuple[int, int, str]]) -> None:
+    text = text.strip()
+    if text.startswith("[") and text.endswith("]"):
+        text = text[1:-1]
+    row = math.prod(shape[1:])
+    position, stop = start, start + math.prod(shape)
+    for item in _items(text):
+        times, inner = 1, [item]
+        if repeat := _REPEAT.fullmatch(item):
+            times, inner = int(repeat[1]), list(_items(repeat[2]))
+        if len(inner) == 1 and not inner[0].startswith("["):
+            count = min(times, stop - position)
+            if count:
+                runs.append((position, count, inner[0]))
+            position += count
+            continue
+        while times and inner and position < stop:
+            times -= 1
+            for part in inner:
+                if position >= stop:
+                    break
+                if part.startswith("[") and len(shape) > 1:
+                    _fill(part, shape[1:], position, runs)
+                    position += row
+                else:
+                    runs.append((position, 1, part))
+                    position += 1
+
+
+def _items(text: str) -> Iterator[str]:
+    """Split at the commas that are outside brackets and strings."""
+    depth, start, quoted = 0, 0, False
+    position = 0
+    while position < len(text):
+        char = text[position]
+        if quoted:
+            position += char == "$"
+            quoted = char != "'"
+        elif char == "'":
+            quoted = True
+        elif char in "([":
+            depth += 1
+        elif char in ")]":
+            depth -= 1
+        elif char == "," and depth == 0:
+            yield text[start:position].strip()
+            start = position + 1
+        position += 1
+    if text[start:].strip():
+        yield text[start:].strip()

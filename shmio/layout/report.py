@@ -1,0 +1,47 @@
+"""Collecting diagnostics, within a bound."""
+
+from __future__ import annotations
+
+from shmio.errors import LayoutError, ShmioError
+from shmio.layout.model import Diagnostic
+
+MAX_ERRORS = 100
+MAX_WARNINGS = 1000
+
+
+class TooManyErrors(ShmioError):  # noqa: N818  (a signal to stop, never seen outside the compiler)
+    """There are ``MAX_ERRORS`` already; the rest of the sources is not read."""
+
+
+class Report:
+    """The errors and warnings of one run."""
+
+    def __init__(self) -> None:
+        self.errors: list[Diagnostic] = []
+        self.warnings: list[Diagnostic] = []
+
+    def add(self, diagnostic: Diagnostic) -> None:
+        """Keep a diagnostic, unless the last error was at the same place: then it is a consequence of that.
+
+        Raises TooManyErrors: this was the last error there is room for.
+        """
+        if diagnostic.severity == "error":
+            if self.errors and _place(self.errors[-1]) == _place(diagnostic):
+                return
+            self.errors.append(diagnostic)
+            if len(self.errors) >= MAX_ERRORS:
+                raise TooManyErrors
+        elif len(self.warnings) < MAX_WARNINGS:
+            self.warnings.append(diagnostic)
+
+    def raise_errors(self) -> None:
+        """Raise LayoutError with all that was found if any of it is an error."""
+        if self.errors:
+            lines = [str(error) for error in self.errors]
+            if len(self.errors) >= MAX_ERRORS:
+                lines.append(f"stopped after {MAX_ERRORS} errors")
+            raise LayoutError("\n".join(lines), (*self.errors, *self.warnings))
+
+
+def _place(diagnostic: Diagnostic) -> tuple[str, int, int]:
+    return diagnostic.file, diagnostic.line, diagnostic.column

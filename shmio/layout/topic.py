@@ -1,0 +1,169 @@
+"""Topic paths: how a register is named from outside.
+
+``<source>/<member>/…[/<index>…]`` and then, if given, ``/in`` or ``/out``. A leading slash is accepted, and so
+is ``<SCHEME>://``, whose scheme is a source's name in any case. In a member's name ``/ % + #`` are
+percent-encoded, and so is the first letter of a member named exactly ``in`` or ``out``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Literal, cast
+
+from shmio.errors import PathError
+from shmio.layout.model import Layout, Register
+
+Direction = Literal["in", "out"]
+
+RESERVED_SOURCES = frozenset({"simlog", "model", "shmio"})
+MAX_TOPIC = 16_384
+_NEAR_CANDIDATES = 500
+
+_SCHEME = re.compile(r"([^/:]+)://")
+_INDEX = re.compile(r"0|-?[1-9][0-9]{0,9}")
+_ESCAPE = re.compile(r"%([0-9A-Fa-f]{2})?")
+_RESERVED = re.compile(r"[/%+#]")
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A register's path within a source, and a direction if one was named.
+
+    ``path`` is in canonical encoding and empty when the text named only the source.
+    """
+
+    source: str
+    path: str
+    direction: Direction | None = None
+
+    def __str__(self) -> str:
+        return "/".join(part for part in (self.source, self.path, self.direction) if part)
+
+
+def encode_segment(name: str) -> str:
+    """Return a member's name as one path segment."""
+    if name in ("in", "out"):
+        return f"%{ord(name[0]):02X}{name[1:]}"
+    return _RESERVED.sub(lambda match: f"%{ord(match[0]):02X}", name)
+
+
+def decode_segment(segment: str) -> str:
+    """Return the member's name of one path segment.
+
+    Raises PathError: a ``%`` without two hexadecimal digits, or bytes that are not UTF-8.
+    """
+    if "%" not in segment:
+        return segment
+    data = bytearray()
+    position = 0
+    for match in _ESCAPE.finditer(segment):
+        if match[1] is None:
+            raise PathError(f"{shorten(segment)}: '%' must be followed by two hexadecimal digits")
+        data += segment[position : match.start()].encode("utf-8", "surrogatepass")
+        data.append(int(match[1], 16))
+        position = match.end()
+    data += segment[position:].encode("utf-8", "surrogatepass")
+    try:
+        return data.decode("utf-8")
+    except UnicodeDecodeError:
+        raise PathError(f"{shorten(segment)}: the percent-encoded bytes are not UTF-8") from None
+
+
+def canonical_path(path: str) -> str:
+    """Return a path with each segment in its one canonical encoding.
+
+    Raises PathError: an empty segment or a wrong percent-encoding.
+    """
+    segments = path.split("/")
+    if "" in segments:
+        raise PathError(f"{shorten(path)}: empty segment in the path")
+    return "/".join(encode_segment(decode_segment(segment)) for segment in segments)
+
+
+def parse_topic(text: str, sources: Collection[str], default: str | None) -> Topic:
+    """Split a topic into source, path and direction.
+
+    A first segment that is a source's name, or a reserved name, is the source; otherwise ``default`` is.
+    A text that names the source alone gives an empty path: the whole block.
+
+    Raises PathError: no such source, no default where one is needed, or a malformed path.
+    """
+    if len(text) > MAX_TOPIC:
+        raise PathError(f"{shorten(text)}: a path is at most {MAX_TOPIC} characters long")
+    text = text.removeprefix("/")
+    source, rest = default, text
+    named = True
+    if scheme := _SCHEME.match(text):
+        source, rest = _source_of_scheme(scheme[1], sources), text[scheme.end() :].removeprefix("/")
+    else:
+        first, _, below = text.partition("/")
+        if first in sources or first in RESERVED_SOURCES:
+            source, rest = first, below
+        else:
+            named = False
+    if source is None:
+        raise PathError(f"{shorten(text)}: name the source first; there is no default source")
+    head, _, last = rest.rpartition("/")
+    direction: Direction | None = None
+    if last in ("in", "out"):
+        direction, rest = cast(Direction, last), head
+    if rest:
+        return Topic(source, canonical_path(rest), direction)
+    if not named:
+        raise PathError(f"{shorten(text)!r}: the path names no register")
+    return Topic(source, "", direction)
+
+
+def _source_of_scheme(scheme: str, sources: Collection[str]) -> str:
+    if scheme in sources:
+        return scheme
+    for source in (*sources, *sorted(RESERVED_SOURCES)):
+        if source.lower() == scheme.lower():
+            return source
+    raise PathError(f"{shorten(scheme)}://: no source of this name")
+
+
+def find(layout: Layout, path: str) -> Register:
+    """Return the register of a canonical path, or an array's element when it ends in indices.
+
+    Raises PathError: there is none; the message has near names.
+    """
+    index = layout.by_path.get(path)
+    if index is not None:
+        return layout.registers[index]
+    head, indices = path, list[int]()
+    while "/" in head and len(indices) < 6:
+        head, _, last = head.rpartition("/")
+        if not _INDEX.fullmatch(last):
+            break
+        indices.insert(0, int(last))
+        array = layout.by_path.get(head)
+        if array is not None:
+            return layout.element(layout.registers[array], tuple(indices))
+    raise PathError(_unknown(layout, path))
+
+
+def _unknown(layout: Layout, path: str) -> str:
+    if not path:
+        return f"{layout.name}: the path names a source, not a register"
+    if below := layout.members(path):
+        inside = ", ".join(layout.registers[i].path for i in below[:3])
+        return f"{shorten(path)}: a structure, not a register; it holds {inside}{', …' if below[3:] else ''}"
+    # Only what shares the longest known prefix is compared, so that a wrong path costs little in a large block.
+    prefix = path
+    candidates: tuple[int, ...] = ()
+    while "/" in prefix and not candidates:
+        prefix = prefix.rpartition("/")[0]
+        candidates = layout.members(prefix)
+    names = [layout.registers[i].path for i in (candidates or range(len(layout.registers)))[:_NEAR_CANDIDATES]]
+    near = difflib.get_close_matches(path[:200], names, n=3)
+    hint = f"; near: {', '.join(near)}" if near else ""
+    return f"{shorten(path)}: no such register in {layout.name}{hint}"
+
+
+def shorten(text: str, limit: int = 120) -> str:
+    """Return text that fits an error message."""
+    return text if len(text) <= limit else f"{text[: limit - 1]}…"

@@ -1,0 +1,98 @@
+"""The elementary types of S7: name, size and alignment.
+
+Sizes and alignments are those of a block with standard access, as Siemens' STEP 7 help gives them under
+"Data types"; ``docs/reference/layout-rules.md`` has the whole table.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import lru_cache
+
+MAX_STRING = 254
+MAX_WSTRING = 16_382
+DEFAULT_STRING = 254
+
+
+@dataclass(frozen=True, slots=True)
+class ElementType:
+    """One elementary type, a string with its length included.
+
+    ``name`` is canonical (``DATE_AND_TIME``, never ``DT``; ``STRING[20]``); ``base`` is the name without the
+    length; ``size`` is in bytes (1 for BOOL, which takes one bit of it); ``align`` is 1 or 2 bytes;
+    ``length`` is the most characters of a string, 0 for all other types.
+    """
+
+    name: str
+    base: str
+    size: int
+    align: int
+    length: int = 0
+
+    @property
+    def stride(self) -> int:
+        """Bytes from one array element to the next; BOOL, which packs bits, is the exception."""
+        return -(-self.size // self.align) * self.align
+
+
+_SIZES = {
+    1: ("BOOL", "BYTE", "CHAR", "SINT", "USINT"),
+    2: ("WORD", "INT", "UINT", "DATE", "S5TIME", "WCHAR"),
+    4: ("DWORD", "DINT", "UDINT", "REAL", "TIME", "TIME_OF_DAY"),
+    6: ("POINTER",),
+    8: ("LWORD", "LINT", "ULINT", "LREAL", "LTIME", "LTOD", "LDT", "DATE_AND_TIME"),
+    10: ("ANY",),
+    12: ("DTL",),
+}
+_FIXED = {
+    name: ElementType(name, name, size, 1 if size == 1 else 2) for size, names in _SIZES.items() for name in names
+}
+
+ALIASES = {
+    "TOD": "TIME_OF_DAY",
+    "DT": "DATE_AND_TIME",
+    "LTIME_OF_DAY": "LTOD",
+    "DATE_AND_LTIME": "LDT",
+}
+
+# Types the system library defines. Their placement in a standard block has no public source, or depends on
+# the version of the library, so they are refused by name rather than guessed.
+# fmt: off
+SYSTEM_TYPES = frozenset({
+    "IEC_TIMER", "IEC_LTIMER", "IEC_SCOUNTER", "IEC_USCOUNTER", "IEC_COUNTER", "IEC_UCOUNTER", "IEC_DCOUNTER",
+    "IEC_UDCOUNTER", "IEC_LCOUNTER", "IEC_ULCOUNTER", "TON_TIME", "TOF_TIME", "TP_TIME", "TONR_TIME", "TON_LTIME",
+    "TOF_LTIME", "TP_LTIME", "TONR_LTIME", "CTU_INT", "CTD_INT", "CTUD_INT", "CTU_DINT", "CTD_DINT", "CTUD_DINT",
+    "R_TRIG", "F_TRIG", "ERROR_STRUCT", "NREF", "CREF", "VREF", "SSL_HEADER", "CONDITIONS", "TADDR_PARAM",
+    "TCON_PARAM", "TCON_IP_V4", "TCON_IP_RFC", "TCON_PHYS", "HSC_PERIOD", "GEOADDR", "LOG2GEO", "IF_CONF_V4",
+    "HW_ANY", "HW_DEVICE", "HW_DPMASTER", "HW_DPSLAVE", "HW_IO", "HW_IOSYSTEM", "HW_SUBMODULE", "HW_MODULE",
+    "HW_INTERFACE", "HW_IEPORT", "HW_HSC", "HW_PWM", "HW_PTO", "AOM_AID", "AOM_IDENT", "EVENT_ANY", "EVENT_ATT",
+    "EVENT_HWINT", "OB_ANY", "OB_DELAY", "OB_TOD", "OB_CYCLIC", "OB_ATT", "OB_PCYCLE", "OB_HWINT", "OB_DIAG",
+    "OB_TIMEERROR", "OB_STARTUP", "PORT", "RTM", "PIP", "CONN_ANY", "CONN_PRG", "CONN_OUC", "CONN_R_ID", "DB_ANY",
+    "DB_WWW", "DB_DYN", "VARIANT", "REMOTE", "TIMER", "COUNTER", "BLOCK_FB", "BLOCK_FC", "BLOCK_DB", "BLOCK_SDB",
+    "VOID",
+})
+# fmt: on
+
+_STRING = re.compile(r"(W?STRING)(?:\[([0-9]{1,5})\])?")
+
+
+def string_limit(base: str) -> int:
+    """Return the most characters ``STRING`` or ``WSTRING`` may be declared with."""
+    return MAX_STRING if base == "STRING" else MAX_WSTRING
+
+
+@lru_cache(maxsize=1024)
+def element_type(name: str) -> ElementType | None:
+    """Return the elementary type of this name, in any case and with aliases, or None if there is none."""
+    upper = name.upper()
+    fixed = _FIXED.get(ALIASES.get(upper, upper))
+    if fixed is not None:
+        return fixed
+    if (match := _STRING.fullmatch(upper)) is None:
+        return None
+    base, length = match[1], int(match[2] or DEFAULT_STRING)
+    if not 1 <= length <= string_limit(base):
+        return None
+    size = length + 2 if base == "STRING" else 2 * length + 4
+    return ElementType(f"{base}[{length}]", base, size, 2, length)
