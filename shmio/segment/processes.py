@@ -28,7 +28,7 @@ _REPORT: Final = struct.Struct("<IIq8Q160s")
 
 COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "source": ("polls", "overruns", "failures", "connects", "round_trip_us", "rate_mhz"),
-    "emulator": ("steps", "overruns", "connections", "requests"),
+    "emulator": ("cycles", "overruns"),
     "grpc": ("streams", "messages", "dropped"),
 }
 """Names of a worker's counters by its kind, in the order of their slots (at most 8)."""

@@ -1,0 +1,28 @@
+"""The process of one emulated controller."""
+
+from __future__ import annotations
+
+from shmio import worker
+from shmio.config import Address
+from shmio.emulators.emulator import Emulator
+from shmio.errors import ShmioError
+from shmio.layout.model import Layout
+from shmio.logs import fields
+from shmio.worker import BEAT_S, Worker
+
+
+def run(worker: Worker) -> None:
+    """Play until told to stop. The compiled layout comes with the process's description."""
+    layout = Layout.from_json(worker.config["layout"].encode())
+    emulator = Emulator(layout, worker.config["program"], Address.parse(worker.config["listen"]))
+    with emulator:
+        worker.log.info("playing %s", worker.config["program"], extra=fields(address=emulator.address))
+        worker.running()
+        while not worker.stopping.wait(BEAT_S):
+            if emulator.failure is not None:
+                raise ShmioError(f"program {worker.config['program']} failed: {emulator.failure}") from emulator.failure
+            worker.report((emulator.cycles, emulator.overruns))
+
+
+if __name__ == "__main__":
+    raise SystemExit(worker.main(run))
