@@ -12,13 +12,23 @@ from shmio.segment.frame import Frame, Provenance, Quality
 
 if TYPE_CHECKING:
     from shmio.layout.model import Layout
+    from shmio.segment._atomics import FrameTuple
 
 Bytes = bytes | bytearray | memoryview
 
 
-def _frame(fields: tuple[object, ...]) -> Frame:
-    frame = Frame._make(fields)
-    return frame._replace(quality=Quality(min(frame.quality, 2)), provenance=Provenance(min(frame.provenance, 3)))
+_QUALITIES = tuple(Quality)
+_PROVENANCES = tuple(Provenance)
+
+
+def _frame(fields: FrameTuple) -> Frame:
+    quality, provenance = fields[6:8]  # from shared memory: what is unknown is bad
+    return Frame(
+        *fields[:6],
+        _QUALITIES[quality] if quality < len(_QUALITIES) else Quality.BAD,
+        _PROVENANCES[provenance] if provenance < len(_PROVENANCES) else Provenance.SIMULATED,
+        *fields[8:],
+    )
 
 
 class Block:

@@ -1,0 +1,66 @@
+"""What holds for every test: nothing is left behind, and each instance has a name of its own."""
+
+from __future__ import annotations
+
+import gc
+import os
+import secrets
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+SHM = Path("/dev/shm")
+
+
+def segments() -> set[str]:
+    return {entry.name for entry in SHM.iterdir() if entry.name.startswith("shmio-")}
+
+
+def children() -> set[int]:
+    found: set[int] = set()
+    for task in Path("/proc/self/task").iterdir():
+        try:
+            found.update(int(pid) for pid in (task / "children").read_text().split())
+        except OSError:
+            continue  # a thread that has just ended
+    return found
+
+
+def sockets() -> set[str]:
+    found = set()
+    for entry in Path("/proc/self/fd").iterdir():
+        try:
+            target = str(entry.readlink())
+        except OSError:
+            continue
+        if target.startswith("socket:"):
+            found.add(target)
+    return found
+
+
+def left_over(before: tuple[set[str], set[int], set[str]]) -> tuple[set[str], set[int], set[str]]:
+    return segments() - before[0], children() - before[1], sockets() - before[2]
+
+
+@pytest.fixture(autouse=True)
+def nothing_left_behind() -> Iterator[None]:
+    """Fail a test that leaves a segment, a process or a socket."""
+    before = segments(), children(), sockets()
+    yield
+    left = left_over(before)
+    deadline = time.monotonic() + 2.0
+    while any(left) and time.monotonic() < deadline:  # what is just ending may end
+        gc.collect()
+        time.sleep(0.01)
+        left = left_over(before)
+    assert not any(left), f"left behind: segments {left[0]}, processes {left[1]}, sockets {left[2]}"
+
+
+@pytest.fixture
+def instance() -> Iterator[str]:
+    """A name that no other instance has; whatever a failing test leaves of it is cleared."""
+    name = f"test-{os.getpid()}-{secrets.token_hex(4)}"
+    yield name
+    (SHM / f"shmio-{name}").unlink(missing_ok=True)

@@ -1,0 +1,74 @@
+"""What a killed supervisor leaves behind."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from shmio.errors import AlreadyRunningError, NotRunningError
+from shmio.segment import ProcessSpec, Segment, instances
+from shmio.segment.leftover import clear
+
+SUPERVISOR = """
+import subprocess, sys
+from shmio.segment import ProcessSpec, Segment
+segment = Segment.create(sys.argv[1], [], [ProcessSpec("cell", "source")])
+child = subprocess.Popen([sys.executable, "-c", sys.argv[2], sys.argv[1]], stdout=sys.stdout)
+child.wait()
+"""
+ORPHAN = """
+import os, signal, sys
+from shmio.segment import Report, Segment
+segment = Segment.open(sys.argv[1], writable=True)
+slot = segment.processes.find("cell")
+assert slot.take()
+slot.report = Report(os.getpid())
+if {stubborn}:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+print(os.getpid(), flush=True)
+signal.pause()
+"""
+
+
+def test_nothing_to_clear_is_no_error(instance: str) -> None:
+    assert clear(instance) == []
+
+
+def test_a_living_supervisor_is_left_alone(instance: str) -> None:
+    with Segment.create(instance, [], [ProcessSpec("cell", "source")]) as segment:
+        with pytest.raises(AlreadyRunningError, match=f"pid {os.getpid()}"):
+            clear(instance)
+        segment.unlink()
+
+
+def test_an_unfinished_segment_is_removed(instance: str) -> None:
+    (Path("/dev/shm") / f"shmio-{instance}").touch()
+    assert clear(instance) == [f"removed the left-over segment shmio-{instance}"]
+
+
+@pytest.mark.parametrize("stubborn", [False, True])
+def test_orphans_of_a_killed_supervisor_are_stopped(
+    instance: str, stubborn: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shmio.segment.leftover.GRACE_S", 0.2)
+    command = [sys.executable, "-c", SUPERVISOR, instance, ORPHAN.format(stubborn=stubborn)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as supervisor:
+        assert supervisor.stdout is not None
+        orphan = int(supervisor.stdout.readline())
+        handle = os.pidfd_open(orphan)
+        supervisor.kill()
+        supervisor.wait()
+        done = clear(instance)
+    os.close(handle)
+    assert done == [
+        f"stopped cell, pid {orphan}, which had lost its supervisor",
+        f"removed the left-over segment shmio-{instance}",
+    ]
+    assert not Path(f"/proc/{orphan}").exists() or "Z" in Path(f"/proc/{orphan}/stat").read_text().split()[2]
+    assert instance not in instances()
+    with pytest.raises(NotRunningError):
+        Segment.open(instance)

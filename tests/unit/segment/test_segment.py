@@ -1,0 +1,252 @@
+"""Building, opening and refusing segments."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from shmio.errors import AlreadyRunningError, FormatError, NotRunningError, SegmentError
+from shmio.layout.model import Layout, Register
+from shmio.segment import (
+    Activity,
+    BlockSpec,
+    Phase,
+    ProcessSpec,
+    Quality,
+    Report,
+    Segment,
+    State,
+    Supervised,
+    instances,
+    segment_size,
+)
+from shmio.segment.header import GENERATION_OFFSET, HEADER_SIZE
+
+LAYOUT = Layout(
+    "DB1", 1, 6, False, (Register("speed", "REAL", (), 0, None, 4, 1), Register("on", "BOOL", (), 4, 0, 1, 1))
+)
+PROCESSES = [ProcessSpec("cell", "source"), ProcessSpec("grpc", "grpc")]
+
+
+def block(source: str = "cell", **changes: int) -> BlockSpec:
+    fields = {"period_ns": 20_000_000, "stale_ns": 500_000_000, "ring_bytes": 1 << 26} | changes
+    return BlockSpec(source, LAYOUT, **fields)
+
+
+def test_who_opens_a_segment_finds_what_its_supervisor_built(instance: str) -> None:
+    with Segment.create(instance, [block("cell"), block("press")], PROCESSES, control="/run/x.sock") as built:
+        with Segment.open(instance) as opened:
+            assert list(opened.blocks) == ["cell", "press"]
+            assert opened.blocks["cell"].layout == LAYOUT
+            assert (opened.blocks["press"].period_ns, opened.blocks["press"].stale_ns) == (20_000_000, 500_000_000)
+            assert [(slot.name, slot.kind) for slot in opened.processes] == [("cell", "source"), ("grpc", "grpc")]
+            assert opened.header == built.header
+            assert (opened.header.instance, opened.header.mode, opened.header.control) == (
+                instance,
+                "live",
+                "/run/x.sock",
+            )
+            assert opened.supervisor == (os.getpid(), State.STARTING)
+            assert opened.supervised
+            built.set_state(4711, State.RUNNING)
+            assert opened.supervisor == (4711, State.RUNNING)
+        assert instance in instances()
+        built.unlink()
+    assert instance not in instances()
+
+
+def test_the_size_is_what_was_foretold(instance: str) -> None:
+    with Segment.create(instance, [block()], PROCESSES) as segment:
+        assert segment.header.size == segment.shared.size == segment_size([block()], len(PROCESSES))
+        segment.unlink()
+
+
+def test_a_second_supervisor_is_refused_with_the_pid_of_the_first(instance: str) -> None:
+    with Segment.create(instance, [block()], PROCESSES) as segment:
+        with pytest.raises(AlreadyRunningError, match=f"pid {os.getpid()}"):
+            Segment.create(instance, [block()], PROCESSES)
+        segment.unlink()
+
+
+def test_an_instance_that_does_not_run_is_named_with_the_remedy(instance: str) -> None:
+    with pytest.raises(NotRunningError, match=f"{instance}.*shmio-supervisor up"):
+        Segment.open(instance)
+
+
+def test_no_room_is_said_at_creation_and_nothing_is_left(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("shmio.segment.shm.os.posix_fallocate", full)
+    with pytest.raises(SegmentError, match=r"no room.*ring_mb"):
+        Segment.create(instance, [block()], PROCESSES)
+    assert instance not in instances()
+
+
+def test_an_unknown_group_is_named_and_nothing_is_left(instance: str) -> None:
+    with pytest.raises(SegmentError, match="no-such-group"):
+        Segment.create(instance, [block()], PROCESSES, group="no-such-group")
+    assert instance not in instances()
+
+
+def test_only_the_owner_can_open_it_by_default(instance: str) -> None:
+    with Segment.create(instance, [block()], PROCESSES) as segment:
+        assert (Path("/dev/shm") / f"shmio-{instance}").stat().st_mode & 0o777 == 0o600
+        segment.unlink()
+
+
+def test_another_abi_is_refused_by_name(instance: str) -> None:
+    with Segment.create(instance, [block()], PROCESSES) as segment:
+        segment.memory[8:12] = (7).to_bytes(4, "little")
+        with pytest.raises(FormatError, match=r"ABI 7.*ABI 1"):
+            Segment.open(instance)
+        segment.unlink()
+
+
+def test_something_else_by_that_name_is_refused(instance: str) -> None:
+    path = Path("/dev/shm") / f"shmio-{instance}"
+    path.write_bytes(b"")
+    with pytest.raises(NotRunningError, match="just starting"):
+        Segment.open(instance)
+    path.write_bytes(bytes(HEADER_SIZE))
+    with pytest.raises(FormatError, match="not a whole shmio segment"):
+        Segment.open(instance)
+
+
+@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=300)
+@given(edits=st.lists(st.tuples(st.integers(8, 12_000), st.binary(min_size=1, max_size=8)), min_size=1, max_size=6))
+def test_a_damaged_segment_is_refused_or_read_but_never_crashes(instance: str, edits: list[tuple[int, bytes]]) -> None:
+    with Segment.create(instance, [block()], PROCESSES) as segment:
+        try:
+            segment.writer("cell").publish(bytes(6), cycle=1)
+            for at, data in edits:
+                end = min(at + len(data), len(segment.memory))
+                segment.memory[at:end] = data[: max(0, end - at)]
+            try:
+                opened = Segment.open(instance)
+            except SegmentError:
+                return
+            with opened:
+                for found in opened.blocks.values():
+                    found.ring.latest()
+                for slot in opened.processes:
+                    assert isinstance(slot.report.pid, int)
+                    assert isinstance(slot.supervised.phase, Phase)
+        finally:
+            segment.unlink()
+
+
+def test_a_section_count_beyond_the_table_is_refused(instance: str) -> None:
+    with Segment.create(instance, [block()], PROCESSES) as segment:
+        segment.memory[GENERATION_OFFSET + 4 : GENERATION_OFFSET + 8] = (60_000).to_bytes(4, "little")
+        with pytest.raises(FormatError, match="more sections"):
+            Segment.open(instance)
+        segment.unlink()
+
+
+@pytest.mark.parametrize(
+    ("period_ns", "slots"), [(20_000_000, 512), (1_000_000, 8192), (3_600_000_000_000, 8), (100_000_000, 128)]
+)
+def test_a_ring_holds_eight_seconds_rounded_up_to_a_power_of_two(period_ns: int, slots: int) -> None:
+    assert block(period_ns=period_ns).slots == slots
+
+
+def test_a_ring_stays_within_its_memory() -> None:
+    bounded = block(ring_bytes=10_000, period_ns=1_000_000)
+    assert bounded.slots * bounded.slot_bytes <= 10_000
+    assert bounded.slots == 32
+
+
+def test_frames_pass_from_writer_to_reader(instance: str) -> None:
+    with Segment.create(instance, [block()], PROCESSES) as segment, Segment.open(instance) as opened:
+        reader = opened.blocks["cell"]
+        cursor = reader.cursor()
+        assert reader.latest() is None
+        writer = segment.writer("cell")
+        writer.publish(b"abcdef", cycle=5)
+        writer.publish(b"ghijkl", cycle=6, quality=Quality.BAD, reason="cut")
+        first, second = cursor.next(1.0), cursor.next(1.0)
+        assert first is not None
+        assert second is not None
+        assert (first.raw, first.cycle, first.quality, first.reason) == (b"abcdef", 5, Quality.GOOD, "")
+        assert (second.raw, second.quality, second.reason) == (b"ghijkl", Quality.BAD, "cut")
+        assert 0 <= first.clock_ns <= second.clock_ns
+        assert cursor.next(0.0) is None
+        assert cursor.missed == 0
+        segment.unlink()
+
+
+def test_a_slow_stream_reader_is_told_exactly_what_it_missed(instance: str) -> None:
+    with Segment.create(instance, [block(period_ns=1_000_000_000)], PROCESSES) as segment:
+        reader = segment.blocks["cell"]
+        slots = reader.ring.slot_count
+        cursor = reader.cursor()
+        writer = segment.writer("cell")
+        total = 3 * slots
+        for cycle in range(total):
+            writer.publish(bytes(6), cycle=cycle)
+        seen = []
+        while (frame := cursor.poll()) is not None:
+            seen.append(frame.cycle)
+        assert seen == list(range(seen[0], total))
+        assert cursor.missed == total - len(seen) == seen[0]
+        segment.unlink()
+
+
+def test_a_successor_goes_on_with_the_numbers_and_has_its_own_incarnation(instance: str) -> None:
+    with Segment.create(instance, [block()], PROCESSES) as segment:
+        assert segment.writer("cell").publish(bytes(6), cycle=1) == 1
+        assert segment.writer("cell").publish(bytes(6), cycle=9) == 2
+        frames = [segment.blocks["cell"].read(number) for number in (1, 2)]
+        assert [(f.incarnation, f.cycle) for f in frames if f] == [(1, 1), (2, 9)]
+        segment.unlink()
+
+
+def test_an_old_frame_is_never_good(instance: str) -> None:
+    with Segment.create(instance, [block()], PROCESSES) as segment:
+        segment.writer("cell").publish(bytes(6), cycle=1)
+        frame = segment.blocks["cell"].latest()
+        assert frame is not None
+        assert frame.assess(500_000_000, frame.publish_ns + 500_000_000) == (Quality.GOOD, "")
+        assert frame.assess(500_000_000, frame.publish_ns + 2_500_000_001) == (
+            Quality.BAD,
+            "stale: no frame for 2.5 s",
+        )
+        segment.unlink()
+
+
+def test_a_process_slot_shows_what_both_sides_wrote(instance: str) -> None:
+    with Segment.create(instance, [block()], PROCESSES) as segment, Segment.open(instance) as opened:
+        mine, theirs = segment.processes.find("cell"), opened.processes.find("cell")
+        assert (theirs.report, theirs.supervised, theirs.heartbeat_ns) == (
+            Report(counters=(0,) * 8),
+            Supervised(),
+            0,
+        )
+        mine.supervised = Supervised(Phase.BACKOFF, 3, 99, "ä" * 100)
+        mine.report = Report(12, Activity.RUNNING, 5, (1, 2, 3, 4, 5, 6), "why\n")
+        mine.beat()
+        assert theirs.supervised == Supervised(Phase.BACKOFF, 3, 99, "ä" * 51)
+        assert theirs.report == Report(12, Activity.RUNNING, 5, (1, 2, 3, 4, 5, 6, 0, 0), "why\n")
+        assert theirs.counters["overruns"] == 2
+        assert theirs.heartbeat_ns > 0
+        segment.unlink()
+
+
+def test_a_role_is_held_by_one_and_freed_with_its_holder(instance: str) -> None:
+    with Segment.create(instance, [block()], PROCESSES) as segment, Segment.open(instance) as watcher:
+        first, second = Segment.open(instance, writable=True), Segment.open(instance, writable=True)
+        assert not watcher.processes.find("cell").alive()
+        assert first.processes.find("cell").take()
+        assert not second.processes.find("cell").take()
+        assert second.processes.find("grpc").take()
+        assert watcher.processes.find("cell").alive()
+        first.close()
+        assert not watcher.processes.find("cell").alive()
+        second.close()
+        segment.unlink()
