@@ -4,7 +4,6 @@
  * cannot be closed under it.
  */
 #include <Python.h>
-#include <stddef.h>
 #include <stdlib.h>
 
 #include "ring.h"
