@@ -19,6 +19,7 @@ import logging
 import socket
 import struct
 import threading
+from typing import Self
 
 from snap7.datatypes import S7Area
 from snap7.s7protocol import S7Function, S7PDUType
@@ -43,7 +44,7 @@ _JOIN_TIMEOUT_S = 10
 class S7Server(Server):
     """Serves data blocks to S7 clients on one address. Start it once, stop it once; or use ``with``.
 
-    ``lock`` is held over each job: who changes blocks while holding it, changes them between jobs.
+    ``lock`` is held over each job: who changes blocks while holding it changes them between jobs.
     """
 
     def __init__(self, address: Address, *, max_clients: int = 16) -> None:
@@ -72,7 +73,7 @@ class S7Server(Server):
         return Address(host, port)
 
     def start(self, tcp_port: int | None = None) -> int:
-        """Listen and serve in threads of its own; EndpointError, naming the address, if it is taken or not this machine's.
+        """Listen and serve in threads of its own; EndpointError, naming the address, if it cannot be had.
 
         No other socket can listen there too: SO_REUSEADDR, unlike SO_REUSEPORT, only passes over closed connections.
         """
@@ -128,6 +129,9 @@ class S7Server(Server):
         if self.server_thread.is_alive() or any(thread.is_alive() for thread in threads):
             raise ShmioError("a thread of the S7 server does not end")
         return 0
+
+    def __enter__(self) -> Self:
+        return self
 
     # -- threads -------------------------------------------------------------------------------------------------------
 

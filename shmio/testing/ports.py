@@ -1,0 +1,23 @@
+"""TCP ports for tests: given by the kernel, never numbered in the tests."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from shmio.config.address import Address
+
+
+@contextmanager
+def reserved_port(host: str = "127.0.0.1") -> Iterator[Address]:
+    """Keep a free port for the length of a ``with`` block.
+
+    The port is bound, but nothing listens: connections are refused, and the kernel gives it to nobody who asks for any
+    port. Who asks for this one, with SO_REUSEADDR as all servers here do, gets it.
+    """
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_STREAM) as keeper:
+        keeper.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        keeper.bind((host, 0))
+        yield Address(host, keeper.getsockname()[1])

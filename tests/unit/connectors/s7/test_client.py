@@ -1,0 +1,378 @@
+"""Through real sockets: every way a controller or a wire can fail, and that the next ``connect`` mends it."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+
+import pytest
+
+from shmio.config.address import Address
+from shmio.connectors.s7 import S7Client, S7Options
+from shmio.emulators.s7 import S7Server
+from shmio.errors import ConfigError, ConnectorError
+from shmio.testing.ports import reserved_port
+from shmio.testing.proxy import FaultProxy
+
+SIZE = 2180
+
+
+class Plc:
+    """An emulated controller with DB201 of random bytes, behind a proxy."""
+
+    def __init__(self, server: S7Server, block: bytearray, proxy: FaultProxy) -> None:
+        self.server = server
+        self.block = block
+        self.proxy = proxy
+        self._stack = ExitStack()
+
+    def client(self, *, size: int = SIZE, db_number: int = 201, **options: object) -> S7Client:
+        given: dict[str, object] = {"host": self.proxy.address.host, "port": self.proxy.address.port, "timeout": 5000}
+        client = S7Client(S7Options(**{**given, **options}), db_number, size)  # type: ignore[arg-type]
+        return self._stack.enter_context(closing(client))
+
+    def close(self) -> None:
+        self._stack.close()
+
+
+@pytest.fixture
+def plc() -> Iterator[Plc]:
+    block = bytearray(os.urandom(SIZE))
+    with S7Server(Address("127.0.0.1", 0)) as server:
+        server.add_block(201, block)
+        server.start()
+        with FaultProxy(server.address) as proxy:
+            plc = Plc(server, block, proxy)
+            yield plc
+            plc.close()
+
+
+Scripted = Callable[..., S7Client]
+
+
+@pytest.fixture
+def scripted() -> Iterator[Scripted]:
+    """Make a client of a peer that sends one given answer to each thing it receives, then closes."""
+    with ExitStack() as stack:
+
+        def make(*answers: bytes, timeout: int = 5000) -> S7Client:
+            listener = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+
+            def play() -> None:
+                peer, _ = listener.accept()
+                with peer:
+                    peer.settimeout(10)
+                    for answer in answers:
+                        peer.recv(4096)
+                        peer.sendall(answer)
+
+            thread = threading.Thread(target=play)
+            thread.start()
+            stack.callback(thread.join)
+            host, port = listener.getsockname()
+            options = S7Options(host=host, port=port, timeout=timeout)
+            return stack.enter_context(closing(S7Client(options, 201, SIZE)))
+
+        yield make
+
+
+def assert_recovers(plc: Plc, client: S7Client) -> None:
+    """The error has closed the client; with the fault gone, it connects and reads."""
+    assert not client.connected
+    with pytest.raises(ConnectorError, match="not connected"):
+        client.read()
+    plc.proxy.pass_all()
+    client.connect()
+    assert client.read() == plc.block
+
+
+# -- what works --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("packet", [None, 1, 96, 461, 941, 942, 65535])
+@pytest.mark.parametrize("jobs", [None, 1, 3])
+def test_reads_the_whole_block(plc: Plc, packet: int | None, jobs: int | None) -> None:
+    client = plc.client(packetSize=packet, maxJobs=jobs)
+    client.connect()
+    assert (client.pdu_size, client.jobs) == (960, jobs or 8)
+    for generation in range(3):
+        plc.block[:] = bytes([generation]) * SIZE
+        assert client.read() == plc.block
+    assert client.round_trip_ns > 0
+
+
+def test_reads_a_block_of_one_byte(plc: Plc) -> None:
+    client = plc.client(size=1)
+    client.connect()
+    assert client.read() == plc.block[:1]
+
+
+def test_references_wrap_around(plc: Plc) -> None:
+    client = plc.client(packetSize=1)  # 2180 references a read
+    client.connect()
+    for _ in range(31):
+        assert client.read() == plc.block
+
+
+def test_reads_over_ipv6() -> None:
+    with S7Server(Address("::1", 0)) as server:
+        server.add_block(1, bytearray(b"six"))
+        server.start()
+        with closing(S7Client(S7Options(host="::1", port=server.address.port), 1, 3)) as client:
+            client.connect()
+            assert client.read() == b"six"
+
+
+def test_answers_in_any_order(plc: Plc) -> None:
+    """The proxy holds all but the last of three answers back, then lets them go."""
+    client = plc.client()
+    client.connect()
+    answers: list[bytes] = []
+
+    def swap(frame: bytes) -> bytes | None:
+        answers.append(frame)
+        return b"".join(reversed(answers)) if len(answers) == 3 else None
+
+    plc.proxy.edit(swap, frames=3)
+    assert client.read() == plc.block
+
+
+# -- nobody there ------------------------------------------------------------------------------------------------------
+
+
+def test_refused() -> None:
+    with reserved_port() as address:
+        client = S7Client(S7Options(host=address.host, port=address.port), 201, SIZE)
+        with pytest.raises(ConnectorError, match=f"^connection refused by {address}$"):
+            client.connect()
+        assert not client.connected
+
+
+def test_refused_later_and_back_again(plc: Plc) -> None:
+    client = plc.client()
+    client.connect()
+    plc.proxy.refuse()
+    with pytest.raises(ConnectorError, match="closed the connection"):
+        client.read()
+    with pytest.raises(ConnectorError, match="connection refused by"):
+        client.connect()
+    assert_recovers(plc, client)
+
+
+def test_unknown_host() -> None:
+    client = S7Client(S7Options(host="no.such.host.invalid"), 201, SIZE)
+    with pytest.raises(ConnectorError, match=r"'no.such.host.invalid' cannot be resolved"):
+        client.connect()
+
+
+def test_frozen_before_the_session(plc: Plc) -> None:
+    plc.proxy.freeze()
+    client = plc.client(timeout=50)
+    with pytest.raises(ConnectorError, match=r"^no answer within 50 ms from 127.0.0.1:"):
+        client.connect()
+    plc.proxy.pass_all()
+    client = plc.client()
+    client.connect()
+    assert client.read() == plc.block
+
+
+def test_frozen_in_a_session(plc: Plc) -> None:
+    client = plc.client(timeout=500)
+    client.connect()
+    assert client.read() == plc.block
+    plc.proxy.freeze()
+    with pytest.raises(ConnectorError, match=r"^no answer within 500 ms from"):
+        client.read()
+    assert_recovers(plc, client)
+
+
+def test_peer_that_drips_is_late_all_the_same(plc: Plc) -> None:
+    """Each byte comes in time, the whole does not: the limit is of the operation."""
+    client = plc.client(packetSize=1, maxJobs=1, timeout=400)
+    client.connect()
+    plc.proxy.delay(0.0, 0.01)  # 2180 times 10 ms
+    with pytest.raises(ConnectorError, match="no answer within 400 ms"):
+        client.read()
+    plc.proxy.delay(0.0, 0.0)
+    assert not client.connected
+
+
+# -- a wire that fails -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reset", [False, True])
+def test_cut_between_reads(plc: Plc, reset: bool) -> None:
+    client = plc.client()
+    client.connect()
+    plc.proxy.cut(reset=reset)
+    with pytest.raises(ConnectorError, match=r"closed the connection$"):
+        client.read()
+    assert_recovers(plc, client)
+
+
+@pytest.mark.parametrize("count", [1, 24, 25, 26, 967, 1000, 2200])
+def test_cut_in_the_middle_of_an_answer(plc: Plc, count: int) -> None:
+    client = plc.client()
+    client.connect()
+    plc.proxy.cut_after(count)
+    with pytest.raises(ConnectorError, match=r"closed the connection$"):
+        client.read()
+    assert_recovers(plc, client)
+
+
+def test_late_answer_is_never_taken_for_the_next(plc: Plc) -> None:
+    client = plc.client(timeout=500)
+    client.connect()
+    plc.proxy.hold()
+    with pytest.raises(ConnectorError, match="no answer within 500 ms"):
+        client.read()
+    assert plc.proxy.wait_held()
+    plc.proxy.edit(lambda frame: frame)  # let the session through, keep what is held
+    client.connect()
+    plc.block[:] = bytes(SIZE)
+    plc.proxy.release()  # the old answers, on the new connection
+    with pytest.raises(ConnectorError, match="not under way"):
+        client.read()
+    assert_recovers(plc, client)
+
+
+def test_wrong_reference(plc: Plc) -> None:
+    client = plc.client()
+    client.connect()
+    plc.proxy.rewrite_reference(lambda reference: reference + 100)
+    with pytest.raises(ConnectorError, match="not under way"):
+        client.read()
+    assert_recovers(plc, client)
+
+
+def test_answer_sent_twice(plc: Plc) -> None:
+    client = plc.client(packetSize=96)
+    client.connect()
+    plc.proxy.edit(lambda frame: frame * 2, frames=1)
+    with pytest.raises(ConnectorError, match="not under way"):
+        client.read()
+    assert_recovers(plc, client)
+
+
+def test_more_than_was_asked_for(plc: Plc) -> None:
+    client = plc.client()
+    client.connect()
+    answers = 0
+
+    def append(frame: bytes) -> bytes:
+        nonlocal answers
+        answers += 1
+        return frame + b"\x03" if answers == 3 else frame
+
+    plc.proxy.edit(append)
+
+    def read_twice() -> None:  # if the byte comes after the rest, it spoils the next read
+        client.read()
+        client.read()
+
+    with pytest.raises(ConnectorError, match=r"unexpected bytes after the last answer|frame of|not ISO-on-TCP"):
+        read_twice()
+    assert_recovers(plc, client)
+
+
+@pytest.mark.parametrize(
+    ("noise", "text"),
+    [
+        (b"HTTP/1.1 400 Bad Request\r\n", "not an S7 controller"),
+        (bytes(2000), "not an S7 controller"),
+        (b"\x03\x00\xff\xff" + bytes(3000), "frame of 65535 bytes"),
+        (b"\x03\x00\x00\x07\x02\xf0\x80", "too short"),
+        (b"\x03\x00\x00\x0b\x06\x80" + bytes(5), "ended the session"),
+    ],
+)
+def test_garbage(plc: Plc, noise: bytes, text: str) -> None:
+    client = plc.client()
+    client.connect()
+    plc.proxy.garble(noise)
+    with pytest.raises(ConnectorError, match=text):
+        client.read()
+    assert_recovers(plc, client)
+
+
+def test_garbage_without_end_takes_no_memory(plc: Plc) -> None:
+    client = plc.client()
+    client.connect()
+    noise = b"\x03\x00\x03\xc7\x02\xf0\x80" * 1_000_000
+    plc.proxy.garble(noise)
+    tracemalloc.start()
+    with pytest.raises(ConnectorError):
+        client.read()
+    client.connect()
+    ours = tracemalloc.take_snapshot().filter_traces([tracemalloc.Filter(True, "*/connectors/s7/*")])
+    tracemalloc.stop()
+    assert sum(trace.size for trace in ours.traces) < 100_000
+    assert_recovers_open(plc, client)
+
+
+def assert_recovers_open(plc: Plc, client: S7Client) -> None:
+    plc.proxy.pass_all()
+    assert client.read() == plc.block
+
+
+# -- a controller that refuses -----------------------------------------------------------------------------------------
+
+
+def test_block_shorter_than_the_layout(plc: Plc) -> None:
+    client = plc.client(size=SIZE + 1)
+    client.connect()
+    wanted = rf"^DB201 is shorter than {SIZE + 1} bytes or does not exist \(item code 0x05\)"
+    with pytest.raises(ConnectorError, match=wanted):
+        client.read()
+    assert not client.connected
+
+
+def test_no_such_block(plc: Plc) -> None:
+    client = plc.client(db_number=202)
+    client.connect()
+    with pytest.raises(ConnectorError, match=r"^DB202 is shorter than 2180 bytes or does not exist \(item code 0x0A\)"):
+        client.read()
+
+
+CONFIRM = bytes.fromhex("0300000b 06 d0 0001 0007 00")
+GRANT = bytes.fromhex("0300001b 02f080 32 03 0000 0000 0008 0000 00 00 f0 00 0001 0001 00f0")
+DENIAL = bytes.fromhex("03000013 02f080 32 02 0000 0001 0000 0000 81 04")
+
+
+def test_access_denied(scripted: Scripted) -> None:
+    client = scripted(CONFIRM, GRANT, DENIAL)
+    client.connect()
+    assert (client.pdu_size, client.jobs) == (240, 1)
+    with pytest.raises(ConnectorError, match="enable 'Permit access with PUT/GET"):
+        client.read()
+    assert not client.connected
+
+
+@pytest.mark.parametrize(
+    ("answers", "text"),
+    [
+        ([], r"closed the connection during set-up: rack 0, slot 1 may be wrong"),
+        ([CONFIRM], r"closed the connection during set-up"),
+        ([b"SSH-2.0-OpenSSH_9.2\r\n"], "not an S7 controller"),
+        ([bytes.fromhex("0300000b 06 80 0001 0007 00")], "refused the session"),
+        ([CONFIRM + b"\x03", GRANT], "frame of|not ISO-on-TCP|unexpected"),
+        ([CONFIRM, GRANT + b"\x03"], "unexpected bytes after the session"),
+        ([CONFIRM, DENIAL], "PUT/GET"),
+        ([CONFIRM, GRANT[:-1] + b"\x10"], "PDUs of only 16 bytes"),
+        ([bytes.fromhex("030003ff")], "frame of 1023 bytes"),
+    ],
+)
+def test_no_session(scripted: Scripted, answers: list[bytes], text: str) -> None:
+    client = scripted(*answers)
+    with pytest.raises(ConnectorError, match=text):
+        client.connect()
+    assert not client.connected
+
+
+@pytest.mark.parametrize(("db_number", "size"), [(0, 1), (65536, 1), (1, 0), (1, 65537)])
+def test_refuses_what_s7_cannot_address(db_number: int, size: int) -> None:
+    with pytest.raises(ConfigError, match=f"^DB{db_number}"):
+        S7Client(S7Options(host="plc"), db_number, size)
