@@ -30,6 +30,8 @@ from shmio.segment.segment import Segment, instances
 if TYPE_CHECKING:
     import numpy as np
 
+    from shmio.layout.frames import FrameCodec
+
 
 @dataclass(frozen=True, slots=True)
 class Reading:
@@ -79,14 +81,14 @@ class View:
         return codec(register, self.layout.byte_order).decode(self.frame.image)
 
     @cached_property
-    def array(self) -> np.ndarray[Any, Any]:
+    def array(self) -> np.ndarray[Any, np.dtype[Any]]:
         """The whole frame decoded: a numpy structured array of shape (1,), one field for each register's path."""
         return _frame_codec(self.layout).decode(self.frame.image)
 
 
 @lru_cache(maxsize=64)
-def _frame_codec(layout: Layout) -> Any:
-    from shmio.layout.framecodec import FrameCodec  # noqa: PLC0415  numpy only for those who ask for arrays
+def _frame_codec(layout: Layout) -> FrameCodec:
+    from shmio.layout.frames import FrameCodec  # noqa: PLC0415  numpy only for those who ask for arrays
 
     return FrameCodec(layout)
 
@@ -106,6 +108,11 @@ class Attachment:
     def sources(self) -> list[str]:
         """Names of the sources."""
         return list(self._segment.blocks)
+
+    @property
+    def current(self) -> bool:
+        """Whether the instance still is the one attached to; after a stop, attach anew."""
+        return self._segment.shared.current()
 
     def block(self, source: str | None = None) -> Block:
         """A source's block; None is allowed when there is only one source. PathError."""

@@ -1,0 +1,94 @@
+"""Registers as the user's tool selects and shows them."""
+
+from __future__ import annotations
+
+import json
+import math
+from datetime import UTC, datetime
+from typing import Any
+
+from shmio.errors import PathError
+from shmio.layout.codec import Value
+from shmio.layout.glob import select
+from shmio.layout.model import Register
+from shmio.layout.text import shortest, to_text
+from shmio.layout.topic import find, parse_topic
+from shmio.segment.attach import Attachment, Reading
+from shmio.segment.block import Block
+from shmio.segment.frame import Quality
+
+SHOWN_CHARACTERS = 60
+
+Selected = tuple[Block, Register]
+
+
+def choose(cell: Attachment, patterns: list[str]) -> list[Selected]:
+    """Registers that the patterns name, each once, in order: a path, an array's element, a structure, or a glob.
+
+    PathError when one of them names nothing.
+    """
+    chosen: dict[tuple[str, str], Selected] = {}
+    sources = cell.sources
+    default = sources[0] if len(sources) == 1 else None
+    for pattern in patterns:
+        topic = parse_topic(pattern, sources, default)
+        if topic.direction == "in":
+            raise PathError(f"{pattern}: what goes into a source cannot be read; leave out /in")
+        if topic.source not in sources:
+            raise PathError(f"{pattern}: nothing is served under {topic.source} in this version")
+        block = cell.block(topic.source)
+        layout = block.layout
+        if not topic.path:
+            registers = list(layout.registers)
+        elif "*" in topic.path or layout.members(topic.path):
+            registers = [layout.registers[i] for i in select(layout, [topic.path])]
+            if not registers:
+                raise PathError(f"{pattern}: no register of {topic.source} has such a path")
+        else:
+            registers = [find(layout, topic.path)]
+        chosen |= {(topic.source, register.path): (block, register) for register in registers}
+    return list(chosen.values())
+
+
+def topic_path(block: Block, register: Register) -> str:
+    """The register's path with its source."""
+    return f"{block.source}/{register.path}"
+
+
+def as_json(reading: Reading, register: Register) -> dict[str, Any]:
+    """A reading as the object that ``get --json`` and ``watch --json`` print."""
+    return {
+        "value": _json_value(reading.value, register),
+        "quality": str(reading.quality),
+        "reason": reading.reason,
+        "provenance": reading.provenance,
+        "source_time": reading.source_time and _iso(reading.source_time),
+        "age_s": reading.age_s,
+    }
+
+
+def as_line(path: str, reading: Reading, register: Register, width: int) -> str:
+    """A reading as a line for people; quality is said unless it is good."""
+    text = "-" if reading.value is None else to_text(reading.value, register)
+    if len(text) > SHOWN_CHARACTERS:
+        text = text[: SHOWN_CHARACTERS - 1] + "…"
+    quality = "" if reading.quality is Quality.GOOD else f"  {reading.quality}: {reading.reason}"
+    return f"{path:<{width}}  {text}{quality}"
+
+
+def dumps(value: Any) -> str:
+    """JSON as all commands print it."""
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _json_value(value: Value, register: Register) -> Any:
+    """JSON knows no NaN or infinity: they are the texts of wire version 1."""
+    if isinstance(value, list):
+        return [_json_value(item, register) for item in value]
+    if isinstance(value, float):
+        return shortest(value, register.element) if math.isfinite(value) else to_text(value, register)
+    return value
+
+
+def _iso(seconds: float) -> str:
+    return datetime.fromtimestamp(seconds, UTC).isoformat(timespec="microseconds").replace("+00:00", "Z")

@@ -1,0 +1,53 @@
+"""``shmio``: the user's tool, on a running instance of this host."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from shmio import __version__
+from shmio.cli import get, registers, watch
+from shmio.cli.run import run
+from shmio.config import load
+from shmio.segment.attach import Attachment, attach
+
+DEFAULT_CONFIG = Path("supervisor.toml")
+
+Verb = Callable[[Attachment, argparse.Namespace], int]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point of the console script; the exit status."""
+    arguments = _parser().parse_args(argv)
+
+    def command() -> int:
+        with attach(_instance(arguments)) as cell:
+            verb: Verb = arguments.verb
+            return verb(cell, arguments)
+
+    return run(command)
+
+
+def _instance(arguments: argparse.Namespace) -> str | None:
+    """Name the instance: as asked, else as the configuration here says, else the only running one."""
+    if arguments.instance is not None:
+        return str(arguments.instance)
+    if arguments.config is not None:
+        return load(arguments.config).instance.name
+    return load(DEFAULT_CONFIG).instance.name if DEFAULT_CONFIG.exists() else None
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="shmio", description="Look at the registers of a running instance.")
+    parser.add_argument("--version", action="version", version=f"shmio {__version__}")
+    common = argparse.ArgumentParser(add_help=False)
+    common.add_argument("-c", dest="config", type=Path, metavar="FILE", help="the instance of this supervisor.toml")
+    common.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
+    common.add_argument("--json", action="store_true", help="print JSON")
+    verbs = parser.add_subparsers(required=True, metavar="VERB")
+    for name, module in (("list", registers), ("get", get), ("watch", watch)):
+        sub = verbs.add_parser(name, parents=[common], help=module.HELP, description=module.HELP)
+        module.arguments(sub)
+        sub.set_defaults(verb=module.execute)
+    return parser

@@ -1,0 +1,82 @@
+"""``shmio watch``: values as they change."""
+
+from __future__ import annotations
+
+import argparse
+import queue
+import threading
+from collections.abc import Iterator
+from datetime import UTC, datetime
+
+from shmio.cli.readings import Selected, as_json, as_line, choose, dumps, topic_path
+from shmio.errors import NotRunningError
+from shmio.layout.model import Register
+from shmio.segment import Block, Frame, Quality
+from shmio.segment.attach import Attachment, Reading, reading
+
+HELP = "Print the values of registers whenever they change, the present ones first."
+IDLE_S = 0.5
+
+News = tuple[Block, Register, Reading]
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's own arguments."""
+    parser.add_argument("patterns", nargs="+", metavar="PATH", help="path, array element, structure or glob")
+    parser.add_argument("-n", dest="count", type=int, metavar="N", help="stop after N lines")
+
+
+def execute(cell: Attachment, options: argparse.Namespace) -> int:
+    """Print a line for each change until interrupted, or until the instance ends."""
+    chosen = choose(cell, options.patterns)
+    width = max(len(topic_path(*item)) for item in chosen)
+    for printed, (block, register, now) in enumerate(_news(cell, chosen), 1):
+        path = topic_path(block, register)
+        if options.json:
+            print(dumps({"path": path, **as_json(now, register)}), flush=True)
+        else:
+            print(f"{_clock(now)}  {as_line(path, now, register, width)}", flush=True)
+        if options.count is not None and printed >= options.count:
+            return 0
+    raise NotRunningError(f"instance {cell.instance!r} has stopped")
+
+
+def _news(cell: Attachment, chosen: list[Selected]) -> Iterator[News]:
+    """What all blocks report; a thread waits on each. Ends when the instance does."""
+    registers: dict[str, tuple[Block, list[Register]]] = {}
+    for block, register in chosen:
+        registers.setdefault(block.source, (block, []))[1].append(register)
+    news: queue.SimpleQueue[list[News]] = queue.SimpleQueue()
+    for block, wanted in registers.values():
+        threading.Thread(target=_follow, args=(block, wanted, news), daemon=True).start()
+    while True:
+        try:
+            yield from news.get(timeout=IDLE_S)
+        except queue.Empty:
+            if not cell.current:
+                return
+
+
+def _follow(block: Block, registers: list[Register], news: queue.SimpleQueue[list[News]]) -> None:
+    """Report each register's reading, then every change of value or quality."""
+    shown: list[tuple[object, Quality, str] | None] = [None] * len(registers)
+    cursor = block.cursor()
+    frame: Frame | None = block.latest()
+    while True:
+        changes: list[News] = []
+        for index, register in enumerate(registers):
+            now = reading(block, register, frame)
+            # A stale reason holds the age: its text changes, the fact does not.
+            state = (now.value, now.quality, now.reason.partition(":")[0])
+            if state != shown[index]:
+                shown[index] = state
+                changes.append((block, register, now))
+        if changes:
+            news.put(changes)
+        frame = cursor.next(timeout_s=min(IDLE_S, block.stale_ns / 1e9)) or block.latest()
+
+
+def _clock(now: Reading) -> str:
+    if now.source_time is None:
+        return "-" * 12
+    return datetime.fromtimestamp(now.source_time, UTC).astimezone().strftime("%H:%M:%S.%f")[:-3]
