@@ -1,0 +1,103 @@
+"""``shmio-layout``: compile data-block sources and print every register with its place."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from shmio.errors import LayoutError
+from shmio.layout.compiler import Source, compile_sources
+from shmio.layout.document import describe
+from shmio.layout.lexer import MAX_SOURCE_BYTES
+from shmio.layout.model import Layout, Register
+
+_HEADINGS = ("offset", "size", "type", "path", "initial", "comment")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; return its exit status: 0 done, 1 failed, 2 wrong usage."""
+    parser = argparse.ArgumentParser(
+        prog="shmio-layout",
+        description="Compile the data blocks of a source exported by TIA Portal and print each register: "
+        "path, type, byte offset, bit, size.",
+    )
+    parser.add_argument("file", metavar="FILE.db", help="the source with the data blocks")
+    parser.add_argument("types", metavar="UDT", nargs="*", help="further sources, with the PLC data types it uses")
+    parser.add_argument("--json", action="store_true", help="print JSON: one object, or a list for several blocks")
+    options = parser.parse_args(arguments)
+    try:
+        compiled = compile_sources([_read(name) for name in (options.file, *options.types)])
+    except LayoutError as error:
+        _complain(error.diagnostics or [error])
+        return 1
+    except OSError as error:
+        _complain([f"shmio-layout: {error.filename}: {error.strerror}"])
+        return 1
+    _complain(compiled.warnings)
+    try:
+        _print(compiled.layouts, as_json=options.json)
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader has seen enough, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
+
+
+def _read(name: str) -> Source:
+    """Read a source; one byte more than allowed is enough for the compiler to refuse it."""
+    with Path(name).open("rb") as file:
+        return Source(name, file.read(MAX_SOURCE_BYTES + 4))
+
+
+def _complain(lines: Iterable[object]) -> None:
+    for line in lines:
+        print(_printable(str(line), sys.stderr.encoding), file=sys.stderr)
+
+
+def _print(layouts: Sequence[Layout], *, as_json: bool) -> None:
+    if as_json:
+        described = [describe(layout) for layout in layouts]
+        # A terminal that is not UTF-8 still gets valid JSON.
+        ascii_only = (sys.stdout.encoding or "").lower().replace("-", "") != "utf8"
+        print(json.dumps(described[0] if len(described) == 1 else described, indent=2, ensure_ascii=ascii_only))
+        return
+    for position, layout in enumerate(layouts):
+        if position:
+            print()
+        for line in _table(layout):
+            print(_printable(line, sys.stdout.encoding))
+
+
+def _table(layout: Layout) -> list[str]:
+    number = f", DB{layout.number}" if layout.number is not None else ""
+    access = "optimized access" if layout.optimized else "standard access"
+    count = len(layout.registers)
+    title = f"{layout.name}{number}: {layout.size} bytes, {count} register{'s' * (count != 1)}, {access}"
+    rows = [_HEADINGS, *(_row(register) for register in layout.registers)]
+    used = [i for i in range(len(_HEADINGS)) if i < 4 or any(row[i] for row in rows[1:])]
+    widths = {i: max(len(row[i]) for row in rows) for i in used}
+    lines = ["  ".join(row[i].rjust(widths[i]) if i < 2 else row[i].ljust(widths[i]) for i in used) for row in rows]
+    return [title, *(line.rstrip() for line in lines)]
+
+
+def _row(register: Register) -> tuple[str, ...]:
+    place = str(register.offset) if register.bit is None else f"{register.offset}.{register.bit}"
+    bounds = ", ".join(f"{low}..{high}" for low, high in register.dims)
+    kind = f"ARRAY[{bounds}] OF {register.type}" if register.dims else register.type
+    initial = " ".join((register.initial or "").split())
+    if len(initial) > 40:
+        initial = f"{initial[:39]}…"
+    return place, str(register.size), kind, register.path, initial, register.comment
+
+
+def _printable(text: str, encoding: str | None) -> str:
+    """Return text that the stream can take, without characters that would move a terminal's cursor."""
+    visible = "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
+    return visible.encode(encoding or "utf-8", "backslashreplace").decode(encoding or "utf-8")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

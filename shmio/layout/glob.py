@@ -1,0 +1,110 @@
+"""Glob patterns over register paths.
+
+``*`` stays within a segment, ``**`` crosses them and as a segment of its own may be none; the name of an array or
+a structure covers what is below it. Segments may be percent-encoded like those of a path, so that ``%2A`` is a
+star in a name. Patterns come from clients: matching takes time linear in the path, whatever the pattern.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+from shmio.errors import PathError
+from shmio.layout.model import Layout
+from shmio.layout.topic import canonical_path, decode_segment, encode_segment, shorten
+
+MAX_PATTERN = 1024
+
+_PIECES = re.compile(r"\*+|[^*]+")
+
+
+class Glob:
+    """One compiled pattern.
+
+    The states of a non-deterministic automaton are the bits of one integer: bit i is set when the first i
+    tokens of the pattern have been matched (Baeza-Yates and Gonnet, 1992).
+
+    Raises PathError for an empty or overlong pattern, an empty segment, or a wrong percent-encoding.
+    """
+
+    def __init__(self, pattern: str) -> None:
+        if len(pattern) > MAX_PATTERN:
+            raise PathError(f"{shorten(pattern)}: a pattern is at most {MAX_PATTERN} characters long")
+        self.pattern = pattern
+        self._literals: dict[str, int] = {}
+        self._stars = self._crossing = self._optional = 0
+        self._final = 0
+        segments = pattern.split("/")
+        if "" in segments:
+            raise PathError(f"{shorten(pattern)!r}: empty segment in the pattern")
+        for position, segment in enumerate(segments):
+            if position:
+                self._literal("/")
+            if segment == "**" and position < len(segments) - 1:
+                self._optional |= 1 << self._final  # `**/` as a whole may match nothing
+            for piece in _pieces(segment):
+                if piece.startswith("*"):
+                    self._star(crossing=len(piece) > 1)
+                else:
+                    for char in piece:
+                        self._literal(char)
+        self._start = self._close(1)
+
+    def matches(self, path: str) -> bool:
+        """Whether the pattern matches the path, or something the path lies below."""
+        final = 1 << self._final
+        states = self._start
+        for char in path:
+            if char == "/" and states & final:
+                return True
+            stay = self._crossing if char == "/" else self._stars
+            states = self._close(((states & self._literals.get(char, 0)) << 1) | (states & stay))
+            if not states:
+                return False
+        return bool(states & final)
+
+    def _literal(self, char: str) -> None:
+        self._literals[char] = self._literals.get(char, 0) | 1 << self._final
+        self._final += 1
+
+    def _star(self, *, crossing: bool) -> None:
+        self._stars |= 1 << self._final
+        if crossing:
+            self._crossing |= 1 << self._final
+        self._final += 1
+
+    def _close(self, states: int) -> int:
+        """Add the states that are reached without a character."""
+        while True:
+            more = states | (states & self._stars) << 1 | (states & self._optional) << 2
+            if more == states:
+                return states
+            states = more
+
+
+def _pieces(segment: str) -> list[str]:
+    """Split a segment into runs of stars and literal text, the text in a path's canonical encoding."""
+    if "*" not in segment:
+        return [encode_segment(decode_segment(segment))]
+    pieces = _PIECES.findall(segment)
+    # "in" and "out" are encoded only as whole names, hence the guard letter.
+    return [piece if piece[0] == "*" else encode_segment(f"_{decode_segment(piece)}")[1:] for piece in pieces]
+
+
+def select(layout: Layout, patterns: Iterable[str]) -> tuple[int, ...]:
+    """Return the indices of the registers that any of the patterns matches, ascending.
+
+    Raises PathError: a malformed pattern.
+    """
+    chosen: set[int] = set()
+    for pattern in patterns:
+        if "*" in pattern:
+            glob = Glob(pattern)
+            chosen.update(i for i, register in enumerate(layout.registers) if glob.matches(register.path))
+            continue
+        path = canonical_path(pattern)
+        if path in layout.by_path:
+            chosen.add(layout.by_path[path])
+        chosen.update(layout.members(path))
+    return tuple(sorted(chosen))

@@ -1,0 +1,130 @@
+"""Values as text, as wire version 1 carries them.
+
+The text of a number is the shortest that reads back to the same value in the register's own type: ``0.1`` for
+a REAL. Reading also takes numbers as Java prints them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from decimal import Decimal
+from typing import Literal
+
+import numpy as np
+
+from shmio.errors import ValueRangeError
+from shmio.layout.codec import Value, flatten
+from shmio.layout.model import Register
+from shmio.layout.scalar import Scalar, brief, scalar_codec, to_bool
+from shmio.layout.types import ElementType
+
+WireType = Literal["double", "int", "bool", "string"]
+
+MAX_NUMBER = 100  # characters
+MAX_TEXT = 1 << 20
+
+_FLOATS = frozenset({"REAL", "LREAL"})
+_STRINGS = frozenset(["CHAR", "WCHAR", "STRING", "WSTRING", "DATE", "DATE_AND_TIME", "LDT", "DTL", "POINTER", "ANY"])
+_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?")
+_NON_FINITE = {"NaN": math.nan, "Infinity": math.inf, "+Infinity": math.inf, "-Infinity": -math.inf}
+
+
+def wire_type(register: Register) -> WireType:
+    """Return version 1's word for the type of the register, or of its elements."""
+    base = register.element.base
+    if base == "BOOL":
+        return "bool"
+    if base in _FLOATS:
+        return "double"
+    return "string" if base in _STRINGS else "int"
+
+
+def to_text(value: Value, register: Register) -> str:
+    """Return a register's decoded value as text: ``true``, ``-3``, ``0.1``, ``NaN``, text as it is, arrays as JSON.
+
+    A scalar of None (bytes that are no value of the type) is the empty text; in an array it is ``null``.
+    """
+    element = register.element
+    if isinstance(value, list):
+        return json.dumps(_shorten_all(value, element), ensure_ascii=False, separators=(",", ":"))
+    return _scalar_text(value, element)
+
+
+def shortest(value: float, element: ElementType) -> float:
+    """Return the float of fewest digits that is the same value in a REAL; of an LREAL, the value itself."""
+    return float(str(np.float32(value))) if element.base == "REAL" and math.isfinite(value) else value
+
+
+def from_text(text: str, register: Register) -> Value:
+    """Return the value of a text: the reverse of ``to_text``, and numbers as Java prints them.
+
+    Raises ValueRangeError: no value of the register's type, or out of its range.
+    """
+    if len(text) > MAX_TEXT:
+        raise ValueRangeError(f"{register.path}: the text is longer than {MAX_TEXT} characters")
+    element = register.element
+    if not register.dims:
+        return _read(text, element)
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        raise ValueRangeError(f"{register.path}: expected a JSON array, found {brief(text)}") from None
+    for item in flatten(value, register.shape, register.path):
+        _check(item, element)
+    return value  # type: ignore[no-any-return]  # flatten has seen to its shape, _check to its elements
+
+
+def _shorten_all(value: Value, element: ElementType) -> Value:
+    if isinstance(value, list):
+        return [_shorten_all(item, element) for item in value]
+    return shortest(value, element) if isinstance(value, float) else value
+
+
+def _scalar_text(value: Scalar, element: ElementType) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        if math.isfinite(value):
+            return repr(shortest(value, element))
+        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    return str(value)
+
+
+def _read(text: str, element: ElementType) -> Scalar:
+    base = element.base
+    if base in _STRINGS:
+        _check(text, element)
+        return text
+    text = text.strip()
+    if base == "BOOL":
+        value: bool | None = {"true": True, "1": True, "false": False, "0": False}.get(text.lower())
+        if value is None:
+            raise ValueRangeError(f"BOOL: expected true or false, found {brief(text)}")
+        return value
+    if base in _FLOATS and text in _NON_FINITE:
+        return _NON_FINITE[text]
+    if len(text) > MAX_NUMBER or not _NUMBER.fullmatch(text):
+        raise ValueRangeError(f"{element.name}: expected a number, found {brief(text)}")
+    if base in _FLOATS:
+        number = float(text)
+        if math.isinf(number):
+            raise ValueRangeError(f"{element.name}: {brief(text)} is out of range")
+        _check(number, element)
+        return number
+    exact = Decimal(text)  # "5.0" and "1.0E2" are whole numbers, and 2^63-1 keeps all its digits
+    if exact != exact.to_integral_value():
+        raise ValueRangeError(f"{element.name}: expected a whole number, found {brief(text)}")
+    _check(int(exact), element)
+    return int(exact)
+
+
+def _check(value: object, element: ElementType) -> None:
+    """Raise ValueRangeError unless the type can hold the value."""
+    if element.base == "BOOL":
+        to_bool(value, "BOOL")
+    else:
+        scalar_codec(element).encode(value)
