@@ -79,6 +79,8 @@ class FaultProxy:
         if self._thread.is_alive():
             self._do(self._end)
             self._thread.join(_TIMEOUT_S)
+        self._wake_in.close()  # here, since whoever calls _do still holds them when the thread is through
+        self._wake_out.close()
 
     # -- faults --------------------------------------------------------------------------------------------------------
 
@@ -242,7 +244,7 @@ class FaultProxy:
     def _close_all(self) -> None:
         for link in self._links:
             link.close()
-        for plain in (self._listener, self._wake_in, self._wake_out, *self._waiting):
+        for plain in (self._listener, *self._waiting):
             if plain is not None:
                 plain.close()
 

@@ -1,0 +1,158 @@
+"""The cell must look alive, and possible."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+
+import pytest
+
+from shmio.emulators.a50 import A50, ACTUATORS, AXIS_LIMITS, CYCLE_S, STEPS
+from shmio.errors import ConfigError
+from shmio.layout.model import Layout
+
+PERIOD_S = 0.02  # at which it is watched
+MAX_DEG_PER_S = 123.0
+
+
+def watch(layout: Layout, begin_s: float, end_s: float) -> list[bytes]:
+    program = A50(layout)
+    frame = bytearray(layout.size)
+    frames = []
+    for cycle in range(round(begin_s / PERIOD_S), round(end_s / PERIOD_S)):
+        program.step(cycle * PERIOD_S, frame)
+        frames.append(bytes(frame))
+    return frames
+
+
+@pytest.fixture
+def film(db201: Layout) -> list[bytes]:
+    return watch(db201, 0, CYCLE_S + 1)
+
+
+def axes(frame: bytes) -> tuple[float, ...]:
+    return struct.unpack_from(">20f", frame, 2100)
+
+
+def bit(frame: bytes, byte: int, place: int) -> bool:
+    return bool(frame[byte] >> place & 1)
+
+
+def test_every_axis_changes_within_a_second_at_any_time(film: list[bytes]) -> None:
+    window = 50
+    for begin in range(len(film) - window):
+        seen = [set(values) for values in zip(*(axes(frame) for frame in film[begin : begin + window]), strict=True)]
+        assert min(len(values) for values in seen) > 15
+
+
+def test_axes_keep_their_limits_and_speeds(film: list[bytes]) -> None:
+    before = axes(film[0])
+    for frame in film:
+        now = axes(frame)
+        for robot in range(3):
+            for axis, (low, high) in enumerate(AXIS_LIMITS):
+                place = 2 + 6 * robot + axis
+                assert low < now[place] < high
+                assert abs(now[place] - before[place]) < MAX_DEG_PER_S * PERIOD_S
+        for place in (0, 1):
+            assert 0 <= now[place] <= 400
+            assert abs(now[place] - before[place]) < 250 * PERIOD_S
+        before = now
+
+
+def test_all_robots_and_axes_take_part(film: list[bytes]) -> None:
+    travel = [max(values) - min(values) for values in zip(*(axes(frame) for frame in film), strict=True)]
+    assert min(travel) > 15
+
+
+def test_a_cycle_goes_through_all_steps_in_order(film: list[bytes]) -> None:
+    numbers = [int.from_bytes(frame[1002:1004], "big") for frame in film]
+    assert list(dict.fromkeys(numbers)) == list(STEPS)
+    assert numbers[-1] == 10
+    assert int.from_bytes(film[-1][1004:1008], "big") == 1
+    for number, duration_s in STEPS.items():
+        assert numbers[:-50].count(number) == pytest.approx(duration_s / PERIOD_S, abs=2)
+
+
+def test_heartbeat_and_its_echo(film: list[bytes]) -> None:
+    beats = [bit(frame, 1000, 0) for frame in film[:500]]
+    assert beats[:25] == [True] * 25
+    assert beats[25:50] == [False] * 25
+    echo = [bit(frame, 0, 4) for frame in film[:500]]
+    assert echo[2:] == beats[:-2]
+
+
+def test_actuators_take_time_and_are_never_at_both_ends(film: list[bytes]) -> None:
+    for place in range(len(ACTUATORS)):
+        states = []
+        for frame in film:
+            switches = int.from_bytes(frame[8:11], "little") >> 2 * place & 3
+            valve = bool(int.from_bytes(frame[1008:1010], "little") >> place & 1)
+            states.append((valve, switches))
+        assert {switches for _, switches in states} == {0, 1, 2}
+        assert set(states) == {(False, 2), (True, 0), (True, 1), (False, 0)}
+
+
+def test_robots_move_only_when_the_trolley_is_clamped(film: list[bytes]) -> None:
+    moved = 0
+    for frame in film:
+        moving = [bit(frame, byte, 1) for byte in (4, 5, 6)]
+        clamped = frame[8] & 0x0F == 0b0101
+        assert clamped or not any(moving)
+        moved += any(moving)
+    assert moved > len(film) / 3
+
+
+def test_only_one_robot_is_at_the_trolley_or_the_units(film: list[bytes]) -> None:
+    for frame in film:
+        assert sum(not bit(frame, byte, 2) for byte in (4, 5, 6)) <= 1
+
+
+def test_engines_turn_only_when_held(film: list[bytes]) -> None:
+    turned = 0
+    for frame in film:
+        speeds = struct.unpack_from(">hh", frame, 16)
+        held = int.from_bytes(frame[8:11], "little") >> 6 & 0xFF == 0b01010101
+        assert held or speeds == (0, 0)
+        turned += speeds > (2000, 2000)
+    assert turned > 300
+
+
+def test_trolley_comes_stays_and_leaves(film: list[bytes]) -> None:
+    places = [int.from_bytes(frame[2:4], "big") for frame in film[:-51]]
+    assert places == sorted(places)
+    assert places[0] == 0
+    assert places[-1] > 5990
+    assert places.count(3000) > 0.8 * len(places)
+    assert all(bit(frame, 1, 1) for frame, place in zip(film, places, strict=False) if place == 3000)
+
+
+def test_same_time_same_frame_wherever_one_begins(db201: Layout, film: list[bytes]) -> None:
+    assert watch(db201, 30, 31) == film[1500:1550]
+
+
+def test_leaves_alone_what_it_does_not_drive(db201: Layout) -> None:
+    frame = bytearray(b"\xa5" * db201.size)
+    A50(db201).step(12.0, frame)
+    assert frame[20:1000] == b"\xa5" * 980
+    assert frame[1013:2100] == b"\xa5" * 1087
+
+
+def test_goes_by_the_layout_not_by_offsets(db201: Layout) -> None:
+    moved = replace(
+        db201, size=db201.size + 10, registers=tuple(replace(r, offset=r.offset + 10) for r in db201.registers)
+    )
+    wide, plain = bytearray(moved.size), bytearray(db201.size)
+    A50(moved).step(33.0, wide)
+    A50(db201).step(33.0, plain)
+    assert wide == bytes(10) + plain
+
+
+@pytest.mark.parametrize("path", ["Inputs", "NCAchse1 Pos", "Robot_825/Axs6_Pos"])
+def test_names_the_register_that_is_missing_or_wrong(db201: Layout, path: str) -> None:
+    without = replace(db201, registers=tuple(r for r in db201.registers if r.path != path))
+    with pytest.raises(ConfigError, match=f"no register {path.replace(' ', '_')}"):
+        A50(without)
+    other = replace(db201, registers=tuple(replace(r, type="DINT") if r.path == path else r for r in db201.registers))
+    with pytest.raises(ConfigError, match="DINT"):
+        A50(other)

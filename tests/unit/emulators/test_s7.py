@@ -1,0 +1,230 @@
+"""The server through real sockets, with python-snap7's own client as the independent peer."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+
+import pytest
+import snap7
+from snap7.type import Area, WordLen
+
+from shmio.config.address import Address
+from shmio.connectors.s7 import S7Client, S7Options
+from shmio.emulators.s7 import S7Server
+from shmio.errors import ConfigError, ConnectorError, EndpointError, ShmioError
+from shmio.testing.ports import reserved_port
+
+LOOPBACK = Address("127.0.0.1", 0)
+
+
+@pytest.fixture
+def block() -> bytearray:
+    return bytearray(i & 0xFF for i in range(1500))
+
+
+@pytest.fixture
+def server(block: bytearray) -> Iterator[S7Server]:
+    before = threading.active_count()
+    with S7Server(LOOPBACK, max_clients=4) as server:
+        server.add_block(5, block)
+        server.start()
+        yield server
+    assert threading.active_count() == before  # a clean stop leaves no thread
+
+
+@pytest.fixture
+def client(server: S7Server) -> Iterator[snap7.Client]:
+    client = snap7.Client()
+    client.connect(server.address.host, 0, 1, server.address.port)
+    yield client
+    client.disconnect()
+    client.destroy()
+
+
+def ours(server: S7Server, size: int = 1500) -> S7Client:
+    return S7Client(S7Options(host=server.address.host, port=server.address.port), 5, size)
+
+
+def test_another_client_reads(client: snap7.Client, block: bytearray) -> None:
+    assert client.db_read(5, 0, 1500) == block
+    assert client.db_read(5, 1499, 1) == block[1499:]
+
+
+def test_another_client_writes(client: snap7.Client, block: bytearray) -> None:
+    client.db_write(5, 100, bytearray(b"hello"))
+    assert block[98:107] == bytes((98, 99)) + b"hello" + bytes((105, 106))
+
+
+def test_another_client_writes_a_bit(client: snap7.Client, block: bytearray) -> None:
+    block[7] = 0b1010_0101
+    client.write_area(Area.DB, 5, 7 * 8 + 1, bytearray(b"\x01"), WordLen.Bit)
+    assert block[7] == 0b1010_0111
+    client.write_area(Area.DB, 5, 7 * 8 + 7, bytearray(b"\x00"), WordLen.Bit)
+    assert block[7] == 0b0010_0111
+
+
+def test_a_write_past_the_end_stores_nothing(client: snap7.Client, block: bytearray) -> None:
+    before = bytes(block)
+    with pytest.raises(Exception, match="0x05"):
+        client.db_write(5, 1498, bytearray(b"four"))
+    assert block == before
+
+
+def test_another_client_asks_for_status(client: snap7.Client) -> None:
+    assert client.get_cpu_info().ModuleTypeName
+    assert client.list_blocks().DBCount == 1
+
+
+def test_block_transfer_is_refused(client: snap7.Client, block: bytearray) -> None:
+    before = bytes(block)
+    with pytest.raises(Exception, match=r"class=0x81, code=0x04"):
+        client.upload(5)
+    assert block == before
+
+
+def test_answers_while_stopped(client: snap7.Client, server: S7Server, block: bytearray) -> None:
+    client.plc_stop()
+    assert server.get_status()[1] == "Stop"
+    assert client.db_read(5, 0, 4) == block[:4]
+    client.plc_hot_start()
+    assert server.get_status()[1] == "Run"
+
+
+def test_the_address_is_exclusive(server: S7Server) -> None:
+    second = S7Server(server.address)
+    with pytest.raises(EndpointError, match=rf"^cannot listen on {server.address}: .*another program"):
+        second.start()
+    assert second.stop() == 0
+
+
+def test_an_address_of_another_machine() -> None:
+    with pytest.raises(EndpointError, match=r"^cannot listen on 192\.0\.2\.1:4102: "):
+        S7Server(Address("192.0.2.1", 4102)).start()
+
+
+def test_the_address_can_be_had_again_at_once() -> None:
+    with reserved_port() as address:
+        for _ in range(2):
+            with S7Server(address) as server:
+                server.add_block(5, bytearray(4))
+                server.start()
+                with closing(ours(server, 4)) as client:  # leaves a connection in TIME_WAIT
+                    client.connect()
+                    assert client.read() == bytes(4)
+                    assert server.stop() == 0
+
+
+def test_is_started_once() -> None:
+    with S7Server(LOOPBACK) as server:
+        with pytest.raises(ShmioError, match="not started"):
+            _ = server.address
+        server.start()
+        with pytest.raises(ShmioError, match="once"):
+            server.start()
+
+
+def test_refuses_a_number_twice_or_none() -> None:
+    server = S7Server(LOOPBACK)
+    server.add_block(1, bytearray(1))
+    for number in (1, 0, 65536):
+        with pytest.raises(ConfigError, match=f"^DB{number}"):
+            server.add_block(number, bytearray(1))
+
+
+def test_takes_only_so_many_clients(server: S7Server, block: bytearray) -> None:
+    with ExitStack() as stack:
+        clients = [stack.enter_context(closing(ours(server))) for _ in range(5)]
+        for client in clients[:4]:
+            client.connect()
+        with pytest.raises(ConnectorError, match="closed the connection"):
+            clients[4].connect()
+        assert [client.read() for client in clients[:4]] == [block] * 4
+
+
+def test_stop_ends_clients_in_every_state(server: S7Server) -> None:
+    with closing(ours(server)) as client, socket.create_connection(tuple_of(server)) as silent:
+        client.connect()
+        silent.settimeout(10)
+        server.stop()
+        with pytest.raises(ConnectorError, match="closed the connection"):
+            client.read()
+        assert silent.recv(1) == b""
+
+
+def tuple_of(server: S7Server) -> tuple[str, int]:
+    return server.address.host, server.address.port
+
+
+SESSION = bytes.fromhex("0300001611e00000000100c1020100c2020101c0010a")
+
+
+@pytest.mark.parametrize(
+    "noise",
+    [
+        b"GET / HTTP/1.1\r\n\r\n",
+        bytes(5000),
+        b"\x03\x00\x00\x03",
+        SESSION + bytes(5000),
+        SESSION + b"\x03\x00\x00\x10" + bytes(12),
+        SESSION + b"\x03\x00\xff\xff" + bytes(9000),
+        SESSION + b"\x03\x00\x00\x11\x02\xf0\x00" + bytes(10),
+        SESSION + b"\x03\x00\x00\x11\x02\xf0\x80\x32\x03" + bytes(8),
+        SESSION + b"\x03\x00\x00\x19\x02\xf0\x80\x32\x07" + b"\xff" * 16,
+    ],
+)
+def test_garbage_ends_only_its_own_connection(server: S7Server, block: bytearray, noise: bytes) -> None:
+    with closing(ours(server)) as client, socket.create_connection(tuple_of(server)) as peer:
+        client.connect()
+        peer.settimeout(10)
+        peer.sendall(noise)
+        peer.shutdown(socket.SHUT_WR)
+        received = b""
+        try:
+            while data := peer.recv(4096):
+                received += data
+        except ConnectionResetError:
+            pass
+        assert len(received) < 200
+        assert client.read() == block
+
+
+def send_forever(peer: socket.socket, data: bytes) -> None:
+    while True:
+        peer.send(data)
+
+
+def test_a_client_that_takes_no_answers_holds_up_no_other(server: S7Server, block: bytearray) -> None:
+    request = bytes.fromhex("0300001f 02f080 32 01 0000 0001 000e 0000 04 01 12 0a 10 02 0384 0005 84 000000")
+    setup = bytes.fromhex("03000019 02f080 32 01 0000 0001 0008 0000 f0 00 0008 0008 03c0")
+    with closing(ours(server)) as client, socket.create_connection(tuple_of(server)) as greedy:
+        greedy.settimeout(10)
+        greedy.sendall(SESSION)
+        greedy.recv(100)
+        greedy.sendall(setup)
+        greedy.recv(100)
+        greedy.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            send_forever(greedy, request * 1000)
+        client.connect()
+        assert client.read() == block
+
+
+def test_requests_in_pieces_and_in_one(server: S7Server, block: bytearray) -> None:
+    setup = bytes.fromhex("03000019 02f080 32 01 0000 0001 0008 0000 f0 00 0008 0008 03c0")
+    request = bytes.fromhex("0300001f 02f080 32 01 0000 0002 000e 0000 04 01 12 0a 10 02 0004 0005 84 000000")
+    answer = bytes.fromhex("0300001d 02f080 32 03 0000 0002 0002 0008 0000 04 01 ff 04 0020") + block[:4]
+    with socket.create_connection(tuple_of(server)) as peer, peer.makefile("rb") as stream:
+        peer.settimeout(10)
+        peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        peer.sendall(SESSION)
+        stream.read(22)
+        peer.sendall(setup)
+        stream.read(27)
+        for byte in request:
+            peer.sendall(bytes((byte,)))
+        assert stream.read(29) == answer
+        peer.sendall(request * 1000)
+        assert stream.read(29 * 1000) == answer * 1000
