@@ -60,6 +60,8 @@ async def _serve(worker: Worker) -> None:
     for feed in feeds.values():
         feed.stop()
     await server.stop()
+    for feed in feeds.values():
+        feed.join()
 
 
 if __name__ == "__main__":

@@ -19,6 +19,9 @@ log = logging.getLogger("shmio.grpc")
 CATCH_UP_FRAMES = 32
 """A feed that is further behind than this goes on with the newest frame: what it skips is conflated, not lost."""
 
+WAIT_S = 0.2
+"""Longest wait for a frame before age is looked at."""
+
 _ENTRY = struct.Struct("=III")
 
 
@@ -73,9 +76,12 @@ class Feed:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread; at most one wait of it later."""
+        """Tell the thread to end; it does within ``WAIT_S``."""
         self._stopping.set()
-        self._thread.join(2.0)
+
+    def join(self) -> None:
+        """Wait until the thread has ended."""
+        self._thread.join()
 
     def listen(self, register: Register, encode: Callable[[Frame], bytes | None], listener: Listener) -> None:
         """Join a register's listeners; the current value, if it is good, is delivered at once."""
@@ -124,7 +130,7 @@ class Feed:
         while not self._stopping.is_set():
             if cursor.behind > CATCH_UP_FRAMES:
                 cursor = block.cursor(after=block.ring.head() - 1)
-            frame = cursor.next(timeout_s=min(0.5, block.stale_ns / 1e9))
+            frame = cursor.next(timeout_s=min(WAIT_S, block.stale_ns / 1e9))
             if frame is None:
                 frame = block.latest()
                 good = frame is not None and frame.assess(block.stale_ns)[0] is not Quality.BAD

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from shmio.config import Address, Tls
-from shmio.endpoints.grpc.simlog_v1 import SimlogV1
+from shmio.endpoints.grpc import simlog_v1
 from shmio.errors import ConfigError, EndpointError
-from shmio.wire import simlog_v1_pb2
 
 MAX_REQUEST_BYTES = 1 << 20
 MAX_CALLS = 4096
@@ -32,13 +30,12 @@ _OPTIONS = [
 class Server:
     """All services on each of the addresses."""
 
-    def __init__(self, simlog: SimlogV1) -> None:
+    def __init__(self, simlog: simlog_v1.SimlogV1) -> None:
         self._health = health.aio.HealthServicer()
         self._server = grpc.aio.server(options=_OPTIONS, maximum_concurrent_rpcs=MAX_CALLS)
-        self._services = [simlog_v1_pb2.DESCRIPTOR.services_by_name["SimlogAPI"].full_name]
-        self._server.add_generic_rpc_handlers((_simlog_v1_handlers(simlog, self._services[0]),))
+        self._server.add_generic_rpc_handlers((simlog.handlers(),))
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
-        names = [*self._services, health.SERVICE_NAME, reflection.SERVICE_NAME]
+        names = [simlog_v1.SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME]
         reflection.enable_server_reflection(names, self._server)
 
     async def start(self, addresses: list[Address], tls: Tls | None) -> list[int]:
@@ -56,7 +53,7 @@ class Server:
                     f"grpc.listen: cannot listen on {address}: another program has it, or this host has no such address"
                 ) from None
         await self._server.start()
-        for service in ["", *self._services]:
+        for service in (health.OVERALL_HEALTH, simlog_v1.SERVICE):
             await self._health.set(service, _SERVING)
         return ports
 
@@ -68,27 +65,6 @@ class Server:
         """Say so, end all streams, close."""
         await self._health.enter_graceful_shutdown()
         await self._server.stop(grace=0.2)
-
-
-def _simlog_v1_handlers(simlog: SimlogV1, service: str) -> grpc.GenericRpcHandler:
-    """The service's handlers, with Subscribe's messages passed on as the bytes they are."""
-    descriptor = simlog_v1_pb2.DESCRIPTOR.services_by_name["SimlogAPI"]
-    handlers = {}
-    for method in descriptor.methods:
-        request: Any = getattr(simlog_v1_pb2, method.input_type.name, None)
-        response: Any = getattr(simlog_v1_pb2, method.output_type.name, None)
-        make = {
-            (False, False): grpc.unary_unary_rpc_method_handler,
-            (False, True): grpc.unary_stream_rpc_method_handler,
-            (True, False): grpc.stream_unary_rpc_method_handler,
-        }[method.client_streaming, method.server_streaming]
-        shared = method.name == "Subscribe"
-        handlers[method.name] = make(
-            getattr(simlog, method.name),
-            request_deserializer=request and request.FromString,
-            response_serializer=None if shared or response is None else response.SerializeToString,
-        )
-    return grpc.method_handlers_generic_handler(service, handlers)
 
 
 def _credentials(tls: Tls) -> grpc.ServerCredentials:

@@ -1,7 +1,4 @@
-"""SimlogAPI version 1, package ``simulation.server``: GetTopic and Subscribe.
-
-The other calls are answered with UNIMPLEMENTED by the generated base class.
-"""
+"""SimlogAPI version 1, package ``simulation.server``: GetTopic and Subscribe. The rest is UNIMPLEMENTED for now."""
 
 from __future__ import annotations
 
@@ -19,14 +16,14 @@ from shmio.layout.text import to_text, wire_type
 from shmio.layout.topic import Topic, find, parse_topic
 from shmio.segment import Frame
 from shmio.wire import simlog_v1_pb2 as wire
-from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIServicer
 
+SERVICE = wire.DESCRIPTOR.services_by_name["SimlogAPI"].full_name
 QUEUE_BOUND = 256
 
 Context = grpc.aio.ServicerContext[Any, Any]
 
 
-class SimlogV1(SimlogAPIServicer):
+class SimlogV1:
     """Serves the registers of all sources as text values."""
 
     def __init__(self, feeds: Mapping[str, Feed], default_source: str | None) -> None:
@@ -40,12 +37,24 @@ class SimlogV1(SimlogAPIServicer):
         """Streams open, messages dropped on slow ones."""
         return len(self._streams), self._dropped + sum(stream.dropped for stream in self._streams)
 
-    async def GetTopic(self, request: wire.TopicDescriptor, context: Context) -> wire.TopicDescriptor:  # noqa: N802
+    def handlers(self) -> grpc.GenericRpcHandler:
+        """The service's calls, for a server."""
+        decode = wire.TopicDescriptor.FromString
+        calls = {
+            "GetTopic": grpc.unary_unary_rpc_method_handler(
+                self.get_topic, decode, wire.TopicDescriptor.SerializeToString
+            ),
+            # No serializer: a change is encoded once, by the feed, and its bytes go to every stream.
+            "Subscribe": grpc.unary_stream_rpc_method_handler(self.subscribe, decode),
+        }
+        return grpc.method_handlers_generic_handler(SERVICE, calls)
+
+    async def get_topic(self, request: wire.TopicDescriptor, context: Context) -> wire.TopicDescriptor:
         """Tell a topic's type; NOT_FOUND, INVALID_ARGUMENT for a structure."""
         _, register = await self._resolve(request.path, context)
         return wire.TopicDescriptor(path=request.path, msgType=wire_type(register))
 
-    async def Subscribe(self, request: wire.TopicDescriptor, context: Context) -> AsyncIterator[bytes]:  # noqa: N802
+    async def subscribe(self, request: wire.TopicDescriptor, context: Context) -> AsyncIterator[bytes]:
         """Stream a topic's values: the current one if it is good, then every change.
 
         While quality is bad nothing is sent; on recovery the value is sent again. A slow client loses

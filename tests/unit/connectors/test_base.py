@@ -1,0 +1,176 @@
+"""The loop that runs a connector, with time in the test's hands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+
+import msgspec
+import pytest
+
+from shmio.connectors.base import Connector, SourceLoop
+from shmio.connectors.schedule import Schedule
+from shmio.errors import ConnectorError
+from shmio.layout.model import Layout, Register
+from shmio.segment import BlockSpec, Frame, ProcessSpec, Quality, Segment
+
+LAYOUT = Layout("DB1", 1, 4, False, (Register("count", "UDINT", (), 0, None, 4, 1),))
+PERIOD_NS = 20_000_000
+
+
+class VirtualClock:
+    """Time moves only by waiting; ends after ``end_ns``."""
+
+    def __init__(self, end_ns: int) -> None:
+        self.time_ns = 0
+        self.end_ns = end_ns
+
+    def now_ns(self) -> int:
+        return self.time_ns
+
+    def wait_ns(self, duration_ns: int) -> bool:
+        self.time_ns += max(0, duration_ns)
+        return self.time_ns >= self.end_ns
+
+
+class Device(Connector):
+    """A device that counts its reads; ``trouble`` may raise or take time."""
+
+    Options = msgspec.Struct
+
+    def __init__(self, trouble: Callable[[str, int], None]) -> None:
+        self.trouble = trouble
+        self.connected = False
+        self.reads = 0
+        self.calls: list[str] = []
+
+    @property
+    def timeout_s(self) -> float:
+        return 1.0
+
+    def connect(self) -> None:
+        assert not self.connected
+        self.calls.append("connect")
+        self.trouble("connect", self.reads)
+        self.connected = True
+
+    def read(self) -> bytes:
+        assert self.connected
+        self.reads += 1
+        self.trouble("read", self.reads)
+        return self.reads.to_bytes(4, "big")
+
+    def close(self) -> None:
+        self.calls.append("close")
+        self.connected = False
+
+
+@pytest.fixture
+def segment(instance: str) -> Iterator[Segment]:
+    with Segment.create(
+        instance, [BlockSpec("cell", LAYOUT, PERIOD_NS, 10**9, 1 << 20)], [ProcessSpec("cell", "source")]
+    ) as s:
+        yield s
+        s.unlink()
+
+
+def run(segment: Segment, trouble: Callable[[str, int], None], cycles: int) -> tuple[Device, SourceLoop, list[Frame]]:
+    clock = VirtualClock(cycles * PERIOD_NS)
+    device = Device(trouble)
+    loop = SourceLoop(device, segment.writer("cell"), Schedule(0, PERIOD_NS), clock)
+    cursor = segment.blocks["cell"].cursor()
+    loop.run()
+    frames = []
+    while (frame := cursor.poll()) is not None:
+        frames.append(frame)
+    return device, loop, frames
+
+
+def test_every_cycle_is_one_frame_and_the_end_is_told(segment: Segment) -> None:
+    device, loop, frames = run(segment, lambda *_: None, 6)
+    assert [(f.cycle, int.from_bytes(f.raw, "big"), f.quality) for f in frames[:-1]] == [
+        (cycle, cycle, Quality.GOOD) for cycle in range(1, 6)
+    ]
+    assert (frames[-1].quality, frames[-1].reason) == (Quality.BAD, "the source was stopped")
+    assert frames[-1].raw == frames[-2].raw
+    assert device.calls == ["connect", "close"]
+    assert (loop.counters.polls, loop.counters.overruns, loop.counters.connects) == (5, 0, 1)
+
+
+def test_a_failure_is_one_bad_frame_with_the_last_bytes_and_recovery_needs_no_restart(segment: Segment) -> None:
+    def cut_in_reads_3_to_5(hook: str, reads: int) -> None:
+        if hook == "read" and 3 <= reads <= 5:
+            raise ConnectorError("cable out")
+
+    device, loop, frames = run(segment, cut_in_reads_3_to_5, 60)
+    assert [int.from_bytes(f.raw, "big") for f in frames[:4]] == [1, 2, 2, 6]
+    assert [(f.quality, f.reason) for f in frames[1:4]] == [
+        (Quality.GOOD, ""),
+        (Quality.BAD, "cable out"),
+        (Quality.GOOD, ""),
+    ]
+    assert device.calls[:7] == ["connect", "close", "connect", "close", "connect", "close", "connect"]
+    assert (loop.counters.failures, loop.counters.overruns) == (3, 0)
+
+
+def test_a_new_reason_is_a_new_bad_frame(segment: Segment) -> None:
+    reasons = iter(["refused", "refused", "garbage"])
+
+    def trouble(hook: str, reads: int) -> None:
+        if hook == "connect" and (reason := next(reasons, None)):
+            raise ConnectorError(reason)
+
+    _, loop, frames = run(segment, trouble, 60)
+    assert [f.reason for f in frames[:3]] == ["refused", "garbage", ""]
+    assert frames[0].raw == bytes(4)
+    assert loop.note == "the source was stopped"
+
+
+def test_backing_off_grows_and_ends_with_success(segment: Segment) -> None:
+    attempts: list[int] = []
+
+    def absent(hook: str, _: int) -> None:
+        if hook == "connect":
+            attempts.append(clock.time_ns)
+            raise ConnectorError("absent")
+
+    clock = VirtualClock(8 * 10**9)
+    SourceLoop(Device(absent), segment.writer("cell"), Schedule(0, PERIOD_NS), clock).run()
+    gaps_ms = [(b - a) // 1_000_000 for a, b in pairwise(attempts)]
+    assert gaps_ms == sorted(gaps_ms)
+    assert gaps_ms[0] < 150
+    assert max(gaps_ms) <= 2000 + 2 * PERIOD_NS // 1_000_000
+
+
+def test_slow_reads_are_counted_as_overruns(segment: Segment) -> None:
+    clock = VirtualClock(20 * PERIOD_NS)
+
+    def slow(hook: str, reads: int) -> None:
+        if hook == "read" and reads == 2:
+            clock.time_ns += 5 * PERIOD_NS
+
+    loop = SourceLoop(Device(slow), segment.writer("cell"), Schedule(0, PERIOD_NS), clock)
+    loop.run()
+    assert loop.counters.overruns == 4
+    assert loop.counters.polls + loop.counters.overruns == 19
+
+
+def test_a_defect_in_a_connector_is_not_taken_for_a_device_error(segment: Segment) -> None:
+    def defect(hook: str, _: int) -> None:
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        run(segment, defect, 5)
+    frame = segment.blocks["cell"].latest()
+    assert frame is not None
+    assert frame.quality is Quality.BAD
+
+
+def test_a_successor_keeps_the_last_bytes_while_it_cannot_connect(segment: Segment) -> None:
+    run(segment, lambda *_: None, 4)
+
+    def absent(hook: str, _: int) -> None:
+        raise ConnectorError("absent")
+
+    _, _, frames = run(segment, absent, 4)
+    assert (frames[0].raw, frames[0].quality, frames[0].incarnation) == ((3).to_bytes(4, "big"), Quality.BAD, 2)

@@ -1,0 +1,383 @@
+"""The gRPC endpoint over real sockets: a segment on one side, a client on the other."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+import trustme
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
+
+from shmio.config import Address, Tls
+from shmio.endpoints.grpc.feed import Feed
+from shmio.endpoints.grpc.queue import ConflatingQueue
+from shmio.endpoints.grpc.server import Server
+from shmio.endpoints.grpc.simlog_v1 import SimlogV1
+from shmio.errors import ConfigError, EndpointError
+from shmio.layout.model import Layout, Register
+from shmio.segment import BlockSpec, BlockWriter, ProcessSpec, Quality, Segment
+from shmio.wire import simlog_v1_pb2 as wire
+from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
+
+LAYOUT = Layout(
+    "DB1",
+    1,
+    14,
+    False,
+    (
+        Register("axis/position", "REAL", (), 0, None, 4, 1),
+        Register("axis/speed", "REAL", (), 4, None, 4, 1),
+        Register("running", "BOOL", (), 8, 3, 1, 1),
+        Register("inputs", "BYTE", ((0, 1),), 10, None, 2, 2),
+        Register("step", "INT", (), 12, None, 2, 1),
+    ),
+)
+STALE_NS = 300_000_000
+TIMEOUT_S = 10
+
+
+def image(
+    position: float = 0.0, speed: float = 0.0, running: bool = False, inputs: bytes = b"\0\0", step: int = 0
+) -> bytes:
+    return struct.pack(">ffBx2sh", position, speed, running << 3, inputs, step)
+
+
+class Endpoint:
+    """A served segment, and a client of it."""
+
+    def __init__(self, writer: BlockWriter, feeds: dict[str, Feed], service: SimlogV1, port: int) -> None:
+        self.writer = writer
+        self.feeds = feeds
+        self.service = service
+        self.port = port
+        self.channel = grpc.aio.insecure_channel(f"127.0.0.1:{port}")
+        self.stub: Any = SimlogAPIStub(self.channel)  # type: ignore[no-untyped-call]
+        self.cycle = 0
+
+    def publish(self, raw: bytes, quality: Quality = Quality.GOOD) -> None:
+        self.cycle += 1
+        self.writer.publish(raw, cycle=self.cycle, quality=quality)
+
+    def subscribe(self, path: str) -> Any:
+        return self.stub.Subscribe(wire.TopicDescriptor(path=path), timeout=TIMEOUT_S)
+
+    async def health(self, service: str) -> int:
+        stub: Any = health_pb2_grpc.HealthStub(self.channel)
+        answer = await stub.Check(health_pb2.HealthCheckRequest(service=service), timeout=TIMEOUT_S)
+        return int(answer.status)
+
+    async def until(self, condition: Callable[[], Awaitable[bool]]) -> None:
+        """Wait for what another thread brings about."""
+        async with asyncio.timeout(TIMEOUT_S):
+            while not await condition():  # noqa: ASYNC110  it is another thread's doing
+                await asyncio.sleep(0)
+
+
+@asynccontextmanager
+async def endpoint(segment: Segment) -> AsyncIterator[Endpoint]:
+    tasks: set[asyncio.Task[None]] = set()
+
+    def on_quality(source: str, good: bool) -> None:
+        tasks.add(asyncio.get_running_loop().create_task(server.set_source(source, good)))
+
+    loop = asyncio.get_running_loop()
+    feeds = {name: Feed(block, loop, on_quality) for name, block in segment.blocks.items()}
+    service = SimlogV1(feeds, "cell")
+    server = Server(service)
+    await server.set_source("cell", False)
+    ports = await server.start([Address("127.0.0.1", 0)], None)
+    for feed in feeds.values():
+        feed.start()
+    served = Endpoint(segment.writer("cell"), feeds, service, ports[0])
+    try:
+        yield served
+    finally:
+        await served.channel.close()
+        for feed in feeds.values():
+            feed.stop()
+            feed.join()
+        await server.stop()
+        await asyncio.gather(*tasks)
+
+
+@pytest.fixture
+def segment(instance: str) -> Iterator[Segment]:
+    block = BlockSpec("cell", LAYOUT, 20_000_000, STALE_NS, 1 << 20)
+    with Segment.create(instance, [block], [ProcessSpec("cell", "source")]) as segment:
+        yield segment
+        segment.unlink()
+
+
+def serve(segment: Segment, test: Callable[[Endpoint], Awaitable[None]]) -> None:
+    async def run() -> None:
+        async with endpoint(segment) as served:
+            await test(served)
+
+    asyncio.run(run())
+
+
+async def value(stream: Any) -> str:
+    message = await asyncio.wait_for(stream.read(), TIMEOUT_S)
+    return str(message.value)
+
+
+async def code(call: Any) -> grpc.StatusCode:
+    with pytest.raises(grpc.aio.AioRpcError) as caught:
+        await call
+    found: grpc.StatusCode = caught.value.code()
+    return found
+
+
+@pytest.mark.parametrize(
+    ("path", "kind"),
+    [
+        ("cell/axis/position", "double"),
+        ("axis/position", "double"),
+        ("/cell/axis/position/out", "double"),
+        ("CELL://axis/position/in", "double"),
+        ("cell/running", "bool"),
+        ("cell/step", "int"),
+        ("cell/inputs/1", "int"),
+    ],
+)
+def test_get_topic_tells_the_type(segment: Segment, path: str, kind: str) -> None:
+    async def test(served: Endpoint) -> None:
+        answer = await served.stub.GetTopic(wire.TopicDescriptor(path=path), timeout=TIMEOUT_S)
+        assert (answer.path, answer.msgType) == (path, kind)
+
+    serve(segment, test)
+
+
+@pytest.mark.parametrize(
+    "path", ["", "/", "cell/nothing", "nothing", "cell/inputs/2", "model/clock", "X://a", "%", "a//b"]
+)
+def test_an_unknown_topic_is_not_found(segment: Segment, path: str) -> None:
+    async def test(served: Endpoint) -> None:
+        topic = wire.TopicDescriptor(path=path)
+        assert await code(served.stub.GetTopic(topic, timeout=TIMEOUT_S)) is grpc.StatusCode.NOT_FOUND
+        assert await code(served.subscribe(path).read()) is grpc.StatusCode.NOT_FOUND
+
+    serve(segment, test)
+
+
+def test_a_structure_is_refused(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        topic = wire.TopicDescriptor(path="cell/axis")
+        assert await code(served.stub.GetTopic(topic, timeout=TIMEOUT_S)) is grpc.StatusCode.INVALID_ARGUMENT
+
+    serve(segment, test)
+
+
+def test_a_subscriber_gets_the_current_value_then_every_change_and_nothing_else(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        served.publish(image(position=0.1))
+        stream = served.subscribe("cell/axis/position")
+        first = await asyncio.wait_for(stream.read(), TIMEOUT_S)
+        assert (first.type, first.value) == ("double", "0.1")
+        served.publish(image(position=0.1, speed=5.0))
+        served.publish(image(position=-0.0, speed=5.0))
+        served.publish(image(position=float("nan")))
+        served.publish(image(position=2.0))
+        assert [await value(stream) for _ in range(3)] == ["-0.0", "NaN", "2.0"]
+        stream.cancel()
+
+    serve(segment, test)
+
+
+def test_time_is_all_nanoseconds_since_the_start(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        served.publish(image())
+        frame = served.feeds["cell"].block.latest()
+        assert frame is not None
+        stream = served.subscribe("cell/step")
+        message = await asyncio.wait_for(stream.read(), TIMEOUT_S)
+        stamp = message.timeStamp.stamp
+        assert (stamp.nsec, stamp.sec) == (frame.clock_ns, frame.clock_ns // 10**9)
+        stream.cancel()
+
+    serve(segment, test)
+
+
+def test_bits_and_arrays_and_their_elements(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        served.publish(image(inputs=b"\x01\x02"))
+        streams = [served.subscribe(path) for path in ("cell/running", "cell/inputs", "cell/inputs/1")]
+        assert [await value(stream) for stream in streams] == ["false", "[1,2]", "2"]
+        served.publish(image(running=True, inputs=b"\x01\xff"))
+        assert [await value(stream) for stream in streams] == ["true", "[1,255]", "255"]
+        for stream in streams:
+            stream.cancel()
+
+    serve(segment, test)
+
+
+def test_nothing_is_sent_while_bad_and_the_value_again_on_recovery(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        served.publish(image(step=1))
+        stream = served.subscribe("cell/step")
+        assert await value(stream) == "1"
+        served.publish(image(step=2), Quality.BAD)
+        served.publish(image(step=1))
+        served.publish(image(step=3))
+        assert [await value(stream) for _ in range(2)] == ["1", "3"]
+        stream.cancel()
+
+    serve(segment, test)
+
+
+def test_a_subscriber_of_a_bad_source_waits_for_it(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        served.publish(image(step=7), Quality.BAD)
+        stream = served.subscribe("cell/step")
+        await served.until(lambda: listening(served, 1))
+        served.publish(image(step=8))
+        assert await value(stream) == "8"
+        stream.cancel()
+
+    serve(segment, test)
+
+
+async def listening(served: Endpoint, streams: int) -> bool:
+    await asyncio.sleep(0)
+    return served.service.counters[0] == streams
+
+
+def test_health_follows_quality_and_age(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        serving, not_serving = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
+
+        async def is_now(status: int) -> bool:
+            return await served.health("source.cell") == status
+
+        assert await served.health("") == serving
+        assert await served.health("simulation.server.SimlogAPI") == serving
+        assert await served.health("source.cell") == not_serving
+        served.publish(image())
+        await served.until(lambda: is_now(serving))
+        served.publish(image(), Quality.BAD)
+        await served.until(lambda: is_now(not_serving))
+        served.publish(image())
+        await served.until(lambda: is_now(serving))
+        await served.until(lambda: is_now(not_serving))  # no frame for longer than stale_ns
+
+    serve(segment, test)
+
+
+def test_a_value_that_went_stale_is_sent_again_when_frames_come_again(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        served.publish(image(step=5))
+        stream = served.subscribe("cell/step")
+        assert await value(stream) == "5"
+
+        async def stale() -> bool:
+            return await served.health("source.cell") == health_pb2.HealthCheckResponse.NOT_SERVING
+
+        await served.until(stale)
+        served.publish(image(step=5))
+        assert await value(stream) == "5"
+        stream.cancel()
+
+    serve(segment, test)
+
+
+def test_what_is_not_built_yet_says_so(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        stub = served.stub
+        unimplemented = grpc.StatusCode.UNIMPLEMENTED
+        assert await code(stub.step(wire.StepRequest(), timeout=TIMEOUT_S)) is unimplemented
+        assert await code(stub.setStepSize(wire.StepSizeRequest(step=5), timeout=TIMEOUT_S)) is unimplemented
+        assert await code(stub.Inject(wire.InjectRequest(), timeout=TIMEOUT_S).read()) is unimplemented
+        assert await code(stub.Publish(iter([]), timeout=TIMEOUT_S)) is unimplemented
+        assert await code(served.subscribe("cell/step/in").read()) is unimplemented
+
+    serve(segment, test)
+
+
+def test_reflection_names_the_services(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        stub: Any = reflection_pb2_grpc.ServerReflectionStub(served.channel)  # type: ignore[arg-type]
+        call = stub.ServerReflectionInfo(timeout=TIMEOUT_S)
+        await call.write(reflection_pb2.ServerReflectionRequest(list_services=""))
+        answer = await call.read()
+        names = {service.name for service in answer.list_services_response.service}
+        assert {"simulation.server.SimlogAPI", "grpc.health.v1.Health"} <= names
+        await call.done_writing()
+
+    serve(segment, test)
+
+
+def test_a_stream_that_ends_leaves_nothing_at_the_feed(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        served.publish(image(step=1))
+        streams = [served.subscribe("cell/step") for _ in range(3)]
+        assert [await value(stream) for stream in streams] == ["1", "1", "1"]
+        streams[0].cancel()
+        await served.until(lambda: listening(served, 2))
+        served.publish(image(step=2))
+        assert [await value(stream) for stream in streams[1:]] == ["2", "2"]
+        for stream in streams[1:]:
+            stream.cancel()
+        await served.until(lambda: listening(served, 0))
+
+    serve(segment, test)
+
+
+def test_a_taken_address_is_refused_by_name(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        second = Server(served.service)
+        with pytest.raises(EndpointError, match=f"127.0.0.1:{served.port}"):
+            await second.start([Address("127.0.0.1", served.port)], None)
+        await second.stop()
+
+    serve(segment, test)
+
+
+def test_tls_serves_those_who_trust_it(segment: Segment, tmp_path: Path) -> None:
+    authority = trustme.CA()
+    server_cert, client_cert = authority.issue_cert("localhost"), authority.issue_cert("twin@example.org")
+    server_cert.private_key_pem.write_to_path(tmp_path / "key.pem")
+    server_cert.cert_chain_pems[0].write_to_path(tmp_path / "cert.pem")
+    authority.cert_pem.write_to_path(tmp_path / "ca.pem")
+    tls = Tls(certificate=str(tmp_path / "cert.pem"), key=str(tmp_path / "key.pem"), client_ca=str(tmp_path / "ca.pem"))
+    topic = wire.TopicDescriptor(path="cell/step")
+
+    async def test(served: Endpoint) -> None:
+        secure = Server(served.service)
+        (port,) = await secure.start([Address("localhost", 0)], tls)
+        known = grpc.ssl_channel_credentials(
+            authority.cert_pem.bytes(), client_cert.private_key_pem.bytes(), client_cert.cert_chain_pems[0].bytes()
+        )
+        anonymous = grpc.ssl_channel_credentials(authority.cert_pem.bytes())
+        async with grpc.aio.secure_channel(f"localhost:{port}", known) as channel:
+            stub: Any = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
+            assert (await stub.GetTopic(topic, timeout=TIMEOUT_S)).msgType == "int"
+        async with grpc.aio.secure_channel(f"localhost:{port}", anonymous) as channel:
+            stub = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
+            assert await code(stub.GetTopic(topic, timeout=TIMEOUT_S)) is grpc.StatusCode.UNAVAILABLE
+        with pytest.raises(ConfigError, match=r"grpc\.tls\.key"):
+            await Server(served.service).start([Address("localhost", 0)], Tls(certificate="x", key="/nowhere"))
+        await secure.stop()
+
+    serve(segment, test)
+
+
+def test_a_slow_reader_gets_the_newest_values_and_the_loss_is_counted() -> None:
+    async def test() -> None:
+        waiting = ConflatingQueue(bound=3)
+        for number in range(10):
+            waiting.push(bytes([number]))
+        assert [await waiting.pop() for _ in range(3)] == [b"\x07", b"\x08", b"\x09"]
+        assert waiting.dropped == 7
+        popped = asyncio.ensure_future(waiting.pop())
+        await asyncio.sleep(0)
+        waiting.push(b"x")
+        assert await popped == b"x"
+
+    asyncio.run(test())
