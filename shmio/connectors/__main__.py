@@ -8,27 +8,12 @@ import time
 
 from shmio import worker
 from shmio.connectors import registry
-from shmio.connectors.base import SourceLoop
+from shmio.connectors.base import SourceLoop, WallClock
 from shmio.connectors.schedule import Schedule
 from shmio.errors import ConnectorError
 from shmio.worker import BEAT_S, Worker
 
 HANG_MARGIN_S = 2.0
-
-
-class WallClock:
-    """The loop's clock in a live instance."""
-
-    def __init__(self, stopping: threading.Event) -> None:
-        self._stopping = stopping
-
-    def now_ns(self) -> int:
-        """CLOCK_MONOTONIC."""
-        return time.monotonic_ns()
-
-    def wait_ns(self, duration_ns: int) -> bool:
-        """Wait; True as soon as the process is to stop."""
-        return self._stopping.wait(duration_ns / 1e9) if duration_ns > 0 else self._stopping.is_set()
 
 
 def run(worker: Worker) -> None:

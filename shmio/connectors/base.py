@@ -7,6 +7,7 @@ counted, one bad frame when quality changes, the connection dropped on any error
 from __future__ import annotations
 
 import logging
+import threading
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -67,6 +68,21 @@ class Clock(Protocol):
 
     def wait_ns(self, duration_ns: int) -> bool:
         """Wait; True as soon as the loop is to stop."""
+
+
+class WallClock:
+    """The loop's clock in a live instance."""
+
+    def __init__(self, stopping: threading.Event) -> None:
+        self._stopping = stopping
+
+    def now_ns(self) -> int:
+        """CLOCK_MONOTONIC."""
+        return time.monotonic_ns()
+
+    def wait_ns(self, duration_ns: int) -> bool:
+        """Wait; True as soon as the process is to stop."""
+        return self._stopping.wait(duration_ns / 1e9) if duration_ns > 0 else self._stopping.is_set()
 
 
 @dataclass(slots=True)

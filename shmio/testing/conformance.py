@@ -1,0 +1,187 @@
+"""The suite that every connector inherits; for connectors of other packages too. Needs pytest.
+
+A subclass brings a :class:`Rig`, a real device behind a fault proxy; the suite breaks the connection in all the ways in
+which cells break it, and holds the loop to its promises: quality bad with a reason, recovery without a restart, never a
+value that the device did not have.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol
+
+import pytest
+
+from shmio.connectors.base import Connector, SourceLoop, WallClock
+from shmio.connectors.schedule import Schedule
+from shmio.layout.model import Layout
+from shmio.segment import BlockSpec, Frame, ProcessSpec, Quality, Segment
+from shmio.testing.proxy import FaultProxy
+
+PATIENCE_S = 20.0
+PERIOD_NS = 5_000_000
+
+
+class Rig(Protocol):
+    """A device whose block changes all the time, behind a proxy."""
+
+    proxy: FaultProxy
+    layout: Layout
+
+    def connector(self) -> Connector:
+        """A new connector that reaches the device through the proxy, with a time-out of some 200 ms."""
+
+    def generation(self, raw: bytes) -> int:
+        """When the device had this image, as a number that never falls; AssertionError if it never had it."""
+
+
+class Run:
+    """A source's loop at work on a connector, watched through its block."""
+
+    def __init__(self, segment: Segment, rig: Rig) -> None:
+        block = segment.blocks["device"]
+        self.frames: list[Frame] = []
+        self._rig = rig
+        self._cursor = block.cursor()
+        self._stopping = threading.Event()
+        schedule = Schedule(segment.header.started_ns, block.period_ns)
+        self.loop = SourceLoop(rig.connector(), segment.writer("device"), schedule, WallClock(self._stopping))
+        self._thread = threading.Thread(target=self.loop.run, daemon=True)
+        self._thread.start()
+
+    def until(self, condition: Callable[[Frame], bool]) -> Frame:
+        """Follow the block until a frame fulfils the condition."""
+        deadline = time.monotonic() + PATIENCE_S
+        while (rest_s := deadline - time.monotonic()) > 0:
+            frame = self._cursor.next(rest_s)
+            if frame is not None:
+                self.frames.append(frame)
+                if condition(frame):
+                    return frame
+        raise AssertionError(f"not seen in time; last frame: {self.frames[-1:]}")
+
+    def good(self) -> Frame:
+        """The next good frame."""
+        return self.until(lambda frame: frame.quality is Quality.GOOD)
+
+    def bad(self) -> Frame:
+        """The next bad frame."""
+        return self.until(lambda frame: frame.quality is Quality.BAD)
+
+    def stop(self) -> None:
+        """End the loop, then hold all frames to what holds always."""
+        self._stopping.set()
+        self._thread.join(PATIENCE_S)
+        assert not self._thread.is_alive(), "the loop did not end"
+        while (frame := self._cursor.poll()) is not None:
+            self.frames.append(frame)
+        assert self._cursor.missed == 0
+        assert (self.frames[-1].quality, self.frames[-1].reason) == (Quality.BAD, "the source was stopped")
+        last = -1
+        for frame in self.frames:
+            if frame.quality is Quality.GOOD:
+                generation = self._rig.generation(frame.raw)
+                assert generation >= last, f"frame {frame.number} is older than the one before it"
+                last = generation
+            else:
+                assert frame.reason, f"frame {frame.number} is bad without a reason"
+        cycles = [frame.cycle for frame in self.frames]
+        assert cycles == sorted(cycles)
+
+
+class ConnectorConformance:
+    """Inherit, and give a fixture ``rig``."""
+
+    @pytest.fixture
+    def run(self, rig: Rig, instance: str) -> Iterator[Run]:
+        """A running loop, stopped and checked at the end."""
+        block = BlockSpec("device", rig.layout, PERIOD_NS, 10**9, 1 << 24)
+        with Segment.create(instance, [block], [ProcessSpec("device", "source")]) as segment:
+            run = Run(segment, rig)
+            try:
+                yield run
+            finally:
+                try:
+                    run.stop()
+                finally:
+                    segment.unlink()
+
+    @pytest.fixture
+    def absent(self, rig: Rig) -> None:
+        """The device is not there when the loop starts."""
+        rig.proxy.refuse()
+
+    def test_values_come_and_change(self, run: Run, rig: Rig) -> None:
+        """A device that works is read every cycle."""
+        first = rig.generation(run.good().raw)
+        run.until(lambda frame: rig.generation(frame.raw) > first)
+
+    def test_absent_at_start(self, absent: None, run: Run, rig: Rig) -> None:
+        """Bad with a reason until the device comes, then good."""
+        assert "refused" in run.bad().reason
+        rig.proxy.admit()
+        run.good()
+
+    def test_lost_and_back(self, run: Run, rig: Rig) -> None:
+        """The peer closes, refuses for a while, and is back: twice."""
+        for _ in range(2):
+            run.good()
+            rig.proxy.refuse()
+            run.bad()
+            rig.proxy.admit()
+            run.good()
+
+    def test_reset(self, run: Run, rig: Rig) -> None:
+        """The peer crashes and is there again at once."""
+        run.good()
+        rig.proxy.cut(reset=True)
+        run.bad()
+        run.good()
+
+    def test_cut_in_the_middle_of_an_answer(self, run: Run, rig: Rig) -> None:
+        """Half an answer is no answer."""
+        run.good()
+        rig.proxy.cut_after(30)
+        run.bad()
+        rig.proxy.pass_all()
+        run.good()
+
+    def test_half_open(self, run: Run, rig: Rig) -> None:
+        """The connection stands but nothing comes: bad after the time-out, then good."""
+        run.good()
+        rig.proxy.freeze()
+        assert "answer" in run.bad().reason
+        rig.proxy.thaw()
+        run.good()
+
+    @pytest.mark.parametrize("garbage", [b"\0" * 64, b"\xff" * 64, b"HTTP/1.1 400 Bad Request\r\n\r\n", b"\x03"])
+    def test_garbage(self, run: Run, rig: Rig, garbage: bytes) -> None:
+        """What is no answer is never a value."""
+        run.good()
+        rig.proxy.garble(garbage)
+        run.bad()
+        rig.proxy.pass_all()
+        run.good()
+
+    def test_a_late_answer_is_not_taken_for_the_next(self, run: Run, rig: Rig) -> None:
+        """An answer comes when nobody waits for it any more, on a new connection."""
+        run.good()
+        rig.proxy.hold(frames=1)
+        run.bad()
+        rig.proxy.release()
+        run.good()
+
+    def test_a_loop_ends_while_the_device_hangs(self, run: Run, rig: Rig) -> None:
+        """Stopping waits for no device longer than its time-out; the fixture checks it."""
+        run.good()
+        rig.proxy.freeze()
+
+    def test_close_may_come_at_any_time(self, rig: Rig) -> None:
+        """Before the first connect, and twice."""
+        connector: Any = rig.connector()
+        connector.close()
+        connector.connect()
+        connector.close()
+        connector.close()
