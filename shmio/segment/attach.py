@@ -23,14 +23,14 @@ from shmio.errors import NotRunningError, PathError, QualityError
 from shmio.layout.codec import Value, codec
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import find, parse_topic
-from shmio.segment.block import Block
+from shmio.segment.block import Block, Cursor
 from shmio.segment.frame import Frame, Quality
 from shmio.segment.segment import Segment, instances
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from shmio.layout.frames import FrameCodec
+    from shmio.layout.framecodec import FrameCodec
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +88,7 @@ class View:
 
 @lru_cache(maxsize=64)
 def _frame_codec(layout: Layout) -> FrameCodec:
-    from shmio.layout.frames import FrameCodec  # noqa: PLC0415  numpy only for those who ask for arrays
+    from shmio.layout.framecodec import FrameCodec  # noqa: PLC0415  numpy only for those who ask for arrays
 
     return FrameCodec(layout)
 
@@ -155,13 +155,9 @@ class Attachment:
         return View(frame, block.layout, block.stale_ns)
 
     def stream(self, source: str | None = None, timeout_s: float | None = None) -> Iterator[View]:
-        """Every frame from now on, once and in order, with exact gap counts; ends after ``timeout_s`` without any."""
+        """Every frame from this call on, once, in order, gaps counted; ends after ``timeout_s`` without one."""
         block = self.block(source)
-        cursor = block.cursor()
-        missed = 0
-        while (frame := cursor.next(timeout_s)) is not None:
-            yield View(frame, block.layout, block.stale_ns, cursor.missed - missed)
-            missed = cursor.missed
+        return _views(block, block.cursor(), timeout_s)
 
     def wait(
         self, source: str | None = None, *, after: View | None = None, timeout_s: float | None = None
@@ -181,6 +177,13 @@ class Attachment:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _views(block: Block, cursor: Cursor, timeout_s: float | None) -> Iterator[View]:
+    missed = 0
+    while (frame := cursor.next(timeout_s)) is not None:
+        yield View(frame, block.layout, block.stale_ns, cursor.missed - missed)
+        missed = cursor.missed
 
 
 def reading(block: Block, register: Register, frame: Frame | None) -> Reading:

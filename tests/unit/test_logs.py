@@ -1,0 +1,77 @@
+"""Log lines and their files."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from shmio import logs
+from shmio.errors import ConfigError
+
+
+@pytest.fixture(autouse=True)
+def root_logger() -> Iterator[None]:
+    root = logging.getLogger()
+    before, level, raising = root.handlers[:], root.level, logging.raiseExceptions
+    root.handlers = []
+    yield
+    for handler in root.handlers:
+        with suppress(OSError):  # /dev/full
+            handler.close()
+    root.handlers, root.level, logging.raiseExceptions = before, level, raising
+    logging.captureWarnings(False)
+
+
+def test_a_line_names_time_level_process_and_fields(tmp_path: Path) -> None:
+    log = logs.setup(tmp_path / "deep" / "cell.log", "cell")
+    log.info("connected to %s", "plc", extra=logs.fields(pdu=960, jobs=8))
+    (line,) = (tmp_path / "deep" / "cell.log").read_text().splitlines()
+    assert re.fullmatch(
+        rf"\d{{4}}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{{6}}Z INFO    cell\[{os.getpid()}\] connected to plc pdu=960 jobs=8",
+        line,
+    )
+
+
+def test_text_from_devices_stays_on_its_line(tmp_path: Path) -> None:
+    logs.setup(tmp_path / "x.log", "cell").warning("name %s", "a\nFAKE ERROR\x1b[2J")
+    assert (tmp_path / "x.log").read_text().count("\n") == 1
+
+
+def test_a_traceback_follows_indented(tmp_path: Path) -> None:
+    log = logs.setup(tmp_path / "x.log", "cell")
+    try:
+        raise ValueError("odd")
+    except ValueError:
+        log.exception("failed")
+    lines = (tmp_path / "x.log").read_text().splitlines()
+    assert lines[0].endswith("failed")
+    assert lines[-1] == "    ValueError: odd"
+    assert all(line.startswith("    ") for line in lines[1:])
+
+
+def test_files_rotate_and_old_ones_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(logs, "MAX_FILE_BYTES", 1000)
+    log = logs.setup(tmp_path / "x.log", "cell")
+    for number in range(100):
+        log.info("line %d", number)
+    files = sorted(file.name for file in tmp_path.iterdir())
+    assert files == ["x.log", "x.log.1", "x.log.2"]
+    assert all((tmp_path / name).stat().st_size <= 1000 for name in files)
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=r"instance\.log_dir: .*file"):
+        logs.setup(tmp_path / "file" / "x.log", "cell")
+
+
+def test_a_full_disk_does_not_stop_the_process(tmp_path: Path) -> None:
+    file = tmp_path / "x.log"
+    file.symlink_to("/dev/full")
+    logs.setup(file, "cell").info("lost")
