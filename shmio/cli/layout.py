@@ -28,7 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("file", metavar="FILE.db", help="the source with the data blocks")
     parser.add_argument("types", metavar="UDT", nargs="*", help="further sources, with the PLC data types it uses")
     parser.add_argument("--json", action="store_true", help="print JSON: one object, or a list for several blocks")
-    options = parser.parse_args(arguments)
+    options = parser.parse_intermixed_args(arguments)
     try:
         compiled = compile_sources([_read(name) for name in (options.file, *options.types)])
     except LayoutError as error:

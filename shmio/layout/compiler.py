@@ -47,7 +47,7 @@ def compile_sources(sources: Sequence[Source]) -> Compiled:
 
     Raises LayoutError: ``diagnostics`` has everything found, errors first.
     """
-    report = Report()
+    report = Report([source.file for source in sources])
     layouts: list[Layout] = []
     with suppress(TooManyErrors):
         units = [_read(source, report) for source in sources]

@@ -34,6 +34,7 @@ _SECTION = ("VAR", "VAR_RETAIN")
 _SECTION_WORDS = ("RETAIN", "NON_RETAIN", "CONSTANT", "DB_SPECIFIC")
 _TOP = ("DATA_BLOCK", "TYPE", "FUNCTION", "FUNCTION_BLOCK", "ORGANIZATION_BLOCK")
 _STOPS = ("END_STRUCT", "END_VAR", "END_TYPE", "END_DATA_BLOCK", "BEGIN", *_TOP)
+_SPACED = "the name {!r} has spaces and no quotes (as in print, where underscores can be lost); it is kept as written"
 _DB_NUMBER = re.compile(r"DB([1-9][0-9]{0,4})", re.IGNORECASE)
 
 
@@ -88,7 +89,10 @@ class _Parser:
         self.header()
         if not self.at.token.is_word("STRUCT"):
             raise self.at.expected("STRUCT")
+        errors = len(self.report.errors)
         body = self.sections()
+        if not body.members and len(self.report.errors) == errors:
+            self.report.add(position.error(f"expected at least one member in the type {name!r}"))
         self.at.accept(";")
         self.at.expect_word("END_TYPE")
         return TypeDeclaration(name, body, position)
@@ -196,6 +200,9 @@ class _Parser:
         if self.at.token.is_punct("{"):
             self.attributes()
         self.at.expect(":", "':' and the type")
+        for name, position, quoted in names:
+            if not quoted and " " in name:
+                self.report.add(position.warning(_SPACED.format(name)))
         first = self.at.index
         type_ = self.type_(depth)
         if self.at.token.is_punct("{"):
@@ -206,24 +213,16 @@ class _Parser:
             raise self.at.expected("';' at the end of the declaration")
         inner = isinstance(type_, Struct) or (isinstance(type_, Array) and isinstance(type_.element, Struct))
         comment = "" if inner else closing.comment or self.at.last_comment(first)
-        members += [Member(name, type_, comment, initial, position) for name, position in names]
+        members += [Member(name, type_, comment, initial, position) for name, position, _ in names]
 
-    def member_name(self) -> tuple[str, Position]:
+    def member_name(self) -> tuple[str, Position, bool]:
+        """Read a name; return it, its place, and whether it was in quotes."""
         position, token = self.at.position, self.at.token
         if token.kind is Kind.QUOTED:
-            self.at.advance()
-            return token.text, position
+            return self.at.advance().text, position, True
         if token.kind is not Kind.WORD:
             raise self.at.expected("a member's name")
-        name = self.at.words()
-        if name != token.text:
-            self.report.add(
-                position.warning(
-                    f"the name {name!r} has spaces and no quotes (as in print, where underscores can be lost); "
-                    "it is kept as written"
-                )
-            )
-        return name, position
+        return self.at.words(), position, False
 
     # -- types -----------------------------------------------------------------------------------------------
 
@@ -242,7 +241,11 @@ class _Parser:
         if depth + 1 >= MAX_DEPTH and token.is_word("STRUCT"):
             raise self.at.fault(token, f"structures are nested more than {MAX_DEPTH} deep")
         if self.at.accept_word("STRUCT"):
-            return Struct(self.members("END_STRUCT", depth + 1), position)
+            errors = len(self.report.errors)
+            members = self.members("END_STRUCT", depth + 1)
+            if not members and len(self.report.errors) == errors:
+                raise self.at.fault(token, "expected at least one member in the structure")
+            return Struct(members, position)
         if token.kind is Kind.QUOTED:
             self.at.advance()
             return Named(token.text, True, position)

@@ -94,7 +94,12 @@ class Placer:
         self._open: list[str] = []
 
     def struct(self, struct: Struct, depth: int = 0) -> Group | None:
-        """Place a structure; None if anything in it is wrong, which then has been reported."""
+        """Place a structure; None if anything in it is wrong, which then has been reported.
+
+        Only the body of a block may have no members: the parser has refused any other.
+        """
+        if depth and not struct.members:
+            return None
         if depth >= MAX_DEPTH:
             self._refuse(struct.position, f"structures are nested more than {MAX_DEPTH} deep")
             return None
@@ -136,11 +141,8 @@ class Placer:
             if declaration is None:
                 self._refuse(name.position, self._unknown(name))
                 return None
-            if not declaration.body.members:
-                self._refuse(declaration.position, f"the type {declaration.name!r} has no members")
-                return None
             self._open.append(key)
-            self._placed[key] = self.struct(declaration.body, depth)
+            self._placed[key] = self.struct(declaration.body, max(depth, 1))
             self._open.pop()
         return self._placed[key]
 
@@ -162,14 +164,7 @@ class Placer:
     def _type(self, type_: Type, depth: int) -> Leaf | Group | Repeat | None:
         inner = type_.element if isinstance(type_, Array) else type_
         dims = type_.dims if isinstance(type_, Array) else ()
-        found: ElementType | Group | None
-        if isinstance(inner, Named):
-            found = self.named(inner, depth)
-        elif inner.members:
-            found = self.struct(inner, depth)
-        else:
-            self._refuse(inner.position, "expected at least one member in the structure")
-            found = None
+        found = self.named(inner, depth) if isinstance(inner, Named) else self.struct(inner, depth)
         if isinstance(found, Group):
             return Repeat(found, dims) if dims else found
         if found is None:

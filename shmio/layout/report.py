@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from shmio.errors import LayoutError, ShmioError
 from shmio.layout.model import Diagnostic
 
@@ -14,9 +16,10 @@ class TooManyErrors(ShmioError):  # noqa: N818  (a signal to stop, never seen ou
 
 
 class Report:
-    """The errors and warnings of one run."""
+    """The errors and warnings of one run over these files."""
 
-    def __init__(self) -> None:
+    def __init__(self, files: Sequence[str]) -> None:
+        self._order = {file: position for position, file in enumerate(files)}
         self.errors: list[Diagnostic] = []
         self.warnings: list[Diagnostic] = []
 
@@ -35,8 +38,9 @@ class Report:
             self.warnings.append(diagnostic)
 
     def raise_errors(self) -> None:
-        """Raise LayoutError with all that was found if any of it is an error."""
+        """Raise LayoutError with all that was found, in source order, if any of it is an error."""
         if self.errors:
+            self.errors.sort(key=lambda error: (self._order.get(error.file, 0), error.line, error.column))
             lines = [str(error) for error in self.errors]
             if len(self.errors) >= MAX_ERRORS:
                 lines.append(f"stopped after {MAX_ERRORS} errors")
