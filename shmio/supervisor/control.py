@@ -1,0 +1,260 @@
+"""Requests to a running supervisor: one JSON object a line over a UNIX stream socket, one answer.
+
+========================================  =================================================  =======================
+request                                   answer                                             given when
+========================================  =================================================  =======================
+``{"do": "stop"}``                        ``{"ok": true}``                                   all is stopped
+``{"do": "restart", "name": "cell"}``     ``{"ok": true}``                                   the process runs again
+``{"do": "where"}``                       ``{"ok": true, "config": …, "log_dir": …}``        at once
+anything else                             ``{"error": "…"}``                                 at once
+========================================  =================================================  =======================
+
+The socket's path stands in the segment's header. Only the supervisor's own user and root are served.
+"""
+
+from __future__ import annotations
+
+import os
+import selectors
+import socket
+import stat
+import struct
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from shmio.errors import ControlError
+
+MAX_REQUEST_BYTES: Final = 4096
+MAX_ANSWER_BYTES: Final = 65536
+MAX_CLIENTS: Final = 8
+REQUEST_S: Final = 2.0
+"""Time that a client has to send its request."""
+MAX_PATH_BYTES: Final = 107  # sun_path holds 108 with the final zero, unix(7)
+_CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
+
+
+class Stop(msgspec.Struct, tag_field="do", tag="stop", forbid_unknown_fields=True):
+    """Stop the instance."""
+
+
+class Restart(msgspec.Struct, tag_field="do", tag="restart", forbid_unknown_fields=True):
+    """Restart one process."""
+
+    name: str
+
+
+class Where(msgspec.Struct, tag_field="do", tag="where", forbid_unknown_fields=True):
+    """Tell which configuration the instance was started from, and where it logs."""
+
+
+Request = Stop | Restart | Where
+
+
+class Answer:
+    """The way back to the client of one request. Answering a client that has gone does nothing."""
+
+    def __init__(self, server: ControlServer, client: socket.socket) -> None:
+        self._server = server
+        self._client = client
+
+    def ok(self, **values: object) -> None:
+        """Done."""
+        self._server.answer(self._client, {"ok": True, **values})
+
+    def error(self, message: str) -> None:
+        """Not done, and why."""
+        self._server.answer(self._client, {"error": message})
+
+
+class ControlServer:
+    """The supervisor's end, driven by its selector: no call here waits for a client.
+
+    Keys registered with the selector have a function without arguments as their data.
+    """
+
+    def __init__(self, path: str, selector: selectors.BaseSelector, handle: Callable[[Request, Answer], None]) -> None:
+        """Bind; the caller holds the instance, so a socket that is there is a dead supervisor's. ControlError."""
+        self._path = path
+        self._selector = selector
+        self._handle = handle
+        self._clients: dict[socket.socket, tuple[bytearray, float | None]] = {}
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        try:
+            _remove(path)
+            self._listener.bind(path)
+            Path(path).chmod(0o600)
+            self._listener.listen(MAX_CLIENTS)
+        except OSError as error:
+            self._listener.close()
+            raise ControlError(f"cannot make the control socket {path}: {error.strerror}") from None
+        selector.register(self._listener, selectors.EVENT_READ, self._accept)
+
+    def _accept(self) -> None:
+        try:
+            client, _ = self._listener.accept()
+        except OSError:  # gone again, or no descriptor is free
+            return
+        client.setblocking(False)
+        if not _trusted(client):
+            _send(client, {"error": "only the supervisor's own user and root may control it"})
+            client.close()
+        elif len(self._clients) >= MAX_CLIENTS:
+            _send(client, {"error": "too many control connections at once"})
+            client.close()
+        else:
+            self._clients[client] = bytearray(), time.monotonic() + REQUEST_S
+            self._selector.register(client, selectors.EVENT_READ, lambda: self._receive(client))
+
+    def _receive(self, client: socket.socket) -> None:
+        if client not in self._clients:  # answered by what came before it in the same round
+            return
+        data, deadline = self._clients[client]
+        try:
+            received = client.recv(MAX_REQUEST_BYTES)
+        except BlockingIOError:
+            return
+        except OSError:
+            received = b""
+        if not received or deadline is None:  # gone, or more than one request
+            self._drop(client)
+            return
+        data += received
+        line, end, rest = data.partition(b"\n")
+        if len(data) > MAX_REQUEST_BYTES or rest:
+            self.answer(client, {"error": f"one request of at most {MAX_REQUEST_BYTES} bytes, ended by a newline"})
+        elif end:
+            self._clients[client] = data, None
+            self._decode(client, bytes(line))
+
+    def _decode(self, client: socket.socket, line: bytes) -> None:
+        try:
+            request = msgspec.json.decode(line, type=Request)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            self.answer(client, {"error": f"not a request: {error}"})
+        else:
+            self._handle(request, Answer(self, client))
+
+    def answer(self, client: socket.socket, message: dict[str, object]) -> None:
+        """Send the answer and close; what the socket's buffer cannot take is lost."""
+        if client in self._clients:
+            _send(client, message)
+            self._drop(client)
+
+    def expire(self) -> None:
+        """Drop those that have not sent a request in time."""
+        now = time.monotonic()
+        for client, (_, deadline) in list(self._clients.items()):
+            if deadline is not None and now > deadline:
+                self.answer(client, {"error": f"no request within {REQUEST_S:g} s"})
+
+    def _drop(self, client: socket.socket) -> None:
+        del self._clients[client]
+        self._selector.unregister(client)
+        client.close()
+
+    def retire(self) -> None:
+        """Remove the socket, which a successor may then make anew; those who wait can still be answered."""
+        if self._listener.fileno() >= 0:
+            self._selector.unregister(self._listener)
+            self._listener.close()
+            with suppress(OSError):
+                _remove(self._path)
+
+    def close(self) -> None:
+        """Retire, and drop all clients."""
+        self.retire()
+        for client in list(self._clients):
+            self._drop(client)
+
+
+def request(path: str, message: Request, timeout_s: float) -> dict[str, Any]:
+    """Ask the supervisor at ``path`` and return its answer.
+
+    ControlError: no such socket, no answer within ``timeout_s``, or the supervisor's refusal.
+    """
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+        deadline = time.monotonic() + timeout_s
+        received = bytearray()
+        try:
+            client.settimeout(timeout_s)
+            client.connect(path)
+            client.sendall(msgspec.json.encode(message) + b"\n")
+            while not received.endswith(b"\n"):
+                client.settimeout(max(0.001, deadline - time.monotonic()))
+                data = client.recv(MAX_ANSWER_BYTES)
+                if not data or len(received) > MAX_ANSWER_BYTES:
+                    raise ControlError("the supervisor ended without an answer")
+                received += data
+        except TimeoutError:
+            raise ControlError(f"the supervisor has not answered within {timeout_s:g} s") from None
+        except OSError as error:
+            raise ControlError(f"the supervisor cannot be reached at {path or '(no path)'}: {error.strerror}") from None
+    try:
+        answer = msgspec.json.decode(received, type=dict[str, Any])
+    except msgspec.DecodeError:
+        raise ControlError("the supervisor's answer makes no sense; is it of this version?") from None
+    if "error" in answer:
+        raise ControlError(str(answer["error"]))
+    return answer
+
+
+def socket_path(instance: str) -> str:
+    """Where the control socket of an instance goes; makes the folder, mode 0700.
+
+    The first that will do of ``$XDG_RUNTIME_DIR/shmio``, ``/run/user/<uid>/shmio``, ``/tmp/shmio-<uid>``. ControlError
+    when none will: not a folder of this user, or the path is too long.
+    """
+    uid = os.getuid()
+    given = os.environ.get("XDG_RUNTIME_DIR")
+    folders = [Path(given) / "shmio"] if given and Path(given).is_absolute() else []
+    folders += [Path(f"/run/user/{uid}/shmio"), Path(f"/tmp/shmio-{uid}")]  # noqa: S108  made with care below
+    refused = []
+    for folder in folders:
+        path = folder / f"{instance}.sock"
+        if len(os.fsencode(path)) > MAX_PATH_BYTES:
+            refused.append(f"{folder}: the path is longer than {MAX_PATH_BYTES} bytes")
+            continue
+        reason = _prepare(folder, uid)
+        if reason is None:
+            return str(path)
+        refused.append(f"{folder}: {reason}")
+    raise ControlError(f"no folder for the control socket ({'; '.join(refused)})")
+
+
+def _prepare(folder: Path, uid: int) -> str | None:
+    """Make a folder that is this user's alone; why not, otherwise. A symbolic link is never followed."""
+    try:
+        with suppress(FileExistsError):
+            folder.mkdir(mode=0o700)
+        fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            if os.fstat(fd).st_uid != uid:
+                return "belongs to another user"
+            os.fchmod(fd, 0o700)
+        finally:
+            os.close(fd)
+    except OSError as error:
+        return error.strerror
+    return None
+
+
+def _remove(path: str) -> None:
+    """Remove a socket; anything else that has the name is left, and bind tells."""
+    with suppress(FileNotFoundError):
+        if stat.S_ISSOCK(os.lstat(path).st_mode):
+            Path(path).unlink()
+
+
+def _trusted(client: socket.socket) -> bool:
+    _, uid, _ = _CREDENTIALS.unpack(client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
+    return uid in (0, os.getuid())
+
+
+def _send(client: socket.socket, message: dict[str, object]) -> None:
+    with suppress(OSError):
+        client.send(msgspec.json.encode(message) + b"\n", socket.MSG_NOSIGNAL | socket.MSG_DONTWAIT)

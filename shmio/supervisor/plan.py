@@ -1,0 +1,110 @@
+"""From a checked configuration to what is started: blocks, processes, their descriptions. No I/O."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from shmio.config import Config
+from shmio.errors import ConfigError
+from shmio.layout.model import Layout
+from shmio.segment import BlockSpec, ProcessSpec, segment_size
+
+RANKS: Final[Mapping[str, int]] = {"emulator": 0, "source": 1, "grpc": 2}
+"""Order of start by kind: what plays a device, what reads devices, what serves the readings."""
+
+MODULES: Final[Mapping[str, str]] = {
+    "source": "shmio.connectors",
+    "emulator": "shmio.emulators",
+    "grpc": "shmio.endpoints.grpc",
+}
+"""The module that is a process of each kind."""
+
+MAX_PROCESSES = 200
+MODES = ("live",)
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A process to run: ``config`` is its section as resolved, what the process gets."""
+
+    name: str
+    kind: str
+    log_file: Path
+    config: dict[str, Any]
+
+    @property
+    def rank(self) -> int:
+        """Place in the order of start."""
+        return RANKS[self.kind]
+
+    def describe(self, instance: str, epoch: int) -> bytes:
+        """The JSON object that the process reads from its standard input."""
+        return msgspec.json.encode(
+            {
+                "instance": instance,
+                "epoch": epoch,
+                "name": self.name,
+                "kind": self.kind,
+                "log_file": str(self.log_file),
+                "config": self.config,
+            }
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """An instance as it will be."""
+
+    instance: str
+    mode: str
+    group: str | None
+    config_file: Path
+    log_dir: Path
+    blocks: tuple[BlockSpec, ...]
+    jobs: tuple[Job, ...]
+
+    @property
+    def processes(self) -> list[ProcessSpec]:
+        """The slots of the process table."""
+        return [ProcessSpec(job.name, job.kind) for job in self.jobs]
+
+    @property
+    def segment_bytes(self) -> int:
+        """Size of the segment."""
+        return segment_size(self.blocks, len(self.jobs))
+
+
+def make_plan(config: Config, layouts: Mapping[str, Layout], *, config_file: Path, mode: str = "live") -> Plan:
+    """Plan an instance. ``layouts``: of each source and emulator, by its name.
+
+    ConfigError: too many processes.
+    """
+    ring_bytes = round(config.instance.ring_mb * 1e6)
+    blocks = tuple(
+        BlockSpec(source.name, layouts[source.name], source.period_ns, source.stale_ns, ring_bytes)
+        for source in config.source
+    )
+    sections: list[tuple[str, str, dict[str, Any]]] = []
+    for emulator in config.emulator:
+        layout = layouts[emulator.name].to_json().decode()
+        sections.append((emulator.name, "emulator", msgspec.to_builtins(emulator) | {"layout": layout}))
+    sections += [(source.name, "source", msgspec.to_builtins(source)) for source in config.source]
+    if config.grpc:
+        sections.append(("grpc", "grpc", msgspec.to_builtins(config.grpc)))
+    if len(sections) > MAX_PROCESSES:
+        raise ConfigError(f"{len(sections)} processes; an instance has at most {MAX_PROCESSES}")
+    log_dir = config.log_dir
+    return Plan(
+        instance=config.instance.name,
+        mode=mode,
+        group=config.instance.group,
+        config_file=config_file.resolve(),
+        log_dir=log_dir,
+        blocks=blocks,
+        jobs=tuple(Job(name, kind, log_dir / f"{name}.log", section) for name, kind, section in sections),
+    )

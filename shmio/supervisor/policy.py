@@ -1,0 +1,186 @@
+"""All decisions of the supervisor, as functions of what is known and the time. No I/O, no clock."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from shmio.segment import Quality
+from shmio.segment import State as InstanceState
+from shmio.supervisor.states import GRAPH, Action, Event, State
+
+REFUSED_STATUS = 2
+"""Exit status by which a worker says that it can never work as configured."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Times and counts by which processes are judged; times in s."""
+
+    start_s: float = 20.0
+    """From its start until it must report that it runs."""
+    hang_s: float = 5.0
+    """Without a heartbeat while running."""
+    grace_s: float = 5.0
+    """From SIGTERM to SIGKILL."""
+    stable_s: float = 5.0
+    """Running this long, it has put its crashes behind it."""
+    backoff_first_s: float = 0.5
+    backoff_most_s: float = 10.0
+    start_attempts: int = 3
+    """Crashes of a process that never ran, after which the start of the instance has failed."""
+    settle_s: float = 3.0
+    """Time for the sources' first frames before the instance's start counts as over."""
+
+
+@dataclass(frozen=True, slots=True)
+class Life:
+    """All that is remembered about a process. Times are CLOCK_MONOTONIC ns."""
+
+    state: State = State.STOPPED
+    due_ns: int | None = None
+    """When the state's time is over."""
+    spawned_ns: int = 0
+    ready_ns: int | None = None
+    """Since when it has been running; None before, and again from its next start."""
+    starts: int = 0
+    crashes: int = 0
+    """In a row; forgotten once it runs stably."""
+    ran: bool = False
+    """Whether it has been running at any time."""
+    note: str = ""
+    """Why it is not running."""
+
+    @property
+    def restarts(self) -> int:
+        """How often it was started again, for whatever reason."""
+        return max(0, self.starts - 1)
+
+
+def step(life: Life, event: Event, now_ns: int, limits: Limits, note: str = "") -> tuple[Life, Action | None]:
+    """Take one edge of the graph; (what is then known, what is to be done). ``note`` tells how a process ended."""
+    edge = GRAPH[life.state].get(event)
+    if edge is None:
+        return life, None
+    state, action = edge
+    life = replace(life, crashes=_crashes(life, event, state, now_ns, limits), note=_note(life, state, limits, note))
+    if action is Action.SPAWN:
+        life = replace(life, starts=life.starts + 1, spawned_ns=now_ns, ready_ns=None)
+    elif event is Event.READY:
+        life = replace(life, ran=True, ready_ns=now_ns)
+    allowed_s = _allowed_s(state, action, life.crashes, limits)
+    due_ns = None if allowed_s is None else now_ns + round(allowed_s * 1e9)
+    return replace(life, state=state, due_ns=due_ns), action
+
+
+def _crashes(life: Life, event: Event, to: State, now_ns: int, limits: Limits) -> int:
+    if event is Event.RESTART:
+        return 0
+    if to not in (State.BACKOFF, State.FATAL):
+        return life.crashes
+    stable = life.ready_ns is not None and now_ns - life.ready_ns >= limits.stable_s * 1e9
+    return 1 if stable else life.crashes + 1
+
+
+def _note(life: Life, to: State, limits: Limits, note: str) -> str:
+    if to is State.HUNG:
+        late = life.state is State.STARTING
+        return f"not running {limits.start_s:g} s after its start" if late else f"no heartbeat for {limits.hang_s:g} s"
+    if to is State.BACKOFF and life.state is State.HUNG:
+        return f"{life.note}, {note}"
+    if to in (State.BACKOFF, State.FATAL):
+        return note
+    return {State.STOPPING: "stopping", State.RESTARTING: "restarting"}.get(to, "")
+
+
+def _allowed_s(state: State, action: Action | None, crashes: int, limits: Limits) -> float | None:
+    if state is State.STARTING:
+        return limits.start_s
+    if state is State.BACKOFF:
+        return backoff_s(crashes, limits)
+    return limits.grace_s if action is Action.TERMINATE else None
+
+
+def backoff_s(crashes: int, limits: Limits) -> float:
+    """Wait before the next start: none after the first crash, then doubling up to the limit."""
+    if crashes <= 1:
+        return 0.0
+    doublings = min(crashes - 2, 32)  # beyond that a float could overflow
+    return float(min(limits.backoff_most_s, limits.backoff_first_s * 2**doublings))
+
+
+def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits) -> Event | None:
+    """What time or the worker's report has brought about, if anything.
+
+    ``ready``: it has reported that it runs. ``quiet_ns``: time without a heartbeat.
+    """
+    if life.state is State.STARTING and ready:
+        return Event.READY
+    if life.state is State.RUNNING and quiet_ns >= limits.hang_s * 1e9:
+        return Event.HANG
+    if life.due_ns is not None and now_ns >= life.due_ns:
+        return Event.ELAPSED
+    return None
+
+
+def ended(returncode: int) -> Event:
+    """What the end of a process means."""
+    return Event.REFUSAL if returncode == REFUSED_STATUS else Event.EXIT
+
+
+Ranked = Sequence[tuple[int, Life]]
+"""The rank of each process and its life: a rank starts after those before it and stops before them."""
+
+
+def to_start(processes: Ranked) -> list[int]:
+    """Indices of the processes whose turn has come: the lowest rank not yet started, once those below had their chance.
+
+    A process that fails does not hold up the others, one that is still at its first start does.
+    """
+    ranks = {rank for rank, life in processes if not life.starts}
+    if not ranks or any(life.starts == 1 and life.state is State.STARTING for _, life in processes):
+        return []
+    turn = min(ranks)
+    return [index for index, (rank, life) in enumerate(processes) if rank == turn and not life.starts]
+
+
+def to_stop(processes: Ranked) -> list[int]:
+    """Indices of the processes whose turn to stop has come: those of the highest rank that is not gone yet."""
+    turn = max((rank for rank, life in processes if life.state is not State.STOPPED), default=None)
+    settled = (State.STOPPED, State.STOPPING)
+    return [index for index, (rank, life) in enumerate(processes) if rank == turn and life.state not in settled]
+
+
+def all_gone(processes: Ranked) -> bool:
+    """Whether a stop is complete."""
+    return all(life.state is State.STOPPED for _, life in processes)
+
+
+def start_failure(life: Life, limits: Limits) -> str | None:
+    """Why the start of the instance has failed at this process; None when it has not."""
+    if life.ran:
+        return None
+    if life.state is State.FATAL:
+        return life.note
+    if life.state is State.BACKOFF and life.crashes >= limits.start_attempts:
+        return f"failed to start {life.crashes} times; {life.note}"
+    return None
+
+
+def start_over(
+    processes: Ranked, qualities: Sequence[Quality | None], since_ns: int, now_ns: int, limits: Limits
+) -> bool:
+    """Whether the instance's start is over: all processes have run, and the sources have told how they fare.
+
+    ``qualities``: of the sources, None for one without a frame; those are given ``settle_s`` from ``since_ns``, when
+    the last process became ready.
+    """
+    if not all(life.ran for _, life in processes):
+        return False
+    return None not in qualities or now_ns - since_ns >= limits.settle_s * 1e9
+
+
+def assess(running: Sequence[bool], qualities: Sequence[Quality | None]) -> InstanceState:
+    """State of an instance after its start: degraded when a process is not running or a source is bad."""
+    healthy = all(running) and not any(q in (None, Quality.BAD) for q in qualities)
+    return InstanceState.RUNNING if healthy else InstanceState.DEGRADED

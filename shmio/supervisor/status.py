@@ -1,0 +1,144 @@
+"""What ``shmio-supervisor status`` tells: read from the segment alone, so it works whoever is dead."""
+
+from __future__ import annotations
+
+import time
+
+import msgspec
+
+from shmio.errors import NotRunningError, SegmentError
+from shmio.segment import Phase, ProcessSlot, Quality, Segment
+from shmio.segment import State as InstanceState
+from shmio.supervisor.policy import assess
+
+
+class ProcessStatus(msgspec.Struct, kw_only=True):
+    """One process. ``uptime_s`` is the time since its last start, 0 when it is not alive; ``pid`` is null then."""
+
+    name: str
+    kind: str
+    pid: int | None
+    state: str
+    restarts: int
+    uptime_s: float
+    note: str
+    counters: dict[str, int]
+
+
+class SourceStatus(ProcessStatus, kw_only=True):
+    """A source: its process, and the newest frame of its block. ``cycle`` is null before the first."""
+
+    quality: str
+    reason: str
+    cycle: int | None
+    rate_hz: float
+    overruns: int
+
+
+class SupervisorStatus(msgspec.Struct):
+    """The supervisor itself."""
+
+    pid: int
+    uptime_s: float
+
+
+class InstanceStatus(msgspec.Struct):
+    """An instance. ``supervisor`` is null when it is dead, ``segment`` when there is none."""
+
+    instance: str | None
+    mode: str | None = None
+    state: str = str(InstanceState.STOPPED)
+    segment: str | None = None
+    segment_bytes: int = 0
+    supervisor: SupervisorStatus | None = None
+    processes: list[SourceStatus | ProcessStatus] = []
+    note: str = ""
+
+    @property
+    def running(self) -> bool:
+        """Whether anything of it runs."""
+        return self.state != str(InstanceState.STOPPED)
+
+
+def read_status(instance: str) -> InstanceStatus:
+    """The status of an instance, running or not. SegmentError: a segment that cannot be read."""
+    try:
+        segment = Segment.open(instance)
+    except NotRunningError as error:
+        return InstanceStatus(instance, note=str(error))
+    with segment:
+        return _read(segment)
+
+
+def _read(segment: Segment) -> InstanceStatus:
+    supervised = segment.supervised
+    pid, state = segment.supervisor
+    now_ns = time.monotonic_ns()
+    processes = [_process(segment, slot, supervised, now_ns) for slot in segment.processes]
+    status = InstanceStatus(
+        instance=segment.instance,
+        mode=segment.header.mode,
+        segment=segment.shared.name,
+        segment_bytes=segment.header.size,
+    )
+    if not supervised:
+        if not any(process.pid for process in processes):
+            status.note = "its supervisor died and left the segment; the next up or down clears it"
+            return status
+        status.note = "its supervisor is dead, nothing watches the processes; up takes over, down stops them"
+        status.state = str(InstanceState.DEGRADED)
+    else:
+        status.supervisor = SupervisorStatus(pid, _seconds(now_ns - segment.header.started_ns))
+        status.state = str(_state(state, processes))
+    status.processes = processes
+    return status
+
+
+def _state(told: InstanceState, processes: list[SourceStatus | ProcessStatus]) -> InstanceState:
+    """The state as told while starting or stopping; else by what is read here, which is newer."""
+    if told not in (InstanceState.RUNNING, InstanceState.DEGRADED):
+        return told
+    running = [process.state == str(Phase.RUNNING) for process in processes]
+    return assess(running, [Quality[p.quality.upper()] for p in processes if isinstance(p, SourceStatus)])
+
+
+def _process(segment: Segment, slot: ProcessSlot, supervised: bool, now_ns: int) -> SourceStatus | ProcessStatus:
+    told, report, alive = slot.supervised, slot.report, slot.alive()
+    phase = told.phase
+    if not supervised:
+        phase = Phase.RUNNING if alive else Phase.STOPPED
+    values = ProcessStatus(
+        name=slot.name,
+        kind=slot.kind,
+        pid=report.pid if alive and report.pid else None,
+        state=str(phase),
+        restarts=told.restarts,
+        uptime_s=_seconds(now_ns - report.started_ns) if alive else 0.0,
+        note=told.note or (report.note if alive else ""),
+        counters=slot.counters,
+    )
+    block = segment.blocks.get(slot.name)
+    if slot.kind != "source" or block is None:
+        return values
+    quality, reason, cycle = Quality.BAD, "no frame yet", None
+    try:
+        frame = block.latest()
+    except SegmentError as error:
+        reason = str(error)
+    else:
+        if frame is not None:
+            cycle = frame.cycle
+            quality, reason = frame.assess(block.stale_ns, time.monotonic_ns())
+    counters = values.counters
+    return SourceStatus(
+        **msgspec.structs.asdict(values),
+        quality=str(quality),
+        reason=reason,
+        cycle=cycle,
+        rate_hz=counters.get("rate_mhz", 0) / 1000 if alive and quality is not Quality.BAD else 0.0,
+        overruns=counters.get("overruns", 0),
+    )
+
+
+def _seconds(duration_ns: int) -> float:
+    return round(max(0, duration_ns) / 1e9, 3)
