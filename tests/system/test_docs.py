@@ -1,0 +1,79 @@
+"""Every command shown in the README is run as shown, in one shell after another, with the demo running."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shmio.segment import instances
+
+ROOT = Path(__file__).parents[2]
+BLOCK = re.compile(r"^```sh( background)?\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def blocks(page: Path) -> Iterator[tuple[bool, str]]:
+    for match in BLOCK.finditer(page.read_text()):
+        yield bool(match[1]), match[2]
+
+
+def shell(commands: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PATH": f"{ROOT / '.venv/bin'}:{os.environ['PATH']}"}
+    return subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", commands],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+@pytest.mark.skipif("a50" in instances(), reason="an instance a50 is running here")
+def test_the_readme_runs_as_shown() -> None:
+    found = list(blocks(ROOT / "README.md"))
+    (demo,) = [commands for background, commands in found if background]
+    with subprocess.Popen(
+        ["bash", "-c", f"exec {demo}"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as cell:
+        try:
+            assert cell.stdout is not None
+            lines = []
+            for line in cell.stdout:
+                lines.append(line)
+                if "127.0.0.1:8089" in line:
+                    break
+            assert any("127.0.0.1:8089" in line for line in lines), "".join(lines)
+            # It says where it serves when all processes run; the PLC is read within a few cycles after that.
+            good = shell("shmio-supervisor status --json; shmio watch -n 1 cell/Robot_800/Axs1_Pos")
+            assert good.returncode == 0, good.stderr
+            for background, commands in found:
+                if not background:
+                    done = shell(commands)
+                    assert done.returncode == 0, f"{commands}\n{done.stdout}\n{done.stderr}"
+                    assert done.stdout.strip(), f"printed nothing:\n{commands}"
+        finally:
+            cell.send_signal(signal.SIGINT)
+            cell.communicate(timeout=30)
+    assert cell.returncode == 0
+    assert "a50" not in instances()
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in LINK.findall(page.read_text()):
+        assert (page.parent / target).exists(), f"{page}: {target}"
+
+
+def test_every_page_is_in_the_index() -> None:
+    index = (ROOT / "docs/index.md").read_text() + (ROOT / "docs/decisions/README.md").read_text()
+    for page in (ROOT / "docs").rglob("*.md"):
+        assert page.name in index or page.name in ("index.md", "README.md"), f"{page} is in no index"
