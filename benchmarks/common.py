@@ -1,0 +1,205 @@
+"""What all benchmarks share: fair rounds, tables with ratios, child processes, the machine's name."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import gc
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from shmio.layout.compiler import Source, compile_sources
+from shmio.layout.model import Layout
+
+HERE = Path(__file__).parent
+ROOT = HERE.parent
+
+Samples = Mapping[str, Sequence[float]]
+
+
+# -- the run -----------------------------------------------------------------------------------------------------------
+
+
+def begin(description: str) -> bool:
+    """Parse the one option all benchmarks have, and print what the figures depend on; whether to be quick."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--quick", action="store_true", help="fewer and shorter rounds: does it work, not how fast")
+    quick: bool = parser.parse_args().quick
+    print(f"# {description}\n{machine()}")
+    return quick
+
+
+def machine() -> str:
+    """What the figures depend on, in one line."""
+    cores = len(os.sched_getaffinity(0))
+    load = "/".join(f"{value:.2f}" for value in os.getloadavg())
+    system, release, architecture = platform.system(), platform.release(), platform.machine()
+    return f"{cores} cores {architecture}, {system} {release}, Python {platform.python_version()}, load {load}"
+
+
+def db201() -> Layout:
+    """The reference load: 2,180 bytes, of which 20 REALs move."""
+    file = ROOT / "tests/golden/layout/db201-as-printed.db"
+    return compile_sources([Source(file.name, file.read_bytes())]).layouts[0]
+
+
+# -- measuring ---------------------------------------------------------------------------------------------------------
+
+
+def interleave(contenders: Mapping[str, Callable[[], float]], rounds: int) -> dict[str, list[float]]:
+    """One sample of each contender a round, another first each time: the machine's other work falls on all."""
+    names = list(contenders)
+    samples: dict[str, list[float]] = {name: [] for name in names}
+    for turn in range(rounds):
+        first = turn % len(names)
+        for name in names[first:] + names[:first]:
+            samples[name].append(contenders[name]())
+    return samples
+
+
+def per_call_ns(function: Callable[[], object], calls: int) -> Callable[[], float]:
+    """Make a sampler: the time of one call, mean of so many, with the garbage collector held."""
+
+    def sample() -> float:
+        turns = range(calls)
+        gc.disable()
+        begun_ns = time.perf_counter_ns()
+        for _ in turns:
+            function()
+        taken_ns = time.perf_counter_ns() - begun_ns
+        gc.enable()
+        return taken_ns / calls
+
+    return sample
+
+
+def per_second(function: Callable[[], object], duration_s: float) -> Callable[[], float]:
+    """Make a sampler: calls a second, over some time."""
+
+    def sample() -> float:
+        count = 0
+        begun_s = time.perf_counter()
+        while (taken_s := time.perf_counter() - begun_s) < duration_s:
+            function()
+            count += 1
+        return count / taken_s
+
+    return sample
+
+
+def quantiles(values: Sequence[float]) -> tuple[float, float, float]:
+    """Median, p90, p99."""
+    cuts = statistics.quantiles(values, n=100, method="inclusive")
+    return cuts[49], cuts[89], cuts[98]
+
+
+# -- printing ----------------------------------------------------------------------------------------------------------
+
+
+def report(title: str, samples: Samples, ours: str, better: Literal["less", "more"]) -> None:
+    """Print best and median of each contender, and how ours compares with it, by the medians."""
+    own = statistics.median(samples[ours])
+    rows = []
+    for name, values in samples.items():
+        median = statistics.median(values)
+        best, ratio = (min(values), median / own) if better == "less" else (max(values), own / median)
+        rows.append([name, f"{best:.0f}", f"{median:.0f}", "" if name == ours else f"{ratio:.2f} times as fast"])
+    table([title, "best", "median", "shmio is"], rows)
+
+
+def table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print rows under titles; the first column flush left."""
+    widths = [max(len(row[place]) for row in [titles, *rows]) for place in range(len(titles))]
+    print()
+    for row in [titles, *rows]:
+        first, *rest = (f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True))
+        print("  ".join([first.strip().ljust(widths[0]), *rest]))
+
+
+# -- child processes ---------------------------------------------------------------------------------------------------
+
+
+class Child:
+    """A script beside this one, in a process of its own, so that no two parties share an interpreter lock.
+
+    It prints one JSON line when it is ready, works until its standard input ends, and may print another. It cannot
+    outlive its parent.
+    """
+
+    def __init__(self, script: str, *arguments: object) -> None:
+        self._script = script
+        command = [sys.executable, str(HERE / script), *map(str, arguments)]
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.pid = self._process.pid
+        self.hello: Any = self._line()
+
+    def _line(self) -> Any:
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            self.stop()
+            raise SystemExit(f"{self._script} ended with status {self._process.returncode}")
+        return json.loads(line)
+
+    def finish(self) -> Any:
+        """Tell it to end; what it prints last."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+        return self._line()
+
+    def stop(self) -> None:
+        """End it, and wait until it has."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
+        try:
+            self._process.wait(10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._process.stdout.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+
+def tell(message: object) -> None:
+    """Print one JSON line for the parent."""
+    print(json.dumps(message), flush=True)
+
+
+def wait_for_parent() -> None:
+    """Return when the parent closes our standard input, or dies."""
+    sys.stdin.read()
+
+
+@dataclass(frozen=True)
+class CpuTime:
+    """CPU time a process has used, all threads, in s (10 ms steps)."""
+
+    user_s: float
+    system_s: float
+
+    @classmethod
+    def of(cls, pid: int) -> CpuTime:
+        """Read fields 14 and 15 of /proc/PID/stat, proc_pid_stat(5)."""
+        after_name = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        tick_s = 1 / os.sysconf("SC_CLK_TCK")
+        return cls(int(after_name[11]) * tick_s, int(after_name[12]) * tick_s)
+
+    def since(self, before: CpuTime) -> CpuTime:
+        """What was used since then."""
+        return CpuTime(self.user_s - before.user_s, self.system_s - before.system_s)

@@ -1,0 +1,61 @@
+"""A controller for the benchmarks, as a process: shmio's emulated S7 server with one data block.
+
+The block is still unless ``--stamp-ms`` is given: then a program writes the time of CLOCK_MONOTONIC in ns into its
+first eight bytes, a LINT, at random intervals around that mean, so that changes fall anywhere in a client's poll cycle.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import struct
+import threading
+import time
+from collections.abc import Callable
+
+from common import tell, wait_for_parent
+
+from shmio.config.address import Address
+from shmio.emulators import s7_jobs
+from shmio.emulators.s7 import S7Server
+
+NUMBER = 201
+SIZE = 2180
+SEED = 201
+
+
+def still_block() -> bytes:
+    """Fill a block with bytes that differ from place to place."""
+    return random.Random(SEED).randbytes(SIZE)
+
+
+def stamp(server: S7Server, block: bytearray, mean_s: float, wait: Callable[[float], bool]) -> None:
+    """Write the time into the block until told to stop."""
+    intervals = random.Random(SEED)
+    while not wait(mean_s * intervals.uniform(0.5, 1.5)):
+        with server.lock:
+            struct.pack_into(">q", block, 0, time.monotonic_ns())
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--pdu", type=int, default=s7_jobs.MAX_PDU_SIZE, help="largest PDU to grant, in bytes")
+    parser.add_argument("--stamp-ms", type=float)
+    arguments = parser.parse_args()
+    s7_jobs.MAX_PDU_SIZE = arguments.pdu  # no setting of the emulator, for only a benchmark wants less than it can
+    server = S7Server(Address("127.0.0.1", 0))
+    block = bytearray(still_block())
+    server.add_block(NUMBER, block)
+    server.start()
+    stopping = threading.Event()
+    if arguments.stamp_ms:
+        mean_s = arguments.stamp_ms / 1000
+        threading.Thread(target=stamp, args=(server, block, mean_s, stopping.wait), daemon=True).start()
+    tell(str(server.address))
+    wait_for_parent()
+    stopping.set()
+    server.stop()
+
+
+if __name__ == "__main__":
+    main()

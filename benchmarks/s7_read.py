@@ -1,0 +1,119 @@
+"""Whole reads of DB201 a second: shmio's S7 client beside python-snap7's ``Client.db_read``, over ever longer links.
+
+Controller, link and clients are processes of their own. Each client keeps its session over all rounds.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+
+import snap7
+from common import Child, begin, interleave, per_second, report, table
+from plc import NUMBER, SIZE, still_block
+from snap7.type import Parameter
+
+from shmio.config.address import Address
+from shmio.connectors.s7 import S7Client, S7Options
+
+OURS = "shmio"
+SMALL = 96  # packetSize of the seed's plc.ini
+ROUND_TRIPS_MS = (0, 1, 3)  # added to the loopback's own
+
+
+def shmio_client(
+    stack: ExitStack, address: Address, size: int, *, packet_size: int | None = None, jobs: int | None = None
+) -> S7Client:
+    """Connect shmio's client."""
+    options = S7Options(host=address.host, port=address.port, packetSize=packet_size, maxJobs=jobs)
+    client = S7Client(options, NUMBER, size)
+    client.connect()
+    stack.callback(client.close)
+    return client
+
+
+def snap7_client(stack: ExitStack, address: Address, pdu_size: int) -> snap7.Client:
+    """Connect python-snap7's client; it takes what PDU the controller grants."""
+    client = snap7.Client()
+    client.set_param(Parameter.PDURequest, pdu_size)
+    client.connect(address.host, 0, 1, address.port)
+    stack.callback(client.disconnect)
+    return client
+
+
+def reader_in_parts(client: snap7.Client, packet_size: int) -> Callable[[], bytes]:
+    """Read the block as users of ``packetSize`` have to: ``db_read`` for each part."""
+
+    def read() -> bytes:
+        parts = [client.db_read(NUMBER, at, min(packet_size, SIZE - at)) for at in range(0, SIZE, packet_size)]
+        return b"".join(parts)
+
+    return read
+
+
+def compare(address: Address, pdu_size: int, packet_size: int | None, title: str, rounds: int, round_s: float) -> None:
+    """Time all clients against one controller over one link."""
+    with ExitStack() as stack:
+        ours = shmio_client(stack, address, SIZE, packet_size=packet_size)
+        one_by_one = shmio_client(stack, address, SIZE, packet_size=packet_size, jobs=1)
+        peer = snap7_client(stack, address, pdu_size)
+        if (ours.pdu_size, peer.get_pdu_length()) != (pdu_size, pdu_size):
+            raise SystemExit(f"PDU sizes are {ours.pdu_size} and {peer.get_pdu_length()}, not {pdu_size}")
+        reads: dict[str, Callable[[], bytes | bytearray]] = {
+            OURS: ours.read,
+            f"{OURS}, one request at a time": one_by_one.read,
+            "python-snap7 db_read": (
+                (lambda: peer.db_read(NUMBER, 0, SIZE)) if packet_size is None else reader_in_parts(peer, packet_size)
+            ),
+        }
+        for name, read in reads.items():
+            if read() != still_block():
+                raise SystemExit(f"{name}: the block came back changed")
+        samplers = {name: per_second(read, round_s) for name, read in reads.items()}
+        report(title, interleave(samplers, rounds), OURS, "more")
+
+
+def measure_link(links: dict[str, Address], calls: int) -> None:
+    """Show what the links add: to one request, and to eight at once, which must not cost eight round trips."""
+    with ExitStack() as stack:
+        single = {name: shmio_client(stack, address, 1, packet_size=1) for name, address in links.items()}
+        eight = {name: shmio_client(stack, address, 8, packet_size=1) for name, address in links.items()}
+        rows = []
+        for name in links:
+            one_ms, eight_ms = (statistics.median(_times_ms(client, calls)) for client in (single[name], eight[name]))
+            rows.append([name, f"{one_ms:.2f}", f"{eight_ms:.2f}"])
+    table(["round trips, median ms", "1 request", "8 at once"], rows)
+
+
+def _times_ms(client: S7Client, calls: int) -> list[float]:
+    times = []
+    for _ in range(calls):
+        begun_s = time.perf_counter()
+        client.read()
+        times.append((time.perf_counter() - begun_s) * 1000)
+    return times
+
+
+def main() -> None:
+    quick = begin("S7: whole reads of DB201 (2,180 bytes) a second")
+    rounds, round_s, calls = (2, 0.1, 20) if quick else (5, 0.4, 300)
+    for pdu_size in (480, 960):
+        with ExitStack() as stack:
+            address = Address.parse(stack.enter_context(Child("plc.py", "--pdu", pdu_size)).hello)
+            links = {"loopback": address}
+            for round_trip_ms in ROUND_TRIPS_MS[1:]:
+                link = stack.enter_context(Child("link.py", address, round_trip_ms))
+                links[f"+{round_trip_ms} ms"] = Address.parse(link.hello)
+            if pdu_size == 480:
+                measure_link(links, calls)
+            for name, place in links.items():
+                compare(place, pdu_size, None, f"PDU {pdu_size}, {name}, reads/s", rounds, round_s)
+            if pdu_size == 480:
+                for name, place in links.items():
+                    compare(place, pdu_size, SMALL, f"packetSize {SMALL}, {name}, reads/s", rounds, round_s)
+
+
+if __name__ == "__main__":
+    main()
