@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from shmio.cli.run import run
 from shmio.errors import LayoutError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.document import describe
@@ -29,20 +29,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("types", metavar="UDT", nargs="*", help="further sources, with the PLC data types it uses")
     parser.add_argument("--json", action="store_true", help="print JSON: one object, or a list for several blocks")
     options = parser.parse_intermixed_args(arguments)
+    return run(lambda: _compile([options.file, *options.types], as_json=options.json))
+
+
+def _compile(names: Sequence[str], *, as_json: bool) -> int:
     try:
-        compiled = compile_sources([_read(name) for name in (options.file, *options.types)])
+        compiled = compile_sources([_read(name) for name in names])
     except LayoutError as error:
-        _complain(error.diagnostics or [error])
-        return 1
-    except OSError as error:
-        _complain([f"shmio-layout: {error.filename}: {error.strerror}"])
+        _complain(error.diagnostics)
         return 1
     _complain(compiled.warnings)
-    try:
-        _print(compiled.layouts, as_json=options.json)
-        sys.stdout.flush()
-    except BrokenPipeError:  # the reader has seen enough, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    _print(compiled.layouts, as_json=as_json)
     return 0
 
 

@@ -33,7 +33,7 @@ class Glob:
             raise PathError(f"{shorten(pattern)}: a pattern is at most {MAX_PATTERN} characters long")
         self.pattern = pattern
         self._literals: dict[str, int] = {}
-        self._stars = self._crossing = self._optional = 0
+        self._stars = self._crossing = self._forks = 0
         self._final = 0
         segments = pattern.split("/")
         if "" in segments:
@@ -42,7 +42,8 @@ class Glob:
             if position:
                 self._literal("/")
             if segment == "**" and position < len(segments) - 1:
-                self._optional |= 1 << self._final  # `**/` as a whole may match nothing
+                self._forks |= 1 << self._final  # `**/` as a whole may match nothing
+                self._final += 1
             for piece in _pieces(segment):
                 if piece.startswith("*"):
                     self._star(crossing=len(piece) > 1)
@@ -77,7 +78,8 @@ class Glob:
     def _close(self, states: int) -> int:
         """Add the states that are reached without a character."""
         while True:
-            more = states | (states & self._stars) << 1 | (states & self._optional) << 2
+            forks = states & self._forks
+            more = states | (states & self._stars | forks) << 1 | forks << 3
             if more == states:
                 return states
             states = more

@@ -131,15 +131,16 @@ def _read(text: str, element: ElementType) -> Scalar:
     if base in _INTEGERS:
         return _integer(text, _SIGNED_BITS.get(base))
     if base in ("REAL", "LREAL"):
-        return float(text.replace("_", "")) if _REAL.fullmatch(text) else None
+        number = float(text.replace("_", "")) if _REAL.fullmatch(text) else math.inf
+        return number if math.isfinite(number) else None
     if base in _MOMENTS:
         ns = calendar.parse_moment(text)
-        if ns is None:
-            return None
-        return text if base == "DATE" and len(text) == 10 else _moment(ns, base)
+        return None if ns is None else _moment(ns, base)
     if base in _UNIT_NS:
-        if (plain := _integer(text, None)) is not None:
-            return plain
+        if not separator:
+            plain = _integer(text, None)  # what a user types, in the type's own unit
+            if plain is not None:
+                return plain
         ns = _duration(text) if base in _DURATIONS else _clock(text)
         return None if ns is None or ns % _UNIT_NS[base] else ns // _UNIT_NS[base]
     return text if base in ("POINTER", "ANY") else None
@@ -182,9 +183,10 @@ def _clock(text: str) -> int | None:
     return ((hour * 60 + minute) * 60 + second) * calendar.NS_PER_SECOND + int((match[4] or "").ljust(9, "0"))
 
 
-def _moment(ns: int, base: str) -> str:
+def _moment(ns: int, base: str) -> str | None:
     if base == "DATE":
-        return calendar.format_day(ns // calendar.NS_PER_DAY)
+        day, rest = divmod(ns, calendar.NS_PER_DAY)
+        return None if rest else calendar.format_day(day)
     digits = 3 if base == "DATE_AND_TIME" and ns % calendar.NS_PER_MS == 0 else 9
     return calendar.format_moment(ns, digits)
 

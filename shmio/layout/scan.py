@@ -18,7 +18,10 @@ _Bytes = npt.NDArray[np.uint8]
 
 
 class ChangeScan:
-    """Compares frames of one layout, for all of its registers or those given by index."""
+    """Compares frames of one layout, for all of its registers or those given by index.
+
+    It works in a buffer of its own: one object for each thread.
+    """
 
     def __init__(self, layout: Layout, indices: Sequence[int] | None = None) -> None:
         chosen = range(len(layout.registers)) if indices is None else sorted(set(indices))

@@ -1,0 +1,110 @@
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from shmio.cli.layout import main
+
+GOLDEN = Path(__file__).parents[2] / "golden" / "layout"
+DB = 'DATA_BLOCK "one" STRUCT a : "T"; END_STRUCT; BEGIN END_DATA_BLOCK\n'
+UDT = "TYPE T STRUCT x : Bool; // flag\n y : Array[0..1] of Int := [1, 2]; END_STRUCT; END_TYPE\n"
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> tuple[str, str]:
+    (tmp_path / "a.db").write_text(DB, encoding="utf-8-sig")
+    (tmp_path / "t.udt").write_text(UDT)
+    return str(tmp_path / "a.db"), str(tmp_path / "t.udt")
+
+
+def test_json_of_one_block(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(GOLDEN / "db201-as-printed.db"), "--json"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out) == json.loads((GOLDEN / "db201-as-printed.json").read_bytes())
+    assert "Optimized block access" in captured.err
+    assert all(": warning: " in line for line in captured.err.splitlines())
+
+
+def test_json_of_several_blocks(files: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "b.db").write_text(DB.replace("one", "two"))
+    assert main([files[0], "--json", str(tmp_path / "b.db"), files[1]]) == 0
+    assert [layout["name"] for layout in json.loads(capsys.readouterr().out)] == ["one", "two"]
+
+
+def test_table(files: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(list(files)) == 0
+    captured = capsys.readouterr()
+    assert captured.out.splitlines() == [
+        "one: 6 bytes, 2 registers, standard access",
+        "offset  size  type                path  initial  comment",
+        "   0.0     1  BOOL                a/x            flag",
+        "     2     4  ARRAY[0..1] OF INT  a/y   [1, 2]",
+    ]
+    assert captured.err == ""
+
+
+def test_table_hides_control_characters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.db").write_text('DATA_BLOCK "b" STRUCT a : Int; // \x1b[2J\u202e\nEND_STRUCT; BEGIN END_DATA_BLOCK')
+    assert main([str(tmp_path / "a.db")]) == 0
+    out = capsys.readouterr().out
+    assert "\x1b" not in out
+    assert "\\x1b[2J\\x202e" in out
+
+
+def test_errors_name_their_place(files: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([files[0], "--json"]) == 1
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith(f"{files[0]}:1:29: error: expected a known type, found 'T'")
+    assert len(captured.err.splitlines()) == 1
+
+
+def test_files_that_cannot_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "latin.db").write_bytes(DB.encode() + b"// \xe4")
+    for name, message in (
+        ("none.db", "No such file"),
+        (".", "Is a directory"),
+        ("latin.db", "latin.db:2:4: error: expected UTF-8"),
+    ):
+        assert main([str(tmp_path / name)]) == 1
+        captured = capsys.readouterr()
+        assert message in captured.err
+        assert len(captured.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("arguments", [[], ["--nope", "x.db"], ["--json"]])
+def test_wrong_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert "usage:" in capsys.readouterr().err
+
+
+def test_terminals_that_are_not_utf8(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.db").write_text(
+        'DATA_BLOCK "b" STRUCT "轴" : Int; END_STRUCT; BEGIN END_DATA_BLOCK', encoding="utf-8"
+    )
+    for arguments, text in ((["--json"], '"path": "\\u8f74"'), ([], "\\u8f74")):
+        out = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+        monkeypatch.setattr(sys, "stdout", out)
+        assert main([str(tmp_path / "a.db"), *arguments]) == 0
+        out.seek(0)
+        assert text in out.read()
+
+
+def test_a_reader_that_leaves_early(tmp_path: Path) -> None:
+    members = "".join(f"a{i} : Int;\n" for i in range(20_000))
+    (tmp_path / "a.db").write_text(f'DATA_BLOCK "b" STRUCT {members} END_STRUCT; BEGIN END_DATA_BLOCK')
+    command = [sys.executable, "-m", "shmio.cli.layout", str(tmp_path / "a.db")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline().startswith(b"b: 40000 bytes")
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait() == 141  # as of a program that the signal ended

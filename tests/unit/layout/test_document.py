@@ -1,0 +1,155 @@
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmio.errors import LayoutError
+from shmio.layout.compiler import Source, compile_sources
+from shmio.layout.image import initial_frame
+from shmio.layout.model import Layout
+
+TEXT = """DATA_BLOCK DB5 STRUCT a : Bool; b : Bool; "c/d" : Array[-1..1] of Byte := [1, 2]; // of c
+    s : Array[1..2] of Struct t : String[3] := 'ä'; END_STRUCT; r : Real := 1.5; m : DT; n : Int := "MAX"; p : DTL;
+    o : Array[0..1] of DT;
+    END_STRUCT; BEGIN END_DATA_BLOCK"""
+
+
+@pytest.fixture
+def layout() -> Layout:
+    return compile_sources([Source("x.db", TEXT.encode())]).layouts[0]
+
+
+def test_round_trip(layout: Layout) -> None:
+    data = layout.to_json()
+    again = Layout.from_json(data)
+    assert again == layout
+    assert again.to_json() == data
+    assert again.hash == layout.hash
+    assert len(layout.hash) == 32
+
+
+def test_the_object_of_the_contract(layout: Layout) -> None:
+    document = json.loads(layout.to_json())
+    assert list(document) == ["name", "number", "size", "optimized", "registers", "byte_order"]
+    assert document["registers"][2] == {
+        "path": "c%2Fd",
+        "type": "BYTE",
+        "dims": [[-1, 1]],
+        "offset": 2,
+        "bit": None,
+        "size": 3,
+        "count": 3,
+        "comment": "of c",
+        "initial": "[1, 2]",
+    }
+    assert document["registers"][0]["dims"] is None
+
+
+def test_hash_tells_layouts_apart(layout: Layout) -> None:
+    other = compile_sources([Source("x.db", TEXT.replace("// of c", "// of d").encode())]).layouts[0]
+    assert other.hash != layout.hash
+
+
+CHANGES: list[tuple[str, Any]] = [
+    ("name", 5),
+    ("number", -1),
+    ("number", 1 << 16),
+    ("size", 10),
+    ("size", -1),
+    ("size", 1 << 40),
+    ("size", "10"),
+    ("optimized", 1),
+    ("registers", {}),
+    ("registers", None),
+    ("byte_order", "middle"),
+    ("extra", 1),
+]
+REGISTER_CHANGES: list[tuple[int, str, Any]] = [
+    (0, "path", ""),
+    (0, "path", "a/"),
+    (0, "path", "a%zz"),
+    (0, "path", "in"),
+    (0, "path", "a%2fb"),
+    (0, "path", "x" * 20_000),
+    (1, "path", "a"),  # twice
+    (0, "type", "Bool"),
+    (0, "type", "TOD"),
+    (0, "type", "NOPE"),
+    (0, "type", "STRING"),
+    (0, "type", "BYTE"),  # with a bit
+    (0, "bit", None),
+    (0, "bit", 8),
+    (1, "bit", 0),  # overlap
+    (2, "bit", 0),
+    (2, "offset", 0),  # overlap
+    (2, "offset", 1 << 30),
+    (2, "offset", 2.5),
+    (2, "size", 4),
+    (2, "count", 2),
+    (2, "dims", [[1, -1]]),
+    (2, "dims", [[0, 1 << 40]]),
+    (2, "dims", [[0, 2, 3]]),
+    (2, "dims", []),
+    (2, "dims", [[0, 0]] * 7),
+    (2, "dims", None),
+    (2, "comment", None),
+    (2, "initial", 5),
+    (2, "more", 5),
+]
+
+
+@pytest.mark.parametrize(("key", "value"), CHANGES)
+def test_changed_layouts_are_refused(layout: Layout, key: str, value: Any) -> None:
+    document = json.loads(layout.to_json()) | {key: value}
+    with pytest.raises(LayoutError):
+        Layout.from_json(json.dumps(document).encode())
+
+
+@pytest.mark.parametrize(("index", "key", "value"), REGISTER_CHANGES)
+def test_changed_registers_are_refused(layout: Layout, index: int, key: str, value: Any) -> None:
+    document = json.loads(layout.to_json())
+    document["registers"][index][key] = value
+    with pytest.raises(LayoutError):
+        Layout.from_json(json.dumps(document).encode())
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"[]", b"null", b"\xff", b"{", b"[" * 100_000, b'{"registers":' * 50_000, b'{"name":"\\ud800"}'],
+)
+def test_other_data_is_refused(data: bytes) -> None:
+    with pytest.raises(LayoutError):
+        Layout.from_json(data)
+
+
+@given(st.data())
+def test_damaged_json_is_refused_or_reads_as_what_it_says(data: st.DataObject) -> None:
+    original = compile_sources([Source("x.db", TEXT.encode())]).layouts[0].to_json()
+    damaged = bytearray(original)
+    for _ in range(data.draw(st.integers(1, 3))):
+        damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        read = Layout.from_json(bytes(damaged))
+    except LayoutError:
+        return
+    assert Layout.from_json(read.to_json()) == read
+
+
+def test_initial_frame(layout: Layout) -> None:
+    frame, unread = initial_frame(layout)
+    assert unread == ("n",)  # a constant only the controller knows
+    expected = bytes.fromhex(
+        "0000"  # a, b
+        "01020000"  # c
+        "0301e40000" + "00" + "0301e40000" + "00"  # s
+        "3fc00000"  # r
+        "9001010000000002"  # m
+        "0000"  # n
+        "07b201010500000000000000"  # p
+         + "9001010000000002" * 2  # o
+    )
+    assert frame.hex() == expected.hex()

@@ -1,0 +1,163 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmio.errors import PathError
+from shmio.layout.compiler import Source, compile_sources
+from shmio.layout.model import Layout
+from shmio.layout.topic import MAX_TOPIC, Topic, decode_segment, encode_segment, find, parse_topic
+
+SOURCES = ("cell", "sim", "Robot")
+
+
+@pytest.mark.parametrize(
+    ("text", "source", "path", "direction"),
+    [
+        ("cell/a/b/out", "cell", "a/b", "out"),
+        ("/cell/a/in", "cell", "a", "in"),
+        ("cell/a", "cell", "a", None),
+        ("a/b/in", "cell", "a/b", "in"),
+        ("/model/clock", "model", "clock", None),
+        ("joints/R3200/Link1/R/position/out", "cell", "joints/R3200/Link1/R/position", "out"),
+        ("SIM://joints/Kuka.j1/R/in", "sim", "joints/Kuka.j1/R", "in"),
+        ("sim:///joints", "sim", "joints", None),
+        ("SIMLOG://step", "simlog", "step", None),
+        ("ROBOT://x", "Robot", "x", None),
+        ("sim/out", "sim", "", "out"),
+        ("sim", "sim", "", None),
+        ("sim/", "sim", "", None),
+        ("SIM://", "sim", "", None),
+        ("CELL://in", "cell", "", "in"),
+        ("Cell/a", "cell", "Cell/a", None),  # only a scheme is free in its case
+        ("cell/cell/a", "cell", "cell/a", None),
+        ("cell/a/In", "cell", "a/In", None),
+        ("cell/a/in/out", "cell", "a/%69n", "out"),
+        ("cell/in/a", "cell", "%69n/a", None),
+        ("cell/%69n/in", "cell", "%69n", "in"),
+        ("cell/%6fut", "cell", "%6Fut", None),
+        ("cell/Axs2%20Pos", "cell", "Axs2 Pos", None),
+        ("cell/Axs2 Pos", "cell", "Axs2 Pos", None),
+        ("cell/a%2fb", "cell", "a%2Fb", None),
+        ("cell/a+b#c", "cell", "a%2Bb%23c", None),
+        ("cell/%E8%BD%B41", "cell", "轴1", None),
+        ("cell/a/5/out", "cell", "a/5", "out"),
+    ],
+)
+def test_parse(text: str, source: str, path: str, direction: str | None) -> None:
+    topic = parse_topic(text, SOURCES, "cell")
+    assert (topic.source, topic.path, topic.direction) == (source, path, direction)
+    assert parse_topic(str(topic), SOURCES, None) == topic
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "/",
+        "in",
+        "/out",
+        "a//b",
+        "cell//a",
+        "//a",
+        "a/",
+        "a/%",
+        "a/%4",
+        "a/%zz",
+        "a/%ff",
+        "nope://a",
+        "x" * (MAX_TOPIC + 1),
+    ],
+)
+def test_malformed(text: str) -> None:
+    with pytest.raises(PathError):
+        parse_topic(text, SOURCES, "cell")
+
+
+def test_without_default_the_source_must_be_named() -> None:
+    assert parse_topic("cell/a", SOURCES, None) == Topic("cell", "a", None)
+    with pytest.raises(PathError, match="no default source"):
+        parse_topic("a/b", SOURCES, None)
+
+
+@given(st.text(st.characters(exclude_categories=["Cs"]), min_size=1))
+def test_every_name_survives_a_path(name: str) -> None:
+    segment = encode_segment(name)
+    assert decode_segment(segment) == name
+    assert not set(segment) & set("/+#")
+    assert parse_topic(f"cell/{segment}", ["cell"], None) == Topic("cell", segment, None)
+    assert parse_topic(f"cell/{segment}/in", ["cell"], None) == Topic("cell", segment, "in")
+
+
+@given(st.text())
+def test_any_text_parses_or_is_refused(text: str) -> None:
+    try:
+        topic = parse_topic(text, SOURCES, "cell")
+    except PathError:
+        return
+    assert parse_topic(str(topic), SOURCES, "cell") == topic
+
+
+@pytest.fixture
+def layout() -> Layout:
+    text = """DATA_BLOCK DB1 STRUCT
+        Inputs : Array[0..9] of Byte;
+        Grid : Array[-1..0, 1..9] of Bool;
+        Robot : Struct Axs1 : Real; Axs2 : Real; END_STRUCT;
+        Zones : Array[1..2] of Struct Level : Array[0..1] of Int; END_STRUCT;
+        END_STRUCT; BEGIN END_DATA_BLOCK"""
+    return compile_sources([Source("x.db", text.encode())]).layouts[0]
+
+
+@pytest.mark.parametrize(
+    ("path", "offset", "bit", "type_"),
+    [
+        ("Inputs", 0, None, "BYTE"),
+        ("Inputs/0", 0, None, "BYTE"),
+        ("Inputs/9", 9, None, "BYTE"),
+        ("Grid/-1/1", 10, 0, "BOOL"),
+        ("Grid/-1/9", 11, 0, "BOOL"),
+        ("Grid/0/2", 12, 1, "BOOL"),
+        ("Robot/Axs2", 18, None, "REAL"),
+        ("Zones/2/Level", 26, None, "INT"),
+        ("Zones/2/Level/1", 28, None, "INT"),
+    ],
+)
+def test_find(layout: Layout, path: str, offset: int, bit: int | None, type_: str) -> None:
+    register = find(layout, path)
+    assert (register.path, register.offset, register.bit, register.type) == (path, offset, bit, type_)
+
+
+@pytest.mark.parametrize(
+    ("path", "message"),
+    [
+        ("", "names a source"),
+        ("Robot", "a structure, not a register; it holds Robot/Axs1, Robot/Axs2"),
+        ("Zones/1", "a structure"),
+        ("Robot/Axs3", "no such register in DB1; near: Robot/Axs2, Robot/Axs1"),
+        ("inputs", "near: Inputs"),
+        ("Inputs/10", "outside [0..9]"),
+        ("Inputs/05", "no such register"),
+        ("Inputs/+5", "no such register"),
+        ("Inputs/5/5", "outside"),
+        ("Grid/0", "outside"),
+        ("Grid/1/1", "outside [-1..0,1..9]"),
+        ("Robot/Axs1/0", "outside"),
+        ("5", "no such register"),
+        ("x" * 10_000, "no such register"),
+        ("Inputs" + "/1" * 5000, "no such register"),
+    ],
+)
+def test_not_found(layout: Layout, path: str, message: str) -> None:
+    with pytest.raises(PathError) as caught:
+        find(layout, path)
+    assert message in str(caught.value)
+    assert len(str(caught.value)) < 400
+
+
+def test_members(layout: Layout) -> None:
+    assert layout.members("Robot") == (2, 3)
+    assert layout.members("Zones") == (4, 5)
+    assert layout.members("Zones/2") == (5,)
+    assert layout.members("Inputs") == layout.members("Rob") == layout.members("") == ()
