@@ -12,7 +12,7 @@ from shmio.connectors.s7 import pdu
 from shmio.errors import ConnectorError
 
 _REFERENCE = struct.Struct(">H")
-_FUTURE, _UNDER_WAY, _ANSWERED = 0, 1, 2
+_UNDER_WAY, _ANSWERED = 1, 2  # of a request; 0 until it is sent
 
 
 class BlockRead:

@@ -31,12 +31,14 @@ MAX_BLOCK_SIZE = 65536  # of a standard data block; also, one byte a read, the n
 WANTED_JOBS = 8
 WANTED_PDU_SIZE = 960
 MIN_PDU_SIZE = 64  # the smallest known controllers grant 240; less than this is not one
-DEFAULT_TPDU_SIZE = 65531  # if the peer names none: RFC 1006, section 5
+DEFAULT_TPDU_SIZE = 65531  # if the peer names none: RFC 1006
 _TPDU_SIZE_CODE = 0x0A  # 2 ** 10
 
 _TPKT = struct.Struct(">BxH")
 _HEADER = struct.Struct(">BxH BBB BB2xHHH")  # up to what all S7 PDUs share
 _ITEM = struct.Struct(">BB BBH")
+_USUAL = struct.Struct(">4x 5s2xH HHH 4sH")  # an answer to a read, cut so that what is always the same is in one piece
+_USUAL_HEAD, _USUAL_ITEM = b"\x02\xf0\x80\x32\x03", b"\x04\x01\xff\x04"
 _HEADER_END = 19
 _ITEM_END = 25
 _COTP_CR, _COTP_CC, _COTP_DR, _COTP_DT = 0xE0, 0xD0, 0x80, 0xF0
@@ -209,6 +211,18 @@ def read_request(db_number: int, start: int, size: int) -> bytes:
 
 def parse_read_answer(frame: memoryview) -> ReadAnswer:
     """Check an answer to a read of one item of bytes; ``data`` is a view of the frame."""
+    if len(frame) >= _ITEM_END:
+        # Nearly all answers look like this; what does not is looked at field by field below, to say why.
+        head, reference, parameter_length, data_length, error, item, bits = _USUAL.unpack_from(frame)
+        if (
+            head == _USUAL_HEAD
+            and item == _USUAL_ITEM
+            and parameter_length == 2
+            and not error
+            and bits == (data_length - 4) * 8
+            and data_length == len(frame) - 21
+        ):
+            return ReadAnswer(reference, ITEM_OK, frame[_ITEM_END:])
     reference, data_length = _check_data_header(frame)
     if len(frame) < _HEADER_END + 3:
         raise ConnectorError(f"answer of {len(frame)} bytes is too short for a read")
