@@ -1,0 +1,111 @@
+"""A whole cell on free ports, as its user has it: started and looked at through the commands alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from shmio.config import Address
+
+BIN = Path(sys.executable).parent
+PATIENCE_S = 30.0
+
+CONFIG = """
+[instance]
+name = "{instance}"
+
+[[source]]
+name = "cell"
+connector = "s7"
+layout = "db201.db"
+period_ms = {period_ms}
+host = "127.0.0.1"
+port = {plc.port}
+timeout = 1000
+
+[[emulator]]
+name = "plc"
+kind = "s7"
+layout = "db201.db"
+program = "a50"
+listen = "{plc}"
+
+[grpc]
+listen = ["{grpc}"]
+"""
+
+
+class Cell:
+    """An instance that was started, as its user has it."""
+
+    def __init__(self, folder: Path, instance: str, grpc: Address) -> None:
+        self.folder = folder
+        self.instance = instance
+        self.grpc = grpc
+
+    def supervisor(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run ``shmio-supervisor`` on this instance."""
+        return self.run("shmio-supervisor", *arguments)
+
+    def run(self, command: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run one of our commands in the cell's folder."""
+        return subprocess.run(
+            [BIN / command, *arguments],
+            cwd=self.folder,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+        )
+
+    def up(self) -> None:
+        """Start it detached; returns when it runs."""
+        done = self.supervisor("up", "--detach")
+        if done.returncode:
+            raise AssertionError(done.stderr)
+
+    def down(self) -> None:
+        """Stop it; returns when it is gone."""
+        done = self.supervisor("down")
+        if done.returncode:
+            raise AssertionError(done.stderr)
+
+    def status(self) -> dict[str, Any]:
+        """``status --json``."""
+        status: dict[str, Any] = json.loads(self.supervisor("status", "--json").stdout)
+        return status
+
+    def processes(self) -> dict[str, dict[str, Any]]:
+        """The processes of ``status``, by name."""
+        return {process["name"]: process for process in self.status()["processes"]}
+
+    def logs(self) -> str:
+        """All log files, for the message of a failing test."""
+        return "\n".join(
+            f"--- {file.name}\n{file.read_text()}" for file in sorted((self.folder / "logs").glob("*.log"))
+        )
+
+
+def until(condition: Callable[[], bool], what: str, patience_s: float = PATIENCE_S) -> None:
+    """Wait for what another process brings about; AssertionError when it does not."""
+    deadline = time.monotonic() + patience_s
+    while not condition():
+        if time.monotonic() > deadline:
+            raise AssertionError(f"not seen in {patience_s} s: {what}")
+        time.sleep(0.01)
+
+
+def kill(pid: int, sign: signal.Signals = signal.SIGKILL) -> None:
+    """Signal a process that is not our child, for certain that one and no other."""
+    handle = os.pidfd_open(pid)
+    try:
+        signal.pidfd_send_signal(handle, sign)
+    finally:
+        os.close(handle)

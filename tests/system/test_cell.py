@@ -1,0 +1,249 @@
+"""The whole cell as a user has it: started, watched from outside, killed part by part, stopped."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import grpc
+import pytest
+
+import shmio
+from shmio.segment import Quality, instances
+from shmio.testing.cell import BIN, PATIENCE_S, Cell, kill, until
+from shmio.wire.simlog_v1_pb2 import TopicDescriptor
+from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
+
+ROOT = Path(__file__).parents[2]
+AXIS = "cell/Robot_800/Axs1_Pos"
+
+
+def five_values(address: str) -> list[float]:
+    with grpc.insecure_channel(address) as channel:
+        stub = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
+        stream = stub.Subscribe(TopicDescriptor(path=AXIS), timeout=PATIENCE_S, wait_for_ready=True)
+        values = [float(next(stream).value) for _ in range(5)]
+        stream.cancel()
+    return values
+
+
+def test_another_process_receives_changing_values(cell: Cell) -> None:
+    values = five_values(str(cell.grpc))
+    assert len(set(values)) > 1
+    until(lambda: cell.status()["state"] == "running", "state running")
+    status = cell.status()
+    assert (status["instance"], status["mode"], status["segment"]) == (cell.instance, "live", f"shmio-{cell.instance}")
+    processes = {p["name"]: p for p in status["processes"]}
+    assert {name: (p["kind"], p["state"], p["restarts"]) for name, p in processes.items()} == {
+        "plc": ("emulator", "running", 0),
+        "cell": ("source", "running", 0),
+        "grpc": ("grpc", "running", 0),
+    }
+    assert processes["cell"]["quality"] == "good"
+    assert {"cycle", "rate_hz", "overruns", "pid", "uptime_s"} <= set(processes["cell"])
+
+
+def test_the_users_tool_reads_the_cell(cell: Cell) -> None:
+    until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")
+    listed = json.loads(cell.run("shmio", "list", "--json").stdout)
+    assert len(listed) == 22
+    got = json.loads(cell.run("shmio", "get", "--json", AXIS, "cell/Inputs/3").stdout)
+    assert set(got) == {AXIS, "cell/Inputs/3"}
+    assert set(got[AXIS]) == {"value", "quality", "reason", "provenance", "source_time", "age_s"}
+    assert (got[AXIS]["quality"], got[AXIS]["provenance"]) == ("good", "live")
+    watched = cell.run("shmio", "watch", "--json", "-n", "3", AXIS)
+    assert [json.loads(line)["path"] for line in watched.stdout.splitlines()] == [AXIS] * 3
+    wrong = cell.run("shmio", "get", "cell/Robot_800/Axs7_Pos")
+    assert (wrong.returncode, wrong.stdout) == (1, "")
+    assert "Axs1_Pos" in wrong.stderr
+    assert wrong.stderr.count("\n") == 1
+
+
+def test_ctrl_c_leaves_nothing(make_cell: Callable[[], Cell]) -> None:
+    cell = make_cell()
+    with subprocess.Popen([BIN / "shmio-supervisor", "up"], cwd=cell.folder, stdout=subprocess.PIPE, text=True) as up:
+        five_values(str(cell.grpc))
+        pids = [process["pid"] for process in cell.status()["processes"]]
+        up.send_signal(signal.SIGINT)
+        up.communicate(timeout=PATIENCE_S)
+    assert up.returncode == 0
+    assert cell.instance not in instances()
+    assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection((cell.grpc.host, cell.grpc.port))
+    after = cell.supervisor("status", "--json")
+    assert (after.returncode, json.loads(after.stdout)["state"]) == (1, "stopped")
+
+
+def test_a_second_up_is_refused_with_the_pid(cell: Cell) -> None:
+    second = cell.supervisor("up")
+    assert second.returncode == 1
+    (line,) = second.stderr.splitlines()
+    (pid,) = [int(word.strip(".,;:()")) for word in line.split() if word.strip(".,;:()").isdigit()]
+    assert b"shmio" in Path(f"/proc/{pid}/cmdline").read_bytes()
+
+
+class Load:
+    """Readers at work: one follows every frame, others hammer the newest, and two subscribe by gRPC."""
+
+    def __init__(self, cell: Cell) -> None:
+        self._stopping = threading.Event()
+        self.cycles: list[tuple[int, int, int]] = []  # number, cycle, incarnation
+        self.missed = 0
+        self._attached = shmio.attach(cell.instance)
+        self._block = self._attached.block("cell")
+        self._threads = [threading.Thread(target=self._stream)] + [
+            threading.Thread(target=self._latest) for _ in range(2)
+        ]
+        self._clients = [
+            subprocess.Popen(
+                [sys.executable, ROOT / "examples/subscribe.py", str(cell.grpc), AXIS], stdout=subprocess.DEVNULL
+            )
+            for _ in range(2)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def _stream(self) -> None:
+        cursor = self._block.cursor()
+        while not self._stopping.is_set():
+            frame = cursor.next(timeout_s=0.1)
+            if frame is not None:
+                self.cycles.append((frame.number, frame.cycle, frame.incarnation))
+        self.missed = cursor.missed
+
+    def _latest(self) -> None:
+        while not self._stopping.wait(0.001):
+            self._block.latest()
+
+    @property
+    def newest(self) -> int:
+        return self.cycles[-1][0] if self.cycles else 0
+
+    def good(self) -> bool:
+        frame = self._block.latest()
+        return frame is not None and frame.assess(self._block.stale_ns)[0] is Quality.GOOD
+
+    def stop(self) -> None:
+        self._stopping.set()
+        for thread in self._threads:
+            thread.join()
+        for client in self._clients:
+            client.terminate()
+            client.wait()
+        del self._block
+        self._attached.close()
+
+
+@pytest.mark.parametrize("victim", ["plc", "cell", "grpc"])
+def test_each_process_comes_back_and_no_other_is_touched(
+    cell: Cell, victim: str, record_property: Callable[[str, object], None]
+) -> None:
+    five_values(str(cell.grpc))
+    until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")
+    load = Load(cell)
+    try:
+        until(lambda: load.newest > 0, "frames")
+        before = cell.processes()
+        killed_s = time.monotonic()
+        kill(before[victim]["pid"])
+        until(
+            lambda: (now := cell.processes()[victim])["state"] == "running" and now["pid"] != before[victim]["pid"],
+            f"{victim} running again",
+        )
+        five_values(str(cell.grpc))
+        until(load.good, "good quality again")
+        record_property("back_s", round(time.monotonic() - killed_s, 2))
+        reached = load.newest
+        until(lambda: load.newest > reached + 10, "more frames")
+    finally:
+        load.stop()
+    after = cell.processes()
+    for name in before:
+        assert after[name]["restarts"] == (1 if name == victim else 0), cell.logs()
+        assert (after[name]["pid"] == before[name]["pid"]) == (name != victim)
+    numbers = [number for number, _, _ in load.cycles]
+    assert numbers == list(range(numbers[0], numbers[-1] + 1))
+    assert load.missed == 0
+    assert {incarnation for _, _, incarnation in load.cycles} == ({1, 2} if victim == "cell" else {1})
+    if victim == "grpc":  # nothing else may lose a cycle
+        cycles = [cycle for _, cycle, _ in load.cycles]
+        overruns = after["cell"]["overruns"] - before["cell"]["overruns"]
+        assert cycles[-1] - cycles[0] + 1 - len(cycles) <= overruns
+
+
+def test_a_frozen_process_is_replaced(cell: Cell) -> None:
+    five_values(str(cell.grpc))
+    before = cell.processes()["grpc"]
+    os.kill(before["pid"], signal.SIGSTOP)
+    until(lambda: cell.processes()["grpc"]["pid"] not in (before["pid"], None), "another process")
+    assert len(five_values(str(cell.grpc))) == 5
+
+
+def test_an_unplugged_plc_is_seen_and_comes_back(cell: Cell) -> None:
+    five_values(str(cell.grpc))
+    with shmio.attach(cell.instance) as attached:
+        plc = cell.processes()["plc"]["pid"]
+        os.kill(plc, signal.SIGSTOP)
+        until(lambda: attached.read(AXIS).quality is Quality.BAD, "bad quality")
+        assert "answer" in attached.read(AXIS).reason
+        assert cell.status()["state"] == "degraded"
+        os.kill(plc, signal.SIGCONT)
+        until(lambda: attached.read(AXIS).quality is Quality.GOOD, "good quality")
+        assert cell.processes()["cell"]["restarts"] == 0
+
+
+def test_a_killed_supervisor_is_followed_by_the_next(cell: Cell) -> None:
+    five_values(str(cell.grpc))
+    pids = [process["pid"] for process in cell.status()["processes"]]
+    with shmio.attach(cell.instance) as attached:
+        supervisor = attached._segment.supervisor[0]
+        kill(supervisor)
+        until(lambda: not attached._segment.supervised, "no supervisor")
+        stream = attached.stream("cell", timeout_s=PATIENCE_S)
+        assert next(stream).frame.number < next(stream).frame.number  # the children live on
+        del stream
+    cell.up()
+    assert len(five_values(str(cell.grpc))) == 5
+    assert not {process["pid"] for process in cell.status()["processes"]} & set(pids)
+    until(lambda: not any(_alive(pid) for pid in pids), "the orphans are gone")
+
+
+def _alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("period_ms", "perid_ms", "source[0].perid_ms"),
+        ("timeout", "timeoutt", "source[0].timeoutt"),
+        ("db201.db", "nowhere.db", "nowhere.db"),
+        ('"s7"\nlayout', '"s8"\nlayout', "s8"),
+        ('program = "a50"', 'program = "a51"', "a51"),
+    ],
+)
+def test_a_mistake_in_the_config_is_one_clear_line(
+    make_cell: Callable[[], Cell], old: str, new: str, message: str
+) -> None:
+    cell = make_cell()
+    file = cell.folder / "supervisor.toml"
+    file.write_text(file.read_text().replace(old, new, 1))
+    for verb in ("check", "up"):
+        done = cell.supervisor(verb)
+        assert done.returncode == 1
+        assert message in done.stderr
+        assert "Traceback" not in done.stderr
+        assert done.stderr.count("\n") == 1
+    assert cell.instance not in instances()

@@ -1,0 +1,66 @@
+"""Another host: a network namespace of its own, joined by a virtual cable."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from shmio.testing.cell import CONFIG, PATIENCE_S, Cell
+
+ROOT = Path(__file__).parents[2]
+
+pytestmark = pytest.mark.skipif(
+    os.geteuid() != 0 or shutil.which("ip") is None, reason="needs root and iproute2 to make a network namespace"
+)
+
+
+def ip(*arguments: str) -> None:
+    subprocess.run(["ip", *arguments], check=True, capture_output=True, text=True)
+
+
+@pytest.fixture
+def other_host() -> Iterator[tuple[str, str]]:
+    """(name of the namespace, our address on the cable to it)."""
+    tag = secrets.token_hex(3)
+    host, ours, theirs = f"shmio-{tag}", f"sh{tag}a", f"sh{tag}b"
+    third = secrets.randbelow(250)
+    ip("netns", "add", host)
+    try:
+        ip("link", "add", ours, "type", "veth", "peer", "name", theirs, "netns", host)
+        ip("addr", "add", f"10.213.{third}.1/30", "dev", ours)
+        ip("link", "set", ours, "up")
+        ip("-n", host, "addr", "add", f"10.213.{third}.2/30", "dev", theirs)
+        ip("-n", host, "link", "set", theirs, "up")
+        yield host, f"10.213.{third}.1"
+    finally:
+        ip("netns", "delete", host)
+
+
+def test_another_host_receives_changing_values(make_cell: Callable[..., Cell], other_host: tuple[str, str]) -> None:
+    host, address = other_host
+    cell = make_cell(config=CONFIG.replace('listen = ["{grpc}"]', f'listen = ["{{grpc}}", "{address}:{{grpc.port}}"]'))
+    refused = cell.supervisor("check")
+    assert refused.returncode == 1
+    assert "insecure = true" in refused.stderr
+    file = cell.folder / "supervisor.toml"
+    file.write_text(file.read_text() + "insecure = true\n")
+    cell.up()
+    client = [sys.executable, str(ROOT / "examples/subscribe.py"), "--count", "5"]
+    done = subprocess.run(
+        ["ip", "netns", "exec", host, *client, f"{address}:{cell.grpc.port}", "cell/Robot_800/Axs1_Pos"],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    values = {line.split()[-1] for line in done.stdout.splitlines()}
+    assert len(values) > 1
+    assert all(float(value) is not None for value in values)
