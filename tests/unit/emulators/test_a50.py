@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import struct
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from shmio.emulators.a50 import A50, ACTUATORS, AXIS_LIMITS, CYCLE_S, STEPS
 from shmio.errors import ConfigError
+from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Layout
 
 PERIOD_S = 0.02  # at which it is watched
@@ -136,6 +138,12 @@ def test_leaves_alone_what_it_does_not_drive(db201: Layout) -> None:
     A50(db201).step(12.0, frame)
     assert frame[20:1000] == b"\xa5" * 980
     assert frame[1013:2100] == b"\xa5" * 1087
+
+
+def test_runs_on_the_printed_source(db201: Layout) -> None:
+    source = Path(__file__).parents[2] / "golden" / "layout" / "db201-as-printed.db"
+    (printed,) = compile_sources([Source(source.name, source.read_bytes())]).layouts
+    assert watch(printed, 40, 41) == watch(db201, 40, 41)
 
 
 def test_goes_by_the_layout_not_by_offsets(db201: Layout) -> None:
