@@ -46,7 +46,7 @@ class Child:
                     stdin=stdin,
                     stdout=log,
                     stderr=log,
-                    env=_environment(),
+                    env=child_environment(),
                     start_new_session=True,
                 )
             finally:
@@ -89,7 +89,7 @@ def describe_end(code: int) -> str:
         return f"killed by signal {-code}"
 
 
-def _environment() -> dict[str, str]:
+def child_environment() -> dict[str, str]:
     """The environment of a child: it must find the shmio that its supervisor is, and no namesakes in this folder.
 
     Hence ``-P``, and the folder of a shmio that is not installed (never site-packages, which would then come before

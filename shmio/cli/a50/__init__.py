@@ -1,0 +1,1 @@
+"""The A50 example that ``shmio-supervisor init`` writes; data only."""

@@ -1,0 +1,1 @@
+"""The verbs of ``shmio-supervisor``: a module each, with ``execute(arguments) -> exit status``."""

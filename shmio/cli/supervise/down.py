@@ -1,0 +1,48 @@
+"""``shmio-supervisor down``: stop an instance and wait until it is gone."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import select
+from contextlib import suppress
+
+from shmio.cli.supervise.target import instance_name
+from shmio.errors import ControlError
+from shmio.segment import Segment, leftover
+from shmio.supervisor import control
+
+STOP_S = 30.0
+EXIT_S = 5.0
+
+
+def execute(arguments: argparse.Namespace) -> int:
+    """Ask the supervisor to stop; clear what is there if it is dead."""
+    name = instance_name(arguments)
+    with Segment.open(name) as segment:
+        supervised, pid, path = segment.supervised, segment.supervisor[0], segment.header.control
+    if not supervised:
+        print(f"{name}: its supervisor is dead; clearing what it left")
+        for line in leftover.clear(name):
+            print(line)
+        return 0
+    print(f"stopping {name}, supervisor pid {pid}", flush=True)
+    pidfd = _pidfd(pid)
+    try:
+        control.request(path, control.Stop(), STOP_S)
+        if pidfd is not None:
+            select.select([pidfd], [], [], EXIT_S)
+    except ControlError as error:
+        raise ControlError(f"{error}; kill -TERM {pid} stops it as well") from None
+    finally:
+        if pidfd is not None:
+            os.close(pidfd)
+    print(f"{name} is stopped")
+    return 0
+
+
+def _pidfd(pid: int) -> int | None:
+    """A handle to wait for the supervisor's end; none when it runs in another process name space."""
+    with suppress(OSError):
+        return os.pidfd_open(pid)
+    return None

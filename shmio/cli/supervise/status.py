@@ -1,0 +1,70 @@
+"""``shmio-supervisor status``: how an instance and its processes are."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+
+import msgspec
+
+from shmio.cli.supervise.target import instance_name
+from shmio.cli.supervise.text import printable
+from shmio.errors import NotRunningError
+from shmio.supervisor.status import InstanceStatus, ProcessStatus, SourceStatus, read_status
+
+_HEADINGS = ("NAME", "KIND", "STATE", "PID", "RESTARTS", "UPTIME", "")
+
+
+def execute(arguments: argparse.Namespace) -> int:
+    """Print the status; 1 when nothing runs."""
+    try:
+        status = read_status(instance_name(arguments))
+    except NotRunningError as error:
+        status = InstanceStatus(None, note=str(error))
+    if arguments.json:
+        print(msgspec.json.format(msgspec.json.encode(status), indent=2).decode())
+    elif status.running:
+        print("\n".join(map(printable, _table(status))))
+    else:
+        print(status.note if status.instance is None else f"{status.instance}: stopped; {status.note}", file=sys.stderr)
+    return 0 if status.running else 1
+
+
+def _table(status: InstanceStatus) -> list[str]:
+    supervisor = status.supervisor
+    by = f"supervisor pid {supervisor.pid}, up {_duration(supervisor.uptime_s)}" if supervisor else status.note
+    lines = [f"{status.instance}: {status.state}, mode {status.mode}, segment {status.segment}, {by}"]
+    rows = [_HEADINGS, *(_row(process) for process in status.processes)]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(_HEADINGS) - 1)]
+    for row in rows:
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=False)]
+        lines.append("  ".join([*cells, row[-1]]).rstrip())
+    return lines
+
+
+def _row(process: ProcessStatus) -> tuple[str, ...]:
+    details = []
+    if isinstance(process, SourceStatus):
+        details.append(f"{process.quality}: {process.reason}" if process.reason else process.quality)
+        if process.cycle is not None:
+            details.append(f"cycle {process.cycle}, {process.rate_hz:.1f} Hz, {process.overruns} overruns")
+    if process.note and process.note not in details[:1] and not _said(process):
+        details.append(process.note)
+    pid = "-" if process.pid is None else str(process.pid)
+    uptime = _duration(process.uptime_s)
+    return process.name, process.kind, process.state, pid, str(process.restarts), uptime, "; ".join(details)
+
+
+def _said(process: ProcessStatus) -> bool:
+    """Whether the note only repeats why the source is bad."""
+    return isinstance(process, SourceStatus) and process.note == process.reason
+
+
+def _duration(seconds: float) -> str:
+    whole = int(seconds)
+    days, hours, minutes = whole // 86400, whole // 3600 % 24, whole // 60 % 60
+    if days:
+        return f"{days} d {hours} h"
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {whole % 60} s" if minutes else f"{whole} s"

@@ -1,0 +1,183 @@
+"""``shmio-supervisor up``: start an instance, in the foreground or detached."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import select
+import subprocess
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import TextIO
+
+from shmio import logs
+from shmio.cli.supervise.prepare import Prepared, prepare
+from shmio.cli.supervise.target import config_file
+from shmio.cli.supervise.text import printable
+from shmio.errors import AlreadyRunningError, ConfigError, ControlError, SegmentError, ShmioError
+from shmio.segment import PREFIX, Segment, State
+from shmio.supervisor.main import Supervisor
+from shmio.supervisor.plan import MODES, Job
+from shmio.supervisor.process import child_environment
+from shmio.supervisor.status import SourceStatus, read_status
+
+DETACH_S = 120.0
+"""The longest time that the start of a detached instance is waited for."""
+
+
+def execute(arguments: argparse.Namespace) -> int:
+    """Start the instance; return when it has stopped, or with ``--detach`` when it runs."""
+    if arguments.mode not in MODES:
+        raise ConfigError(f"--mode {arguments.mode}: this version of shmio has the mode live only")
+    file = config_file(arguments)
+    if arguments.report is not None:
+        return _detached(file, arguments.mode, arguments.report)
+    prepared = prepare(file, arguments.mode)
+    for warning in prepared.warnings:
+        _say(f"warning: {warning}", sys.stderr)
+    return _detach(prepared) if arguments.detach else _foreground(prepared)
+
+
+def _foreground(prepared: Prepared) -> int:
+    _refuse_second(prepared.plan.instance)
+    _announce(prepared)
+    console = logging.StreamHandler(sys.stderr)
+    console.setFormatter(_Console())
+    supervisor = Supervisor(prepared.plan, on_state=_tell_running)
+    logs.setup(prepared.plan.log_dir / "supervisor.log", "supervisor")
+    logging.getLogger("shmio.supervisor").addHandler(console)
+    supervisor.run()
+    return 0
+
+
+def _tell_running(state: State) -> None:
+    hint = {State.RUNNING: "; Ctrl-C stops it", State.DEGRADED: "; shmio-supervisor status tells why"}.get(state, "")
+    _say(f"{state}{hint}")
+
+
+def _refuse_second(instance: str) -> None:
+    """Say so before anything else is said; what decides is the lock that the supervisor takes."""
+    try:
+        segment = Segment.open(instance)
+    except SegmentError:
+        return
+    with segment:
+        if segment.supervised:
+            pid = segment.supervisor[0]
+            raise AlreadyRunningError(f"instance {instance!r} is already running, supervisor pid {pid}")
+
+
+def _announce(prepared: Prepared) -> None:
+    plan = prepared.plan
+    size = f"{plan.segment_bytes / 1e6:.1f} MB"
+    _say(f"{plan.instance}: mode {plan.mode}, segment {PREFIX}{plan.instance} ({size}), logs in {plan.log_dir}")
+    width = max((len(job.name) for job in plan.jobs), default=0)
+    for job in sorted(plan.jobs, key=lambda job: job.rank):
+        _say(f"  {job.name:<{width}}  {job.kind:<8}  {_describe(job, prepared)}")
+
+
+def _describe(job: Job, prepared: Prepared) -> str:
+    config = job.config
+    if job.kind == "source":
+        layout = prepared.layouts[job.name]
+        host, port = config["options"].get("host"), config["options"].get("port")
+        peer = f" {host}:{port}" if host and port else f" {host}" if host else ""
+        return f"{config['connector']}{peer}, {layout.name}: {layout.size} bytes every {config['period_ms']:g} ms"
+    if job.kind == "emulator":
+        return f"{config['kind']} on {config['listen']}, program {config['program']}"
+    return f"on {', '.join(config['listen'])}"
+
+
+def _detached(file: Path, mode: str, report: int) -> int:
+    """The detached supervisor itself: tell the parent how the start went, by a line or by the error."""
+    told = False
+
+    def tell(message: str) -> None:
+        nonlocal told
+        if not told:
+            told = True
+            with suppress(OSError):  # the parent gave up
+                os.write(report, message.encode())
+            os.close(report)
+
+    try:
+        prepared = prepare(file, mode)
+        logs.setup(prepared.plan.log_dir / "supervisor.log", "supervisor")
+        Supervisor(prepared.plan, on_state=lambda state: tell("ok") if state is not State.STOPPING else None).run()
+    except (ShmioError, OSError) as error:
+        tell(str(error))
+        return 1
+    tell("it was told to stop while it started")
+    return 0
+
+
+def _detach(prepared: Prepared) -> int:
+    plan = prepared.plan
+    _refuse_second(plan.instance)
+    log_file = plan.log_dir / "supervisor.log"
+    logs.setup(log_file, "supervisor")
+    command = (sys.executable, "-P", "-m", "shmio.cli.supervisor", "up")
+    reader, writer = os.pipe()
+    with os.fdopen(reader, "rb") as answers, log_file.open("ab") as log:
+        child = subprocess.Popen(
+            [*command, "-c", str(plan.config_file), "--mode", plan.mode, "--report", str(writer)],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            pass_fds=(writer,),
+            env=child_environment(),
+            start_new_session=True,
+        )
+        os.close(writer)
+        try:
+            answer = _await(answers.fileno(), DETACH_S)
+        except BaseException:
+            child.terminate()
+            child.wait()
+            raise
+    if answer != "ok":
+        child.wait()
+        raise ControlError(answer or f"the supervisor died while it started; see {log_file}")
+    child.returncode = 0  # it lives on, which Popen would complain about
+    _announce(prepared)
+    _tell_how(plan.instance)
+    return 0
+
+
+def _await(fd: int, timeout_s: float) -> str:
+    """Read to the end of the pipe: the child's answer, or none if it died."""
+    deadline = time.monotonic() + timeout_s
+    answer = b""
+    while True:
+        ready, _, _ = select.select([fd], [], [], max(0.0, deadline - time.monotonic()))
+        if not ready:
+            raise ControlError(f"the instance is not running after {timeout_s:g} s and is stopped again")
+        data = os.read(fd, 65536)
+        if not data:
+            return answer.decode(errors="replace")
+        answer += data
+
+
+def _tell_how(instance: str) -> None:
+    status = read_status(instance)
+    for process in status.processes:
+        if isinstance(process, SourceStatus) and process.quality == "bad":
+            _say(f"warning: source {process.name} is bad: {process.reason}", sys.stderr)
+    pid = status.supervisor.pid if status.supervisor else None
+    _say(f"{status.state}, supervisor pid {pid}; shmio-supervisor down stops it")
+
+
+class _Console(logging.Formatter):
+    """A record's message alone."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(record.getMessage())
+
+
+def _say(line: str, stream: TextIO | None = None) -> None:
+    """Print; a terminal that has gone away must not stop the instance."""
+    with suppress(OSError):
+        print(printable(line), file=stream or sys.stdout, flush=True)
