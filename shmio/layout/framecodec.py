@@ -19,7 +19,7 @@ the empty text.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -61,21 +61,15 @@ class FrameCodec:
         self.dtype = np.dtype([(register.path, *_field(register)) for register in registers])
         order = ">" if layout.byte_order == "big" else "<"
         plain = [register for register in registers if register.type in _PLAIN]
-        # The frame itself seen as a record, and where its fields go: one assignment converts them all.
-        self._plain = [register.path for register in plain]
-        self._view = np.dtype(
-            {
-                "names": self._plain,
-                "formats": [(order + _PLAIN[register.type], register.shape) for register in plain],
-                "offsets": [register.offset for register in plain],
-                "itemsize": layout.size,
-            }
-        )
+        # The frame seen as a record, and the result seen as one with the same fields: one assignment converts all.
+        runs = _runs(plain, self.dtype)
+        self._plain_in = _record([(order + kind, count, start) for kind, count, start, _ in runs], layout.size)
+        self._plain_out = _record([(kind, count, start) for kind, count, _, start in runs], self.dtype.itemsize)
         bits = [register for register in registers if register.type == "BOOL" and not register.dims]
         self._bits = [register.path for register in bits]
         self._bit_bytes = np.array([register.offset for register in bits], dtype=np.intp)
         self._bit_shifts = np.array([register.bit for register in bits], dtype=np.uint8)
-        done = {*self._plain, *self._bits}
+        done = {register.path for register in (*plain, *bits)}
         self._others = [(r, _decoder(r, order)) for r in registers if r.path not in done]
 
     def decode(self, frames: bytes | bytearray | memoryview | Bytes) -> Array:
@@ -89,9 +83,12 @@ class FrameCodec:
         if raw.ndim != 2 or raw.shape[1] != self.size:
             raise ValueError(f"expected frames of {self.size} bytes, found an array of shape {raw.shape}")
         raw = np.ascontiguousarray(raw)
-        out = np.empty(len(raw), self.dtype)
-        if self._plain:
-            out[self._plain] = raw.view(self._view)[:, 0]
+        if not self.dtype.names:
+            return np.empty(len(raw), self.dtype)
+        record = np.empty(len(raw), self._plain_out)  # numpy is slow to make an array of thousands of fields
+        if self._plain_in.names:
+            record[:] = raw.view(self._plain_in)[:, 0]
+        out: Array = record.view(self.dtype)
         if self._bits:
             bits = raw[:, self._bit_bytes] >> self._bit_shifts & 1
             for column, path in enumerate(self._bits):
@@ -99,6 +96,34 @@ class FrameCodec:
         for register, decode in self._others:
             out[register.path] = decode(raw)
         return out
+
+
+def _runs(plain: list[Register], dtype: np.dtype[Any]) -> list[tuple[str, int, int, int]]:
+    """Return (type, elements, offset in the frame, offset in the result): neighbours of one type are one run."""
+    fields: Mapping[str, Any] = dtype.fields or {}
+    runs: list[tuple[str, int, int, int]] = []
+    ends = kind_before = None
+    for register in plain:
+        kind, start, result = _PLAIN[register.type], register.offset, int(fields[register.path][1])
+        if ends == (start, result) and kind == kind_before:
+            _, count, *starts = runs.pop()
+            runs.append((kind, count + register.count, starts[0], starts[1]))
+        else:
+            runs.append((kind, register.count, start, result))
+        ends, kind_before = (start + register.size, result + register.size), kind
+    return runs
+
+
+def _record(fields: list[tuple[str, int, int]], size: int) -> np.dtype[Any]:
+    """Return a record of (type, elements, offset) fields in so many bytes."""
+    return np.dtype(
+        {
+            "names": [f"f{position}" for position in range(len(fields))],
+            "formats": [(kind, (count,)) for kind, count, _ in fields],
+            "offsets": [start for _, _, start in fields],
+            "itemsize": size,
+        }
+    )
 
 
 def _field(register: Register) -> tuple[str, tuple[int, ...]]:

@@ -144,6 +144,21 @@ def test_frames_need_not_be_contiguous() -> None:
     assert FrameCodec(layout).decode(frames[::-2, :4])["a"].tolist() == [3, 1]
 
 
+def test_a_block_without_registers() -> None:
+    assert FrameCodec(compile_members("")).decode(np.zeros((2, 0), np.uint8)).shape == (2,)
+
+
+def test_neighbours_and_gaps() -> None:
+    layout = compile_members(
+        "a : Byte; b : Byte; c : Int; d : Byte; e : Array[0..2] of Byte; f : Byte; g : USInt; h : Word;"
+    )
+    frame = bytes(range(1, layout.size + 1))
+    row = FrameCodec(layout).decode(frame)[0]
+    assert {r.path: row[r.path].tolist() for r in layout.registers} == {
+        r.path: codec(r).decode(frame) for r in layout.registers
+    }
+
+
 def test_no_frames_and_wrong_sizes() -> None:
     layout = compile_members("a : Int; b : Bool; c : String[3]; d : WString[2]; e : DTL; f : Array[0..1] of Bool;")
     assert FrameCodec(layout).decode(np.zeros((0, layout.size), np.uint8)).shape == (0,)
