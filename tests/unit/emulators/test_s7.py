@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 import threading
 from collections.abc import Iterator
@@ -179,14 +180,13 @@ def test_garbage_ends_only_its_own_connection(server: S7Server, block: bytearray
     with closing(ours(server)) as client, socket.create_connection(tuple_of(server)) as peer:
         client.connect()
         peer.settimeout(10)
-        peer.sendall(noise)
-        peer.shutdown(socket.SHUT_WR)
         received = b""
-        try:
+        with contextlib.suppress(ConnectionError):  # it may close before all is sent, or after
+            peer.sendall(noise)
+            with contextlib.suppress(OSError):  # not connected any more
+                peer.shutdown(socket.SHUT_WR)
             while data := peer.recv(4096):
                 received += data
-        except ConnectionResetError:
-            pass
         assert len(received) < 200
         assert client.read() == block
 
