@@ -22,6 +22,8 @@ from shmio.layout.model import Layout
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent
+DB201 = ROOT / "shmio/cli/a50/db201.db"
+"""The reference load: 2,180 bytes, of which 20 REALs move."""
 
 Samples = Mapping[str, Sequence[float]]
 
@@ -47,9 +49,8 @@ def machine() -> str:
 
 
 def db201() -> Layout:
-    """The reference load: 2,180 bytes, of which 20 REALs move."""
-    file = ROOT / "tests/golden/layout/db201-as-printed.db"
-    return compile_sources([Source(file.name, file.read_bytes())]).layouts[0]
+    """Compile the reference load."""
+    return compile_sources([Source(DB201.name, DB201.read_bytes())]).layouts[0]
 
 
 # -- measuring ---------------------------------------------------------------------------------------------------------
