@@ -75,15 +75,11 @@ def main() -> None:
         cell = Cell(folder, "restart", address)
         cell.up()
         stack.callback(cell.down)
-        clients = [
-            subprocess.Popen(
-                [sys.executable, ROOT / "examples/subscribe.py", str(address), AXIS],
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.DEVNULL,
-            )
-            for _ in range(2)
-        ]
-        stack.callback(lambda: [(client.kill(), client.wait()) for client in clients])
+        for _ in range(2):  # the load; ends with the endpoint's first death
+            client = [sys.executable, ROOT / "examples/subscribe.py", str(address), AXIS]
+            quiet = subprocess.DEVNULL
+            load = stack.enter_context(subprocess.Popen(client, stdout=quiet, stderr=quiet))
+            stack.callback(load.kill)
         segment = stack.enter_context(Segment.open("restart"))
         found: dict[str, list[tuple[float, float]]] = defaultdict(list)
         for _ in range(rounds):
