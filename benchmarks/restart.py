@@ -76,7 +76,7 @@ def main() -> None:
         cell.up()
         stack.callback(cell.down)
         for _ in range(2):  # the load; ends with the endpoint's first death
-            client = [sys.executable, ROOT / "examples/subscribe.py", str(address), AXIS]
+            client = [sys.executable, str(ROOT / "examples/subscribe.py"), str(address), AXIS]
             quiet = subprocess.DEVNULL
             load = stack.enter_context(subprocess.Popen(client, stdout=quiet, stderr=quiet))
             stack.callback(load.kill)

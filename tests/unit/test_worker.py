@@ -1,0 +1,141 @@
+"""What every child process does, as its supervisor sees it: a real process, a real segment."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shmio.segment import Activity, ProcessSpec, Segment
+from shmio.testing.cell import until
+
+WORK = """
+import sys
+from shmio import worker
+from shmio.errors import ConfigError, ConnectorError
+
+def run(w):
+    w.running()
+    what = w.config["do"]
+    if what == "refuse":
+        raise ConfigError("host: this key is needed")
+    if what == "fail":
+        raise ConnectorError("the device is on fire")
+    if what == "crash":
+        raise ZeroDivisionError
+    while not w.stopping.wait(0.01):
+        w.report((1, 2, 3), note="at work")
+
+raise SystemExit(worker.main(run))
+"""
+
+
+@pytest.fixture
+def segment(instance: str) -> Iterator[Segment]:
+    with Segment.create(instance, [], [ProcessSpec("cell", "source")]) as segment:
+        yield segment
+        segment.unlink()
+
+
+class Started:
+    """A worker process; killed at the end of the test, if it still runs."""
+
+    def __init__(self, segment: Segment, folder: Path, do: str, **changes: Any) -> None:
+        self.log = folder / "cell.log"
+        spec = {
+            "instance": segment.instance,
+            "epoch": segment.header.epoch,
+            "name": "cell",
+            "kind": "source",
+            "log_file": str(self.log),
+            "config": {"do": do},
+        } | changes
+        self.start(json.dumps(spec))
+
+    def start(self, standard_input: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", WORK], stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        assert self.process.stdin is not None
+        self.process.stdin.write(standard_input)
+        self.process.stdin.close()
+
+    def __enter__(self) -> Started:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
+        assert self.process.stderr is not None
+        self.process.stderr.close()
+
+    def end(self) -> tuple[int, str]:
+        assert self.process.stderr is not None
+        errors = self.process.stderr.read()
+        return self.process.wait(20), errors
+
+
+def test_it_takes_its_role_reports_beats_and_stops_when_told(segment: Segment, tmp_path: Path) -> None:
+    slot = segment.processes.find("cell")
+    with Started(segment, tmp_path, "work") as worker:
+        until(lambda: slot.report.note == "at work", "a report")
+        report = slot.report
+        assert (report.pid, report.activity, report.counters[:3]) == (worker.process.pid, Activity.RUNNING, (1, 2, 3))
+        assert slot.alive()
+        beat = slot.heartbeat_ns
+        until(lambda: slot.heartbeat_ns > beat, "a beat")
+        worker.process.send_signal(signal.SIGINT)  # Ctrl-C is the supervisor's business
+        beat = slot.heartbeat_ns
+        until(lambda: slot.heartbeat_ns > beat, "a beat after SIGINT")
+        worker.process.terminate()
+        assert worker.end() == (0, "")
+    assert (slot.report.activity, slot.alive()) == (Activity.STOPPING, False)
+    assert "stopped" in worker.log.read_text().splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("do", "status", "note"),
+    [("refuse", 2, "host: this key is needed"), ("fail", 1, "the device is on fire"), ("crash", 1, "")],
+)
+def test_the_exit_status_says_whether_another_start_could_help(
+    segment: Segment, tmp_path: Path, do: str, status: int, note: str
+) -> None:
+    with Started(segment, tmp_path, do) as worker:
+        returned, errors = worker.end()
+        assert returned == status
+        assert ("ZeroDivisionError" in errors) == (do == "crash")
+    assert segment.processes.find("cell").report.note == note
+    assert (note or "ZeroDivisionError") in worker.log.read_text()
+
+
+def test_a_role_is_waited_for_until_its_holder_is_gone(segment: Segment, tmp_path: Path) -> None:
+    slot = segment.processes.find("cell")
+    with Started(segment, tmp_path, "work") as first:
+        until(lambda: slot.report.note == "at work", "the first at work")
+        with Started(segment, tmp_path, "work") as second:
+            os.kill(first.process.pid, signal.SIGKILL)
+            until(lambda: slot.report.pid == second.process.pid, "the second in its role")
+
+
+def test_a_worker_of_another_run_of_the_instance_ends(segment: Segment, tmp_path: Path) -> None:
+    with Started(segment, tmp_path, "work", epoch=1) as worker:
+        returned, errors = worker.end()
+    assert returned == 1
+    assert "another run" in errors
+
+
+def test_without_a_description_it_says_who_starts_it(segment: Segment, tmp_path: Path) -> None:
+    for standard_input in ("", "nonsense", "[]", '{"name": "cell"}'):
+        with Started.__new__(Started) as worker:
+            worker.start(standard_input)
+            returned, errors = worker.end()
+        assert returned == 2
+        assert "description" in errors
+        assert "Traceback" not in errors
