@@ -12,10 +12,12 @@ from pathlib import Path
 import pytest
 
 SHM = Path("/dev/shm")
+PREFIX = f"test-{os.getpid()}-"
 
 
 def segments() -> set[str]:
-    return {entry.name for entry in SHM.iterdir() if entry.name.startswith("shmio-")}
+    """Those of this run: other instances on this host are none of our business."""
+    return {entry.name for entry in SHM.iterdir() if entry.name.startswith(f"shmio-{PREFIX}")}
 
 
 def children() -> set[int]:
@@ -61,6 +63,6 @@ def nothing_left_behind() -> Iterator[None]:
 @pytest.fixture
 def instance() -> Iterator[str]:
     """A name that no other instance has; whatever a failing test leaves of it is cleared."""
-    name = f"test-{os.getpid()}-{secrets.token_hex(4)}"
+    name = PREFIX + secrets.token_hex(4)
     yield name
     (SHM / f"shmio-{name}").unlink(missing_ok=True)
