@@ -5,9 +5,9 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
-from shmio.layout.initial import InitialTexts
+from shmio.layout.initial import DTL_PARTS, InitialTexts
 from shmio.layout.model import Dims, Register
 from shmio.layout.place import Field, Group, Leaf, Repeat
 from shmio.layout.report import Report
@@ -62,34 +62,72 @@ def assign(
         if isinstance(target, str):
             report.add(assignment.position.error(target))
             continue
-        path, element = target
-        index = by_path[path]
-        register = found[index]
-        texts.setdefault(index, InitialTexts(register)).set(element, assignment.value)
+        index = by_path[target.path]
+        text = texts.setdefault(index, InitialTexts(found[index]))
+        if not target.part:
+            text.set(target.index, assignment.value)
+        elif not text.set_part(target.index, target.part, assignment.value):
+            report.add(assignment.position.error(f"expected a whole number for {target.part}"))
     result = list(found)
     for index, text in texts.items():
         result[index] = replace(found[index], initial=str(text))
     return tuple(result)
 
 
-def _target(group: Group, assignment: Assignment) -> tuple[str, tuple[int, ...]] | str:
-    """Return the register's path and the element's index, ``()`` for the whole; or what is wrong."""
+@dataclass(frozen=True, slots=True)
+class _Target:
+    path: str
+    index: tuple[int, ...] = ()  # of an array's element
+    part: str = ""  # of a DTL, which TIA Portal also assigns member by member
+
+
+def _target(group: Group, assignment: Assignment) -> _Target | str:
+    """Return the register that is assigned; or what is wrong."""
     path = ""
+    element: tuple[int, ...] = ()
     place: Leaf | Group | Repeat = group
-    for part in assignment.target:
-        if isinstance(part, str):
-            field = place.fields.get(part.lower()) if isinstance(place, Group) else None
-            if field is None:
-                return f"expected a member of this block, found {part!r}"
-            path, place = (f"{path}/" if path else "") + field.segment, field.type
-            continue
-        dims = () if isinstance(place, Group) else place.dims
-        if len(part) != len(dims) or not all(low <= i <= high for i, (low, high) in zip(part, dims, strict=True)):
-            return f"expected an index within {list(map(list, dims))}, found {list(part)}"
-        if isinstance(place, Leaf):
-            return path, part
+    parts = list(assignment.target)
+    while parts and not isinstance(place, Leaf):
+        part = parts.pop(0)
         if isinstance(place, Repeat):
+            if isinstance(part, str) or not _inside(part, place.dims):
+                return _expected_index(place.dims, part)
             path, place = f"{path}/{'/'.join(map(str, part))}", place.group
-    if isinstance(place, Leaf):
-        return path, ()
-    return "expected the name of a single value, found a structure"
+            continue
+        field = place.fields.get(part.lower()) if isinstance(part, str) else None
+        if field is None:
+            return f"expected a member of this block, found {_written(part)}"
+        path, place = (f"{path}/" if path else "") + field.segment, field.type
+    if not isinstance(place, Leaf):
+        return "expected the name of a single value, found a structure"
+    if parts and not isinstance(index := parts[0], str):
+        if not _inside(index, place.dims):
+            return _expected_index(place.dims, index)
+        element = index
+        del parts[0]
+    if not parts:
+        return _Target(path, element)
+    part, single = parts[0], bool(element) or not place.dims
+    if (
+        single
+        and place.element.base == "DTL"
+        and len(parts) == 1
+        and isinstance(part, str)
+        and part.upper() in DTL_PARTS
+    ):
+        return _Target(path, element, part.upper())
+    return f"expected ':=' and a value, found {_written(part)}"
+
+
+def _inside(index: tuple[int, ...], dims: Dims) -> bool:
+    return len(index) == len(dims) and all(low <= i <= high for i, (low, high) in zip(index, dims, strict=True))
+
+
+def _expected_index(dims: Dims, found: str | tuple[int, ...]) -> str:
+    if not dims:
+        return f"expected no index, found {_written(found)}"
+    return f"expected an index within {list(map(list, dims))}, found {_written(found)}"
+
+
+def _written(part: str | tuple[int, ...]) -> str:
+    return repr(part) if isinstance(part, str) else str(list(part))

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from bisect import bisect_left
 from itertools import groupby
 
+from shmio.layout import calendar
 from shmio.layout.literal import default_text, split_array
 from shmio.layout.model import Register
+
+DTL_PARTS = ("YEAR", "MONTH", "DAY", "WEEKDAY", "HOUR", "MINUTE", "SECOND", "NANOSECOND")
+_DTL = "DTL#{YEAR:04}-{MONTH:02}-{DAY:02}-{HOUR:02}:{MINUTE:02}:{SECOND:02}.{NANOSECOND:09}"
 
 
 class InitialTexts:
@@ -19,17 +24,39 @@ class InitialTexts:
         self._register = register
         self._whole = register.initial
         self._elements: dict[int, str] = {}
+        self._parts: dict[tuple[int, ...], dict[str, int]] = {}  # of the DTLs assigned member by member
 
     def set(self, index: tuple[int, ...], text: str) -> None:
         """Assign one element, or the whole with ``()``."""
+        self._parts.pop(index, None)
         if not index:
             self._whole = text
             self._elements.clear()
+            self._parts.clear()
             return
+        self._elements[self._flat(index)] = text
+
+    def set_part(self, index: tuple[int, ...], part: str, text: str) -> bool:
+        """Assign one member of a DTL; return whether the text is a whole number, as all its members are."""
+        digits = text.replace("_", "")
+        if not digits.isdecimal() or not digits.isascii() or len(digits) > 9:
+            return False
+        parts = self._parts.get(index)
+        if parts is None:
+            current = self._elements.get(self._flat(index)) if index else self._whole
+            ns = calendar.parse_moment((current or "").rpartition("#")[2]) or 0
+            moment = [int(field) for field in re.findall(r"[0-9]+", calendar.format_moment(ns, 9))]
+            parts = dict(zip(DTL_PARTS, [*moment[:3], 0, *moment[3:]], strict=True))
+        parts[part] = int(digits)
+        self.set(index, _DTL.format(**parts))
+        self._parts[index] = parts
+        return True
+
+    def _flat(self, index: tuple[int, ...]) -> int:
         flat = 0
         for i, (low, high) in zip(index, self._register.dims, strict=True):
             flat = flat * (high - low + 1) + i - low
-        self._elements[flat] = text
+        return flat
 
     def __str__(self) -> str:
         if not self._elements:

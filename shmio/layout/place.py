@@ -193,7 +193,10 @@ class Placer:
             )
         if name.name.lower() in self._skipped:
             return f"{name.name!r} is a function block; instance data blocks are not supported"
-        return f"expected a known type, found {name.name!r}; if it is a PLC data type, name its .udt file as well"
+        return (
+            f"expected a known type, found {name.name!r}; if it is a PLC data type, name its .udt file as well "
+            "(instances of function blocks are not supported)"
+        )
 
     def _refuse(self, position: Position, message: str) -> None:
         """Report an error."""

@@ -231,6 +231,22 @@ def test_begin_assigns_initial_values() -> None:
     }
 
 
+def test_begin_assigns_the_members_of_a_dtl() -> None:
+    found = registers(
+        "a, b : DTL; c : DTL := DTL#2024-01-31-12:00:00; d : Array[0..2] of DTL;",
+        """a.YEAR := 2262; a.MONTH := 4; a.DAY := 11; a.WEEKDAY := 6; a.NANOSECOND := 5; a := DTL#2000-01-01-00:00:00;
+        b.Year := 2008; b.second := 59; b.NANOSECOND := 567_000_000; c.MONTH := 2; c.DAY := 29; d[1].HOUR := 3;""",
+    )
+    assert [register.initial for register in found.values()] == [
+        "DTL#2000-01-01-00:00:00",
+        "DTL#2008-01-01-00:00:59.567000000",
+        "DTL#2024-02-29-12:00:00.000000000",
+        "[DTL#1970-01-01-00:00:00, DTL#1970-01-01-03:00:00.000000000, DTL#1970-01-01-00:00:00]",
+    ]
+    assert "expected a whole number for YEAR" in errors(block("a : DTL;", "a.YEAR := x;"))[0]
+    assert "found 'CENTURY'" in errors(block("a : DTL;", "a.CENTURY := 1;"))[0]
+
+
 def test_initial_value_of_a_structure_warns() -> None:
     compiled = compile_text(UDT + block('p : "Point" := (1.0, 2.0);'))
     assert ["not read" in warning.message for warning in compiled.warnings] == [True]
@@ -289,7 +305,10 @@ def test_errors_say_where_and_what(members: str, message: str) -> None:
         ("s := 1;", "found a structure"),
         ("v[2] := 1;", "expected an index within [[0, 1]], found [2]"),
         ("v[0,0] := 1;", "expected an index"),
-        ("u[1].x[0] := 1;", "expected an index"),
+        ("u[1].x[0] := 1;", "expected no index, found [0]"),
+        ("u.x := 1;", "expected an index within [[1, 1]], found 'x'"),
+        ("v[0].x := 1;", "expected ':=' and a value, found 'x'"),
+        ("v.YEAR := 1;", "expected ':=' and a value, found 'YEAR'"),
         ("u[1] := 1;", "found a structure"),
         ("v 1;", "expected ':=' and a value"),
     ],
