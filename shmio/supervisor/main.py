@@ -263,8 +263,15 @@ class Supervisor:
         self._segment.set_state(os.getpid(), state)
         if state is not self._state:
             self._state = state
-            log.info("instance %s", state)
+            reasons = ", ".join(self._weak()) if state is InstanceState.DEGRADED else ""
+            log.info("instance %s%s", state, f": {reasons}" if reasons else "")
             self._on_state(state)
+
+    def _weak(self) -> list[str]:
+        """What makes the instance degraded."""
+        weak = [f"{m.job.name} is not running" for m in self._managed if m.life.state is not State.RUNNING]
+        named = zip(self._segment.blocks, self._qualities, strict=True)
+        return weak + [f"source {name} is bad" for name, quality in named if quality in (None, Quality.BAD)]
 
     def _apply(self, managed: Managed, event: Event, note: str = "") -> None:
         before = managed.life
@@ -280,7 +287,7 @@ class Supervisor:
         elif managed.child is not None and action is Action.KILL:
             managed.child.kill()
         self._publish(managed)
-        _log_step(managed, before, action)
+        _log_step(managed, before, action, self._limits)
         self._answer(managed)
 
     def _spawn(self, managed: Managed) -> None:
@@ -334,7 +341,7 @@ def _wake(_number: int, _frame: FrameType | None) -> None:
     """A handler must exist for the wake-up descriptor to be written."""
 
 
-def _log_step(managed: Managed, before: Life, action: Action | None) -> None:
+def _log_step(managed: Managed, before: Life, action: Action | None, limits: Limits) -> None:
     name, life = managed.job.name, managed.life
     if life.state is State.RUNNING:
         log.info("%s running", name, extra=fields(pid=managed.child.pid) if managed.child else None)
@@ -342,9 +349,9 @@ def _log_step(managed: Managed, before: Life, action: Action | None) -> None:
         log.warning("%s hangs, %s: killed", name, life.note)
     elif life.state is State.FATAL:
         log.error("%s cannot work as configured: %s", name, life.note)
-    elif life.state is State.BACKOFF and life.due_ns is not None:
-        wait_s = (life.due_ns - time.monotonic_ns()) / 1e9
-        when = f"in {wait_s:.1f} s" if wait_s > 0 else "at once"
+    elif life.state is State.BACKOFF:
+        wait_s = policy.backoff_s(life.crashes, limits)
+        when = f"in {wait_s:g} s" if wait_s else "at once"
         log.warning("%s crashed: %s; starting it again %s", name, life.note, when)
     elif life.state is State.STOPPED:
         log.info("%s stopped", name)

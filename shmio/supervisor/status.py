@@ -107,14 +107,15 @@ def _process(segment: Segment, slot: ProcessSlot, supervised: bool, now_ns: int)
     phase = told.phase
     if not supervised:
         phase = Phase.RUNNING if alive else Phase.STOPPED
+    current = alive and report.pid != 0 and report.started_ns >= told.spawned_ns  # not a predecessor's report
     values = ProcessStatus(
         name=slot.name,
         kind=slot.kind,
-        pid=report.pid if alive and report.pid else None,
+        pid=report.pid if current else None,
         state=str(phase),
         restarts=told.restarts,
-        uptime_s=_seconds(now_ns - report.started_ns) if alive else 0.0,
-        note=told.note or (report.note if alive else ""),
+        uptime_s=_seconds(now_ns - report.started_ns) if current else 0.0,
+        note=told.note or (report.note if current else ""),
         counters=slot.counters,
     )
     block = segment.blocks.get(slot.name)
@@ -135,7 +136,7 @@ def _process(segment: Segment, slot: ProcessSlot, supervised: bool, now_ns: int)
         quality=str(quality),
         reason=reason,
         cycle=cycle,
-        rate_hz=counters.get("rate_mhz", 0) / 1000 if alive and quality is not Quality.BAD else 0.0,
+        rate_hz=counters.get("rate_mhz", 0) / 1000 if current and quality is not Quality.BAD else 0.0,
         overruns=counters.get("overruns", 0),
     )
 

@@ -6,6 +6,7 @@ import argparse
 
 from shmio.cli.supervise.prepare import prepare
 from shmio.cli.supervise.target import config_file
+from shmio.cli.supervise.text import printable
 from shmio.segment import PREFIX, BlockSpec
 
 
@@ -19,7 +20,7 @@ def execute(arguments: argparse.Namespace) -> int:
         print(f"  {_describe(block)}")
     print(f"  segment {PREFIX}{plan.instance}: {plan.segment_bytes / 1e6:.2f} MB of shared memory")
     for warning in prepared.warnings:
-        print(f"warning: {warning}")
+        print(printable(warning))
     count = len(prepared.warnings)
     print(f"usable, with {count} warning{'s' * (count != 1)}" if count else "no faults found")
     return 0

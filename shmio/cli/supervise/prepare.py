@@ -22,7 +22,7 @@ EMULATOR_KINDS = ("s7",)
 
 @dataclass(frozen=True)
 class Prepared:
-    """A configuration that can be started, and what is odd about it."""
+    """A configuration that can be started, and what is odd about it, a line each."""
 
     config: Config
     plan: Plan
@@ -45,7 +45,7 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
     except ConfigError as error:
         raise ConfigError(f"{file}: {error}") from None
     plan = make_plan(config, layouts, config_file=file, mode=mode)
-    return Prepared(config, plan, layouts, [*files.warnings, *odd])
+    return Prepared(config, plan, layouts, [*files.warnings, *(f"{file}: warning: {text}" for text in odd)])
 
 
 class _LayoutFiles:

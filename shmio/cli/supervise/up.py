@@ -37,25 +37,20 @@ def execute(arguments: argparse.Namespace) -> int:
         return _detached(file, arguments.mode, arguments.report)
     prepared = prepare(file, arguments.mode)
     for warning in prepared.warnings:
-        _say(f"warning: {warning}", sys.stderr)
+        _say(warning, sys.stderr)
     return _detach(prepared) if arguments.detach else _foreground(prepared)
 
 
 def _foreground(prepared: Prepared) -> int:
     _refuse_second(prepared.plan.instance)
     _announce(prepared)
+    _say("Ctrl-C stops it")
     console = logging.StreamHandler(sys.stderr)
     console.setFormatter(_Console())
-    supervisor = Supervisor(prepared.plan, on_state=_tell_running)
     logs.setup(prepared.plan.log_dir / "supervisor.log", "supervisor")
     logging.getLogger("shmio.supervisor").addHandler(console)
-    supervisor.run()
+    Supervisor(prepared.plan).run()
     return 0
-
-
-def _tell_running(state: State) -> None:
-    hint = {State.RUNNING: "; Ctrl-C stops it", State.DEGRADED: "; shmio-supervisor status tells why"}.get(state, "")
-    _say(f"{state}{hint}")
 
 
 def _refuse_second(instance: str) -> None:

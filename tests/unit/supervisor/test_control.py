@@ -1,0 +1,245 @@
+"""The control socket: who is served, what is refused, and that nobody can hold it up."""
+
+from __future__ import annotations
+
+import json
+import os
+import selectors
+import socket
+import stat
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from shmio.errors import ControlError
+from shmio.supervisor import control
+from shmio.supervisor.control import Answer, ControlServer, Request, Restart, Stop, Where
+
+
+class Served:
+    """A server, driven step by step from the test's own thread."""
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self.selector = selectors.DefaultSelector()
+        self.requests: list[tuple[Request, Answer]] = []
+        self.server = ControlServer(
+            path, self.selector, lambda request, answer: self.requests.append((request, answer))
+        )
+
+    def turn(self) -> None:
+        """Handle what there is, and wait for nothing."""
+        while events := self.selector.select(0):
+            for key, _ in events:
+                key.data()
+
+    def client(self, data: bytes = b"") -> socket.socket:
+        client = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        client.settimeout(10)
+        client.connect(self.path)
+        client.sendall(data)
+        self.turn()
+        return client
+
+    def close(self) -> None:
+        self.server.close()
+        self.selector.close()
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Served]:
+    served = Served(str(tmp_path / "a.sock"))
+    yield served
+    served.close()
+
+
+def answer_to(client: socket.socket) -> dict[str, object]:
+    received = b""
+    with client:
+        while data := client.recv(4096):
+            received += data
+    found = json.loads(received)
+    assert isinstance(found, dict)
+    return found
+
+
+@pytest.mark.parametrize("request_", [Stop(), Restart("cell"), Where()])
+def test_a_request_arrives_as_it_was_sent(served: Served, request_: Request) -> None:
+    client = served.client(msgspec.json.encode(request_) + b"\n")
+    [(request, answer)] = served.requests
+    assert request == request_
+    answer.ok(more=1)
+    assert answer_to(client) == {"ok": True, "more": 1}
+
+
+def test_a_request_may_come_in_pieces(served: Served) -> None:
+    client = served.client(b'{"do": ')
+    assert served.requests == []
+    client.sendall(b'"stop"}\n')
+    served.turn()
+    assert served.requests[0][0] == Stop()
+    served.requests[0][1].error("no")
+    assert answer_to(client) == {"error": "no"}
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"\n",
+        b"garbage\n",
+        b"\xff\xfe\n",
+        b"[" * 4000 + b"\n",
+        b'{"do": "format the disk"}\n',
+        b'{"do": "stop", "more": 1}\n',
+        b'{"do": "restart"}\n',
+        b'{"do": "restart", "name": 5}\n',
+        b'{"do": "stop"}\n{"do": "stop"}\n',
+        b"x" * (control.MAX_REQUEST_BYTES + 1),
+        b'{"do": "stop"}' + b" " * control.MAX_REQUEST_BYTES + b"\n",
+    ],
+)
+def test_what_is_no_request_is_refused(served: Served, data: bytes) -> None:
+    client = served.client(data)
+    assert served.requests == []
+    assert list(answer_to(client)) == ["error"]
+
+
+def test_a_silent_client_is_dropped_when_its_time_is_over(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    client = served.client(b'{"do"')
+    served.server.expire()
+    other = served.client(b'{"do": "stop"}\n')
+    assert served.requests, "it keeps nobody waiting"
+    moved = time.monotonic() + control.REQUEST_S + 1
+    monkeypatch.setattr(time, "monotonic", lambda: moved)
+    served.server.expire()
+    assert "no request within" in str(answer_to(client)["error"])
+    served.requests[0][1].ok()
+    assert answer_to(other) == {"ok": True}, "one whose request is being done is not dropped"
+
+
+def test_too_many_clients_are_turned_away(served: Served) -> None:
+    clients = [served.client() for _ in range(control.MAX_CLIENTS)]
+    assert answer_to(served.client()) == {"error": "too many control connections at once"}
+    clients.pop().close()
+    served.turn()
+    clients.append(served.client(b'{"do": "where"}\n'))
+    assert served.requests[0][0] == Where()
+    for client in clients:
+        client.close()
+
+
+def test_a_client_that_goes_away_before_its_answer_does_no_harm(served: Served) -> None:
+    served.client(b'{"do": "stop"}\n').close()
+    served.turn()
+    served.requests[0][1].ok()
+    client = served.client(b'{"do": "stop"}\n')
+    client.close()
+    served.requests[1][1].ok()
+
+
+def test_other_users_are_refused(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    own = os.getuid()
+    monkeypatch.setattr(os, "getuid", lambda: own + 1)
+    client = served.client(b'{"do": "stop"}\n')
+    trusted = own == 0  # root may
+    assert bool(served.requests) is trusted
+    if not trusted:
+        assert answer_to(client) == {"error": "only the supervisor's own user and root may control it"}
+    client.close()
+
+
+def test_the_socket_is_its_users_alone_and_removed(tmp_path: Path) -> None:
+    path = tmp_path / "a.sock"
+    served = Served(str(path))
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    served.close()
+    assert not path.exists()
+
+
+def test_a_dead_supervisors_socket_is_replaced_but_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "a.sock"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as dead:
+        dead.bind(str(path))
+    Served(str(path)).close()
+    path.write_text("precious")
+    with pytest.raises(ControlError, match=str(path)):
+        Served(str(path))
+    assert path.read_text() == "precious"
+
+
+def test_a_retired_server_still_answers(served: Served) -> None:
+    client = served.client(b'{"do": "stop"}\n')
+    served.server.retire()
+    assert not Path(served.path).exists()
+    served.requests[0][1].ok()
+    assert answer_to(client) == {"ok": True}
+
+
+def test_asking_and_being_refused(served: Served) -> None:
+    got: list[object] = []
+
+    def ask() -> None:
+        try:
+            got.append(control.request(served.path, Restart("x"), 10))
+        except ControlError as error:
+            got.append(str(error))
+
+    for outcome in ({"ok": True}, "no process x"):
+        asking = threading.Thread(target=ask)
+        asking.start()
+        while not served.requests:
+            for key, _ in served.selector.select(10):
+                key.data()
+        _, answer = served.requests.pop()
+        answer.error(outcome) if isinstance(outcome, str) else answer.ok()
+        asking.join()
+        assert got.pop() == outcome
+
+
+def test_asking_in_vain(tmp_path: Path) -> None:
+    with pytest.raises(ControlError, match="cannot be reached"):
+        control.request(str(tmp_path / "none.sock"), Stop(), 1)
+    with pytest.raises(ControlError, match="cannot be reached"):
+        control.request("", Stop(), 1)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as deaf:
+        deaf.bind(str(tmp_path / "deaf.sock"))
+        deaf.listen(1)
+        with pytest.raises(ControlError, match=r"not answered within 0\.01 s"):
+            control.request(str(tmp_path / "deaf.sock"), Stop(), 0.01)
+
+
+class TestPath:
+    @pytest.fixture(autouse=True)
+    def no_other_folder(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+    def test_it_lies_in_the_users_runtime_folder(self, tmp_path: Path) -> None:
+        assert control.socket_path("a50") == str(tmp_path / "shmio" / "a50.sock")
+        assert stat.S_IMODE((tmp_path / "shmio").stat().st_mode) == 0o700
+
+    def test_a_folder_that_others_may_enter_is_closed(self, tmp_path: Path) -> None:
+        (tmp_path / "shmio").mkdir(mode=0o777)
+        control.socket_path("a50")
+        assert stat.S_IMODE((tmp_path / "shmio").stat().st_mode) == 0o700
+
+    def test_a_symbolic_link_is_not_followed(self, tmp_path: Path) -> None:
+        (tmp_path / "elsewhere").mkdir()
+        (tmp_path / "shmio").symlink_to(tmp_path / "elsewhere")
+        assert not control.socket_path("a50").startswith(str(tmp_path))
+        assert not list((tmp_path / "elsewhere").iterdir())
+
+    def test_a_path_that_is_too_long_is_passed_over(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        deep = tmp_path / ("d" * 100)
+        deep.mkdir()
+        monkeypatch.setenv("XDG_RUNTIME_DIR", str(deep))
+        path = control.socket_path("a50")
+        assert not path.startswith(str(deep))
+        assert len(path.encode()) <= control.MAX_PATH_BYTES
+
+    def test_no_folder_at_all_is_an_error_that_says_why(self) -> None:
+        with pytest.raises(ControlError, match="longer than 107 bytes"):
+            control.socket_path("a" * 120)

@@ -1,0 +1,207 @@
+"""The supervisor with real processes that crash, hang, refuse and linger."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+from pathlib import Path
+
+import pytest
+
+from shmio.errors import ControlError
+from shmio.segment import Segment, instances
+from shmio.supervisor.control import Restart, Stop, Where
+from tests.unit.supervisor.harness import Launch, until
+
+
+def test_processes_start_in_order_and_stop_in_reverse(launch: Launch, tmp_path: Path) -> None:
+    cell = launch([("grpc", "grpc", ["good"]), ("cell", "source", ["good"]), ("plc", "emulator", ["good"])])
+    cell.wait_state("running")
+    assert re.findall(r"(\w+) running pid=", cell.log()) == ["plc", "cell", "grpc"]
+    assert list(cell.pids()) == ["grpc", "cell", "plc"]
+    assert cell.stop() == 0
+    assert (tmp_path / "ends").read_text().split() == ["grpc", "cell", "plc"]
+    assert cell.instance not in instances()
+    assert not list((tmp_path / "run" / "shmio").iterdir())
+    assert cell.errors() == ""
+
+
+@pytest.mark.parametrize("name", ["plc", "cell", "grpc"])
+def test_a_killed_process_comes_back_and_no_other_is_touched(launch: Launch, name: str) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    before = cell.pids()
+    os.kill(cell.pid(name), signal.SIGKILL)
+    cell.wait_state("degraded")
+    cell.wait_state("running")
+    after = cell.pids()
+    assert after.pop(name) != before.pop(name)
+    assert after == before
+    assert [process.restarts for process in cell.status().processes] == [
+        int(n == name) for n in ("plc", "cell", "grpc")
+    ]
+    assert f"{name} crashed: killed by SIGKILL; starting it again at once" in cell.log()
+
+
+def test_a_process_that_crashes_when_started_is_tried_again(launch: Launch) -> None:
+    cell = launch([("plc", "emulator", ["crash", "crash", "good"])], backoff_first_s=0.05)
+    cell.wait_state("running")
+    assert cell.of("plc").restarts == 2
+    assert "plc crashed: exit status 3; starting it again in 0.05 s" in cell.log()
+
+
+@pytest.mark.parametrize("behaviour", ["silent", "stopped"])
+def test_a_process_that_hangs_is_replaced(launch: Launch, behaviour: str) -> None:
+    cell = launch([("cell", "source", ["good" if behaviour == "stopped" else behaviour, "good"])], hang_s=0.5)
+    cell.wait_state("running")
+    if behaviour == "stopped":
+        os.kill(cell.pid("cell"), signal.SIGSTOP)
+    until(lambda: cell.of("cell").restarts == 1 and cell.of("cell").state == "running")
+    assert "cell hangs, no heartbeat for 0.5 s: killed" in cell.log()
+    assert "cell crashed: no heartbeat for 0.5 s, killed by SIGKILL" in cell.log()
+
+
+def test_a_process_that_never_gets_ready_is_replaced(launch: Launch) -> None:
+    cell = launch([("cell", "source", ["never", "good"])], start_s=0.5)
+    cell.wait_state("running")
+    assert "cell hangs, not running 0.5 s after its start: killed" in cell.log()
+    assert cell.of("cell").restarts == 1
+
+
+def test_a_process_that_ignores_sigterm_is_killed(launch: Launch) -> None:
+    cell = launch([("plc", "emulator", ["stubborn"])], grace_s=0.2)
+    cell.wait_state("running")
+    assert cell.stop() == 0
+    assert "plc does not stop: killed" in cell.log()
+
+
+def test_asking_twice_to_stop_hastens(launch: Launch) -> None:
+    cell = launch([("plc", "emulator", ["stubborn"]), ("grpc", "grpc", ["stubborn"])], grace_s=3600)
+    cell.wait_state("running")
+    cell.process.send_signal(signal.SIGINT)
+    cell.wait_state("stopping")
+    assert cell.of("grpc").note == "stopping"
+    assert cell.of("plc").state == "running", "its turn has not come"
+    cell.process.send_signal(signal.SIGINT)
+    assert cell.wait_end() == 0
+
+
+def test_a_refused_configuration_fails_the_start(launch: Launch, tmp_path: Path) -> None:
+    cell = launch([("plc", "emulator", ["good"]), ("cell", "source", ["unfit"])])
+    assert cell.wait_end() == 1
+    assert cell.errors() == "cell: no such thing here (exit status 2)\n"
+    assert (tmp_path / "ends").read_text() == "plc\n", "the other one was stopped in good order"
+    assert cell.instance not in instances()
+
+
+def test_a_process_that_never_runs_fails_the_start_and_its_traceback_is_kept(launch: Launch) -> None:
+    cell = launch([("cell", "source", ["traceback"])], backoff_first_s=0.01)
+    assert cell.wait_end() == 1
+    assert cell.errors() == "cell: failed to start 3 times; RuntimeError: as told (exit status 1)\n"
+    assert cell.log("cell").count("Traceback (most recent call last)") == 3
+
+
+def test_a_refusal_later_on_is_fatal_for_that_process_alone(launch: Launch) -> None:
+    cell = launch([("plc", "emulator", ["good"]), ("cell", "source", ["good", "unfit", "good"])])
+    cell.wait_state("running")
+    plc = cell.pid("plc")
+    os.kill(cell.pid("cell"), signal.SIGKILL)
+    until(lambda: cell.of("cell").state == "fatal")
+    assert cell.status().state == "degraded"
+    assert cell.of("cell").note == "no such thing here (exit status 2)"
+    assert cell.pid("plc") == plc
+    assert cell.request(Restart("cell")) == {"ok": True}
+    assert cell.of("cell").state == "running"
+
+
+def test_restart_replaces_one_process_and_answers_when_it_runs(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    before = cell.pids()
+    assert cell.request(Restart("cell")) == {"ok": True}
+    after = cell.pids()
+    assert cell.of("cell").state == "running"
+    assert after.pop("cell") != before.pop("cell")
+    assert after == before
+
+
+def test_restart_tells_what_went_wrong(launch: Launch) -> None:
+    cell = launch([("cell", "source", ["good", "crash", "good"])])
+    cell.wait_state("running")
+    with pytest.raises(ControlError, match="cell did not come back: exit status 3"):
+        cell.request(Restart("cell"))
+    with pytest.raises(ControlError, match="no process 'cel'; there are: cell"):
+        cell.request(Restart("cel"))
+
+
+def test_stop_by_request_answers_when_the_instance_is_gone(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    assert cell.request(Where()) == {
+        "ok": True,
+        "config": str(cell.folder / "supervisor.toml"),
+        "log_dir": str(cell.folder),
+    }
+    assert cell.request(Stop()) == {"ok": True}
+    assert cell.instance not in instances()
+    assert cell.wait_end() == 0
+
+
+def test_a_second_supervisor_is_refused(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    pids = cell.pids()
+    second = launch()
+    assert second.wait_end() == 1
+    assert second.errors() == f"instance {cell.instance!r} is already running, supervisor pid {cell.process.pid}\n"
+    assert cell.pids() == pids
+    assert cell.request(Restart("plc")) == {"ok": True}, "its control socket is still its own"
+
+
+def test_a_killed_supervisor_leaves_the_processes_and_the_next_one_takes_over(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    pids = cell.pids()
+    cell.process.kill()
+    cell.wait_end()
+    status = cell.status()
+    assert (status.state, status.supervisor) == ("degraded", None)
+    assert cell.pids() == pids, "they live on"
+    successor = launch()
+    successor.wait_state("running")
+    assert set(pids.values()).isdisjoint(successor.pids().values())
+    assert f"stopped cell, pid {pids['cell']}, which had lost its supervisor" in successor.log()
+    assert successor.stop() == 0
+
+
+def test_sighup_is_ignored(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    cell.process.send_signal(signal.SIGHUP)
+    assert cell.request(Restart("plc")) == {"ok": True}
+
+
+def test_processes_are_out_of_reach_of_ctrl_c(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    sessions = {os.getsid(pid) for pid in cell.pids().values() if pid is not None}
+    assert len(sessions) == 3
+    assert os.getsid(cell.process.pid) not in sessions
+
+
+def test_a_stop_during_the_start_stops_what_has_started(launch: Launch) -> None:
+    cell = launch([("plc", "emulator", ["good"]), ("cell", "source", ["never"])])
+    until(lambda: cell.instance in instances() and bool(cell.status().processes))
+    until(lambda: cell.of("cell").pid is not None)
+    assert cell.stop() == 0
+    assert cell.instance not in instances()
+
+
+def test_the_segment_tells_who_supervises(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    with Segment.open(cell.instance) as segment:
+        assert segment.supervised
+        assert segment.supervisor[0] == cell.process.pid
+        assert segment.header.control == str(cell.folder / "run" / "shmio" / f"{cell.instance}.sock")

@@ -1,0 +1,61 @@
+"""What is started for a configuration."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from shmio.config import Config, Emulator, Grpc, Instance, Source
+from shmio.errors import ConfigError
+from shmio.layout.model import Layout, Register
+from shmio.supervisor.plan import MAX_PROCESSES, MODULES, RANKS, make_plan
+
+LAYOUT = Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
+
+
+def config(folder: Path, sources: int = 1) -> Config:
+    return Config(
+        instance=Instance(name="a50", ring_mb=0.001),
+        source=[Source(name=f"cell{i}", connector="s7", period_ms=10) for i in range(sources)],
+        emulator=[Emulator(name="plc", kind="s7", layout="x.db", program="a50", listen="127.0.0.1:0")],
+        grpc=Grpc(listen=["127.0.0.1:0"]),
+        folder=str(folder),
+    )
+
+
+def test_blocks_and_processes_follow_the_configuration(tmp_path: Path) -> None:
+    plan = make_plan(config(tmp_path), {"cell0": LAYOUT, "plc": LAYOUT}, config_file=tmp_path / "s.toml")
+    [block] = plan.blocks
+    assert (block.source, block.layout, block.period_ns) == ("cell0", LAYOUT, 10_000_000)
+    assert block.size <= 1000 + 8 * block.slot_bytes, "ring_mb bounds it"
+    assert [(p.name, p.kind) for p in plan.processes] == [("plc", "emulator"), ("cell0", "source"), ("grpc", "grpc")]
+    assert [job.rank for job in plan.jobs] == [0, 1, 2]
+    assert plan.segment_bytes > block.size
+
+
+def test_a_process_is_told_what_it_needs(tmp_path: Path) -> None:
+    plan = make_plan(config(tmp_path), {"cell0": LAYOUT, "plc": LAYOUT}, config_file=tmp_path / "s.toml")
+    emulator, source, grpc = (json.loads(job.describe(plan.instance, 77)) for job in plan.jobs)
+    assert {key: source[key] for key in ("instance", "epoch", "name", "kind")} == {
+        "instance": "a50",
+        "epoch": 77,
+        "name": "cell0",
+        "kind": "source",
+    }
+    assert source["log_file"] == str(tmp_path / "logs" / "cell0.log")
+    assert source["config"]["connector"] == "s7"
+    assert Layout.from_json(emulator["config"]["layout"].encode()) == LAYOUT
+    assert grpc["config"]["listen"] == ["127.0.0.1:0"]
+
+
+def test_too_many_processes_are_refused(tmp_path: Path) -> None:
+    count = MAX_PROCESSES - 1
+    layouts = {f"cell{i}": LAYOUT for i in range(count)} | {"plc": LAYOUT}
+    with pytest.raises(ConfigError, match=f"{count + 2} processes"):
+        make_plan(config(tmp_path, count), layouts, config_file=tmp_path / "s.toml")
+
+
+def test_every_kind_has_its_module_and_its_place() -> None:
+    assert set(MODULES) == set(RANKS)

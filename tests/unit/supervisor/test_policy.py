@@ -1,0 +1,253 @@
+"""Decisions under a virtual clock."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import pytest
+
+from shmio.segment import Quality
+from shmio.segment import State as InstanceState
+from shmio.supervisor import policy
+from shmio.supervisor.policy import Life, Limits
+from shmio.supervisor.states import GRAPH, Action, Event, State
+
+LIMITS = Limits()
+S = 1_000_000_000
+
+
+@dataclass
+class World:
+    """One process and the time, driven as the supervisor drives them."""
+
+    now_ns: int = 1000 * S
+    life: Life = field(default_factory=Life)
+    actions: list[Action] = field(default_factory=list)
+
+    def happens(self, event: Event, note: str = "") -> None:
+        self.life, action = policy.step(self.life, event, self.now_ns, LIMITS, note)
+        if action is not None:
+            self.actions.append(action)
+
+    def state(self) -> State:
+        return self.life.state
+
+    def last_action(self) -> Action:
+        return self.actions[-1]
+
+    def passes(self, seconds: float, *, ready: bool = False, quiet_s: float = 0.0) -> Event | None:
+        self.now_ns += round(seconds * S)
+        event = policy.due(self.life, self.now_ns, ready=ready, quiet_ns=round(quiet_s * S), limits=LIMITS)
+        if event is not None:
+            self.happens(event)
+        return event
+
+    def starts_again_after(self) -> float:
+        """Wait out the back-off; how long it was."""
+        assert self.state() is State.BACKOFF
+        assert self.life.due_ns is not None
+        wait_s = (self.life.due_ns - self.now_ns) / S
+        if wait_s:
+            assert self.passes(wait_s - 0.001) is None
+            self.now_ns += S // 1000
+        assert self.passes(0) is Event.ELAPSED
+        assert self.state() is State.STARTING
+        assert self.last_action() is Action.SPAWN
+        return wait_s
+
+
+@pytest.fixture
+def world() -> World:
+    return World()
+
+
+def started(world: World) -> World:
+    world.happens(Event.START)
+    assert world.passes(0.1, ready=True) is Event.READY
+    assert world.state() is State.RUNNING
+    return world
+
+
+@pytest.mark.parametrize("state", State)
+@pytest.mark.parametrize("event", Event)
+def test_every_pair_follows_the_graph(state: State, event: Event) -> None:
+    life = Life(state, starts=1)
+    after, action = policy.step(life, event, 5 * S, LIMITS, "why")
+    if event in GRAPH[state]:
+        assert (after.state, action) == GRAPH[state][event]
+        assert after.starts == life.starts + (action is Action.SPAWN)
+    else:
+        assert (after, action) == (life, None)
+
+
+def test_the_first_crash_restarts_at_once_and_the_next_ones_back_off_to_a_limit(world: World) -> None:
+    started(world)
+    waits = []
+    for _ in range(9):
+        world.happens(Event.EXIT, "killed by SIGKILL")
+        assert world.life.note == "killed by SIGKILL"
+        waits.append(world.starts_again_after())
+        assert world.life.note == ""
+    assert waits == [0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 10.0, 10.0, 10.0]
+    assert world.life.restarts == 9
+
+
+def test_backoff_never_gives_up_or_overflows() -> None:
+    assert policy.backoff_s(10**9, LIMITS) == LIMITS.backoff_most_s
+
+
+def test_running_stably_resets_the_backoff(world: World) -> None:
+    started(world)
+    for _ in range(3):
+        world.happens(Event.EXIT)
+        world.starts_again_after()
+        world.passes(0.1, ready=True)
+    assert world.life.crashes == 3
+    world.passes(LIMITS.stable_s - 0.1)
+    world.happens(Event.EXIT)
+    assert world.life.crashes == 4, "not yet stable"
+    world.starts_again_after()
+    world.passes(0.1, ready=True)
+    world.passes(LIMITS.stable_s)
+    world.happens(Event.EXIT)
+    assert world.starts_again_after() == 0.0
+
+
+def test_a_long_start_is_not_stable_running(world: World) -> None:
+    world.happens(Event.START)
+    for crashes in (1, 2):
+        world.passes(LIMITS.stable_s + 1)
+        world.happens(Event.EXIT)
+        assert world.life.crashes == crashes
+        world.starts_again_after()
+
+
+def test_no_report_in_time_is_a_crash(world: World) -> None:
+    world.happens(Event.START)
+    assert world.passes(LIMITS.start_s - 0.001) is None
+    assert world.passes(0.001) is Event.ELAPSED
+    assert (world.state(), world.last_action()) == (State.HUNG, Action.KILL)
+    world.happens(Event.EXIT, "killed by SIGKILL")
+    assert world.life.note == "not running 20 s after its start, killed by SIGKILL"
+    assert world.life.crashes == 1
+
+
+def test_silence_while_running_is_a_crash(world: World) -> None:
+    started(world)
+    assert world.passes(100, quiet_s=LIMITS.hang_s - 0.001) is None, "only silence counts, not time"
+    assert world.passes(0, quiet_s=LIMITS.hang_s) is Event.HANG
+    assert (world.state(), world.last_action()) == (State.HUNG, Action.KILL)
+    assert world.passes(100, quiet_s=200) is None, "killed once"
+    world.happens(Event.EXIT, "killed by SIGKILL")
+    assert world.life.note == "no heartbeat for 5 s, killed by SIGKILL"
+
+
+def test_silence_while_starting_is_none(world: World) -> None:
+    world.happens(Event.START)
+    assert world.passes(LIMITS.start_s - 1, quiet_s=LIMITS.start_s) is None
+
+
+def test_a_refusal_is_fatal_until_asked(world: World) -> None:
+    started(world)
+    world.happens(Event.REFUSAL, "no such program")
+    assert (world.state(), world.life.note) == (State.FATAL, "no such program")
+    assert world.passes(10_000) is None
+    world.happens(Event.RESTART)
+    assert (world.state(), world.last_action(), world.life.crashes) == (State.STARTING, Action.SPAWN, 0)
+
+
+@pytest.mark.parametrize(("code", "event"), [(0, Event.EXIT), (1, Event.EXIT), (2, Event.REFUSAL), (-2, Event.EXIT)])
+def test_what_an_exit_status_means(code: int, event: Event) -> None:
+    assert policy.ended(code) is event
+
+
+def test_a_process_that_does_not_stop_is_killed_after_its_grace(world: World) -> None:
+    started(world)
+    world.happens(Event.STOP)
+    assert world.last_action() is Action.TERMINATE
+    assert world.passes(LIMITS.grace_s - 0.001, quiet_s=60) is None
+    assert world.passes(0.001) is Event.ELAPSED
+    assert world.last_action() is Action.KILL
+    assert world.passes(100) is None, "killed once"
+    world.happens(Event.EXIT)
+    assert (world.state(), world.life.due_ns) == (State.STOPPED, None)
+
+
+def test_a_restart_asked_for_is_not_held_against_the_process(world: World) -> None:
+    started(world)
+    for _ in range(3):
+        world.happens(Event.EXIT)
+        world.starts_again_after()
+    world.passes(0.1, ready=True)
+    world.happens(Event.RESTART)
+    assert world.life.note == "restarting"
+    world.happens(Event.EXIT)
+    assert (world.state(), world.life.crashes, world.life.note) == (State.STARTING, 0, "")
+
+
+def lives(*states: tuple[int, State, int]) -> list[tuple[int, Life]]:
+    return [(rank, Life(state, starts=starts)) for rank, state, starts in states]
+
+
+@pytest.mark.parametrize(
+    ("processes", "turn"),
+    [
+        pytest.param(lives((2, State.STOPPED, 0), (0, State.STOPPED, 0), (0, State.STOPPED, 0)), [1, 2], id="lowest"),
+        pytest.param(lives((0, State.STARTING, 1), (1, State.STOPPED, 0)), [], id="wait for the one before"),
+        pytest.param(lives((0, State.RUNNING, 1), (1, State.STOPPED, 0)), [1], id="it runs"),
+        pytest.param(lives((0, State.BACKOFF, 1), (1, State.STOPPED, 0)), [1], id="it failed"),
+        pytest.param(lives((0, State.STARTING, 2), (1, State.STOPPED, 0)), [1], id="it tries again"),
+        pytest.param(lives((0, State.STOPPED, 1), (1, State.RUNNING, 1)), [], id="all had their turn"),
+        pytest.param([], [], id="none"),
+    ],
+)
+def test_whose_turn_it_is_to_start(processes: list[tuple[int, Life]], turn: list[int]) -> None:
+    assert policy.to_start(processes) == turn
+
+
+@pytest.mark.parametrize(
+    ("processes", "turn", "gone"),
+    [
+        pytest.param(
+            lives((0, State.RUNNING, 1), (2, State.RUNNING, 1), (2, State.FATAL, 1)), [1, 2], False, id="last"
+        ),
+        pytest.param(lives((0, State.RUNNING, 1), (2, State.STOPPING, 1)), [], False, id="wait for the one before"),
+        pytest.param(lives((0, State.HUNG, 1), (2, State.STOPPED, 1)), [0], False, id="it is gone"),
+        pytest.param(lives((0, State.STOPPED, 1), (2, State.STOPPED, 0)), [], True, id="all are gone"),
+        pytest.param([], [], True, id="none"),
+    ],
+)
+def test_whose_turn_it_is_to_stop(processes: list[tuple[int, Life]], turn: list[int], gone: bool) -> None:
+    assert policy.to_stop(processes) == turn
+    assert policy.all_gone(processes) is gone
+
+
+def test_a_start_fails_by_refusal_or_by_crashing_over_and_over() -> None:
+    assert policy.start_failure(Life(State.FATAL, note="bad key"), LIMITS) == "bad key"
+    crashed = Life(State.BACKOFF, crashes=3, note="exit status 1")
+    assert policy.start_failure(crashed, LIMITS) == "failed to start 3 times; exit status 1"
+    assert policy.start_failure(replace(crashed, crashes=2), LIMITS) is None
+    assert policy.start_failure(replace(crashed, ran=True), LIMITS) is None, "it has been running"
+
+
+def test_a_start_is_over_when_all_ran_and_the_sources_have_told() -> None:
+    ran, new = (0, Life(State.RUNNING, ran=True)), (1, Life(State.STARTING))
+    assert not policy.start_over([ran, new], [], 0, 100 * S, LIMITS)
+    assert policy.start_over([ran, ran], [Quality.GOOD, Quality.BAD], 100 * S, 100 * S, LIMITS)
+    assert not policy.start_over([ran], [None], 100 * S, 103 * S - 1, LIMITS)
+    assert policy.start_over([ran], [None], 100 * S, 103 * S, LIMITS)
+
+
+@pytest.mark.parametrize(
+    ("running", "qualities", "state"),
+    [
+        ([True, True], [Quality.GOOD], InstanceState.RUNNING),
+        ([True], [Quality.UNCERTAIN], InstanceState.RUNNING),
+        ([True, False], [Quality.GOOD], InstanceState.DEGRADED),
+        ([True], [Quality.GOOD, Quality.BAD], InstanceState.DEGRADED),
+        ([True], [None], InstanceState.DEGRADED),
+        ([], [], InstanceState.RUNNING),
+    ],
+)
+def test_what_an_instance_is(running: list[bool], qualities: list[Quality | None], state: InstanceState) -> None:
+    assert policy.assess(running, qualities) is state
