@@ -123,7 +123,7 @@ def table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     print()
     for row in [titles, *rows]:
         first, *rest = (f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True))
-        print("  ".join([first.strip().ljust(widths[0]), *rest]))
+        print("  ".join([first.strip().ljust(widths[0]), *rest]).rstrip())
 
 
 # -- child processes ---------------------------------------------------------------------------------------------------

@@ -98,7 +98,7 @@ def _times_ms(client: S7Client, calls: int) -> list[float]:
 
 def main() -> None:
     quick = begin("S7: whole reads of DB201 (2,180 bytes) a second")
-    rounds, round_s, calls = (2, 0.1, 20) if quick else (5, 0.4, 300)
+    rounds, round_s, calls = (2, 0.05, 10) if quick else (5, 0.4, 300)
     for pdu_size in (480, 960):
         with ExitStack() as stack:
             address = Address.parse(stack.enter_context(Child("plc.py", "--pdu", pdu_size)).hello)
