@@ -27,19 +27,21 @@ MAX_SPEC_BYTES = 1 << 22
 
 
 class Worker:
-    """A child process in its role. Use from the main thread, except ``stopping`` and ``beat``."""
+    """A child process in its role. Use from the main thread, except ``stopping``."""
 
     def __init__(self, spec: dict[str, Any]) -> None:
         self.name: str = spec["name"]
         self.kind: str = spec["kind"]
         self.config: dict[str, Any] = spec["config"]
         self.stopping = threading.Event()
+        self._on_stop: Callable[[], object] | None = None
         self.log = logs.setup(Path(spec["log_file"]), self.name)
         self.segment = Segment.open(spec["instance"], writable=True)
         if self.segment.header.epoch != spec["epoch"]:
             raise SegmentError(f"the segment of instance {spec['instance']!r} is another run's; this process ends")
         self.slot = self.segment.processes.find(self.name)
         self._take_role()
+        self._heed_signals()
         self._report = Report(os.getpid(), Activity.STARTING, time.monotonic_ns())
         self.slot.report = self._report
         self.slot.beat()
@@ -76,9 +78,29 @@ class Worker:
             self.slot.report = self._report
         self.slot.beat()
 
-    def stop(self, *_: object) -> None:
-        """Ask the work to end; the handler of SIGTERM."""
+    def on_stop(self, call: Callable[[], object]) -> None:
+        """Have ``call`` run once, in a thread of its own, when the process is to stop; at once if it is already."""
+        self._on_stop = call
+        if self.stopping.is_set():
+            call()
+
+    def _heed_signals(self) -> None:
+        """Let SIGTERM set ``stopping``; Ctrl-C is the supervisor's.
+
+        The handler itself must touch no lock: the main thread may hold that of the event it would set.
+        """
+        reader, writer = os.pipe()
+        os.set_blocking(writer, False)
+        signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
+        signal.signal(signal.SIGTERM, lambda *_: None)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        threading.Thread(target=self._await_signal, args=(reader,), name="signals", daemon=True).start()
+
+    def _await_signal(self, reader: int) -> None:
+        os.read(reader, 1)
         self.stopping.set()
+        if self._on_stop is not None:
+            self._on_stop()
 
 
 def main(run: Callable[[Worker], None]) -> int:
@@ -86,8 +108,6 @@ def main(run: Callable[[Worker], None]) -> int:
     worker = None
     try:
         worker = Worker(_read_spec())
-        signal.signal(signal.SIGTERM, worker.stop)
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the supervisor's
         run(worker)
         worker.report(activity=Activity.STOPPING)
         worker.log.info("stopped")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import signal
 
 import msgspec
 
@@ -24,7 +23,7 @@ def run(worker: Worker) -> None:
 async def _serve(worker: Worker) -> None:
     loop = asyncio.get_running_loop()
     stopping = asyncio.Event()
-    loop.add_signal_handler(signal.SIGTERM, stopping.set)
+    worker.on_stop(lambda: loop.call_soon_threadsafe(stopping.set))
     config = msgspec.convert(worker.config, Grpc)
     tasks: set[asyncio.Task[None]] = set()
 

@@ -45,9 +45,9 @@ def expected(value: Any, register: Register) -> Any:
     if base in ("CHAR", "WCHAR", "STRING", "WSTRING"):
         return (value or "").rstrip("\0")
     if base in ("TIME", "S5TIME", "TIME_OF_DAY"):
-        return np.timedelta64("NaT") if value is None else value * MS
+        return np.timedelta64("NaT", "ms") if value is None else value * MS
     if base in ("LTIME", "LTOD"):
-        return np.timedelta64("NaT") if value is None or value == -(1 << 63) else value * NS
+        return np.timedelta64("NaT", "ns") if value is None or value == -(1 << 63) else value * NS
     if base in ("DATE", "DATE_AND_TIME", "LDT", "DTL"):
         return np.datetime64("NaT" if value is None else value)
     return bytes.fromhex(value) if base in ("POINTER", "ANY") else value
