@@ -85,7 +85,7 @@ class ControlServer:
         self._clients: dict[socket.socket, tuple[bytearray, float | None]] = {}
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         try:
-            _remove(path)
+            remove_socket(path)
             self._listener.bind(path)
             Path(path).chmod(0o600)
             self._listener.listen(MAX_CLIENTS)
@@ -163,7 +163,7 @@ class ControlServer:
             self._selector.unregister(self._listener)
             self._listener.close()
             with suppress(OSError):
-                _remove(self._path)
+                remove_socket(self._path)
 
     def close(self) -> None:
         """Retire, and drop all clients."""
@@ -243,7 +243,7 @@ def _prepare(folder: Path, uid: int) -> str | None:
     return None
 
 
-def _remove(path: str) -> None:
+def remove_socket(path: str) -> None:
     """Remove a socket; anything else that has the name is left, and bind tells."""
     with suppress(FileNotFoundError):
         if stat.S_ISSOCK(os.lstat(path).st_mode):

@@ -25,6 +25,8 @@ def execute(arguments: argparse.Namespace) -> int:
         print(f"{name}: its supervisor is dead; clearing what it left")
         for line in leftover.clear(name):
             print(line)
+        if path == control.socket_path(name):  # never what somebody else's segment names
+            control.remove_socket(path)
         return 0
     print(f"stopping {name}, supervisor pid {pid}", flush=True)
     pidfd = _pidfd(pid)

@@ -31,25 +31,21 @@ def last_lines(files: Iterable[Path], count: int) -> list[bytes]:
     return list(deque((line for _, line in merged), maxlen=count))
 
 
-def _stamped(file: Path, count: int) -> list[tuple[bytes, bytes]]:
+def _stamped(file: Path, count: int) -> Iterable[tuple[bytes, bytes]]:
     """The last ``count`` lines of one file, each with its time stamp or that of the line it follows."""
     try:
         with file.open("rb") as stream:
-            lines = deque(_lines(stream), maxlen=count)
+            return deque(_lines(stream), maxlen=count)
     except OSError:
-        return []
-    stamped = []
+        return ()
+
+
+def _lines(stream: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
     stamp = b""
-    for line in lines:
+    while line := stream.readline(MAX_LINE_BYTES):
         found = _STAMP.match(line)
         stamp = found[0] if found else stamp
-        stamped.append((stamp, line))
-    return stamped
-
-
-def _lines(stream: BinaryIO) -> Iterator[bytes]:
-    while line := stream.readline(MAX_LINE_BYTES):
-        yield line.rstrip(b"\r\n")
+        yield stamp, line.rstrip(b"\r\n")
 
 
 class Follower:

@@ -1,0 +1,244 @@
+"""``shmio-supervisor``: what it prints, refuses and writes, without starting anything."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from shmio.cli.supervise import target
+from shmio.cli.supervisor import main
+from shmio.config import load
+from shmio.segment import Segment, instances
+
+ROOT = Path(__file__).parents[3]
+SEED = ROOT / "tests" / "golden" / "layout" / "db201-as-printed.db"
+
+Edit = Callable[[str, str], None]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def example(capsys: pytest.CaptureFixture[str]) -> Edit:
+    """The A50 example in this folder; replaces one text in it by another."""
+    assert main(["init"]) == 0
+    capsys.readouterr()
+    file = Path("supervisor.toml")
+
+    def edit(old: str, new: str) -> None:
+        text = file.read_text()
+        assert text.count(old) == 1
+        file.write_text(text.replace(old, new))
+
+    return edit
+
+
+def test_the_example_is_the_one_at_the_root(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["init"]) == 0
+    assert capsys.readouterr().out.splitlines()[:2] == ["wrote supervisor.toml", "wrote db201.db"]
+    for name in ("supervisor.toml", "db201.db"):
+        assert Path(name).read_bytes() == (ROOT / name).read_bytes()
+
+
+@pytest.mark.parametrize("name", ["supervisor.toml", "db201.db"])
+def test_init_never_overwrites(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path(name).write_text("mine")
+    assert main(["init"]) == 1
+    assert capsys.readouterr().err.startswith(f"{name} is there already")
+    assert [entry.name for entry in Path().iterdir()] == [name]
+    assert Path(name).read_text() == "mine"
+
+
+def test_init_does_not_write_through_a_dangling_link(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("supervisor.toml").symlink_to("elsewhere.toml")
+    assert main(["init"]) == 1
+    assert not Path("elsewhere.toml").exists()
+
+
+def test_init_from_the_files_of_the_java_version(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("plc.ini").write_text(
+        "model=S7_1500\nhost=10.76.0.12\nport=102\nrack=0\nslot=1\npacketSize=96\ndbNumber=201\n"
+    )
+    Path("cell.db").write_bytes(SEED.read_bytes())
+    assert main(["init", "plc.ini", "cell.db"]) == 0
+    assert "cell.db:7:7: warning" in capsys.readouterr().err
+    config = load(Path("supervisor.toml"))
+    [source] = config.source
+    assert (source.layout, source.properties, source.options["host"]) == ("cell.db", "plc.ini", "10.76.0.12")
+    assert main(["check"]) == 0
+    output = capsys.readouterr().out
+    assert "DB201, 22 registers, 2180 bytes" in output
+    assert "optimized access" in output
+
+
+def test_init_from_a_layout_alone_leaves_the_address_to_fill_in() -> None:
+    (folder := Path("blocks")).mkdir()
+    (folder / "x.db").write_bytes((ROOT / "db201.db").read_bytes())
+    assert main(["init", "blocks/x.db", "-c", "other.toml"]) == 0
+    [source] = load(Path("other.toml")).source
+    assert (source.layout, source.options) == ("blocks/x.db", {"host": "192.168.0.1"})
+
+
+@pytest.mark.parametrize("files", [["plc.ini"], ["a.db", "b.db"], ["plc.ini", "x.ini", "a.db"], ["no.db"]])
+def test_init_of_other_files_is_refused(files: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["init", *files]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not Path("supervisor.toml").exists()
+
+
+def test_check_tells_what_the_instance_takes(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check"]) == 0
+    output = capsys.readouterr().out
+    assert "supervisor.toml: instance a50, 3 processes" in output
+    assert "source cell: DB201, 22 registers, 2180 bytes; ring of 512 frames, 10.2 s" in output
+    assert re.search(r"segment shmio-a50: \d\.\d\d MB", output)
+    assert output.endswith("no faults found\n")
+    assert "a50" not in instances()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "error"),
+    [
+        ("port = 1102", "prot = 1102", "source[0].prot: unknown key; did you mean port?"),
+        ("port = 1102", 'port = "eleven"', "source[0].port: Expected `int`, got `str`"),
+        ('connector = "s7"', 'connector = "s8"', "source[0].connector: no connector 's8'; there are:"),
+        ('kind = "s7"', 'kind = "s8"', "emulator[0].kind: 's8' is none; there are: s7"),
+        ('program = "a50"', 'program = "a51"', "emulator[0].program: 'a51' is none; there are: a50"),
+        ('"127.0.0.1:8090"', '"127.0.0.1:1102"', "grpc.listen[1]: 127.0.0.1:1102 is the address of emulator[0].listen"),
+        ('"Outputs", ', '"a//b", ', "source[0].writable: "),
+        ("period_ms = 20", "period_ms = 20\nproperties = 'none.ini'", "source[0].properties: "),
+    ],
+)
+def test_faults_are_named(example: Edit, old: str, new: str, error: str, capsys: pytest.CaptureFixture[str]) -> None:
+    example(old, new)
+    for verb in (["check"], ["up"], ["up", "--detach"]):
+        assert main(verb) == 1
+        output = capsys.readouterr()
+        assert output.err.startswith(f"supervisor.toml: {error}")
+        assert output.err.count("\n") == 1
+
+
+def test_faults_of_a_layout_have_their_place(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("db201.db").write_text("DATA_BLOCK x\nSTRUCT\na : Reel;\nEND_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n")
+    assert main(["check"]) == 1
+    assert re.search(r"db201\.db:3:\d+: error: ", capsys.readouterr().err)
+    Path("db201.db").unlink()
+    assert main(["check"]) == 1
+    assert "db201.db: No such file or directory" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("pattern", "odd"),
+    [("Outpts", True), ("Robot_9*/*", True), ("Outputs/5", False), ("Inputs/*", False), ("Robot_800", False)],
+)
+def test_a_writable_that_names_nothing_is_odd(
+    example: Edit, pattern: str, odd: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example('"Outputs"', f'"{pattern}"')
+    assert main(["check"]) == 0
+    output = capsys.readouterr().out
+    assert (f"warning: source[0].writable: '{pattern}' names nothing" in output) is odd
+    assert ("usable, with 1 warning\n" in output) is odd
+
+
+def test_a_block_is_chosen_by_its_number(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    other = "DATA_BLOCK DB7\nSTRUCT\na : Int;\nEND_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n"
+    Path("two.db").write_text(Path("db201.db").read_text() + other)
+    example('layout = "db201.db"\nhost', 'layout = "two.db"\nhost')
+    assert main(["check"]) == 1
+    assert "two.db holds several data blocks (DB201, DB7); choose one by dbNumber" in capsys.readouterr().err
+    example("port = 1102", "port = 1102\ndbNumber = 7")
+    example('writable = ["Outputs", "Robot_*/*"]', "")
+    assert main(["check"]) == 0
+    assert "source cell: DB7, 1 registers, 2 bytes" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("mode", ["log", "replay"])
+def test_modes_to_come_are_refused(example: Edit, mode: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["up", "--mode", mode]) == 1
+    assert f"--mode {mode}: this version" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("arguments", [[], ["fly"], ["up", "--mode", "dead"], ["restart"], ["logs", "-n", "-1"]])
+def test_wrong_usage_is_2(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2
+
+
+@pytest.mark.parametrize("verb", [["down"], ["restart", "cell"], ["logs"], ["status"]])
+def test_with_nothing_running_verbs_say_so(verb: list[str], instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*verb, "--instance", instance]) == 1
+    error = capsys.readouterr().err
+    assert f"no instance {instance!r} is running" in error
+    assert error.count("\n") == 1
+
+
+def test_status_of_nothing_is_an_object(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["status", "--json", "--instance", instance]) == 1
+    output = capsys.readouterr()
+    status = json.loads(output.out)
+    assert (status["state"], status["processes"], status["instance"]) == ("stopped", [], instance)
+    assert output.err == ""
+
+
+class TestTarget:
+    """Which instance a verb acts on."""
+
+    def test_the_one_of_the_file_here(self, example: Edit, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+        example('name = "a50"', f'name = "{instance}"')
+        assert main(["down"]) == 1
+        assert f"no instance {instance!r} is running" in capsys.readouterr().err
+
+    def test_a_spoilt_file_still_names_its_instance(self, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+        Path("spoilt.toml").write_text(f'wings = 2\n[instance]\nname = "{instance}"\nnmae = 3\n')
+        assert main(["down", "-c", "spoilt.toml"]) == 1
+        assert f"no instance {instance!r} is running" in capsys.readouterr().err
+
+    @pytest.mark.parametrize("text", ["[instance", "[instance]\n", "instance = 3\n", '[instance]\nname = "../x"\n'])
+    def test_a_file_without_a_name_is_refused(self, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+        Path("spoilt.toml").write_text(text)
+        assert main(["down", "-c", "spoilt.toml"]) == 1
+        assert capsys.readouterr().err.startswith("spoilt.toml: ")
+
+    @pytest.mark.parametrize("name", ["../../etc/passwd", "", "a" * 41, "a b"])
+    def test_what_is_no_name_is_refused(self, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["status", "--instance", name]) == 1
+        assert "is not a name" in capsys.readouterr().err
+
+    def test_the_only_one_or_none_or_a_choice(
+        self, instance: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        running: list[str] = []
+        monkeypatch.setattr(target, "instances", lambda: running)
+        assert main(["status"]) == 1
+        assert "no instance is running, and there is no supervisor.toml here" in capsys.readouterr().err
+        running.append(instance)
+        with Segment.create(instance, [], []) as segment:
+            assert main(["status", "--json"]) == 0
+            assert json.loads(capsys.readouterr().out)["instance"] == instance
+            running.append("other")
+            assert main(["status"]) == 1
+            assert f"choose one by --instance ({instance}, other)" in capsys.readouterr().err
+            segment.unlink()
+
+
+def test_looking_needs_no_heavy_imports() -> None:
+    """``status`` must answer at once."""
+    heavy = {"numpy", "grpc", "snap7", "asyncio"}
+    code = (
+        "import sys; from shmio.cli.supervisor import main; main(['status', '--json', '--instance', 'none-such']); "
+        f"sys.exit(','.join({heavy!r} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.stderr.strip() == ""

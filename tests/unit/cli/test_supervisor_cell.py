@@ -1,0 +1,179 @@
+"""The A50 example as a user runs it: real processes, detached and in the foreground."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shmio.segment import instances
+
+ROOT = Path(__file__).parents[3]
+DEADLINE_S = 60.0
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+class Cell:
+    """The example in a folder of its own, with an instance name and ports of its own."""
+
+    def __init__(self, folder: Path, instance: str) -> None:
+        self.folder = folder
+        self.instance = instance
+        runtime = folder / "run"
+        runtime.mkdir()
+        self.environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_RUNTIME_DIR": str(runtime)}
+        self.run("init", status=0)
+        file = folder / "supervisor.toml"
+        text = file.read_text().replace('"a50"  ', f'"{instance}"').replace("1102", str(free_port()))
+        file.write_text(text.replace("127.0.0.1:8089", "127.0.0.1:0").replace("127.0.0.1:8090", "127.0.0.1:0"))
+
+    def command(self, *arguments: str) -> list[str]:
+        return [sys.executable, "-m", "shmio.cli.supervisor", *arguments]
+
+    def run(self, *arguments: str, status: int) -> subprocess.CompletedProcess[str]:
+        done = subprocess.run(
+            self.command(*arguments),
+            cwd=self.folder,
+            env=self.environment,
+            capture_output=True,
+            text=True,
+            timeout=DEADLINE_S,
+            check=False,
+        )
+        assert done.returncode == status, done.stderr
+        return done
+
+    def status(self) -> dict[str, Any]:
+        found = json.loads(self.run("status", "--json", status=0).stdout)
+        assert isinstance(found, dict)
+        return found
+
+    def of(self, name: str) -> dict[str, Any]:
+        return next(process for process in self.status()["processes"] if process["name"] == name)
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        deadline = time.monotonic() + DEADLINE_S
+        while not condition():  # each look is a process of its own, which paces this loop
+            assert time.monotonic() < deadline, "waited in vain"
+
+
+@pytest.fixture
+def cell(tmp_path: Path, instance: str) -> Iterator[Cell]:
+    cell = Cell(tmp_path, instance)
+    yield cell
+    if instance in instances():  # a test has failed
+        cell.run("down", status=0)
+
+
+def test_a_day_in_the_life_of_the_cell(cell: Cell) -> None:
+    up = cell.run("up", "--detach", status=0).stdout
+    assert f"{cell.instance}: mode live, segment shmio-{cell.instance}" in up
+    assert "running, supervisor pid" in up
+    status = cell.status()
+    assert (status["instance"], status["mode"], status["state"]) == (cell.instance, "live", "running")
+    assert [(p["name"], p["kind"], p["state"]) for p in status["processes"]] == [
+        ("plc", "emulator", "running"),
+        ("cell", "source", "running"),
+        ("grpc", "grpc", "running"),
+    ]
+    assert cell.of("cell")["quality"] == "good"
+
+    refused = cell.run("up", status=1)
+    assert refused.stderr == (
+        f"instance {cell.instance!r} is already running, supervisor pid {status['supervisor']['pid']}\n"
+    )
+    assert refused.stdout == ""
+
+    pids = {process["name"]: process["pid"] for process in status["processes"]}
+    os.kill(pids["plc"], signal.SIGKILL)
+    cell.until(lambda: cell.of("plc")["restarts"] == 1 and cell.status()["state"] == "running")
+    assert cell.of("cell")["pid"] == pids["cell"]
+    assert "killed by SIGKILL" in cell.run("logs", "supervisor", status=0).stdout
+
+    assert cell.run("restart", "cell", status=0).stdout == "cell runs again\n"
+    assert cell.of("cell")["pid"] != pids["cell"]
+    assert "there are: plc, cell, grpc" in cell.run("restart", "nobody", status=1).stderr
+    assert cell.run("logs", "--instance", cell.instance, "cell", status=0).stdout
+
+    down = cell.run("down", status=0).stdout
+    assert down.splitlines()[-1] == f"{cell.instance} is stopped"
+    assert cell.instance not in instances()
+    assert not list((cell.folder / "run" / "shmio").iterdir())
+    assert json.loads(cell.run("status", "--json", status=1).stdout)["state"] == "stopped"
+
+
+def test_down_clears_what_a_killed_supervisor_left(cell: Cell) -> None:
+    cell.run("up", "--detach", status=0)
+    status = cell.status()
+    os.kill(status["supervisor"]["pid"], signal.SIGKILL)
+    cell.until(lambda: cell.status()["supervisor"] is None)
+    assert "supervisor of instance" in cell.run("restart", "cell", status=1).stderr
+    lines = cell.run("down", status=0).stdout
+    for process in status["processes"]:
+        assert f"stopped {process['name']}, pid {process['pid']}" in lines
+    assert cell.instance not in instances()
+    assert not list((cell.folder / "run" / "shmio").iterdir())
+
+
+def test_a_device_that_is_not_there_is_told_but_does_not_hold_up_the_start(cell: Cell) -> None:
+    file = cell.folder / "supervisor.toml"
+    file.write_text(file.read_text().replace('listen = "127.0.0.1:', f'listen = "127.0.0.1:{free_port()}" #'))
+    assert "warning: source cell is bad: " in cell.run("up", "--detach", status=0).stderr
+    assert cell.status()["state"] == "degraded"
+    cell.run("down", status=0)
+
+
+def test_a_start_that_fails_tells_why_and_leaves_nothing(cell: Cell) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        file = cell.folder / "supervisor.toml"
+        file.write_text(file.read_text().replace('["127.0.0.1:0", "127.0.0.1:0"]', f'["127.0.0.1:{port}"]'))
+        error = cell.run("up", "--detach", status=1).stderr
+    assert error.startswith("grpc: ")
+    assert str(port) in error
+    assert cell.instance not in instances()
+
+
+@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
+def test_in_the_foreground_a_signal_stops_it_cleanly(cell: Cell, sign: signal.Signals) -> None:
+    with subprocess.Popen(
+        cell.command("up"),
+        cwd=cell.folder,
+        env=cell.environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        bufsize=0,
+    ) as up:
+        assert up.stderr is not None
+        assert up.stdout is not None
+        said = b""
+        while b"instance running" not in said:
+            assert select.select([up.stderr], [], [], DEADLINE_S)[0], said
+            line = up.stderr.readline()
+            assert line, said
+            said += line
+        up.send_signal(sign)
+        assert up.wait(DEADLINE_S) == 0
+        announced = up.stdout.read().decode()
+        assert "Traceback" not in up.stderr.read().decode()
+    assert "program a50" in announced
+    assert "127.0.0.1:0, 127.0.0.1:0" in announced
+    assert cell.instance not in instances()

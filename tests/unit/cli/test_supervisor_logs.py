@@ -1,0 +1,125 @@
+"""``shmio-supervisor logs``: several files as one, and what is added to them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from shmio.cli.supervise.tail import MAX_LINE_BYTES, Follower, last_lines
+from shmio.cli.supervisor import main
+
+
+def stamped(second: int, text: str) -> str:
+    return f"2026-11-21T05:20:{second:02}.000000Z INFO    {text}\n"
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> list[Path]:
+    files = [tmp_path / "a.log", tmp_path / "b.log"]
+    files[0].write_text(
+        stamped(1, "a one") + stamped(4, "a four") + "    Traceback\n    of four\n" + stamped(9, "a nine")
+    )
+    files[1].write_text(stamped(2, "b two") + stamped(5, "b five"))
+    return files
+
+
+def words(lines: list[bytes]) -> list[str]:
+    return [line.decode().split()[-1] for line in lines]
+
+
+def test_lines_are_merged_by_time_and_tracebacks_stay_whole(files: list[Path]) -> None:
+    assert words(last_lines(files, 100)) == ["one", "two", "four", "Traceback", "four", "five", "nine"]
+    assert words(last_lines(files, 3)) == ["four", "five", "nine"]
+    assert last_lines(files, 0) == []
+
+
+def test_a_missing_file_has_no_lines(tmp_path: Path) -> None:
+    assert last_lines([tmp_path / "none.log"], 5) == []
+
+
+def test_a_follower_gives_what_is_added(files: list[Path]) -> None:
+    with Follower(files) as follower:
+        with files[1].open("a") as log:
+            log.write("new one\nand a par")
+        assert follower.wait() == [b"new one"]
+        with files[1].open("a") as log:
+            log.write("t\n")
+        assert follower.wait() == [b"and a part"]
+
+
+def test_a_follower_goes_on_after_a_rotation(files: list[Path]) -> None:
+    with Follower(files) as follower:
+        with files[0].open("a") as log:
+            log.write("last of the old\n")
+        files[0].rename(files[0].with_suffix(".log.1"))
+        files[0].write_text("first of the new\n")
+        assert follower.wait() == [b"last of the old", b"first of the new"]
+
+
+def test_a_follower_waits_for_a_file_that_is_not_there_yet(tmp_path: Path) -> None:
+    with Follower([tmp_path / "late.log"]) as follower:
+        (tmp_path / "late.log").write_text("here\n")
+        assert follower.wait() == [b"here"]
+
+
+def test_a_line_without_end_is_given_in_parts(files: list[Path]) -> None:
+    with Follower(files) as follower:
+        with files[0].open("a") as log:
+            log.write("x" * (MAX_LINE_BYTES + 1))
+        assert [len(line) for line in follower.wait()] == [MAX_LINE_BYTES + 1]
+
+
+def test_a_follower_of_no_folder_is_an_error(tmp_path: Path) -> None:
+    open_before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
+    with pytest.raises(OSError, match="No such file"):
+        Follower([tmp_path / "none" / "a.log"])
+    assert len(os.listdir("/proc/self/fd")) == open_before  # noqa: PTH208
+
+
+@pytest.fixture
+def instance_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Path:
+    monkeypatch.chdir(tmp_path)
+    assert main(["init"]) == 0
+    capsys.readouterr()
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    (logs / "supervisor.log").write_text(stamped(1, "cell running"))
+    (logs / "cell.log").write_text(stamped(2, "connected \x1b[31mred"))
+    return logs
+
+
+def test_logs_of_all_and_of_one(instance_logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["logs"]) == 0
+    output = capsys.readouterr().out
+    assert output == stamped(1, "cell running") + stamped(2, "connected \\x1b[31mred"), "nothing moves the cursor"
+    assert main(["logs", "supervisor", "-n", "1"]) == 0
+    assert capsys.readouterr().out == stamped(1, "cell running")
+
+
+def test_logs_of_an_unknown_process_names_those_there_are(
+    instance_logs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["logs", "cel"]) == 1
+    assert capsys.readouterr().err == "no process 'cel'; there are: supervisor, plc, cell, grpc\n"
+
+
+def test_logs_before_the_first_start(instance_logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["logs", "plc"]) == 1
+    assert "no log file in" in capsys.readouterr().err
+
+
+def test_following_ends_with_ctrl_c_as_done(
+    instance_logs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rounds = iter([[b"more"]])
+
+    def wait(_: Follower) -> list[bytes]:
+        for lines in rounds:
+            return lines
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(Follower, "wait", wait)
+    assert main(["logs", "-f", "-n", "0"]) == 0
+    assert capsys.readouterr().out == "more\n"
