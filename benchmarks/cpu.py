@@ -20,16 +20,15 @@ def measure(running: Instance, subscribers: Child | None, duration_s: float) -> 
     """Print one table."""
     pids = running.pids | ({} if subscribers is None else {"subscribers": subscribers.pid})
     time.sleep(WARM_UP_S)
-    slots = running.segment.processes
-    counters = [slots.find("cell").counters["polls"], slots.find("grpc").counters["messages"]]
+    ring, endpoint = running.segment.blocks["cell"].ring, running.segment.processes.find("grpc")
+    frames, messages = ring.head(), endpoint.counters["messages"]
     before, begun_s = {name: CpuTime.of(pid) for name, pid in pids.items()}, time.monotonic()
     time.sleep(duration_s)
     used, taken_s = (
         {name: CpuTime.of(pid).since(before[name]) for name, pid in pids.items()},
         time.monotonic() - begun_s,
     )
-    polls = slots.find("cell").counters["polls"] - counters[0]
-    messages = slots.find("grpc").counters["messages"] - counters[1]
+    frames, messages = ring.head() - frames, endpoint.counters["messages"] - messages
 
     def percent(*names: str) -> list[str]:
         user_s, system_s = sum(used[name].user_s for name in names), sum(used[name].system_s for name in names)
@@ -41,7 +40,7 @@ def measure(running: Instance, subscribers: Child | None, duration_s: float) -> 
     rows += [[name, *percent(name)] for name in used if name not in ours]
     count = len(REGISTERS) if subscribers else 0
     table([f"{count} subscribers, % of a core", "user", "system", "sum"], rows)
-    print(f"in {taken_s:.1f} s: {polls} polls, {messages} changes encoded")
+    print(f"in {taken_s:.1f} s: {frames} frames, {messages} changes encoded")
 
 
 def main() -> None:

@@ -6,7 +6,6 @@ the source, the endpoint, the controller and the client are processes of their o
 
 from __future__ import annotations
 
-import statistics
 import time
 
 from common import HERE, Child, begin, quantiles, table
@@ -34,21 +33,18 @@ def measure(period_ms: float, mean_change_ms: float, duration_s: float) -> None:
         after = source.counters
         started_ns = running.segment.header.started_ns
         stamps = [stamp for stamp in client.finish()["stamps"][0] if stamp[0] > begun_s * 1e9]
-    read_ms = statistics.median(round_trips_us) / 1000
-    to_frame_ms = [(started_ns + clock_ns - changed_ns) / 1e6 for changed_ns, clock_ns, _ in stamps]
-    to_client_ms = [(received_ns - started_ns - clock_ns) / 1e6 for _, clock_ns, received_ns in stamps]
-    whole_ms = [(received_ns - changed_ns) / 1e6 for changed_ns, _, received_ns in stamps]
-    rows = [
-        [name, *(f"{value:.2f}" for value in quantiles(values))]
-        for name, values in (
-            ("change to frame: poll wait and read", to_frame_ms),
-            ("frame to client", to_client_ms),
-            ("change to client", whole_ms),
-        )
-    ]
-    table([f"poll each {period_ms:g} ms, ms", "median", "p90", "p99"], rows)
+    rows = {
+        "change to frame": [(started_ns + clock_ns - changed_ns) / 1e6 for changed_ns, clock_ns, _ in stamps],
+        "  of which reading the block": [value_us / 1000 for value_us in round_trips_us],
+        "frame to client": [(received_ns - started_ns - clock_ns) / 1e6 for _, clock_ns, received_ns in stamps],
+        "change to client": [(received_ns - changed_ns) / 1e6 for changed_ns, _, received_ns in stamps],
+    }
+    table(
+        [f"poll each {period_ms:g} ms, ms", "median", "p90", "p99"],
+        [[name, *(f"{value:.2f}" for value in quantiles(values))] for name, values in rows.items()],
+    )
     polls, overruns = (after[name] - before[name] for name in ("polls", "overruns"))
-    print(f"{len(stamps)} changes, {polls} polls, {overruns} overruns; a read of the block takes {read_ms:.2f} ms")
+    print(f"{len(stamps)} changes, {polls} polls, {overruns} overruns")
 
 
 def main() -> None:

@@ -67,7 +67,7 @@ def shmio_rings(frame: bytes) -> Iterator[list[Contender]]:
             ),
             Contender(
                 "shmio BlockWriter, Block",
-                partial(writer.publish, frame, cycle=1),
+                lambda: writer.publish(frame, cycle=1),
                 block.latest,
                 lambda fields: bytes(fields.raw),
             ),
