@@ -13,6 +13,7 @@ from shmio.config.address import Address
 from shmio.emulators.programs import program
 from shmio.emulators.s7 import S7Server
 from shmio.errors import ConfigError
+from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
 
 
@@ -36,7 +37,7 @@ class Emulator:
             raise ConfigError(f"dbNumber: the layout {layout.name!r} names no number; give one")
         self._program = program(program_name, layout)
         self._period_s = self._program.period_ms / 1000
-        self._frame = bytearray(layout.size)
+        self._frame, _ = initial_frame(layout)
         self._server = S7Server(listen, max_clients=max_clients)
         self._server.add_block(number, self._frame)
         self._thread = threading.Thread(target=self._run, name=f"program-{program_name}", daemon=True)

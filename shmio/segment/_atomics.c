@@ -329,7 +329,8 @@ static PyObject *atomics_cell_read(PyObject *module, PyObject *args)
 typedef struct {
     uint32_t offset;
     uint32_t size;
-    uint32_t mask; /* of the one byte, for a BOOL; 0: all bytes count */
+    uint32_t mask;  /* of the one byte, for bits; 0: all bytes count */
+    uint32_t index; /* reported; entries of one index follow each other */
 } scan_entry;
 
 static bool entry_changed(const scan_entry *entry, const uint8_t *old, const uint8_t *new, const uint8_t *dirty)
@@ -351,7 +352,7 @@ static PyObject *atomics_changed(PyObject *module, PyObject *args)
     const scan_entry *entries = table.buf;
     Py_ssize_t count = table.len / (Py_ssize_t)sizeof *entries;
     if (old.len != new.len || table.len % (Py_ssize_t)sizeof *entries || (uintptr_t)table.buf % 4) {
-        PyErr_SetString(PyExc_ValueError, "two images of one size and a table of (offset, size, mask) are needed");
+        PyErr_SetString(PyExc_ValueError, "two images of one size and a table of (offset, size, mask, index) are needed");
         goto done;
     }
     result = PyList_New(0);
@@ -366,6 +367,7 @@ static PyObject *atomics_changed(PyObject *module, PyObject *args)
         size_t at = chunk * CHUNK, rest = (size_t)old.len - at;
         dirty[chunk] = memcmp((uint8_t *)old.buf + at, (uint8_t *)new.buf + at, rest < CHUNK ? rest : CHUNK) != 0;
     }
+    uint64_t reported = UINT64_MAX;
     for (Py_ssize_t i = 0; i < count; i++) {
         const scan_entry *entry = &entries[i];
         if (entry->size == 0 || (uint64_t)entry->offset + entry->size > (uint64_t)old.len) {
@@ -373,8 +375,9 @@ static PyObject *atomics_changed(PyObject *module, PyObject *args)
             Py_CLEAR(result);
             break;
         }
-        if (!entry_changed(entry, old.buf, new.buf, dirty)) continue;
-        PyObject *index = PyLong_FromSsize_t(i);
+        if (entry->index == reported || !entry_changed(entry, old.buf, new.buf, dirty)) continue;
+        reported = entry->index;
+        PyObject *index = PyLong_FromUnsignedLong(entry->index);
         if (!index || PyList_Append(result, index) < 0) {
             Py_XDECREF(index);
             Py_CLEAR(result);
@@ -397,7 +400,7 @@ static PyMethodDef functions[] = {
     METHOD(atomics, store64, METH_VARARGS, "Release store of an aligned 64-bit word."),
     METHOD(atomics, cell_write, METH_VARARGS, "Write a cell; one writer."),
     METHOD(atomics, cell_read, METH_VARARGS, "A consistent copy of a cell, or None while it is being written."),
-    METHOD(atomics, changed, METH_VARARGS, "Indices of the table's entries whose bytes differ between two images."),
+    METHOD(atomics, changed, METH_VARARGS, "Indices in a table of (offset, size, mask, index) whose bytes differ between two images."),
     {0},
 };
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import struct
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -12,7 +11,7 @@ from typing import NamedTuple, Protocol
 
 from shmio.layout.model import Register
 from shmio.segment import Block, Frame, Quality
-from shmio.segment._atomics import changed
+from shmio.segment.scan import ChangeScan
 
 log = logging.getLogger("shmio.grpc")
 
@@ -21,8 +20,6 @@ CATCH_UP_FRAMES = 32
 
 WAIT_S = 0.2
 """Longest wait for a frame before age is looked at."""
-
-_ENTRY = struct.Struct("=III")
 
 
 class Listener(Protocol):
@@ -46,7 +43,7 @@ class Channel:
 
 class _Table(NamedTuple):
     channels: tuple[Channel, ...]
-    scan: bytes
+    scan: ChangeScan
 
 
 class Feed:
@@ -62,7 +59,7 @@ class Feed:
         self._loop = loop
         self._on_quality = on_quality
         self._channels: dict[Register, Channel] = {}
-        self._table = _Table((), b"")
+        self._table = _Table((), ChangeScan([]))
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"feed-{block.source}", daemon=True)
 
@@ -108,11 +105,7 @@ class Feed:
 
     def _rebuild(self) -> None:
         channels = tuple(self._channels.values())
-        entries = (
-            _ENTRY.pack(c.register.offset, c.register.size, 0 if c.register.bit is None else 1 << c.register.bit)
-            for c in channels
-        )
-        self._table = _Table(channels, b"".join(entries))
+        self._table = _Table(channels, ChangeScan([channel.register for channel in channels]))
 
     # ---- the feed's own thread ---------------------------------------------------------------------------------
 
@@ -150,7 +143,7 @@ class Feed:
                 news: Sequence[Channel] = table.channels
             else:
                 assert shown is not None  # noqa: S101  for the type checker
-                news = [table.channels[i] for i in changed(shown, frame.image, table.scan)]
+                news = [table.channels[i] for i in table.scan.changed(shown, frame.image)]
             shown = frame.image
             batch = [(channel, message) for channel in news if (message := channel.encode(frame)) is not None]
             if batch:

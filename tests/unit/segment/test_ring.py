@@ -236,7 +236,7 @@ def test_cells_and_words_stay_inside_the_buffer(offset: int, size: int) -> None:
             _atomics.store64(memory, offset, 1)
 
 
-ENTRY = struct.Struct("=III")
+ENTRY = struct.Struct("=IIII")
 
 
 @given(st.binary(min_size=300, max_size=300), st.lists(st.tuples(st.integers(0, 299), st.integers(0, 255))), st.data())
@@ -262,14 +262,14 @@ def test_changed_names_exactly_the_entries_whose_bytes_differ(
             else old[offset : offset + size] != bytes(new[offset : offset + size])
         )
     ]
-    table = b"".join(ENTRY.pack(*entry) for entry in entries)
+    table = b"".join(ENTRY.pack(*entry, index) for index, entry in enumerate(entries))
     assert _atomics.changed(old, bytes(new), table) == expected
 
 
 def test_changed_refuses_what_lies_outside() -> None:
     with pytest.raises(ValueError, match="outside"):
-        _atomics.changed(b"ab", b"ac", ENTRY.pack(1, 2, 0))
+        _atomics.changed(b"ab", b"ac", ENTRY.pack(1, 2, 0, 0))
     with pytest.raises(ValueError, match="outside"):
-        _atomics.changed(b"ab", b"ac", ENTRY.pack(0xFFFFFFFF, 0xFFFFFFFF, 0))
+        _atomics.changed(b"ab", b"ac", ENTRY.pack(0xFFFFFFFF, 0xFFFFFFFF, 0, 0))
     with pytest.raises(ValueError, match="one size"):
         _atomics.changed(b"ab", b"abc", b"")
