@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import selectors
 import signal
@@ -16,13 +15,14 @@ from typing import Final
 
 from shmio.errors import SegmentError, ShmioError
 from shmio.logs import fields
-from shmio.segment import Activity, Phase, ProcessSlot, Quality, Segment, Supervised, leftover
+from shmio.segment import Phase, Quality, Segment, Supervised, leftover
 from shmio.segment import State as InstanceState
 from shmio.supervisor import policy
 from shmio.supervisor.control import Answer, ControlServer, Request, Restart, Stop, socket_path
-from shmio.supervisor.plan import MODULES, Job, Plan
+from shmio.supervisor.managed import Managed, log, log_step
+from shmio.supervisor.plan import MODULES, Plan
 from shmio.supervisor.policy import Life, Limits
-from shmio.supervisor.process import Child, describe_end
+from shmio.supervisor.process import Child
 from shmio.supervisor.states import PHASES, Action, Event, State
 
 TICK_S: Final = 0.1
@@ -31,46 +31,6 @@ START_TICK_S: Final = 0.01
 """The same while a process starts: its report has no bell to ring."""
 QUALITY_S: Final = 0.5
 """How often the sources' quality is looked at, once the start is over."""
-
-log = logging.getLogger("shmio.supervisor")
-
-
-class Managed:
-    """A job, its life, and its process while it has one."""
-
-    def __init__(self, job: Job, slot: ProcessSlot) -> None:
-        self.job = job
-        self.slot = slot
-        self.life = Life()
-        self.child: Child | None = None
-        self.waiting: list[Answer] = []
-        self._beat_ns = 0
-        self._quiet_ns = 0
-
-    @property
-    def ready(self) -> bool:
-        """Whether the present process, not a predecessor, has reported that it runs."""
-        report = self.slot.report
-        return self.child is not None and report.pid == self.child.pid and report.activity is Activity.RUNNING
-
-    def quiet_ns(self, elapsed_ns: int) -> int:
-        """Time without a heartbeat, as the supervisor has lived through it."""
-        beat_ns = self.slot.heartbeat_ns
-        # The first look at a running process starts the count, too.
-        fresh = beat_ns != self._beat_ns or self.life.state is not State.RUNNING
-        self._beat_ns = beat_ns
-        self._quiet_ns = 0 if fresh else self._quiet_ns + elapsed_ns
-        return self._quiet_ns
-
-    def end_note(self, pid: int, code: int) -> str:
-        """Why the process ended, with its own words if it left any."""
-        end = describe_end(code)
-        if code <= 0:
-            return end
-        report = self.slot.report
-        words = report.note if report.pid == pid and report.note else ""
-        words = words or (self.child.last_words() if self.child else "")
-        return f"{words} ({end})" if words else end
 
 
 class Supervisor:
@@ -287,7 +247,7 @@ class Supervisor:
         elif managed.child is not None and action is Action.KILL:
             managed.child.kill()
         self._publish(managed)
-        _log_step(managed, before, action, self._limits)
+        log_step(managed, before, action, self._limits)
         self._answer(managed)
 
     def _spawn(self, managed: Managed) -> None:
@@ -339,21 +299,3 @@ class Supervisor:
 
 def _wake(_number: int, _frame: FrameType | None) -> None:
     """A handler must exist for the wake-up descriptor to be written."""
-
-
-def _log_step(managed: Managed, before: Life, action: Action | None, limits: Limits) -> None:
-    name, life = managed.job.name, managed.life
-    if life.state is State.RUNNING:
-        log.info("%s running", name, extra=fields(pid=managed.child.pid) if managed.child else None)
-    elif life.state is State.HUNG:
-        log.warning("%s hangs, %s: killed", name, life.note)
-    elif life.state is State.FATAL:
-        log.error("%s cannot work as configured: %s", name, life.note)
-    elif life.state is State.BACKOFF:
-        wait_s = policy.backoff_s(life.crashes, limits)
-        when = f"in {wait_s:g} s" if wait_s else "at once"
-        log.warning("%s crashed: %s; starting it again %s", name, life.note, when)
-    elif life.state is State.STOPPED:
-        log.info("%s stopped", name)
-    elif action is Action.KILL and before.state is life.state:
-        log.warning("%s does not stop: killed", name)

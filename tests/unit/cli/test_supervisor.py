@@ -96,14 +96,15 @@ def test_init_of_other_files_is_refused(files: list[str], capsys: pytest.Capture
     assert not Path("supervisor.toml").exists()
 
 
-def test_check_tells_what_the_instance_takes(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_tells_what_the_instance_takes(example: Edit, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+    example('name = "a50"', f'name = "{instance}"')
     assert main(["check"]) == 0
     output = capsys.readouterr().out
-    assert "supervisor.toml: instance a50, 3 processes" in output
+    assert f"supervisor.toml: instance {instance}, 3 processes" in output
     assert "source cell: DB201, 22 registers, 2180 bytes; ring of 512 frames, 10.2 s" in output
-    assert re.search(r"segment shmio-a50: \d\.\d\d MB", output)
+    assert re.search(rf"segment shmio-{instance}: \d\.\d\d MB", output)
     assert output.endswith("no faults found\n")
-    assert "a50" not in instances()
+    assert instance not in instances()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,73 @@
+"""A job together with its life and its process, and what the log says about them."""
+
+from __future__ import annotations
+
+import logging
+
+from shmio.logs import fields
+from shmio.segment import Activity, ProcessSlot
+from shmio.supervisor import policy
+from shmio.supervisor.control import Answer
+from shmio.supervisor.plan import Job
+from shmio.supervisor.policy import Life, Limits
+from shmio.supervisor.process import Child, describe_end
+from shmio.supervisor.states import Action, State
+
+log = logging.getLogger("shmio.supervisor")
+
+
+class Managed:
+    """A job, its life, and its process while it has one."""
+
+    def __init__(self, job: Job, slot: ProcessSlot) -> None:
+        self.job = job
+        self.slot = slot
+        self.life = Life()
+        self.child: Child | None = None
+        self.waiting: list[Answer] = []
+        self._beat_ns = 0
+        self._quiet_ns = 0
+
+    @property
+    def ready(self) -> bool:
+        """Whether the present process, not a predecessor, has reported that it runs."""
+        report = self.slot.report
+        return self.child is not None and report.pid == self.child.pid and report.activity is Activity.RUNNING
+
+    def quiet_ns(self, elapsed_ns: int) -> int:
+        """Time without a heartbeat, as the supervisor has lived through it."""
+        beat_ns = self.slot.heartbeat_ns
+        # The first look at a running process starts the count, too.
+        fresh = beat_ns != self._beat_ns or self.life.state is not State.RUNNING
+        self._beat_ns = beat_ns
+        self._quiet_ns = 0 if fresh else self._quiet_ns + elapsed_ns
+        return self._quiet_ns
+
+    def end_note(self, pid: int, code: int) -> str:
+        """Why the process ended, with its own words if it left any."""
+        end = describe_end(code)
+        if code <= 0:
+            return end
+        report = self.slot.report
+        words = report.note if report.pid == pid and report.note else ""
+        words = words or (self.child.last_words() if self.child else "")
+        return f"{words} ({end})" if words else end
+
+
+def log_step(managed: Managed, before: Life, action: Action | None, limits: Limits) -> None:
+    """Tell about one edge of the graph, unless it says nothing."""
+    name, life = managed.job.name, managed.life
+    if life.state is State.RUNNING:
+        log.info("%s running", name, extra=fields(pid=managed.child.pid) if managed.child else None)
+    elif life.state is State.HUNG:
+        log.warning("%s hangs, %s: killed", name, life.note)
+    elif life.state is State.FATAL:
+        log.error("%s cannot work as configured: %s", name, life.note)
+    elif life.state is State.BACKOFF:
+        wait_s = policy.backoff_s(life.crashes, limits)
+        when = f"in {wait_s:g} s" if wait_s else "at once"
+        log.warning("%s crashed: %s; starting it again %s", name, life.note, when)
+    elif life.state is State.STOPPED:
+        log.info("%s stopped", name)
+    elif action is Action.KILL and before.state is life.state:
+        log.warning("%s does not stop: killed", name)
