@@ -31,23 +31,37 @@ class LineFormatter(logging.Formatter):
         """One record as text."""
         stamp = datetime.fromtimestamp(record.created, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
         fields = getattr(record, "fields", {})
-        message = _escape(" ".join([record.getMessage(), *(f"{key}={value}" for key, value in fields.items())]))
+        message = printable(" ".join([record.getMessage(), *(f"{key}={value}" for key, value in fields.items())]))
         line = f"{stamp} {record.levelname:<7} {self._process} {message}"
         if record.exc_info:
             line += "\n    " + self.formatException(record.exc_info).replace("\n", "\n    ")
         return line
 
 
-def setup(file: Path, process: str, *, console: bool = False) -> logging.Logger:
+class RotatingLog(logging.handlers.RotatingFileHandler):
+    """A log file that rotates, and takes what the process prints with it if ``streams`` says so."""
+
+    def __init__(self, file: Path, *, streams: bool) -> None:
+        super().__init__(file, maxBytes=MAX_FILE_BYTES, backupCount=KEPT_FILES - 1)
+        self._streams = streams
+
+    def doRollover(self) -> None:  # noqa: N802  the base class's name
+        """Begin a new file; the traceback of a dying interpreter must not go to one that is deleted."""
+        super().doRollover()
+        if self._streams and self.stream is not None:
+            os.dup2(self.stream.fileno(), 1)
+            os.dup2(self.stream.fileno(), 2)
+
+
+def setup(file: Path, process: str, *, console: bool = False, streams: bool = False) -> logging.Logger:
     """Send this process's records to ``file``, rotated at 5 MB with 3 kept; with ``console`` to standard error too.
 
+    ``streams``: standard output and error lead to the file already and are to follow it.
     Returns the logger named ``shmio``. ConfigError when the file cannot be written.
     """
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        handlers: list[logging.Handler] = [
-            logging.handlers.RotatingFileHandler(file, maxBytes=MAX_FILE_BYTES, backupCount=KEPT_FILES - 1)
-        ]
+        handlers: list[logging.Handler] = [RotatingLog(file, streams=streams)]
     except OSError as error:
         raise ConfigError(f"instance.log_dir: cannot write {file}: {error.strerror}") from None
     if console:
@@ -70,6 +84,6 @@ def fields(**values: object) -> dict[str, dict[str, object]]:
     return {"fields": values}
 
 
-def _escape(message: str) -> str:
-    """Keep text from devices on one line."""
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
+def printable(text: str) -> str:
+    """Text from devices and files as one line, without characters that would move a terminal's cursor."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -35,7 +35,7 @@ class Worker:
         self.config: dict[str, Any] = spec["config"]
         self.stopping = threading.Event()
         self._on_stop: Callable[[], object] | None = None
-        self.log = logs.setup(Path(spec["log_file"]), self.name)
+        self.log = logs.setup(Path(spec["log_file"]), self.name, streams=True)
         self.segment = Segment.open(spec["instance"], writable=True)
         if self.segment.header.epoch != spec["epoch"]:
             raise SegmentError(f"the segment of instance {spec['instance']!r} is another run's; this process ends")

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from shmio.cli.readings import as_json, as_line, choose, dumps, topic_path
+from shmio.cli.readings import as_json, as_line, choose, topic_path
+from shmio.cli.run import dumps
 from shmio.segment import Frame
 from shmio.segment.attach import Attachment, reading
 

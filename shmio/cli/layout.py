@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from shmio.cli.run import run
+from shmio.cli.run import dumps, run
 from shmio.errors import LayoutError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.document import describe
 from shmio.layout.lexer import MAX_SOURCE_BYTES
 from shmio.layout.model import Layout, Register
+from shmio.logs import printable
 
 _HEADINGS = ("offset", "size", "type", "path", "initial", "comment")
 
@@ -51,21 +51,19 @@ def _read(name: str) -> Source:
 
 def _complain(lines: Iterable[object]) -> None:
     for line in lines:
-        print(_printable(str(line), sys.stderr.encoding), file=sys.stderr)
+        print(printable(str(line)), file=sys.stderr)
 
 
 def _print(layouts: Sequence[Layout], *, as_json: bool) -> None:
     if as_json:
         described = [describe(layout) for layout in layouts]
-        # A terminal that is not UTF-8 still gets valid JSON.
-        ascii_only = (sys.stdout.encoding or "").lower().replace("-", "") != "utf8"
-        print(json.dumps(described[0] if len(described) == 1 else described, indent=2, ensure_ascii=ascii_only))
+        print(dumps(described[0] if len(described) == 1 else described, indent=2))
         return
     for position, layout in enumerate(layouts):
         if position:
             print()
         for line in _table(layout):
-            print(_printable(line, sys.stdout.encoding))
+            print(printable(line))
 
 
 def _table(layout: Layout) -> list[str]:
@@ -88,12 +86,6 @@ def _row(register: Register) -> tuple[str, ...]:
     if len(initial) > 40:
         initial = f"{initial[:39]}…"
     return place, str(register.size), kind, register.path, initial, register.comment
-
-
-def _printable(text: str, encoding: str | None) -> str:
-    """Return text that the stream can take, without characters that would move a terminal's cursor."""
-    visible = "".join(c if c.isprintable() else f"\\x{ord(c):02x}" for c in text)
-    return visible.encode(encoding or "utf-8", "backslashreplace").decode(encoding or "utf-8")
 
 
 if __name__ == "__main__":

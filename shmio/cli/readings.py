@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from datetime import UTC, datetime
 from typing import Any
@@ -13,6 +12,7 @@ from shmio.layout.glob import select
 from shmio.layout.model import Register
 from shmio.layout.text import shortest, to_text
 from shmio.layout.topic import find, parse_topic
+from shmio.logs import printable
 from shmio.segment.attach import Attachment, Reading
 from shmio.segment.block import Block
 from shmio.segment.frame import Quality
@@ -69,16 +69,11 @@ def as_json(reading: Reading, register: Register) -> dict[str, Any]:
 
 def as_line(path: str, reading: Reading, register: Register, width: int) -> str:
     """A reading as a line for people; quality is said unless it is good."""
-    text = "-" if reading.value is None else to_text(reading.value, register)
+    text = "-" if reading.value is None else printable(to_text(reading.value, register))
     if len(text) > SHOWN_CHARACTERS:
         text = text[: SHOWN_CHARACTERS - 1] + "…"
-    quality = "" if reading.quality is Quality.GOOD else f"  {reading.quality}: {reading.reason}"
-    return f"{path:<{width}}  {text}{quality}"
-
-
-def dumps(value: Any) -> str:
-    """JSON as all commands print it."""
-    return json.dumps(value, ensure_ascii=False)
+    quality = "" if reading.quality is Quality.GOOD else f"  {reading.quality}: {printable(reading.reason)}"
+    return f"{printable(path):<{width}}  {text}{quality}"
 
 
 def _json_value(value: Value, register: Register) -> Any:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 
-from shmio.cli.readings import choose, dumps, topic_path
+from shmio.cli.readings import choose, topic_path
+from shmio.cli.run import dumps
 from shmio.layout.model import Register
+from shmio.logs import printable
 from shmio.segment.attach import Attachment
 
 HELP = "List registers with their types."
@@ -37,7 +39,7 @@ def execute(cell: Attachment, options: argparse.Namespace) -> int:
     width = max((len(topic_path(*item)) for item in found), default=0)
     for block, register in found:
         comment = f"  {register.comment}" if register.comment else ""
-        print(f"{topic_path(block, register):<{width}}  {_type(register)}{comment}".rstrip())
+        print(printable(f"{topic_path(block, register):<{width}}  {_type(register)}{comment}".rstrip()))
     return 0
 
 

@@ -8,7 +8,8 @@ import threading
 from collections.abc import Iterator
 from datetime import UTC, datetime
 
-from shmio.cli.readings import Selected, as_json, as_line, choose, dumps, topic_path
+from shmio.cli.readings import Selected, as_json, as_line, choose, topic_path
+from shmio.cli.run import dumps
 from shmio.errors import NotRunningError
 from shmio.layout.model import Register
 from shmio.segment import Block, Frame, Quality

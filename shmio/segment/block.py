@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from shmio.errors import SegmentError
 from shmio.segment._atomics import REASON_SIZE, Ring
 from shmio.segment.frame import Frame, Provenance, Quality
+from shmio.segment.header import cut
 
 if TYPE_CHECKING:
     from shmio.layout.model import Layout
@@ -151,7 +152,7 @@ class BlockWriter:
     ) -> int:
         """Publish one frame of ``layout.size`` bytes and wake its readers; returns its number.
 
-        ``source_ns`` is UTC, default now. ``reason`` says why quality is not good; it is cut at 128 bytes.
+        ``source_ns`` is UTC, default now. ``reason`` says why quality is not good; it is cut at 256 bytes.
         """
         return self.block.ring.publish(
             raw,
@@ -162,5 +163,5 @@ class BlockWriter:
             time.time_ns() if source_ns is None else source_ns,
             quality,
             provenance,
-            reason.encode()[:REASON_SIZE],
+            cut(reason, REASON_SIZE),
         )

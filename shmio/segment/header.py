@@ -15,7 +15,7 @@ MAGIC: Final = int.from_bytes(b"SHMIOSEG", "little")
 ABI_VERSION: Final = 1
 HEADER_SIZE: Final = 4096
 SECTION_SIZE: Final = 128
-SLOT_SIZE: Final = 512
+SLOT_SIZE: Final = 1024
 MAX_SECTIONS: Final = 1024
 MAX_PROCESSES: Final = 256
 
@@ -175,6 +175,11 @@ def read_supervisor(memory: memoryview) -> tuple[int, State]:
 def text(field: bytes) -> str:
     """A zero-padded UTF-8 field."""
     return field.split(b"\0", 1)[0].decode("utf-8", "replace")
+
+
+def cut(message: str, size: int) -> bytes:
+    """At most ``size`` bytes of UTF-8, whole characters only."""
+    return message.encode()[:size].decode("utf-8", "ignore").encode()
 
 
 def _counts(memory: memoryview) -> tuple[int, int]:

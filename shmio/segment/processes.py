@@ -14,17 +14,17 @@ from enum import IntEnum
 from typing import Final
 
 from shmio.segment import _atomics
-from shmio.segment.header import HEARTBEAT_OFFSET, SLOT_SIZE, Header, text
+from shmio.segment.header import HEARTBEAT_OFFSET, SLOT_SIZE, Header, cut, text
 from shmio.segment.shm import SharedObject
 
 SUPERVISOR_LOCK: Final = 0  # lock byte of the instance; slot i has byte i + 1
 
 _FIXED: Final = struct.Struct("<64s16s")
 _SUPERVISED_AT: Final = 128
-_SUPERVISED: Final = struct.Struct("<IIq104s")
-_HEARTBEAT_AT: Final = 256
-_REPORT_AT: Final = 264
-_REPORT: Final = struct.Struct("<IIq8Q160s")
+_SUPERVISED: Final = struct.Struct("<IIq352s")
+_HEARTBEAT_AT: Final = 512
+_REPORT_AT: Final = 520
+_REPORT: Final = struct.Struct("<IIq8Q408s")
 
 COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "source": ("polls", "overruns", "failures", "connects", "round_trip_us", "rate_mhz"),
@@ -108,7 +108,7 @@ class ProcessSlot:
 
     @supervised.setter
     def supervised(self, value: Supervised) -> None:
-        data = _SUPERVISED.pack(value.phase, value.restarts, value.spawned_ns, cut(value.note, 103))
+        data = _SUPERVISED.pack(value.phase, value.restarts, value.spawned_ns, cut(value.note, 351))
         _atomics.cell_write(self._memory, self._offset + _SUPERVISED_AT, data)
 
     @property
@@ -123,7 +123,7 @@ class ProcessSlot:
     @report.setter
     def report(self, value: Report) -> None:
         counters = (*value.counters, *(0,) * (8 - len(value.counters)))
-        data = _REPORT.pack(value.pid, value.activity, value.started_ns, *counters, cut(value.note, 159))
+        data = _REPORT.pack(value.pid, value.activity, value.started_ns, *counters, cut(value.note, 407))
         _atomics.cell_write(self._memory, self._offset + _REPORT_AT, data)
 
     @property
@@ -187,8 +187,3 @@ class ProcessTable(Sequence[ProcessSlot]):
 def supervisor_beat(memory: memoryview) -> None:
     """The supervisor's own heartbeat."""
     _atomics.store64(memory, HEARTBEAT_OFFSET, time.monotonic_ns())
-
-
-def cut(message: str, size: int) -> bytes:
-    """At most ``size`` bytes of UTF-8, whole characters only."""
-    return message.encode()[:size].decode("utf-8", "ignore").encode()

@@ -22,7 +22,7 @@
 
 #define RING_HEADER_SIZE 128u
 #define SLOT_HEADER_SIZE 64u
-#define REASON_SIZE 128u
+#define REASON_SIZE 256u
 #define RAW_OFFSET (SLOT_HEADER_SIZE + REASON_SIZE)
 #define MAX_SLOTS (1u << 24)
 #define MAX_FRAME_SIZE (1u << 26)

@@ -131,6 +131,9 @@ class SharedObject:
             with suppress(BufferError):  # somebody holds a view; the mapping goes with it
                 self._map.close()
             self._map = None
+        # The mapping has a copy of the descriptor, which would keep the locks as long as a view is held.
+        unlock = struct.pack(_FLOCK, fcntl.F_UNLCK, os.SEEK_SET, 0, 0, 0)
+        fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, unlock)
         os.close(self._fd)
         self._fd = -1
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -75,3 +77,25 @@ def test_a_full_disk_does_not_stop_the_process(tmp_path: Path) -> None:
     file = tmp_path / "x.log"
     file.symlink_to("/dev/full")
     logs.setup(file, "cell").info("lost")
+
+
+STRAY = """
+import os, sys
+from pathlib import Path
+from shmio import logs
+file = Path(sys.argv[1])
+output = os.open(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+os.dup2(output, 1)
+os.dup2(output, 2)
+logs.MAX_FILE_BYTES = 500
+log = logs.setup(file, "cell", streams=True)
+for number in range(100):
+    log.info("line %d", number)
+print("stray", flush=True)
+"""
+
+
+def test_what_a_process_prints_follows_the_rotation(tmp_path: Path) -> None:
+    file = tmp_path / "x.log"
+    subprocess.run([sys.executable, "-c", STRAY, str(file)], check=True)
+    assert "stray" in file.read_text()

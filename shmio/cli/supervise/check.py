@@ -6,7 +6,7 @@ import argparse
 
 from shmio.cli.supervise.prepare import prepare
 from shmio.cli.supervise.target import config_file
-from shmio.cli.supervise.text import printable
+from shmio.logs import printable
 from shmio.segment import PREFIX, BlockSpec
 
 

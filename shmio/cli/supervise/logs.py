@@ -9,9 +9,9 @@ from pathlib import Path
 
 from shmio.cli.supervise.tail import Follower, last_lines
 from shmio.cli.supervise.target import DEFAULT_CONFIG, config_file, instance_name, open_supervised
-from shmio.cli.supervise.text import printable
 from shmio.config import Config, load
 from shmio.errors import ConfigError
+from shmio.logs import printable
 from shmio.supervisor import control
 
 WHERE_S = 5.0

@@ -8,8 +8,8 @@ import sys
 import msgspec
 
 from shmio.cli.supervise.target import instance_name
-from shmio.cli.supervise.text import printable
 from shmio.errors import NotRunningError
+from shmio.logs import printable
 from shmio.supervisor.status import InstanceStatus, ProcessStatus, SourceStatus, read_status
 
 _HEADINGS = ("NAME", "KIND", "STATE", "PID", "RESTARTS", "UPTIME", "")

@@ -16,8 +16,8 @@ from typing import TextIO
 from shmio import logs
 from shmio.cli.supervise.prepare import Prepared, prepare
 from shmio.cli.supervise.target import config_file
-from shmio.cli.supervise.text import printable
 from shmio.errors import AlreadyRunningError, ConfigError, ControlError, SegmentError, ShmioError
+from shmio.logs import printable
 from shmio.segment import PREFIX, Segment, State
 from shmio.supervisor.main import Supervisor
 from shmio.supervisor.plan import MODES, Job

@@ -53,7 +53,7 @@ def test_table_hides_control_characters(tmp_path: Path, capsys: pytest.CaptureFi
     assert main([str(tmp_path / "a.db")]) == 0
     out = capsys.readouterr().out
     assert "\x1b" not in out
-    assert "\\x1b[2J\\x202e" in out
+    assert "\\x1b[2J\\u202e" in out
 
 
 def test_errors_name_their_place(files: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:

@@ -228,10 +228,10 @@ def test_a_process_slot_shows_what_both_sides_wrote(instance: str) -> None:
             Supervised(),
             0,
         )
-        mine.supervised = Supervised(Phase.BACKOFF, 3, 99, "ä" * 100)
+        mine.supervised = Supervised(Phase.BACKOFF, 3, 99, "ä" * 300)
         mine.report = Report(12, Activity.RUNNING, 5, (1, 2, 3, 4, 5, 6), "why\n")
         mine.beat()
-        assert theirs.supervised == Supervised(Phase.BACKOFF, 3, 99, "ä" * 51)
+        assert theirs.supervised == Supervised(Phase.BACKOFF, 3, 99, "ä" * 175)
         assert theirs.report == Report(12, Activity.RUNNING, 5, (1, 2, 3, 4, 5, 6, 0, 0), "why\n")
         assert theirs.counters["overruns"] == 2
         assert theirs.heartbeat_ns > 0
@@ -249,4 +249,15 @@ def test_a_role_is_held_by_one_and_freed_with_its_holder(instance: str) -> None:
         first.close()
         assert not watcher.processes.find("cell").alive()
         second.close()
+        segment.unlink()
+
+
+def test_closing_frees_the_role_even_while_a_ring_is_held(instance: str) -> None:
+    with Segment.create(instance, [block()], PROCESSES) as segment:
+        holder = Segment.open(instance, writable=True)
+        ring = holder.blocks["cell"].ring
+        assert holder.processes.find("cell").take()
+        holder.close()
+        assert not segment.processes.find("cell").alive()
+        assert ring.head() == 0  # the mapping stays
         segment.unlink()
