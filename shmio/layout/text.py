@@ -12,6 +12,7 @@ import re
 from decimal import Decimal
 from typing import Literal
 
+import msgspec
 import numpy as np
 
 from shmio.errors import ValueRangeError
@@ -48,7 +49,9 @@ def to_text(value: Value, register: Register) -> str:
     """
     element = register.element
     if isinstance(value, list):
-        return json.dumps(_shorten_all(value, element), ensure_ascii=False, separators=(",", ":"))
+        if element.base in _FLOATS:  # NaN and infinities, which JSON does not know
+            return json.dumps(_shorten_all(value, element), ensure_ascii=False, separators=(",", ":"))
+        return msgspec.json.encode(value).decode()
     return _scalar_text(value, element)
 
 

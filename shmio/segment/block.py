@@ -23,12 +23,22 @@ _PROVENANCES = tuple(Provenance)
 
 
 def _frame(fields: FrameTuple) -> Frame:
-    quality, provenance = fields[6:8]  # from shared memory: what is unknown is bad
+    number, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance = fields[:8]
+    event, reason, raw, effective = fields[8:]
     return Frame(
-        *fields[:6],
+        number,
+        cycle,
+        publish_ns,
+        clock_ns,
+        source_ns,
+        incarnation,
+        # From shared memory: what is unknown is bad.
         _QUALITIES[quality] if quality < len(_QUALITIES) else Quality.BAD,
         _PROVENANCES[provenance] if provenance < len(_PROVENANCES) else Provenance.SIMULATED,
-        *fields[8:],
+        event,
+        reason,
+        raw,
+        effective,
     )
 
 
@@ -134,7 +144,8 @@ class Cursor:
 class BlockWriter:
     """Writing side of a block: exactly one, in its source's process, from one thread at a time."""
 
-    def __init__(self, block: Block, clock_ns: Callable[[], int]) -> None:
+    def __init__(self, block: Block, clock_ns: Callable[[int], int]) -> None:
+        """``clock_ns`` turns CLOCK_MONOTONIC into the instance's clock."""
         self.block = block
         self._clock_ns = clock_ns
         self.incarnation = block.ring.begin()
@@ -154,14 +165,15 @@ class BlockWriter:
 
         ``source_ns`` is UTC, default now. ``reason`` says why quality is not good; it is cut at 256 bytes.
         """
+        now_ns = time.monotonic_ns()
         return self.block.ring.publish(
             raw,
             effective,
             cycle,
-            time.monotonic_ns(),
-            self._clock_ns(),
+            now_ns,
+            self._clock_ns(now_ns),
             time.time_ns() if source_ns is None else source_ns,
             quality,
             provenance,
-            cut(reason, REASON_SIZE),
+            cut(reason, REASON_SIZE) if reason else b"",
         )

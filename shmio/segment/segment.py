@@ -146,9 +146,9 @@ class Segment:
             blocks[entry.name] = Block(entry.name, layout, ring)
         return blocks
 
-    def clock_ns(self) -> int:
-        """The instance's clock: ns since its start."""
-        return time.monotonic_ns() - self.header.started_ns
+    def clock_ns(self, now_ns: int) -> int:
+        """The instance's clock, ns since its start, at a time of CLOCK_MONOTONIC."""
+        return now_ns - self.header.started_ns
 
     def writer(self, source: str) -> BlockWriter:
         """The writing side of a source's block; for its process alone, which holds the role's lock."""

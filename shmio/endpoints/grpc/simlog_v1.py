@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable, Mapping
+from functools import lru_cache
 from typing import Any
 
 import grpc
@@ -109,7 +110,7 @@ class _Stream(ConflatingQueue):
 def encoder(register: Register, layout: Layout) -> Callable[[Frame], bytes | None]:
     """A function from a frame to the register's ROSMessage, serialised; None where the bytes hold no value.
 
-    Fields of a protobuf message may be concatenated, so what never changes is encoded once.
+    Fields of a protobuf message may be concatenated: what never changes is encoded once, the time once a frame.
     """
     kind = wire.ROSMessage(type=wire_type(register)).SerializeToString()
     decode = codec(register, layout.byte_order).decode
@@ -118,10 +119,13 @@ def encoder(register: Register, layout: Layout) -> Callable[[Frame], bytes | Non
         value = decode(frame.image)
         if value is None:
             return None
-        stamp = wire.time(sec=frame.clock_ns // 1_000_000_000, nsec=frame.clock_ns)
-        body = wire.ROSMessage(
-            value=to_text(value, register), timeStamp=wire.Header(seq=frame.number & 0xFFFFFFFF, stamp=stamp)
-        )
-        return kind + body.SerializeToString()
+        text = wire.ROSMessage(value=to_text(value, register)).SerializeToString()
+        return kind + text + _time_stamp(frame.number, frame.clock_ns)
 
     return encode
+
+
+@lru_cache(maxsize=64)  # a frame or two for each feed
+def _time_stamp(number: int, clock_ns: int) -> bytes:
+    stamp = wire.time(sec=clock_ns // 1_000_000_000, nsec=clock_ns)
+    return wire.ROSMessage(timeStamp=wire.Header(seq=number & 0xFFFFFFFF, stamp=stamp)).SerializeToString()
