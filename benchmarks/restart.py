@@ -1,14 +1,11 @@
 """Kills each process of a whole cell with SIGKILL, under load, and says how long it is gone.
 
-python benchmarks/restart.py [--rounds N]
-
 ``running``: the successor has reported that it runs. ``serving``: its data flows again, seen from outside: a good frame
 in the segment for source and emulator, a value by a new gRPC call for the endpoint.
 """
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import signal
 import statistics
@@ -21,6 +18,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import grpc
+from common import begin, table
 
 from shmio.segment import Activity, Quality, Segment
 from shmio.testing.cell import CONFIG, Cell, kill, until
@@ -30,6 +28,8 @@ from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
 
 ROOT = Path(__file__).parents[1]
 AXIS = "cell/Robot_800/Axs1_Pos"
+ROUNDS = 5
+FIGURES = (min, statistics.median, max)
 STABLE_S = 6.0  # a process that ran this long is restarted at once; sooner, it would wait its turn
 
 
@@ -64,9 +64,7 @@ def measure(cell: Cell, segment: Segment, victim: str) -> tuple[float, float]:
 
 def main() -> None:
     """Print a table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--rounds", type=int, default=3)
-    rounds = parser.parse_args().rounds
+    rounds = 1 if begin("Restart: how long a killed process is gone") else ROUNDS
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         plc, address = (stack.enter_context(reserved_port()) for _ in range(2))
@@ -86,13 +84,11 @@ def main() -> None:
             for victim in ("plc", "cell", "grpc"):
                 time.sleep(STABLE_S)
                 found[victim].append(measure(cell, segment, victim))
-    print(f"{'killed':8} {'running, s':>24} {'serving, s':>24}   (min, median, max of {rounds})")
-    for victim, times in found.items():
-        columns = [
-            f"{min(column):.2f} {statistics.median(column):.2f} {max(column):.2f}"
-            for column in zip(*times, strict=True)
-        ]
-        print(f"{victim:8} {columns[0]:>24} {columns[1]:>24}")
+    rows = [
+        [victim, *(f"{figure(column):.2f}" for column in zip(*times, strict=True) for figure in FIGURES)]
+        for victim, times in found.items()
+    ]
+    table(["killed", "running, s: best", "median", "worst", "serving, s: best", "median", "worst"], rows)
 
 
 if __name__ == "__main__":
