@@ -1,6 +1,6 @@
 """Print the values of topics from another process or host, by SimlogAPI version 1.
 
-python examples/subscribe.py [--count N] HOST:PORT TOPIC...
+python examples/subscribe.py [--count N] [--ca CA.pem [--certificate C.pem --key K.pem]] HOST:PORT TOPIC...
 """
 
 from __future__ import annotations
@@ -8,7 +8,9 @@ from __future__ import annotations
 import argparse
 import asyncio
 import itertools
+import os
 import sys
+from pathlib import Path
 from typing import Any
 
 import grpc
@@ -28,14 +30,25 @@ async def follow(stub: Any, path: str, count: int | None) -> None:
     stream.cancel()
 
 
+def channel_to(options: argparse.Namespace) -> grpc.aio.Channel:
+    """A channel in plain text, or by TLS."""
+    if options.ca is None:
+        return grpc.aio.insecure_channel(options.address)
+    ca, key, certificate = (file and file.read_bytes() for file in (options.ca, options.key, options.certificate))
+    return grpc.aio.secure_channel(options.address, grpc.ssl_channel_credentials(ca, key, certificate))
+
+
 async def main() -> int:
     """Subscribe to all topics at once; exit status 1 when the server refuses or is not there."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, help="stop after so many values of each topic")
+    parser.add_argument("--ca", type=Path, help="use TLS, and trust this authority (PEM)")
+    parser.add_argument("--certificate", type=Path, help="our own certificate (PEM), where the server asks for one")
+    parser.add_argument("--key", type=Path, help="its key (PEM)")
     parser.add_argument("address", metavar="HOST:PORT")
     parser.add_argument("topics", metavar="TOPIC", nargs="+")
     options = parser.parse_args()
-    async with grpc.aio.insecure_channel(options.address) as channel:
+    async with channel_to(options) as channel:
         stub = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
         try:
             await asyncio.gather(*(follow(stub, path, options.count) for path in options.topics))
@@ -50,3 +63,8 @@ if __name__ == "__main__":
         sys.exit(asyncio.run(main()))
     except KeyboardInterrupt:
         sys.exit(130)
+    except BrokenPipeError:  # who read our output went away, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(141)
+    except OSError as error:
+        sys.exit(f"{error.filename}: {error.strerror}")

@@ -111,6 +111,7 @@ class SourceLoop:
         self._reason: str | None = None  # of the bad frame that stands, None while good
         last = writer.block.latest()
         self._raw = last.raw if last else bytes(writer.block.layout.size)
+        self._read_ns = last.source_ns if last else 0  # UTC of the last good image; 0: there was none
         self.counters = Counters()
         self.note = ""
 
@@ -131,13 +132,12 @@ class SourceLoop:
         try:
             if not self._connected:
                 self._connect()
-            began_ns = time.perf_counter_ns()
+            read_ns = time.time_ns()  # the device had these values then, or later
             raw = self._timed_read()
-            self.counters.round_trip_us = (time.perf_counter_ns() - began_ns) // 1000
         except ConnectorError as error:
             return self._fail(cycle, str(error))
-        self._raw = raw
-        self._writer.publish(raw, cycle=cycle)
+        self._raw, self._read_ns = raw, read_ns
+        self._writer.publish(raw, cycle=cycle, source_ns=read_ns)
         self.counters.polls += 1
         if self._reason is not None:
             log.info("quality good", extra=fields(cycle=cycle))
@@ -157,11 +157,18 @@ class SourceLoop:
         log.info("connected %s", self._connector.describe())
 
     def _timed_read(self) -> bytes:
-        self.counters.busy_since_ns = self._clock.now_ns()
+        """An image that is not stale already: nobody knows when, during a long wait, the device had it."""
+        began_ns = self.counters.busy_since_ns = self._clock.now_ns()
         try:
-            return self._connector.read()
+            raw = self._connector.read()
         finally:
             self.counters.busy_since_ns = 0
+        took_ns = self._clock.now_ns() - began_ns
+        self.counters.round_trip_us = took_ns // 1000
+        if took_ns > self._writer.block.stale_ns:
+            limit_ms = self._writer.block.stale_ns / 1e6
+            raise ConnectorError(f"the answer took {took_ns / 1e6:.0f} ms: older than stale_ms ({limit_ms:.0f}) allows")
+        return raw
 
     def _fail(self, cycle: int, reason: str) -> bool:
         self.counters.failures += 1
@@ -179,4 +186,4 @@ class SourceLoop:
             return
         self._reason = reason
         log.warning("quality bad: %s", reason, extra=fields(cycle=cycle))
-        self._writer.publish(self._raw, cycle=cycle, quality=Quality.BAD, reason=reason)
+        self._writer.publish(self._raw, cycle=cycle, source_ns=self._read_ns, quality=Quality.BAD, reason=reason)

@@ -121,6 +121,8 @@ class Layout:
         if len(index) != len(register.dims) or not all(
             low <= i <= high for i, (low, high) in zip(index, register.dims, strict=True)
         ):
+            if not register.dims:
+                raise PathError(f"{register.path}: a single {register.type}, not an array")
             bounds = ",".join(f"{low}..{high}" for low, high in register.dims)
             raise PathError(f"{register.path}: index {list(index)} is outside [{bounds}]")
         if not index:

@@ -152,16 +152,26 @@ def _unknown(layout: Layout, path: str) -> str:
     if below := layout.members(path):
         inside = ", ".join(layout.registers[i].path for i in below[:3])
         return f"{shorten(path)}: a structure, not a register; it holds {inside}{', …' if below[3:] else ''}"
-    # Only what shares the longest known prefix is compared, so that a wrong path costs little in a large block.
-    prefix = path
-    candidates: tuple[int, ...] = ()
-    while "/" in prefix and not candidates:
-        prefix = prefix.rpartition("/")[0]
-        candidates = layout.members(prefix)
-    names = [layout.registers[i].path for i in (candidates or range(len(layout.registers)))[:_NEAR_CANDIDATES]]
-    near = difflib.get_close_matches(path[:200], names, n=3)
-    hint = f"; near: {', '.join(near)}" if near else ""
+    known, missing, names = _where_it_ends(layout, path)
+    prefix = f"{known}/" if known else ""
+    if names and all(map(_INDEX.fullmatch, names)):
+        numbers = sorted(map(int, names))
+        return f"{shorten(prefix + missing)}: the index is outside {numbers[0]}..{numbers[-1]}"
+    near = difflib.get_close_matches(missing[:200], names, n=3)
+    hint = f"; near: {', '.join(prefix + name for name in near)}" if near else ""
     return f"{shorten(path)}: no such register in {layout.name}{hint}"
+
+
+def _where_it_ends(layout: Layout, path: str) -> tuple[str, str, list[str]]:
+    """(the longest prefix that is a structure, the segment after it, the names that could stand there)."""
+    known, below = path, tuple[int, ...]()
+    while known and not below:
+        known = known.rpartition("/")[0]
+        below = layout.members(known)
+    start = len(known) + 1 if known else 0
+    indices = below or range(len(layout.registers))
+    names = dict.fromkeys(layout.registers[i].path[start:].partition("/")[0] for i in indices[:_NEAR_CANDIDATES])
+    return known, path[start:].partition("/")[0], list(names)
 
 
 def shorten(text: str, limit: int = 120) -> str:

@@ -15,16 +15,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
-from shmio.errors import NotRunningError, PathError, QualityError
+from shmio.errors import NotRunningError, PathError, QualityError, SegmentError
 from shmio.layout.codec import Value, codec
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import find, parse_topic
 from shmio.segment.block import Block, Cursor
-from shmio.segment.frame import Frame, Quality
+from shmio.segment.frame import Frame, Provenance, Quality
 from shmio.segment.segment import Segment, instances
 
 if TYPE_CHECKING:
@@ -55,6 +55,7 @@ class View:
     ``missed`` counts the frames lost between the one before in its stream and this one.
     """
 
+    source: str
     frame: Frame
     layout: Layout
     stale_ns: int
@@ -77,7 +78,7 @@ class View:
 
     def __getitem__(self, path: str) -> Value:
         """The value of a register, or of an array's element, whatever the quality; PathError."""
-        register = find(self.layout, path)
+        register = find(self.layout, parse_topic(path, (self.source,), self.source).path)
         return codec(register, self.layout.byte_order).decode(self.frame.image)
 
     @cached_property
@@ -99,6 +100,11 @@ class Attachment:
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
 
+    def _blocks(self) -> dict[str, Block]:
+        if self._segment.closed:
+            raise SegmentError(f"detached from instance {self.instance!r}")
+        return self._segment.blocks
+
     @property
     def instance(self) -> str:
         """Name of the instance."""
@@ -107,7 +113,7 @@ class Attachment:
     @property
     def sources(self) -> list[str]:
         """Names of the sources."""
-        return list(self._segment.blocks)
+        return list(self._blocks())
 
     @property
     def current(self) -> bool:
@@ -116,7 +122,7 @@ class Attachment:
 
     def block(self, source: str | None = None) -> Block:
         """A source's block; None is allowed when there is only one source. PathError."""
-        blocks = self._segment.blocks
+        blocks = self._blocks()
         if source is None and len(blocks) == 1:
             return next(iter(blocks.values()))
         if source not in blocks:
@@ -125,7 +131,7 @@ class Attachment:
 
     def resolve(self, path: str) -> tuple[Block, Register]:
         """Block and register of a topic's path; the source may be left out when there is only one. PathError."""
-        blocks = self._segment.blocks
+        blocks = self._blocks()
         topic = parse_topic(path, blocks, next(iter(blocks)) if len(blocks) == 1 else None)
         if topic.source not in blocks:
             raise PathError(f"{path}: nothing is served under {topic.source} in this version")
@@ -152,7 +158,7 @@ class Attachment:
         frame = block.latest()
         if frame is None:
             raise QualityError(f"source {block.source}: no data yet")
-        return View(frame, block.layout, block.stale_ns)
+        return View(block.source, frame, block.layout, block.stale_ns)
 
     def stream(self, source: str | None = None, timeout_s: float | None = None) -> Iterator[View]:
         """Every frame from this call on, once, in order, gaps counted; ends after ``timeout_s`` without one."""
@@ -166,7 +172,7 @@ class Attachment:
         block = self.block(source)
         cursor = block.cursor(after=None if after is None else max(after.frame.number, block.ring.head() - 1))
         frame = cursor.next(timeout_s)
-        return None if frame is None else View(frame, block.layout, block.stale_ns)
+        return None if frame is None else View(block.source, frame, block.layout, block.stale_ns)
 
     def close(self) -> None:
         """Detach."""
@@ -182,31 +188,36 @@ class Attachment:
 def _views(block: Block, cursor: Cursor, timeout_s: float | None) -> Iterator[View]:
     missed = 0
     while (frame := cursor.next(timeout_s)) is not None:
-        yield View(frame, block.layout, block.stale_ns, cursor.missed - missed)
+        yield View(block.source, frame, block.layout, block.stale_ns, cursor.missed - missed)
         missed = cursor.missed
 
 
 def reading(block: Block, register: Register, frame: Frame | None) -> Reading:
     """One register of one frame, with what is known about it now."""
     if frame is None:
-        return Reading(None, Quality.BAD, "no data yet", "live", None, None)
+        return Reading(None, Quality.BAD, "no data yet", str(Provenance.LIVE), None, None)
     now_ns = time.monotonic_ns()
     quality, reason = frame.assess(block.stale_ns, now_ns)
-    value = codec(register, block.layout.byte_order).decode(frame.image)
-    result = Reading(
-        value, quality, reason, str(frame.provenance), frame.source_ns / 1e9, round(frame.age_ns(now_ns) / 1e9, 6)
-    )
-    if value is None and quality is not Quality.BAD:
-        return replace(result, quality=Quality.BAD, reason=f"the bytes are no {register.type}")
-    return result
+    known = frame.source_ns != 0
+    value = codec(register, block.layout.byte_order).decode(frame.image) if known else None
+    if quality is not Quality.BAD and _holds_none(value):
+        quality, reason = Quality.BAD, f"the bytes are no {register.type}"
+    source_time = frame.source_ns / 1e9 if known else None
+    return Reading(value, quality, reason, str(frame.provenance), source_time, round(frame.age_ns(now_ns) / 1e9, 6))
+
+
+def _holds_none(value: Value) -> bool:
+    """Whether a value, or an element of it, could not be decoded."""
+    return any(map(_holds_none, value)) if isinstance(value, list) else value is None
 
 
 def attach(instance: str | None = None) -> Attachment:
     """Attach to a running instance, by default the only one; NotRunningError, FormatError, SegmentError."""
     if instance is None:
         running = instances()
-        if len(running) != 1:
-            names = ", ".join(running) or "none"
-            raise NotRunningError(f"name the instance to attach to; running: {names}")
+        if not running:
+            raise NotRunningError("no instance is running; start one with shmio-supervisor up")
+        if len(running) > 1:
+            raise NotRunningError(f"several instances are running, name one of them: {', '.join(running)}")
         instance = running[0]
     return Attachment(Segment.open(instance))

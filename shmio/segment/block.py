@@ -163,7 +163,8 @@ class BlockWriter:
     ) -> int:
         """Publish one frame of ``layout.size`` bytes and wake its readers; returns its number.
 
-        ``source_ns`` is UTC, default now. ``reason`` says why quality is not good; it is cut at 256 bytes.
+        ``source_ns`` is UTC, default now; 0: no image yet. ``reason`` says why quality is not
+        good; it is cut at 256 bytes.
         """
         now_ns = time.monotonic_ns()
         return self.block.ring.publish(

@@ -36,7 +36,8 @@ class Frame(NamedTuple):
     ``raw`` is what the source delivered, in its own byte order; ``effective`` is what consumers see, None while it
     equals raw. ``publish_ns`` is CLOCK_MONOTONIC, ``clock_ns`` the instance's clock since its start, ``source_ns``
     UTC. ``cycle`` counts the periods of the source's schedule, so frames of two incarnations of the source's process
-    are told apart from frames that a reader lost.
+    are told apart from frames that a reader lost. ``source_ns`` of a bad frame is that of the image it repeats; 0: the
+    source never had one, and the image is zeros.
     """
 
     number: int

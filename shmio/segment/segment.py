@@ -174,6 +174,11 @@ class Segment:
         if self.shared.current():
             shm.unlink(self.shared.name)
 
+    @property
+    def closed(self) -> bool:
+        """Whether :meth:`close` was called."""
+        return self.shared.closed
+
     def close(self) -> None:
         """Give up mapping and locks; blocks taken from here keep the mapping as long as they are held."""
         self.blocks = {}

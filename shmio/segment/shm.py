@@ -123,6 +123,11 @@ class SharedObject:
         except FileNotFoundError:
             return False
 
+    @property
+    def closed(self) -> bool:
+        """Whether :meth:`close` was called."""
+        return self._fd < 0
+
     def close(self) -> None:
         """Give up mapping, descriptor and locks. A view still held keeps the mapping, not the locks."""
         if self._fd < 0:

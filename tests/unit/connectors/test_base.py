@@ -174,3 +174,35 @@ def test_a_successor_keeps_the_last_bytes_while_it_cannot_connect(segment: Segme
 
     _, _, frames = run(segment, absent, 4)
     assert (frames[0].raw, frames[0].quality, frames[0].incarnation) == ((3).to_bytes(4, "big"), Quality.BAD, 2)
+
+
+def test_an_answer_that_took_too_long_is_never_good(segment: Segment) -> None:
+    clock = VirtualClock(300 * PERIOD_NS)
+
+    def held(hook: str, reads: int) -> None:
+        if hook == "read" and reads == 3:
+            clock.time_ns += segment.blocks["cell"].stale_ns + 1
+
+    device = Device(held)
+    cursor = segment.blocks["cell"].cursor()
+    SourceLoop(device, segment.writer("cell"), Schedule(0, PERIOD_NS), clock).run()
+    frames = list(iter(cursor.poll, None))
+    values = [(int.from_bytes(f.raw, "big"), f.quality) for f in frames[:4]]
+    assert values == [(1, Quality.GOOD), (2, Quality.GOOD), (2, Quality.BAD), (4, Quality.GOOD)]
+    assert "the answer took 1000 ms" in frames[2].reason
+    assert device.calls[:3] == ["connect", "close", "connect"]
+
+
+def test_a_bad_frame_tells_since_when_its_bytes_are(segment: Segment) -> None:
+    def fails_at_first_and_later(hook: str, reads: int) -> None:
+        if (hook == "connect" and not reads) or (hook == "read" and reads == 3):
+            attempts.append(hook)
+            if attempts != ["connect", "connect"]:
+                raise ConnectorError("out")
+
+    attempts: list[str] = []
+    _, _, frames = run(segment, fails_at_first_and_later, 60)
+    never, first, second, again = frames[:4]
+    assert (never.quality, never.source_ns) == (Quality.BAD, 0)
+    assert 0 < first.source_ns <= second.source_ns
+    assert (again.quality, again.source_ns) == (Quality.BAD, second.source_ns)

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 import shmio
-from shmio.errors import NotRunningError, PathError, QualityError
+from shmio.errors import NotRunningError, PathError, QualityError, SegmentError
 from shmio.layout.model import Layout, Register
 from shmio.segment import BlockSpec, BlockWriter, ProcessSpec, Quality, Segment
 from shmio.segment.attach import Attachment
@@ -134,3 +134,22 @@ def test_attaching_to_nothing_names_the_remedy(instance: str) -> None:
 def test_an_unknown_attribute_of_the_package_is_an_attribute_error() -> None:
     with pytest.raises(AttributeError, match="nonsense"):
         shmio.nonsense  # noqa: B018
+
+
+def test_a_value_that_was_never_read_is_none(cell: Attachment, writer: BlockWriter) -> None:
+    writer.publish(image(0), cycle=1, quality=Quality.BAD, reason="absent", source_ns=0)
+    now = cell.read("cell/axis/position")
+    assert (now.value, now.source_time, now.quality) == (None, None, Quality.BAD)
+
+
+def test_a_view_takes_paths_with_the_source_too(cell: Attachment, writer: BlockWriter) -> None:
+    writer.publish(image(3.5), cycle=1)
+    view = cell.frame()
+    assert view["cell/axis/position"] == view["axis/position"] == 3.5
+
+
+def test_a_detached_program_is_told_so(instance: str, writer: BlockWriter) -> None:
+    cell = shmio.attach(instance)
+    cell.close()
+    with pytest.raises(SegmentError, match="detached"):
+        cell["cell/on"]
