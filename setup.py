@@ -22,6 +22,7 @@ class AbiWheel(bdist_wheel):
     """One wheel for every CPython from 3.11 on (limited API)."""
 
     def finalize_options(self) -> None:
+        """Say which Pythons the extension serves."""
         self.py_limited_api = "cp311"
         super().finalize_options()
 

@@ -2,7 +2,7 @@
 
 One line an event, fields in fixed order, extra fields as ``key=value``::
 
-    2026-11-21T05:20:01.123456Z INFO    cell[1234] connected pdu=960 jobs=8
+    2026-11-21T05:20:01.123456Z INFO    cell[1234] quality good source=cell cycle=1207
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ KEPT_FILES = 3
 class LineFormatter(logging.Formatter):
     """Formats a record as one line; a traceback follows indented. Control characters are escaped."""
 
-    def __init__(self, process: str) -> None:
+    def __init__(self, process: str, source: str | None) -> None:
         super().__init__()
         self._process = f"{process}[{os.getpid()}]"
+        self._always = {} if source is None else {"source": source}
 
     def format(self, record: logging.LogRecord) -> str:
         """One record as text."""
         stamp = datetime.fromtimestamp(record.created, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
-        fields = getattr(record, "fields", {})
+        fields = self._always | getattr(record, "fields", {})
         message = printable(" ".join([record.getMessage(), *(f"{key}={value}" for key, value in fields.items())]))
         line = f"{stamp} {record.levelname:<7} {self._process} {message}"
         if record.exc_info:
@@ -53,10 +54,12 @@ class RotatingLog(logging.handlers.RotatingFileHandler):
             os.dup2(self.stream.fileno(), 2)
 
 
-def setup(file: Path, process: str, *, console: bool = False, streams: bool = False) -> logging.Logger:
+def setup(
+    file: Path, process: str, *, source: str | None = None, console: bool = False, streams: bool = False
+) -> logging.Logger:
     """Send this process's records to ``file``, rotated at 5 MB with 3 kept; with ``console`` to standard error too.
 
-    ``streams``: standard output and error lead to the file already and are to follow it.
+    ``source``: named in each line. ``streams``: standard output and error lead to the file already; they are to follow.
     Returns the logger named ``shmio``. ConfigError when the file cannot be written.
     """
     try:
@@ -71,7 +74,7 @@ def setup(file: Path, process: str, *, console: bool = False, streams: bool = Fa
         root.removeHandler(old)
         old.close()
     for handler in handlers:
-        handler.setFormatter(LineFormatter(process))
+        handler.setFormatter(LineFormatter(process, source))
         root.addHandler(handler)
     root.setLevel(logging.INFO)
     logging.captureWarnings(True)

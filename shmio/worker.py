@@ -23,7 +23,7 @@ from shmio.segment import Activity, Report, Segment
 
 BEAT_S = 0.2
 ROLE_WAIT_S = 10.0
-MAX_SPEC_BYTES = 1 << 22
+MAX_SPEC_BYTES = 1 << 26
 
 
 class Worker:
@@ -35,7 +35,9 @@ class Worker:
         self.config: dict[str, Any] = spec["config"]
         self.stopping = threading.Event()
         self._on_stop: Callable[[], object] | None = None
-        self.log = logs.setup(Path(spec["log_file"]), self.name, streams=True)
+        self.log = logs.setup(
+            Path(spec["log_file"]), self.name, source=self.name if self.kind == "source" else None, streams=True
+        )
         self.segment = Segment.open(spec["instance"], writable=True)
         if self.segment.header.epoch != spec["epoch"]:
             raise SegmentError(f"the segment of instance {spec['instance']!r} is another run's; this process ends")
@@ -53,6 +55,9 @@ class Worker:
             if time.monotonic() > deadline:
                 raise SegmentError(f"role {self.name} is still held by pid {self.slot.report.pid}")
             time.sleep(0.02)
+        # Its supervisor may have died meanwhile, and who cleared up after it did not see us: then this is no instance.
+        if not self.segment.shared.current():
+            raise SegmentError(f"the segment of instance {self.segment.instance!r} was removed; this process ends")
 
     def running(self) -> None:
         """Tell that start-up is over."""
@@ -133,8 +138,11 @@ def _read_spec() -> dict[str, Any]:
     if sys.stdin.isatty():
         raise ConfigError("this module is a worker: shmio-supervisor starts it")
     try:
-        spec = json.loads(sys.stdin.buffer.read(MAX_SPEC_BYTES))
+        data = sys.stdin.buffer.read(MAX_SPEC_BYTES + 1)
         sys.stdin.close()
+        if len(data) > MAX_SPEC_BYTES:
+            raise ConfigError(f"the process description is larger than {MAX_SPEC_BYTES} bytes: the layout is too large")
+        spec = json.loads(data)
     except ValueError:
         raise ConfigError("no process description on standard input; shmio-supervisor starts workers") from None
     missing = {"instance", "epoch", "name", "kind", "log_file", "config"} - set(spec)

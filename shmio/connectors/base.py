@@ -7,6 +7,7 @@ counted, one bad frame when quality changes, the connection dropped on any error
 from __future__ import annotations
 
 import logging
+import re
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -20,6 +21,9 @@ from shmio.errors import ConnectorError
 from shmio.layout.model import Layout
 from shmio.logs import fields
 from shmio.segment import BlockWriter, Quality
+
+STABLE_NS = 1_000_000_000
+"""A connection that has lasted this long has put its failures behind it."""
 
 log = logging.getLogger("shmio.source")
 
@@ -107,8 +111,8 @@ class SourceLoop:
         self._schedule = schedule
         self._clock = clock
         self._backoff = Backoff()
-        self._connected = False
-        self._reason: str | None = None  # of the bad frame that stands, None while good
+        self._connected_ns: int | None = None
+        self._reason: str | None = None  # of the bad frame that stands, without its numbers; empty while good
         last = writer.block.latest()
         self._raw = last.raw if last else bytes(writer.block.layout.size)
         self._read_ns = last.source_ns if last else 0  # UTC of the last good image; 0: there was none
@@ -130,7 +134,7 @@ class SourceLoop:
     def poll(self, cycle: int) -> bool:
         """One cycle: connect if need be, read, publish. False: told to stop while backing off."""
         try:
-            if not self._connected:
+            if self._connected_ns is None:
                 self._connect()
             read_ns = time.time_ns()  # the device had these values then, or later
             raw = self._timed_read()
@@ -139,11 +143,12 @@ class SourceLoop:
         self._raw, self._read_ns = raw, read_ns
         self._writer.publish(raw, cycle=cycle, source_ns=read_ns)
         self.counters.polls += 1
-        if self._reason is not None:
-            log.info("quality good", extra=fields(cycle=cycle))
-            self._reason = None
+        if self._reason != "":
+            log.info("quality good, connected %s", self._connector.describe(), extra=fields(cycle=cycle))
+            self._reason = ""
         self.note = ""
-        self._backoff.reset()
+        if self._connected_ns is not None and self._clock.now_ns() - self._connected_ns > STABLE_NS:
+            self._backoff.reset()
         return True
 
     def _connect(self) -> None:
@@ -152,9 +157,8 @@ class SourceLoop:
             self._connector.connect()
         finally:
             self.counters.busy_since_ns = 0
-        self._connected = True
+        self._connected_ns = self._clock.now_ns()
         self.counters.connects += 1
-        log.info("connected %s", self._connector.describe())
 
     def _timed_read(self) -> bytes:
         """An image that is not stale already: nobody knows when, during a long wait, the device had it."""
@@ -172,7 +176,7 @@ class SourceLoop:
 
     def _fail(self, cycle: int, reason: str) -> bool:
         self.counters.failures += 1
-        self._connected = False
+        self._connected_ns = None
         self._connector.close()
         self._bad(cycle, reason)
         stop = self._clock.wait_ns(round(self._backoff.next_s() * 1e9))
@@ -180,10 +184,11 @@ class SourceLoop:
         return not stop
 
     def _bad(self, cycle: int, reason: str) -> None:
-        """Publish one bad frame for each new reason, with the last bytes known."""
+        """Publish one bad frame for each new reason, with the last bytes known; another number in it is none."""
         self.note = reason
-        if reason == self._reason:
+        kind = re.sub(r"[0-9]+", "#", reason)
+        if kind == self._reason:
             return
-        self._reason = reason
+        self._reason = kind
         log.warning("quality bad: %s", reason, extra=fields(cycle=cycle))
         self._writer.publish(self._raw, cycle=cycle, source_ns=self._read_ns, quality=Quality.BAD, reason=reason)

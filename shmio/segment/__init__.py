@@ -7,7 +7,7 @@ from shmio.segment.block import Block, BlockWriter, Cursor
 from shmio.segment.frame import Frame, Provenance, Quality
 from shmio.segment.header import State
 from shmio.segment.processes import Activity, Phase, ProcessSlot, ProcessSpec, Report, Supervised
-from shmio.segment.segment import PREFIX, BlockSpec, Segment, instances, segment_size
+from shmio.segment.segment import PREFIX, BlockSpec, Segment, instances, running_instances, segment_size
 
 __all__ = [
     "PREFIX",
@@ -27,5 +27,6 @@ __all__ = [
     "State",
     "Supervised",
     "instances",
+    "running_instances",
     "segment_size",
 ]

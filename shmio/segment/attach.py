@@ -25,12 +25,16 @@ from shmio.layout.model import Layout, Register
 from shmio.layout.topic import find, parse_topic
 from shmio.segment.block import Block, Cursor
 from shmio.segment.frame import Frame, Provenance, Quality
-from shmio.segment.segment import Segment, instances
+from shmio.segment.segment import Segment, running_instances
 
 if TYPE_CHECKING:
     import numpy as np
 
     from shmio.layout.framecodec import FrameCodec
+
+
+TURN_S = 1.0
+"""How often a waiting reader looks whether the instance still is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +82,10 @@ class View:
 
     def __getitem__(self, path: str) -> Value:
         """The value of a register, or of an array's element, whatever the quality; PathError."""
-        register = find(self.layout, parse_topic(path, (self.source,), self.source).path)
+        topic = parse_topic(path, (self.source,), self.source)
+        if topic.direction == "in":
+            raise PathError(f"{path}: a frame holds what comes out of its source; leave out /in")
+        register = find(self.layout, topic.path)
         return codec(register, self.layout.byte_order).decode(self.frame.image)
 
     @cached_property
@@ -161,9 +168,31 @@ class Attachment:
         return View(block.source, frame, block.layout, block.stale_ns)
 
     def stream(self, source: str | None = None, timeout_s: float | None = None) -> Iterator[View]:
-        """Every frame from this call on, once, in order, gaps counted; ends after ``timeout_s`` without one."""
+        """Every frame from this call on, once, in order, gaps counted; ends after ``timeout_s`` without one.
+
+        NotRunningError when the instance has stopped.
+        """
         block = self.block(source)
-        return _views(block, block.cursor(), timeout_s)
+        return self._views(block, block.cursor(), timeout_s)
+
+    def _views(self, block: Block, cursor: Cursor, timeout_s: float | None) -> Iterator[View]:
+        missed = 0
+        while (frame := self._next(cursor, timeout_s)) is not None:
+            yield View(block.source, frame, block.layout, block.stale_ns, cursor.missed - missed)
+            missed = cursor.missed
+
+    def _next(self, cursor: Cursor, timeout_s: float | None) -> Frame | None:
+        """Wait for a frame in turns: a stopped instance rings no bell."""
+        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            rest_s = TURN_S if deadline_s is None else deadline_s - time.monotonic()
+            frame = cursor.next(min(rest_s, TURN_S))
+            if frame is not None:
+                return frame
+            if not self.current:
+                raise NotRunningError(f"instance {self.instance!r} has stopped")
+            if rest_s < TURN_S:
+                return None
 
     def wait(
         self, source: str | None = None, *, after: View | None = None, timeout_s: float | None = None
@@ -171,7 +200,7 @@ class Attachment:
         """The newest frame as soon as it is newer than ``after`` (default: than now); None when the time is over."""
         block = self.block(source)
         cursor = block.cursor(after=None if after is None else max(after.frame.number, block.ring.head() - 1))
-        frame = cursor.next(timeout_s)
+        frame = self._next(cursor, timeout_s)
         return None if frame is None else View(block.source, frame, block.layout, block.stale_ns)
 
     def close(self) -> None:
@@ -183,13 +212,6 @@ class Attachment:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _views(block: Block, cursor: Cursor, timeout_s: float | None) -> Iterator[View]:
-    missed = 0
-    while (frame := cursor.next(timeout_s)) is not None:
-        yield View(block.source, frame, block.layout, block.stale_ns, cursor.missed - missed)
-        missed = cursor.missed
 
 
 def reading(block: Block, register: Register, frame: Frame | None) -> Reading:
@@ -214,7 +236,7 @@ def _holds_none(value: Value) -> bool:
 def attach(instance: str | None = None) -> Attachment:
     """Attach to a running instance, by default the only one; NotRunningError, FormatError, SegmentError."""
     if instance is None:
-        running = instances()
+        running = running_instances()
         if not running:
             raise NotRunningError("no instance is running; start one with shmio-supervisor up")
         if len(running) > 1:

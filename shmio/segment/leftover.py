@@ -9,7 +9,7 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from shmio.errors import AlreadyRunningError, NotRunningError, SegmentError
+from shmio.errors import AlreadyRunningError, SegmentError
 from shmio.segment import shm
 from shmio.segment.processes import SUPERVISOR_LOCK
 from shmio.segment.segment import PREFIX, Segment
@@ -22,7 +22,7 @@ def clear(instance: str) -> list[str]:
     """Stop the orphans of a dead supervisor and unlink its segment; what was done, a line each.
 
     The supervisor's lock is held meanwhile, so that of two callers one does it. AlreadyRunningError: a supervisor is
-    alive. Nothing to clear is no error.
+    alive. SegmentError: a process cannot be identified. Nothing to clear is no error.
     """
     name = PREFIX + instance
     try:
@@ -34,7 +34,7 @@ def clear(instance: str) -> list[str]:
             raise AlreadyRunningError(_supervisor(instance))
         if not shared.current():
             return []
-        done = _stop_orphans(instance)
+        done = _stop_orphans(instance, shared)
         shm.unlink(name)
         return [*done, f"removed the left-over segment {name}"]
     finally:
@@ -49,37 +49,52 @@ def _supervisor(instance: str) -> str:
         return f"another supervisor is just starting instance {instance!r}"
 
 
-def _stop_orphans(instance: str) -> list[str]:
-    """Terminate every process that still holds its role's lock."""
+def _stop_orphans(instance: str, shared: SharedObject) -> list[str]:
+    """Terminate every process that holds a role, and take all roles, so that a late one gets none."""
     try:
         segment = Segment.open(instance)
-    except (NotRunningError, SegmentError):
+    except SegmentError:
         return []  # not a whole segment: its supervisor died before it had children
+    stopped: dict[int, tuple[str, int]] = {}
     with segment:
-        orphans = [(slot.name, slot.report.pid) for slot in segment.processes if slot.alive()]
-        handles: dict[int, tuple[str, int]] = {}
-        for name, pid in orphans:
-            with suppress(ProcessLookupError):
-                fd = os.pidfd_open(pid) if pid else -1
-                if fd >= 0 and _maps(pid, segment.shared.name):
-                    handles[fd] = (name, pid)
-                elif fd >= 0:
-                    os.close(fd)
+        held = {index: slot for index, slot in enumerate(segment.processes) if not shared.try_lock(index + 1)}
+        deadline = time.monotonic() + GRACE_S
         try:
-            for sign, grace_s in ((signal.SIGTERM, GRACE_S), (signal.SIGKILL, GRACE_S)):
-                _signal_and_wait(set(handles), sign, grace_s)
+            while held and time.monotonic() < deadline:
+                for index, slot in list(held.items()):
+                    pid = slot.report.pid  # a process that has just taken its role has not told it yet
+                    fd = _open_if_it_maps(pid, shared.inode) if pid else None
+                    if fd is not None:
+                        stopped[fd] = (slot.name, pid)
+                    if fd is not None or shared.try_lock(index + 1):
+                        del held[index]
+                time.sleep(0.01 if held else 0)
+            for sign in (signal.SIGTERM, signal.SIGKILL):
+                _signal_and_wait(set(stopped), sign, GRACE_S)
         finally:
-            for fd in handles:
+            for fd in stopped:
                 os.close(fd)
-        return [f"stopped {name}, pid {pid}, which had lost its supervisor" for name, pid in handles.values()]
+    if held:
+        names = ", ".join(slot.name for slot in held.values())
+        raise SegmentError(
+            f"instance {instance!r} has processes that cannot be told from others: {names}; end them first"
+        )
+    return [f"stopped {name}, pid {pid}, which had lost its supervisor" for name, pid in stopped.values()]
 
 
-def _maps(pid: int, name: str) -> bool:
-    """Whether the process maps the segment: certainty that the pid is not a stranger's by now."""
+def _open_if_it_maps(pid: int, inode: int) -> int | None:
+    """A pidfd, if the process maps the segment: certainty that the pid is not a stranger's by now."""
     try:
-        return f"{shm.DIRECTORY}/{name}" in Path(f"/proc/{pid}/maps").read_text()
-    except OSError:
-        return False
+        fd = os.pidfd_open(pid)
+    except ProcessLookupError:
+        return None
+    with suppress(OSError):
+        maps = Path(f"/proc/{pid}/maps").read_text().splitlines()
+        # address perms offset dev inode path: proc_pid_maps(5)
+        if any(line.split(maxsplit=5)[4] == str(inode) and str(shm.DIRECTORY) in line for line in maps):
+            return fd
+    os.close(fd)
+    return None
 
 
 def _signal_and_wait(pidfds: set[int], sign: signal.Signals, grace_s: float) -> None:

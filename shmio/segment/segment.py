@@ -115,7 +115,7 @@ class Segment:
         try:
             shared = SharedObject.open(name, writable=writable)
         except FileNotFoundError:
-            running = ", ".join(instances()) or "none"
+            running = ", ".join(running_instances()) or "none"
             raise NotRunningError(
                 f"no instance {instance!r} is running (running: {running}); start it with shmio-supervisor up"
             ) from None
@@ -196,6 +196,16 @@ class Segment:
 def instances() -> list[str]:
     """Names of the instances that have a segment, whole or left over."""
     return [name.removeprefix(PREFIX) for name in shm.names(PREFIX)]
+
+
+def running_instances() -> list[str]:
+    """Names of the instances that live: a supervisor, or at least one of its processes, is there."""
+    found = []
+    for name in instances():
+        with suppress(SegmentError), Segment.open(name) as segment:
+            if segment.supervised or any(slot.alive() for slot in segment.processes):
+                found.append(name)
+    return found
 
 
 def segment_size(blocks: Sequence[BlockSpec], processes: int) -> int:

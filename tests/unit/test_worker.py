@@ -131,6 +131,19 @@ def test_a_worker_of_another_run_of_the_instance_ends(segment: Segment, tmp_path
     assert "another run" in errors
 
 
+def test_a_worker_that_gets_its_role_in_a_removed_segment_ends(segment: Segment, tmp_path: Path) -> None:
+    with Segment.open(segment.instance, writable=True) as holder:
+        assert holder.processes.find("cell").take()
+        with Started(segment, tmp_path, "work") as worker:
+            name = f"/dev/shm/shmio-{segment.instance}"
+            until(lambda: name in Path(f"/proc/{worker.process.pid}/maps").read_text(), "the worker attached")
+            segment.unlink()
+            holder.close()
+            returned, errors = worker.end()
+    assert returned == 1
+    assert "was removed" in errors
+
+
 def test_without_a_description_it_says_who_starts_it(segment: Segment, tmp_path: Path) -> None:
     for standard_input in ("", "nonsense", "[]", '{"name": "cell"}'):
         with Started.__new__(Started) as worker:

@@ -194,15 +194,57 @@ def test_an_answer_that_took_too_long_is_never_good(segment: Segment) -> None:
 
 
 def test_a_bad_frame_tells_since_when_its_bytes_are(segment: Segment) -> None:
-    def fails_at_first_and_later(hook: str, reads: int) -> None:
-        if (hook == "connect" and not reads) or (hook == "read" and reads == 3):
-            attempts.append(hook)
-            if attempts != ["connect", "connect"]:
-                raise ConnectorError("out")
+    def fails_first_and_in_read_3(hook: str, reads: int) -> None:
+        if (hook == "connect" and not device_calls) or (hook == "read" and reads == 3):
+            device_calls.append(hook)
+            raise ConnectorError("out")
 
-    attempts: list[str] = []
-    _, _, frames = run(segment, fails_at_first_and_later, 60)
+    device_calls: list[str] = []
+    _, _, frames = run(segment, fails_first_and_in_read_3, 60)
     never, first, second, again = frames[:4]
     assert (never.quality, never.source_ns) == (Quality.BAD, 0)
     assert 0 < first.source_ns <= second.source_ns
     assert (again.quality, again.source_ns) == (Quality.BAD, second.source_ns)
+
+
+def test_a_flapping_device_is_left_alone_for_longer_and_longer(segment: Segment) -> None:
+    clock = VirtualClock(8 * 10**9)
+    connects_ns: list[int] = []
+
+    def flaps(hook: str, reads: int) -> None:
+        if hook == "connect":
+            connects_ns.append(clock.time_ns)
+        elif reads % 2 == 0:
+            raise ConnectorError("gone again")
+
+    SourceLoop(Device(flaps), segment.writer("cell"), Schedule(0, PERIOD_NS), clock).run()
+    gaps_ms = [(b - a) // 1_000_000 for a, b in pairwise(connects_ns)]
+    assert gaps_ms[0] < 300
+    assert gaps_ms[-1] >= 2000
+
+
+def test_a_device_that_was_stable_is_tried_again_at_once(segment: Segment) -> None:
+    clock = VirtualClock(20 * 10**9)
+    failures_ns: list[int] = []
+    connects_ns: list[int] = []
+
+    def fails_every_100_reads(hook: str, reads: int) -> None:
+        if hook == "connect":
+            connects_ns.append(clock.time_ns)
+        elif reads % 100 == 0:
+            failures_ns.append(clock.time_ns)
+            raise ConnectorError("gone")
+
+    SourceLoop(Device(fails_every_100_reads), segment.writer("cell"), Schedule(0, PERIOD_NS), clock).run()
+    waits_ms = [(c - f) // 1_000_000 for f, c in zip(failures_ns, connects_ns[1:], strict=False)]
+    assert len(waits_ms) > 5
+    assert max(waits_ms) < 150
+
+
+def test_a_number_in_a_reason_makes_no_new_frame(segment: Segment) -> None:
+    def varies(hook: str, reads: int) -> None:
+        if hook == "read":
+            raise ConnectorError(f"frame of {reads} bytes")
+
+    _, _, frames = run(segment, varies, 100)
+    assert [frame.reason for frame in frames] == ["frame of 1 bytes", "the source was stopped"]
