@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from datetime import UTC, datetime
 from typing import Any
 
 from shmio.errors import PathError
-from shmio.layout.codec import Value
 from shmio.layout.glob import select
 from shmio.layout.model import Register
-from shmio.layout.text import shortest, to_text
+from shmio.layout.text import json_value, to_text
 from shmio.layout.topic import find, parse_topic
 from shmio.logs import printable
 from shmio.segment.attach import Attachment, Reading
@@ -58,7 +56,7 @@ def topic_path(block: Block, register: Register) -> str:
 def as_json(reading: Reading, register: Register) -> dict[str, Any]:
     """A reading as the object that ``get --json`` and ``watch --json`` print."""
     return {
-        "value": _json_value(reading.value, register),
+        "value": json_value(reading.value, register.element),
         "quality": str(reading.quality),
         "reason": reading.reason,
         "provenance": reading.provenance,
@@ -74,15 +72,6 @@ def as_line(path: str, reading: Reading, register: Register, width: int) -> str:
         text = text[: SHOWN_CHARACTERS - 1] + "…"
     quality = "" if reading.quality is Quality.GOOD else f"  {reading.quality}: {printable(reading.reason)}"
     return f"{printable(path):<{width}}  {text}{quality}"
-
-
-def _json_value(value: Value, register: Register) -> Any:
-    """JSON knows no NaN or infinity: they are the texts of wire version 1."""
-    if isinstance(value, list):
-        return [_json_value(item, register) for item in value]
-    if isinstance(value, float):
-        return shortest(value, register.element) if math.isfinite(value) else to_text(value, register)
-    return value
 
 
 def _iso(seconds: float) -> str:

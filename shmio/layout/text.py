@@ -49,9 +49,7 @@ def to_text(value: Value, register: Register) -> str:
     """
     element = register.element
     if isinstance(value, list):
-        if element.base in _FLOATS:  # NaN and infinities, which JSON does not know
-            return json.dumps(_shorten_all(value, element), ensure_ascii=False, separators=(",", ":"))
-        return msgspec.json.encode(value).decode()
+        return msgspec.json.encode(json_value(value, element) if element.base in _FLOATS else value).decode()
     return _scalar_text(value, element)
 
 
@@ -74,15 +72,27 @@ def from_text(text: str, register: Register) -> Value:
         value = json.loads(text)
     except (ValueError, RecursionError):
         raise ValueRangeError(f"{register.path}: expected a JSON array, found {brief(text)}") from None
+    if element.base in _FLOATS:
+        value = _finite_or_not(value)
     for item in flatten(value, register.shape, register.path):
         _check(item, element)
     return value  # type: ignore[no-any-return]  # flatten has seen to its shape, _check to its elements
 
 
-def _shorten_all(value: Value, element: ElementType) -> Value:
+def json_value(value: Value, element: ElementType) -> Value:
+    """Return a value fit for JSON: a REAL's shortest digits; NaN and infinities, which JSON does not know, as texts."""
     if isinstance(value, list):
-        return [_shorten_all(item, element) for item in value]
-    return shortest(value, element) if isinstance(value, float) else value
+        return [json_value(item, element) for item in value]
+    if isinstance(value, float):
+        return shortest(value, element) if math.isfinite(value) else _scalar_text(value, element)
+    return value
+
+
+def _finite_or_not(value: object) -> object:
+    """Read the texts of ``json_value`` back."""
+    if isinstance(value, list):
+        return [_finite_or_not(item) for item in value]
+    return _NON_FINITE.get(value, value) if isinstance(value, str) else value
 
 
 def _scalar_text(value: Scalar, element: ElementType) -> str:

@@ -120,7 +120,8 @@ def test_refused(text: str, type_: str) -> None:
 def test_arrays() -> None:
     reals = register("REAL", ((0, 1), (0, 1)), 4)
     value: Value = [[0.10000000149011612, math.nan], [math.inf, -0.0]]
-    assert to_text(value, reals) == "[[0.1,NaN],[Infinity,-0.0]]"
+    assert to_text(value, reals) == '[[0.1,"NaN"],["Infinity",-0.0]]'
+    assert repr(from_text(to_text(value, reals), reals)) == "[[0.1, nan], [inf, -0.0]]"
     assert repr(from_text("[[0.1,NaN],[Infinity,-0.0]]", reals)) == "[[0.1, nan], [inf, -0.0]]"
     bits = register("BOOL", ((0, 1),), 2)
     assert to_text([True, False], bits) == "[true,false]"
