@@ -31,6 +31,9 @@ class Listener(Protocol):
     def deliver(self, message: bytes) -> None:
         """Take one message for this stream."""
 
+    def lose(self) -> None:
+        """Quality is bad: what was not sent yet must not be sent any more."""
+
 
 class Channel:
     """One register as somebody listens to it: how a frame becomes a message, and who gets it."""
@@ -60,6 +63,8 @@ class Feed:
         self._on_quality = on_quality
         self._channels: dict[Register, Channel] = {}
         self._table = _Table((), ChangeScan([]))
+        self._owed: dict[Listener, Channel] = {}  # joined while there was no good value
+        _ = block.layout.members("")  # builds what paths are looked up in, before the first client waits for it
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"feed-{block.source}", daemon=True)
 
@@ -81,27 +86,54 @@ class Feed:
         self._thread.join()
 
     def listen(self, register: Register, encode: Callable[[Frame], bytes | None], listener: Listener) -> None:
-        """Join a register's listeners; the current value, if it is good, is delivered at once."""
+        """Join a register's listeners; the current value is delivered at once, or as soon as it is good."""
         channel = self._channels.get(register)
         if channel is None:
             channel = self._channels[register] = Channel(register, encode)
             self._rebuild()
-        frame = self.block.latest()
-        listener.since = 0
-        if frame is not None and frame.assess(self.block.stale_ns)[0] is not Quality.BAD:
-            listener.since = frame.number
-            message = channel.encode(frame)
-            if message is not None:
-                listener.deliver(message)
         channel.listeners.add(listener)
+        listener.since = 0
+        self._owed[listener] = channel
+        self._settle()
 
     def leave(self, register: Register, listener: Listener) -> None:
         """Leave; the last listener takes the channel with it."""
+        self._owed.pop(listener, None)
         channel = self._channels[register]
         channel.listeners.discard(listener)
         if not channel.listeners:
             del self._channels[register]
             self._rebuild()
+
+    def _settle(self) -> None:
+        """Give those who are owed a value the newest one, if it is good."""
+        frame = self.block.latest() if self._owed else None
+        if frame is None or frame.assess(self.block.stale_ns)[0] is Quality.BAD:
+            return
+        for listener, channel in self._owed.items():
+            listener.since = frame.number
+            message = channel.encode(frame)
+            if message is not None:
+                listener.deliver(message)
+        self._owed.clear()
+
+    def _deliver(self, frame: int, batch: list[tuple[Channel, bytes]]) -> None:
+        """Hand a frame's messages to all who have not seen that frame yet."""
+        for channel, message in batch:
+            for listener in channel.listeners:
+                if frame > listener.since:
+                    self._owed.pop(listener, None)
+                    listener.deliver(message)
+        self._settle()
+
+    def _turn(self, good: bool) -> None:
+        """Tell a change of quality, in its place between the messages."""
+        if not good:
+            for channel in self._channels.values():
+                for listener in channel.listeners:
+                    listener.lose()
+                    listener.since = 0  # it may have lost this very value
+        self._on_quality(self.block.source, good)
 
     def _rebuild(self) -> None:
         channels = tuple(self._channels.values())
@@ -119,44 +151,31 @@ class Feed:
         block = self.block
         newest = block.latest()
         cursor = block.cursor(after=newest.number - 1 if newest else 0)
-        shown: bytes | None = None  # the image that listeners have seen; None while quality is bad
+        shown: Frame | None = None  # what listeners have seen; None while quality is bad
         while not self._stopping.is_set():
             if cursor.behind > CATCH_UP_FRAMES:
                 cursor = block.cursor(after=block.ring.head() - 1)
             frame = cursor.next(timeout_s=min(WAIT_S, block.stale_ns / 1e9))
-            if frame is None:
-                frame = block.latest()
-                good = frame is not None and frame.assess(block.stale_ns)[0] is not Quality.BAD
-                if shown is not None and not good:
-                    shown = None
-                    self._tell(False)
-                continue
-            if frame.quality is Quality.BAD or frame.age_ns(time.monotonic_ns()) > block.stale_ns:
-                if shown is not None:
-                    self._tell(False)
+            good = frame is not None and frame.assess(block.stale_ns)[0] is not Quality.BAD
+            # Age by the next frame's time, if there is one: it may have been stale while nobody was awake to see it.
+            until_ns = frame.publish_ns if frame else time.monotonic_ns()
+            stale = shown is not None and shown.age_ns(until_ns) > block.stale_ns
+            if shown is not None and (stale or (frame is not None and not good)):
                 shown = None
-                continue
-            recovered = shown is None
-            table = self._table
-            if recovered:
-                self._tell(True)
-                news: Sequence[Channel] = table.channels
-            else:
-                assert shown is not None  # noqa: S101  for the type checker
-                news = [table.channels[i] for i in table.scan.changed(shown, frame.image)]
-            shown = frame.image
-            batch = [(channel, message) for channel in news if (message := channel.encode(frame)) is not None]
-            if batch:
-                self.messages += len(batch)
-                self._loop.call_soon_threadsafe(_deliver, frame.number, batch)
+                self._loop.call_soon_threadsafe(self._turn, False)
+            if frame is not None and good:
+                self._show(shown, frame)
+                shown = frame
 
-    def _tell(self, good: bool) -> None:
-        self._loop.call_soon_threadsafe(self._on_quality, self.block.source, good)
-
-
-def _deliver(frame: int, batch: list[tuple[Channel, bytes]]) -> None:
-    """Hand a frame's messages to all who have not seen that frame yet."""
-    for channel, message in batch:
-        for listener in channel.listeners:
-            if frame > listener.since:
-                listener.deliver(message)
+    def _show(self, shown: Frame | None, frame: Frame) -> None:
+        """Encode what has changed since the frame shown before; everything, if there is none."""
+        table = self._table
+        if shown is None:
+            self._loop.call_soon_threadsafe(self._turn, True)
+            news: Sequence[Channel] = table.channels
+        else:
+            news = [table.channels[i] for i in table.scan.changed(shown.image, frame.image)]
+        batch = [(channel, message) for channel in news if (message := channel.encode(frame)) is not None]
+        if batch or self._owed:
+            self.messages += len(batch)
+            self._loop.call_soon_threadsafe(self._deliver, frame.number, batch)

@@ -7,23 +7,30 @@ from collections import deque
 
 
 class ConflatingQueue:
-    """Holds the newest ``bound`` messages; a slow reader loses the oldest ones, and they are counted.
+    """Passes every change to a client that keeps up; one that does not gets the newest value, and the loss is counted.
 
+    ``bound`` messages may wait. One more replaces them all: a client that has fallen behind is not shown the past.
     For the event loop's thread alone, with one reader.
     """
 
     def __init__(self, bound: int) -> None:
-        self._messages: deque[bytes] = deque(maxlen=bound)
+        self._bound = bound
+        self._messages: deque[bytes] = deque()
         self._waiter: asyncio.Future[None] | None = None
         self.dropped = 0
 
     def push(self, message: bytes) -> None:
-        """Add a message, in place of the oldest if the queue is full."""
-        if len(self._messages) == self._messages.maxlen:
-            self.dropped += 1
+        """Add a message, in place of all that wait if they are too many."""
+        if len(self._messages) >= self._bound:
+            self.clear()
         self._messages.append(message)
         if self._waiter is not None and not self._waiter.done():
             self._waiter.set_result(None)
+
+    def clear(self) -> None:
+        """Drop what waits."""
+        self.dropped += len(self._messages)
+        self._messages.clear()
 
     async def pop(self) -> bytes:
         """The oldest message, waited for."""

@@ -14,12 +14,12 @@ from shmio.errors import PathError
 from shmio.layout.codec import codec
 from shmio.layout.model import Layout, Register
 from shmio.layout.text import to_text, wire_type
-from shmio.layout.topic import Topic, find, parse_topic
+from shmio.layout.topic import Topic, find, parse_topic, shorten
 from shmio.segment import Frame
 from shmio.wire import simlog_v1_pb2 as wire
 
 SERVICE = wire.DESCRIPTOR.services_by_name["SimlogAPI"].full_name
-QUEUE_BOUND = 256
+QUEUE_BOUND = 16
 
 Context = grpc.aio.ServicerContext[Any, Any]
 
@@ -65,13 +65,13 @@ class SimlogV1:
         if topic.direction == "in":
             await context.abort(
                 grpc.StatusCode.UNIMPLEMENTED,
-                f"{request.path}: this version serves what comes out of sources; use /out",
+                f"{shorten(request.path)}: this version serves what comes out of sources; use /out",
             )
         feed = self._feeds[topic.source]
         stream = _Stream()
-        self._streams.add(stream)
-        feed.listen(register, encoder(register, feed.block.layout), stream)
         try:
+            feed.listen(register, encoder(register, feed.block.layout), stream)
+            self._streams.add(stream)
             while True:
                 yield await stream.pop()
         finally:
@@ -84,11 +84,11 @@ class SimlogV1:
             topic = parse_topic(path, self._feeds, self._default)
             feed = self._feeds.get(topic.source)
             if feed is None:
-                raise PathError(f"{path}: {topic.source} is reserved, and this version serves nothing there")
+                raise PathError(f"{shorten(path)}: {topic.source} is reserved, and this version serves nothing there")
             layout = feed.block.layout
             if layout.members(topic.path) or not topic.path:
                 await context.abort(
-                    grpc.StatusCode.INVALID_ARGUMENT, f"{path}: a structure; version 1 serves single registers"
+                    grpc.StatusCode.INVALID_ARGUMENT, f"{shorten(path)}: a structure; version 1 serves single registers"
                 )
             return topic, find(layout, topic.path)
         except PathError as error:
@@ -105,6 +105,9 @@ class _Stream(ConflatingQueue):
 
     def deliver(self, message: bytes) -> None:
         self.push(message)
+
+    def lose(self) -> None:
+        self.clear()
 
 
 def encoder(register: Register, layout: Layout) -> Callable[[Frame], bytes | None]:

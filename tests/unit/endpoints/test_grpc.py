@@ -361,23 +361,92 @@ def test_tls_serves_those_who_trust_it(segment: Segment, tmp_path: Path) -> None
         async with grpc.aio.secure_channel(f"localhost:{port}", anonymous) as channel:
             stub = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
             assert await code(stub.GetTopic(topic, timeout=TIMEOUT_S)) is grpc.StatusCode.UNAVAILABLE
-        with pytest.raises(ConfigError, match=r"grpc\.tls\.key"):
-            await Server(served.service).start([Address("localhost", 0)], Tls(certificate="x", key="/nowhere"))
+        unusable = Server(served.service)
+        with pytest.raises(ConfigError, match=r"grpc\.tls\.(key|certificate)"):
+            await unusable.start([Address("localhost", 0)], Tls(certificate="/nowhere", key="/nowhere"))
+        await unusable.stop()
         await secure.stop()
 
     serve(segment, test)
 
 
-def test_a_slow_reader_gets_the_newest_values_and_the_loss_is_counted() -> None:
+def test_a_slow_reader_gets_the_newest_value_and_the_loss_is_counted() -> None:
     async def test() -> None:
         waiting = ConflatingQueue(bound=3)
+        for number in range(3):
+            waiting.push(bytes([number]))
+        assert [await waiting.pop() for _ in range(3)] == [b"\x00", b"\x01", b"\x02"]
         for number in range(10):
             waiting.push(bytes([number]))
-        assert [await waiting.pop() for _ in range(3)] == [b"\x07", b"\x08", b"\x09"]
-        assert waiting.dropped == 7
+        assert await waiting.pop() == b"\x09"
+        assert waiting.dropped == 9
         popped = asyncio.ensure_future(waiting.pop())
         await asyncio.sleep(0)
         waiting.push(b"x")
         assert await popped == b"x"
 
     asyncio.run(test())
+
+
+class Recorder:
+    """A listener that keeps what it gets."""
+
+    def __init__(self) -> None:
+        self.since = 0
+        self.got: list[bytes] = []
+        self.lost = 0
+
+    def deliver(self, message: bytes) -> None:
+        self.got.append(message)
+
+    def lose(self) -> None:
+        self.lost += 1
+
+
+def test_who_joins_while_the_source_stalls_gets_the_value_of_a_register_that_never_changes(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        step = LAYOUT.registers[4]
+        feed = served.feeds["cell"]
+        served.publish(image(step=7))
+        frame = feed.block.latest()
+        assert frame is not None
+        while not frame.age_ns() > STALE_NS:  # noqa: ASYNC110  age is what is waited for
+            await asyncio.sleep(0.01)
+        late = Recorder()
+        feed.listen(step, lambda f: f.image[12:14], late)
+        assert late.got == []
+
+        async def value_came() -> bool:
+            served.publish(image(step=7))
+            return bool(late.got)
+
+        await served.until(value_came)
+        assert set(late.got) == {b"\0\x07"}
+        feed.leave(step, late)
+
+    serve(segment, test)
+
+
+def test_what_waits_is_dropped_when_the_source_turns_bad(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        step = LAYOUT.registers[4]
+        feed = served.feeds["cell"]
+        served.publish(image(step=1))
+        listener = Recorder()
+        feed.listen(step, lambda f: f.image[12:14], listener)
+        served.publish(image(step=2), Quality.BAD)
+
+        async def told() -> bool:
+            return listener.lost > 0
+
+        await served.until(told)
+        served.publish(image(step=1))
+
+        async def again() -> bool:
+            return len(listener.got) >= 2
+
+        await served.until(again)
+        assert listener.got == [b"\0\x01"] * len(listener.got)
+        feed.leave(step, listener)
+
+    serve(segment, test)
