@@ -11,6 +11,7 @@ import logging
 import logging.handlers
 import os
 import sys
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -47,8 +48,29 @@ class RotatingLog(logging.handlers.RotatingFileHandler):
         self._streams = streams
 
     def doRollover(self) -> None:  # noqa: N802  the base class's name
-        """Begin a new file; the traceback of a dying interpreter must not go to one that is deleted."""
+        """Begin a new file."""
         super().doRollover()
+        self._take_streams()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a record; into a new file, where somebody removed the old one."""
+        with suppress(OSError):
+            if self._removed():
+                Path(self.baseFilename).parent.mkdir(parents=True, exist_ok=True)
+                self.close()
+                self.stream = self._open()
+                self._take_streams()
+        super().emit(record)
+
+    def _removed(self) -> bool:
+        try:
+            there = Path(self.baseFilename).stat()
+        except FileNotFoundError:
+            return True
+        return self.stream is not None and not os.path.samestat(there, os.fstat(self.stream.fileno()))
+
+    def _take_streams(self) -> None:
+        """The traceback of a dying interpreter must not go to a file that nobody will find."""
         if self._streams and self.stream is not None:
             os.dup2(self.stream.fileno(), 1)
             os.dup2(self.stream.fileno(), 2)

@@ -35,9 +35,7 @@ class Worker:
         self.config: dict[str, Any] = spec["config"]
         self.stopping = threading.Event()
         self._on_stop: Callable[[], object] | None = None
-        self.log = logs.setup(
-            Path(spec["log_file"]), self.name, source=self.name if self.kind == "source" else None, streams=True
-        )
+        self.log = self._set_up_log(Path(spec["log_file"]))
         self.segment = Segment.open(spec["instance"], writable=True)
         if self.segment.header.epoch != spec["epoch"]:
             raise SegmentError(f"the segment of instance {spec['instance']!r} is another run's; this process ends")
@@ -47,6 +45,13 @@ class Worker:
         self._report = Report(os.getpid(), Activity.STARTING, time.monotonic_ns())
         self.slot.report = self._report
         self.slot.beat()
+
+    def _set_up_log(self, file: Path) -> logging.Logger:
+        source = self.name if self.kind == "source" else None
+        try:
+            return logs.setup(file, self.name, source=source, streams=True)
+        except ConfigError:  # a controller is read with or without a log
+            return logs.setup(Path(os.devnull), self.name, source=source)
 
     def _take_role(self) -> None:
         """Wait for a predecessor to be gone: the kernel frees its lock at the moment of its death."""

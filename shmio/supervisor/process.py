@@ -33,7 +33,7 @@ class Child:
 
         What it prints, such as the traceback of an interpreter that dies, goes to the end of its log file.
         """
-        log = os.open(log_file, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        log = _open_log(log_file)
         try:
             log_size = os.fstat(log).st_size
             # A file in memory, not a pipe: a child that never reads cannot block its supervisor.
@@ -77,6 +77,15 @@ class Child:
             lines = log.read(_TAIL_BYTES).decode("utf-8", "replace").split("\n")
             return _STAMP.sub("", next((line.strip() for line in reversed(lines) if line.strip()), ""))
         return ""
+
+
+def _open_log(file: Path) -> int:
+    """Open a log file for appending. A controller is read with or without one."""
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        return os.open(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    except OSError:
+        return os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)
 
 
 def describe_end(code: int) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -99,3 +100,12 @@ def test_what_a_process_prints_follows_the_rotation(tmp_path: Path) -> None:
     file = tmp_path / "x.log"
     subprocess.run([sys.executable, "-c", STRAY, str(file)], check=True)
     assert "stray" in file.read_text()
+
+
+def test_a_removed_file_is_made_anew_with_its_folder(tmp_path: Path) -> None:
+    file = tmp_path / "logs" / "x.log"
+    log = logs.setup(file, "cell")
+    log.info("before")
+    shutil.rmtree(tmp_path / "logs")
+    log.info("after")
+    assert "after" in file.read_text()

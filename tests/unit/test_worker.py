@@ -124,6 +124,13 @@ def test_a_role_is_waited_for_until_its_holder_is_gone(segment: Segment, tmp_pat
             until(lambda: slot.report.pid == second.process.pid, "the second in its role")
 
 
+def test_a_worker_works_without_a_log(segment: Segment, tmp_path: Path) -> None:
+    slot = segment.processes.find("cell")
+    (tmp_path / "file").touch()
+    with Started(segment, tmp_path / "file", "work"):
+        until(lambda: slot.report.note == "at work", "work")
+
+
 def test_a_worker_of_another_run_of_the_instance_ends(segment: Segment, tmp_path: Path) -> None:
     with Started(segment, tmp_path, "work", epoch=1) as worker:
         returned, errors = worker.end()
