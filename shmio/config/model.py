@@ -7,9 +7,13 @@ from typing import Annotated, Any
 
 from msgspec import Meta, Struct
 
-Name = Annotated[str, Meta(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}\Z")]
+NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}\Z"
+NAME_RULE = "at most 40 letters, digits and _ . -, the first a letter or a digit"
+Name = Annotated[str, Meta(pattern=NAME_PATTERN)]
 Milliseconds = Annotated[float, Meta(gt=0, le=3_600_000)]
 Text = Annotated[str, Meta(min_length=1)]
+Texts = Annotated[list[Text], Meta(min_length=1)]
+DbNumber = Annotated[int, Meta(ge=1, le=65535)]
 
 
 class Section(Struct, forbid_unknown_fields=True, kw_only=True):
@@ -26,17 +30,23 @@ class Instance(Section):
 
 
 class Source(Section):
-    """``[[source]]``: a producer of registers. ``options`` are the connector's own keys, inline over ``properties``."""
+    """``[[source]]``: a producer of registers.
+
+    ``options`` are the connector's own keys; ``texts`` those of the ``properties`` file that are not overruled, text
+    there whatever their type. The connector, which knows the types, checks both.
+    """
 
     name: Name
     connector: Text
-    layout: Text | None = None
+    layout: Text | Texts | None = None
+    block: Text | None = None
     properties: Text | None = None
     period_ms: Annotated[float, Meta(ge=0.1, le=3_600_000)] = 20.0
     stale_ms: Milliseconds | None = None
     writable: list[Text] = []
     armed: bool = False
     options: dict[str, Any] = {}
+    texts: dict[str, str] = {}
 
     @property
     def period_ns(self) -> int:
@@ -54,9 +64,11 @@ class Emulator(Section):
 
     name: Name
     kind: Text
-    layout: Text
+    layout: Text | Texts
     program: Text
     listen: Text
+    block: Text | None = None
+    dbNumber: DbNumber | None = None  # noqa: N815 - named as the source's
     insecure: bool = False
 
 
@@ -71,7 +83,7 @@ class Tls(Section):
 class Grpc(Section):
     """``[grpc]``: the endpoint that serves remote programs."""
 
-    listen: Annotated[list[Text], Meta(min_length=1)]
+    listen: Texts
     default_source: Text | None = None
     insecure: bool = False
     tls: Tls | None = None

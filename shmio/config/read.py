@@ -13,6 +13,7 @@ import msgspec
 from shmio.config.address import Address
 from shmio.config.model import Config, Emulator, Grpc, Instance, Section, Source, Tls
 from shmio.config.properties import read_properties
+from shmio.config.wording import explain, named
 from shmio.errors import ConfigError
 
 RESERVED_SOURCES = frozenset({"simlog", "model", "shmio"})
@@ -27,6 +28,7 @@ _TABLES: dict[str, type[Section]] = {
     "grpc": Grpc,
     "grpc.tls": Tls,
 }
+_DERIVED = ("folder", "options", "texts")  # fields that are no keys of the file
 
 
 def load(file: Path) -> Config:
@@ -34,33 +36,46 @@ def load(file: Path) -> Config:
 
     Raises ConfigError: no such file, not TOML, unknown key, wrong type, a rule of the contract broken.
     """
+    tables = read_tables(file)
+    try:
+        return _resolve(tables, file.resolve().parent)
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {named(str(error), tables)}") from None
+
+
+def read_tables(file: Path) -> dict[str, Any]:
+    """The file's TOML, unchecked; ConfigError."""
     try:
         with file.open("rb") as stream:
             data = stream.read(MAX_FILE_BYTES + 1)
-    except OSError as error:
+    except FileNotFoundError as error:
         raise ConfigError(f"{file}: {error.strerror}; write one with shmio-supervisor init") from None
+    except IsADirectoryError as error:
+        raise ConfigError(f"{file}: {error.strerror}; name the file, such as {file / 'supervisor.toml'}") from None
+    except OSError as error:
+        raise ConfigError(f"{file}: {error.strerror}") from None
     if len(data) > MAX_FILE_BYTES:
         raise ConfigError(f"{file}: larger than {MAX_FILE_BYTES} bytes")
     try:
-        tables = tomllib.loads(data.decode("utf-8"))
+        return tomllib.loads(data.decode("utf-8"))
     except UnicodeDecodeError as error:
         raise ConfigError(f"{file}: not UTF-8 at byte {error.start}") from None
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ConfigError(f"{file}: not TOML: {error}") from None
-    try:
-        return _resolve(tables, file.resolve().parent)
-    except ConfigError as error:
-        raise ConfigError(f"{file}: {error}") from None
 
 
 def _resolve(tables: dict[str, Any], folder: Path) -> Config:
     if "folder" in tables:
         raise ConfigError(_unknown("folder", ""))
+    for name in ("source", "emulator"):
+        if isinstance(tables.get(name), dict):
+            raise ConfigError(f"{name}: write [[{name}]], in two brackets: there can be several")
     sources = tables.get("source", [])
     if isinstance(sources, list):
         tables = {**tables, "source": [_with_options(source, i, folder) for i, source in enumerate(sources)]}
     config = _convert({**tables, "folder": str(folder)})
     _check_names(config)
+    _check_times(config)
     _check_listening(config)
     if config.grpc and config.grpc.tls:
         tls = config.grpc.tls
@@ -71,42 +86,46 @@ def _resolve(tables: dict[str, Any], folder: Path) -> Config:
 
 
 def _with_options(source: Any, index: int, folder: Path) -> Any:
-    """Move the connector's own keys to ``options``; they are checked by the connector, which knows them."""
+    """Move the connector's own keys to ``options`` and ``texts``; inline keys win."""
     if not isinstance(source, dict):
         return source
-    common = set(Source.__struct_fields__) - {"options"}
+    common = set(Source.__struct_fields__) - set(_DERIVED)
     inline = {key: value for key, value in source.items() if key not in common}
     properties = source.get("properties")
     read = read_properties(folder / properties, f"source[{index}]") if isinstance(properties, str) else {}
-    return {key: source[key] for key in source if key in common} | {"options": read | inline}
+    texts = {key: text for key, text in read.items() if key not in inline}
+    return {key: source[key] for key in source if key in common} | {"options": inline, "texts": texts}
 
 
 def _convert(tables: dict[str, Any]) -> Config:
     try:
         return msgspec.convert(tables, Config)
     except msgspec.ValidationError as error:
-        message, _, at = str(error).partition(" - at `$")
+        text, _, at = str(error).partition(" - at `$")
         path = at.rstrip("`").lstrip(".")
-        field = re.search(r"(?:unknown field|missing required field) `([^`]*)`", message)
-        if field is None:
-            raise ConfigError(f"{path}: {message[:1].lower()}{message[1:]}") from None
-        key = f"{path}.{field[1]}" if path else field[1]
-        unknown = "unknown" in message
-        raise ConfigError(_unknown(key, path) if unknown else f"{key}: this key is needed") from None
+        unknown = re.search(r"unknown field `([^`]*)`", text)
+        if unknown is None:
+            raise ConfigError(explain(error)) from None
+        raise ConfigError(_unknown(f"{path}.{unknown[1]}" if path else unknown[1], path)) from None
 
 
 def _unknown(key: str, table: str) -> str:
     known = _TABLES.get(re.sub(r"\[[^]]*\]", "", table))
-    names = [name for name in known.__struct_fields__ if name not in ("folder", "options")] if known else []
-    near = difflib.get_close_matches(key.rpartition(".")[2], names, 1)
-    return f"{key}: unknown key" + (f"; did you mean {near[0]}?" if near else f"; known here: {', '.join(names)}")
+    names = [name for name in known.__struct_fields__ if name not in _DERIVED] if known else []
+    hint = _hint(key.rpartition(".")[2], names, f"known here: {', '.join(names)}")
+    return f"{key}: unknown key; {hint}"
 
 
 def unknown_option(index: int, key: str, known: list[str]) -> str:
     """Message for a key of ``source[index]`` that neither the contract nor the connector knows."""
-    near = difflib.get_close_matches(key, [*known, *(f for f in Source.__struct_fields__ if f != "options")], 1)
-    hint = f"did you mean {near[0]}?" if near else f"the connector knows: {', '.join(known)}"
+    names = [*known, *(name for name in Source.__struct_fields__ if name not in _DERIVED)]
+    hint = _hint(key, names, f"the connector knows: {', '.join(known)}")
     return f"source[{index}].{key}: unknown key; {hint}"
+
+
+def _hint(key: str, names: list[str], otherwise: str) -> str:
+    near = difflib.get_close_matches(key, names, 1)
+    return f"did you mean {near[0]}?" if near else otherwise
 
 
 def _check_names(config: Config) -> None:
@@ -129,6 +148,15 @@ def _check_names(config: Config) -> None:
         if config.grpc.default_source not in names:
             raise ConfigError(
                 f"grpc.default_source: no source {config.grpc.default_source!r}; there are: {', '.join(names)}"
+            )
+
+
+def _check_times(config: Config) -> None:
+    for index, source in enumerate(config.source):
+        if source.stale_ms is not None and source.stale_ms < 2 * source.period_ms:
+            raise ConfigError(
+                f"source[{index}].stale_ms: {source.stale_ms:g} is less than two periods of {source.period_ms:g} ms: "
+                "one late frame would make the source bad"
             )
 
 

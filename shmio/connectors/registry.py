@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Mapping
 from importlib.metadata import entry_points
 from typing import Any
 
 import msgspec
 
+from shmio.config.wording import explain
 from shmio.connectors.base import Connector
 from shmio.errors import ConfigError
 
@@ -46,13 +48,22 @@ def options_type(name: str) -> type[msgspec.Struct]:
     return load(name).Options
 
 
-def convert_options(name: str, options: dict[str, Any]) -> msgspec.Struct:
-    """Check a source's own keys; text values, as properties files have them, are read as their types.
+def convert_options(name: str, options: dict[str, Any], texts: Mapping[str, str] | None = None) -> msgspec.Struct:
+    """Check a source's own keys. ``texts``: more of them as a properties file has them, read as their types.
 
-    ConfigError with the message alone: the caller knows where the keys stand.
+    ConfigError begins with the key alone: the caller knows where the keys stand.
     """
+    kind = options_type(name)
+    types = {field.encode_name: field.type for field in msgspec.structs.fields(kind)}
+    read = {key: _convert_text(key, text, types.get(key, Any)) for key, text in (texts or {}).items()}
     try:
-        return msgspec.convert(options, options_type(name), strict=False)
+        return msgspec.convert(read | options, kind)
     except msgspec.ValidationError as error:
-        message, _, at = str(error).partition(" - at `$.")
-        raise ConfigError(f"{at.rstrip('`')}: {message}" if at else message) from None
+        raise ConfigError(explain(error)) from None
+
+
+def _convert_text(key: str, text: str, kind: Any) -> Any:
+    try:
+        return msgspec.convert(text, kind, strict=False)
+    except msgspec.ValidationError as error:
+        raise ConfigError(explain(error, key)) from None

@@ -14,7 +14,8 @@ from shmio.worker import BEAT_S, Worker
 def run(worker: Worker) -> None:
     """Play until told to stop. The compiled layout comes with the process's description."""
     layout = Layout.from_json(worker.config["layout"].encode())
-    emulator = Emulator(layout, worker.config["program"], Address.parse(worker.config["listen"]))
+    config = worker.config
+    emulator = Emulator(layout, config["program"], Address.parse(config["listen"]), db_number=config["dbNumber"])
     with emulator:
         worker.log.info("playing %s", worker.config["program"], extra=fields(address=emulator.address))
         worker.running()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ipaddress
+import re
 from typing import Annotated
 
 import msgspec
@@ -11,13 +13,10 @@ _CPU_SLOT = {"S7_300": 2, "S7_400": 3, "S7_1200": 1, "S7_1500": 1}
 
 
 class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """Where the controller is and how to talk to it.
-
-    Values from a properties file are text: read them with ``msgspec.convert(..., S7Options, strict=False)``.
-    """
+    """Where the controller is and how to talk to it. ValueError: a host or a model that is none."""
 
     host: Annotated[str, msgspec.Meta(min_length=1, max_length=253)]
-    model: Annotated[str, msgspec.Meta(max_length=64)] | None = None
+    model: str | None = None
     """``S7_300``, ``S7_400``, ``S7_1200`` or ``S7_1500``; only the default of ``slot`` depends on it."""
     port: Annotated[int, msgspec.Meta(ge=1, le=65535)] = 102
     rack: Annotated[int, msgspec.Meta(ge=0, le=7)] = 0
@@ -31,14 +30,36 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
     maxJobs: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None  # noqa: N815 - named as its siblings
     """The most requests under way at once; what the controller grants bounds it too."""
 
+    def __post_init__(self) -> None:
+        if not _is_host(self.host):
+            raise ValueError(
+                f"host: {self.host!r} is no host name or address; write it without port: that is a key of its own"
+            )
+        if self.model is not None and _family(self.model) not in _CPU_SLOT:
+            raise ValueError(f"model: {self.model!r} is none; there are: {', '.join(_CPU_SLOT)}")
+
     @property
     def cpu_slot(self) -> int:
         """The slot as configured, else the usual one of the model."""
         if self.slot is not None:
             return self.slot
-        return _CPU_SLOT.get((self.model or "").strip().upper().replace("-", "_"), 1)
+        return 1 if self.model is None else _CPU_SLOT[_family(self.model)]
 
     @property
     def peer(self) -> str:
         """``host:port`` for messages, IPv6 in brackets."""
         return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+def _family(model: str) -> str:
+    """The model as the table has it: ``s7-1500`` is ``S7_1500``."""
+    return model.strip().upper().replace("-", "_").replace(" ", "_")
+
+
+def _is_host(text: str) -> bool:
+    """Whether it is an IP address (with a zone, for IPv6) or can be a host's name."""
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return re.fullmatch(r"[^\s:/\[\]@]+", text) is not None
+    return True

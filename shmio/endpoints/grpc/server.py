@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from shmio.config import Address, Tls
+from shmio.config.tls import read_tls
 from shmio.endpoints.grpc import simlog_v1
-from shmio.errors import ConfigError, EndpointError
+from shmio.errors import EndpointError
 
 MAX_REQUEST_BYTES = 1 << 20
 MAX_CALLS = 4096
@@ -39,7 +38,10 @@ class Server:
         reflection.enable_server_reflection(names, self._server)
 
     async def start(self, addresses: list[Address], tls: Tls | None) -> list[int]:
-        """Listen on all addresses; the ports, for those that were 0. EndpointError names the address in the way."""
+        """Listen on all addresses; the ports, for those that were 0.
+
+        ConfigError: a file of ``tls`` cannot be used. EndpointError names the address in the way.
+        """
         credentials = _credentials(tls) if tls else None
         ports = []
         for address in addresses:
@@ -68,12 +70,9 @@ class Server:
 
 
 def _credentials(tls: Tls) -> grpc.ServerCredentials:
-    def read(key: str, name: str) -> bytes:
-        try:
-            return Path(name).read_bytes()
-        except OSError as error:
-            raise ConfigError(f"grpc.tls.{key}: {name}: {error.strerror}") from None
-
-    pair = (read("key", tls.key), read("certificate", tls.certificate))
-    ca = read("client_ca", tls.client_ca) if tls.client_ca else None
-    return grpc.ssl_server_credentials([pair], root_certificates=ca, require_client_auth=ca is not None)
+    files = read_tls(tls)
+    return grpc.ssl_server_credentials(
+        [(files.key, files.certificate)],
+        root_certificates=files.client_ca,
+        require_client_auth=files.client_ca is not None,
+    )

@@ -69,25 +69,34 @@ def test_the_whole_contract_is_read(folder: Path) -> None:
 
 
 def test_inline_keys_win_over_properties(folder: Path) -> None:
-    options = load(written(folder, WHOLE)).source[0].options
-    assert options == {
+    [source] = load(written(folder, WHOLE)).source
+    assert source.options == {"slot": 2}
+    assert source.texts == {
         "model": "S7_1500",
         "host": "10.76.0.12",
         "port": "102",
         "rack": "0",
-        "slot": 2,
         "timeout": "5000",
         "packetSize": "96",
         "dbNumber": "201",
     }
 
 
+def test_a_layout_may_be_several_files(folder: Path) -> None:
+    text = WHOLE.replace('layout = "db201.db"', 'layout = ["u.db", "u.udt"]\nblock = "Cell"')
+    text = text.replace("program =", "dbNumber = 7\nprogram =")
+    config = load(written(folder, text))
+    for section in (config.source[0], config.emulator[0]):
+        assert (section.layout, section.block) == (["u.db", "u.udt"], "Cell")
+    assert config.emulator[0].dbNumber == 7
+
+
 @pytest.mark.parametrize(("period_ms", "stale_ms"), [(20, 500), (1, 500), (1000, 5000)])
 def test_a_frame_is_stale_after_five_periods_and_half_a_second(folder: Path, period_ms: int, stale_ms: int) -> None:
     text = WHOLE.replace("period_ms = 20", f"period_ms = {period_ms}")
     assert load(written(folder, text)).source[0].stale_ns == stale_ms * 1_000_000
-    text = text.replace("armed = false", "stale_ms = 80")
-    assert load(written(folder, text)).source[0].stale_ns == 80_000_000
+    text = text.replace("armed = false", "stale_ms = 2400")
+    assert load(written(folder, text)).source[0].stale_ns == 2_400_000_000
 
 
 def test_tls_files_are_relative_to_the_config(folder: Path) -> None:
@@ -105,18 +114,24 @@ def test_tls_files_are_relative_to_the_config(folder: Path) -> None:
     [
         ("[instance]", "[instanse]", r"instanse: unknown key; did you mean instance\?"),
         ("ring_mb", "ring_megabytes", r"instance\.ring_megabytes: unknown key"),
-        ("ring_mb = 8", 'ring_mb = "8"', r"instance\.ring_mb: expected"),
-        ("ring_mb = 8", "ring_mb = 0", r"instance\.ring_mb: expected"),
+        ("ring_mb = 8", 'ring_mb = "8"', r"instance\.ring_mb: expected a number, got text"),
+        ("ring_mb = 8", "ring_mb = 0", r"instance\.ring_mb: expected a number > 0"),
         ('name = "a50"\n', "", r"instance\.name: this key is needed"),
-        ('name = "a50"', 'name = "a/50"', r"instance\.name: "),
+        ('name = "a50"', 'name = "a/50"', r"instance\.name: expected a name: at most 40 letters, digits and _ \. -"),
         ('name = "a50"', 'name = ""', r"instance\.name: "),
+        ("[[source]]", "[source]", r"source: write \[\[source\]\]"),
+        ("[[emulator]]", "[emulator]", r"emulator: write \[\[emulator\]\]"),
+        ('layout = "db201.db"', "layout = []", r'source\[0\]\.layout: must not be empty \(source "cell"\)$'),
+        ('layout = "db201.db"', "layout = 5", r"source\[0\]\.layout: expected text or a list, got a whole number"),
+        ("armed = false", "armed = 1", r"source\[0\]\.armed: expected true or false, got a whole number"),
+        ("armed = false", "stale_ms = 30", r"source\[0\]\.stale_ms: 30 is less than two periods of 20 ms"),
         ('name = "cell"', 'name = "Model"', r"source\[0\]\.name: 'Model' is reserved"),
         ('name = "cell"', 'name = "grpc"', r"source\[0\]\.name: 'grpc' is the name of a section's process"),
         ('name = "plc"', 'name = "CELL"', r"emulator\[0\]\.name: 'CELL' is already the name of source\[0\]"),
         ("period_ms = 20", "period_ms = 0", r"source\[0\]\.period_ms: expected"),
         ("period_ms = 20", "period_ms = nan", r"source\[0\]\.period_ms: "),
-        ('"Robot_*/*"', "5", r"source\[0\]\.writable\[1\]: expected `str`"),
-        ('program = "a50"\n', "", r"emulator\[0\]\.program: this key is needed"),
+        ('"Robot_*/*"', "5", r"source\[0\]\.writable\[1\]: expected text, got a whole number"),
+        ('program = "a50"\n', "", r'emulator\[0\]\.program: this key is needed \(emulator "plc"\)$'),
         (
             'program = "a50"',
             'programm = "a50"',
@@ -179,7 +194,7 @@ def test_a_wrong_line_of_the_properties_is_named(folder: Path, text: str, messag
 
 def test_properties_may_have_comments_sections_and_a_bom(folder: Path) -> None:
     (folder / "plc.ini").write_bytes(b"\xef\xbb\xbf# PLC\r\n; two\r\n[s7]\r\n host = a = b \r\n\r\n")
-    assert load(written(folder, WHOLE)).source[0].options == {"host": "a = b", "slot": 2}
+    assert load(written(folder, WHOLE)).source[0].texts == {"host": "a = b"}
 
 
 def test_an_unknown_option_of_a_connector_gets_the_nearest_name() -> None:

@@ -1,0 +1,52 @@
+"""What msgspec finds wrong, in the words of the file's user."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from msgspec import ValidationError
+
+from shmio.config.model import NAME_PATTERN, NAME_RULE
+
+_TYPES = {
+    "int": "a whole number",
+    "float": "a number",
+    "str": "text",
+    "bool": "true or false",
+    "array": "a list",
+    "object": "a table",
+}
+
+
+def explain(error: ValidationError, key: str = "") -> str:
+    """``key: what is wrong``. ``key``: of what was converted, when it is not a whole table."""
+    text, _, at = str(error).partition(" - at `$")
+    path = f"{key}{at.rstrip('`')}".lstrip(".")
+    missing = re.search(r"missing required field `([^`]*)`", text)
+    if missing:
+        return f"{path}.{missing[1]}: this key is needed".lstrip(".")
+    if repr(NAME_PATTERN) in text:
+        text = f"expected a name: {NAME_RULE}"
+    elif text.endswith("of length >= 1"):
+        text = "must not be empty"
+    text = re.sub(r"`([a-z]+(?: \| [a-z]+)*)`", _types, text)
+    text = text[:1].lower() + text[1:]
+    return f"{path}: {text}" if path else text
+
+
+def _types(match: re.Match[str]) -> str:
+    return " or ".join(_TYPES.get(name, name) for name in match[1].split(" | ") if name != "null")
+
+
+def named(message: str, tables: Mapping[str, Any]) -> str:
+    """The message, with the name of the source or emulator that its key tells by number."""
+    key = re.match(r"(source|emulator)\[(\d+)\](?!\.name:)", message)
+    if key is None:
+        return message
+    try:
+        name = tables[key[1]][int(key[2])]["name"]
+    except (LookupError, TypeError):
+        return message
+    return f'{message} ({key[1]} "{name}")' if isinstance(name, str) else message
