@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import argparse
 
-from shmio.cli.supervise.prepare import prepare
-from shmio.cli.supervise.target import config_file
+from shmio.cli.supervise.prepare import peer, prepare
+from shmio.cli.target import config_file
 from shmio.logs import printable
 from shmio.segment import PREFIX, BlockSpec
 
@@ -16,8 +16,8 @@ def execute(arguments: argparse.Namespace) -> int:
     prepared = prepare(file)
     plan = prepared.plan
     print(f"{file}: instance {plan.instance}, {len(plan.jobs)} processes")
-    for block in plan.blocks:
-        print(f"  {_describe(block)}")
+    for source, block in zip(prepared.config.source, plan.blocks, strict=True):
+        print(printable(f"  {_describe(block, peer(source))}"))
     print(f"  segment {PREFIX}{plan.instance}: {plan.segment_bytes / 1e6:.2f} MB of shared memory")
     for warning in prepared.warnings:
         print(printable(warning))
@@ -26,10 +26,11 @@ def execute(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _describe(block: BlockSpec) -> str:
+def _describe(block: BlockSpec, peer: str) -> str:
     layout = block.layout
     held_s = block.slots * block.period_ns / 1e9
+    at = f" at {peer}" if peer else ""
     return (
-        f"source {block.source}: {layout.name}, {len(layout.registers)} registers, {layout.size} bytes; "
+        f"source {block.source}{at}: {layout.name}, {len(layout.registers)} registers, {layout.size} bytes; "
         f"ring of {block.slots} frames, {held_s:.1f} s, {block.size / 1e6:.2f} MB"
     )

@@ -7,7 +7,7 @@ import os
 import select
 from contextlib import suppress
 
-from shmio.cli.supervise.target import instance_name
+from shmio.cli.target import instance_name
 from shmio.errors import ControlError
 from shmio.segment import Segment, leftover
 from shmio.supervisor import control

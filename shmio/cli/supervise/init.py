@@ -7,27 +7,33 @@ import json
 import os
 import re
 import sys
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
-from shmio.cli.supervise.target import config_file
+from shmio.cli.supervise.layouts import compile_files, summarize
+from shmio.cli.target import config_file
 from shmio.config.properties import read_properties
 from shmio.errors import ConfigError
-from shmio.layout import compiler
-from shmio.layout.lexer import MAX_SOURCE_BYTES
+from shmio.layout.model import Layout
+from shmio.logs import printable
 
 EXAMPLE = ("supervisor.toml", "db201.db")
+SOURCES = (".db", ".udt", ".scl")
 _NAME = re.compile(r"[^A-Za-z0-9_-]+")
 
 
 def execute(arguments: argparse.Namespace) -> int:
     """Write the files, or none of them when one is there already."""
     file = config_file(arguments)
-    written = _own(file, arguments.files) if arguments.files else _example(file)
+    _refuse_present(file)
+    text, missing = _own(file, arguments.files) if arguments.files else (None, [])
+    written = _example(file) if text is None else {file: text}
     _write(written)
     for path in written:
-        print(f"wrote {path}")
-    print(f"next: shmio-supervisor check{_option(file)}, then shmio-supervisor up{_option(file)}")
+        print(printable(f"wrote {path}"))
+    first = f"fill in {' and '.join(missing)} in {file}, then " if missing else ""
+    print(printable(f"next: {first}shmio-supervisor check{_option(file)}, then shmio-supervisor up{_option(file)}"))
     return 0
 
 
@@ -42,21 +48,42 @@ def _example(file: Path) -> dict[Path, str]:
     return {file: config, file.parent / EXAMPLE[1]: layout}
 
 
-def _own(file: Path, files: list[Path]) -> dict[Path, str]:
-    """A configuration for the two files of the Java version (D6.5, section 4.2): plc.ini and the block's source."""
-    layouts = [path for path in files if path.suffix.lower() == ".db"]
-    others = [path for path in files if path not in layouts]
-    if len(layouts) != 1 or len(others) > 1:
-        raise ConfigError("init takes one .db file and at most one properties file such as plc.ini, or no file")
-    block = _compile(layouts[0])
-    name = _NAME.sub("-", block.lower()).strip("-_")[:40] or "cell"
-    lines = ["[instance]", f"name = {_text(name)}", "", "[[source]]", 'name = "cell"', 'connector = "s7"']
-    lines.append(f"layout = {_text(_relative(layouts[0], file))}")
+def _own(file: Path, files: Sequence[Path]) -> tuple[str, list[str]]:
+    """A configuration for the controller's files (D6.5, section 4.2), and the keys that are left to fill in."""
+    sources = [path for path in files if path.suffix.lower() in SOURCES]
+    others = [path for path in files if path not in sources]
+    if not sources or len(others) > 1:
+        raise ConfigError(
+            f"init takes the sources of one controller ({', '.join(SOURCES)}) and at most one properties file such as "
+            "plc.ini, or no file"
+        )
+    properties = read_properties(others[0], "init") if others else {}
+    compiled = compile_files(sources)
+    for line in summarize(compiled.warnings):
+        print(printable(line), file=sys.stderr)
+    block = _first(compiled.layouts, properties.get("dbNumber"))
+    paths = [_relative(path, file) for path in sources]
+    lines = [
+        "[instance]",
+        f"name = {_toml(_instance(block))}",
+        "",
+        "[[source]]",
+        'name = "cell"',
+        'connector = "s7"',
+        f"layout = {_toml(paths if len(paths) > 1 else paths[0])}",
+    ]
+    if len(compiled.layouts) > 1:
+        held = ", ".join(layout.name for layout in compiled.layouts)
+        lines.append(f"block = {_toml(block.name)}  # of {printable(held)}")
     if others:
-        read_properties(others[0], "init")
-        lines.append(f"properties = {_text(_relative(others[0], file))}")
-    else:
-        lines.append('host = "192.168.0.1"                  # the address of your controller')
+        lines.append(f"properties = {_toml(_relative(others[0], file))}")
+    missing = []
+    if "host" not in properties:
+        missing.append("host")
+        lines.append('# host = ""                           # needed: the address of your controller')
+    if block.number is None and "dbNumber" not in properties:
+        missing.append("dbNumber")
+        lines.append("# dbNumber =                          # needed: the number of the data block")
     lines += [
         "period_ms = 20",
         "writable = []                         # nothing is writable unless named",
@@ -67,16 +94,17 @@ def _own(file: Path, files: list[Path]) -> dict[Path, str]:
         'default_source = "cell"',
         "",
     ]
-    return {file: "\n".join(lines)}
+    return "\n".join(lines), missing
 
 
-def _compile(path: Path) -> str:
-    """Check the source and return its block's name; warnings go to standard error."""
-    with path.open("rb") as stream:
-        compiled = compiler.compile_sources([compiler.Source(str(path), stream.read(MAX_SOURCE_BYTES + 4))])
-    for warning in compiled.warnings:
-        print(warning, file=sys.stderr)
-    return compiled.layouts[0].name
+def _first(layouts: Sequence[Layout], number: str | None) -> Layout:
+    """The block of this number, else the first."""
+    return next((layout for layout in layouts if str(layout.number) == number), layouts[0])
+
+
+def _instance(block: Layout) -> str:
+    """A name for the instance, after its block."""
+    return _NAME.sub("-", block.name.lower()).strip("-_")[:40] or "cell"
 
 
 def _relative(path: Path, file: Path) -> str:
@@ -85,16 +113,21 @@ def _relative(path: Path, file: Path) -> str:
     return str(absolute.relative_to(folder)) if absolute.is_relative_to(folder) else str(absolute)
 
 
-def _text(value: str) -> str:
-    """A TOML basic string; JSON's escapes are a subset of TOML's."""
+def _toml(value: str | list[str]) -> str:
+    """A TOML basic string, or an array of them; JSON's escapes are a subset of TOML's."""
     return json.dumps(value, ensure_ascii=False)
 
 
+def _refuse_present(path: Path) -> None:
+    if os.path.lexists(path):
+        raise ConfigError(f"{path} is there already and is left as it is; choose another by -c FILE, or remove it")
+
+
 def _write(files: dict[Path, str]) -> None:
-    """Write all or none; a file that is there is never touched, one with the same content serves as it is."""
+    """Write all or none; a file that is there is never touched, a layout with the same content serves as it is."""
     for path, content in files.items():
-        if os.path.lexists(path) and not (path.is_file() and path.suffix == ".db" and path.read_text() == content):
-            raise ConfigError(f"{path} is there already and is left as it is; choose another by -c FILE, or remove it")
+        if not (path.is_file() and path.suffix == ".db" and path.read_bytes() == content.encode()):
+            _refuse_present(path)
     for path, content in files.items():
         if not path.exists():
             with path.open("x", encoding="utf-8") as stream:

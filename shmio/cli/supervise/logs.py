@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from shmio.cli.supervise.tail import Follower, last_lines
-from shmio.cli.supervise.target import DEFAULT_CONFIG, config_file, instance_name, open_supervised
+from shmio.cli.target import DEFAULT_CONFIG, config_file, instance_name, open_supervised
 from shmio.config import Config, load
 from shmio.errors import ConfigError
 from shmio.logs import printable

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import msgspec
 
+from shmio.cli.supervise.host import check_host
+from shmio.cli.supervise.layouts import LayoutFiles
 from shmio.config import Address, Config, Emulator, Source, load
 from shmio.config.read import unknown_option
+from shmio.config.wording import named
 from shmio.errors import ConfigError, PathError
-from shmio.layout import compiler
 from shmio.layout.glob import Glob
-from shmio.layout.lexer import MAX_SOURCE_BYTES
 from shmio.layout.model import Layout
 from shmio.layout.topic import find
 from shmio.supervisor.plan import Plan, make_plan
@@ -33,8 +34,9 @@ class Prepared:
 def prepare(file: Path, mode: str = "live") -> Prepared:
     """Read and check everything that can be checked without starting anything; ConfigError, LayoutError."""
     config = load(file)
-    files = _LayoutFiles(config)
+    files = LayoutFiles(config)
     try:
+        check_host(config)
         _check_listening(config)
         layouts = {}
         for index, source in enumerate(config.source):
@@ -43,46 +45,19 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
             layouts[emulator.name] = _check_emulator(index, emulator, files)
         odd = _odd(config, layouts)
     except ConfigError as error:
-        raise ConfigError(f"{file}: {error}") from None
+        raise ConfigError(f"{file}: {named(str(error), msgspec.to_builtins(config))}") from None
     plan = make_plan(config, layouts, config_file=file, mode=mode)
     return Prepared(config, plan, layouts, [*files.warnings, *(f"{file}: warning: {text}" for text in odd)])
 
 
-class _LayoutFiles:
-    """Compiles each file once."""
-
-    def __init__(self, config: Config) -> None:
-        self._config = config
-        self._compiled: dict[Path, tuple[Layout, ...]] = {}
-        self.warnings: list[str] = []
-
-    def get(self, key: str, text: str | None, number: object = None) -> Layout:
-        """The file's data block; if it has several, the one of this number."""
-        if text is None:
-            raise ConfigError(f"{key}: this key is needed: the .db source of the data block")
-        path = self._config.path(text)
-        if path not in self._compiled:
-            compiled = compiler.compile_sources([_read(key, path)])
-            self._compiled[path] = compiled.layouts
-            self.warnings += map(str, compiled.warnings)
-        layouts = self._compiled[path]
-        if len(layouts) > 1:
-            layouts = tuple(layout for layout in layouts if layout.number is not None and layout.number == number)
-        if len(layouts) != 1:
-            names = ", ".join(layout.name for layout in self._compiled[path])
-            raise ConfigError(f"{key}: {text} holds several data blocks ({names}); choose one by dbNumber")
-        return layouts[0]
+def peer(source: Source) -> str:
+    """The device of a checked source, as host:port where it has such; empty if not."""
+    host, port = source.options.get("host"), source.options.get("port")
+    return str(Address(host, port)) if host and port else str(host or "")
 
 
-def _read(key: str, path: Path) -> compiler.Source:
-    try:
-        with path.open("rb") as file:
-            return compiler.Source(str(path), file.read(MAX_SOURCE_BYTES + 4))
-    except OSError as error:
-        raise ConfigError(f"{key}: {path}: {error.strerror}") from None
-
-
-def _check_source(index: int, source: Source, files: _LayoutFiles) -> Layout:
+def _check_source(index: int, source: Source, files: LayoutFiles) -> Layout:
+    """The source's layout; its ``options`` are complete and of their types from here on."""
     # Connectors are imported here: status and its like do without them.
     from shmio.connectors import registry  # noqa: PLC0415
 
@@ -92,14 +67,15 @@ def _check_source(index: int, source: Source, files: _LayoutFiles) -> Layout:
     except ConfigError as error:
         raise ConfigError(f"{key}.connector: {error}") from None
     known = [field.encode_name for field in msgspec.structs.fields(connector.Options)]
-    for option in source.options:
+    for option in (*source.options, *source.texts):
         if option not in known:
             raise ConfigError(unknown_option(index, option, known))
     try:
-        options = registry.convert_options(source.connector, source.options)
+        options = registry.convert_options(source.connector, source.options, source.texts)
     except ConfigError as error:
         raise ConfigError(f"{key}.{error}") from None
-    layout = files.get(f"{key}.layout", source.layout, getattr(options, "dbNumber", None))
+    source.options, source.texts = msgspec.to_builtins(options), {}
+    layout = files.get(key, source, source.options.get("dbNumber"))
     try:
         connector(options, layout).close()
     except ConfigError as error:
@@ -107,15 +83,17 @@ def _check_source(index: int, source: Source, files: _LayoutFiles) -> Layout:
     return layout
 
 
-def _check_emulator(index: int, emulator: Emulator, files: _LayoutFiles) -> Layout:
+def _check_emulator(index: int, emulator: Emulator, files: LayoutFiles) -> Layout:
     from shmio.emulators.programs import program  # noqa: PLC0415
 
     key = f"emulator[{index}]"
     if emulator.kind not in EMULATOR_KINDS:
         raise ConfigError(f"{key}.kind: {emulator.kind!r} is none; there are: {', '.join(EMULATOR_KINDS)}")
-    layout = files.get(f"{key}.layout", emulator.layout)
-    if layout.number is None:
-        raise ConfigError(f"{key}.layout: the data block {layout.name!r} has no number in its name")
+    layout = files.get(key, emulator, emulator.dbNumber)
+    if layout.number is None and emulator.dbNumber is None:
+        raise ConfigError(
+            f"{key}.dbNumber: this key is needed, for the data block {layout.name!r} has no number in its name"
+        )
     try:
         program(emulator.program, layout)
     except ConfigError as error:
@@ -148,7 +126,7 @@ def _odd(config: Config, layouts: dict[str, Layout]) -> list[str]:
             except PathError as error:
                 raise ConfigError(f"{key}.writable: {error}") from None
         number = source.options.get("dbNumber")
-        if number is not None and layout.number is not None and str(number) != str(layout.number):
+        if number is not None and layout.number is not None and number != layout.number:
             odd.append(f"{key}.dbNumber: {number}, but the layout is that of DB{layout.number}")
     if not config.source:
         odd.append("there is no [[source]]: the instance will hold no registers")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from shmio.cli.supervise.target import instance_name, open_supervised
+from shmio.cli.target import instance_name, open_supervised
 from shmio.supervisor import control
 
 RESTART_S = 40.0

@@ -7,7 +7,7 @@ import sys
 
 import msgspec
 
-from shmio.cli.supervise.target import instance_name
+from shmio.cli.target import instance_name
 from shmio.errors import NotRunningError
 from shmio.logs import printable
 from shmio.supervisor.status import InstanceStatus, ProcessStatus, SourceStatus, read_status

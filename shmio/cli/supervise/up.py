@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import TextIO
 
 from shmio import logs
-from shmio.cli.supervise.prepare import Prepared, prepare
-from shmio.cli.supervise.target import config_file
+from shmio.cli.supervise.prepare import Prepared, peer, prepare
+from shmio.cli.target import config_file
 from shmio.errors import AlreadyRunningError, ConfigError, ControlError, SegmentError, ShmioError
 from shmio.logs import printable
 from shmio.segment import PREFIX, Segment, State
@@ -78,9 +78,9 @@ def _describe(job: Job, prepared: Prepared) -> str:
     config = job.config
     if job.kind == "source":
         layout = prepared.layouts[job.name]
-        host, port = config["options"].get("host"), config["options"].get("port")
-        peer = f" {host}:{port}" if host and port else f" {host}" if host else ""
-        return f"{config['connector']}{peer}, {layout.name}: {layout.size} bytes every {config['period_ms']:g} ms"
+        source = next(source for source in prepared.config.source if source.name == job.name)
+        device = f"{source.connector} {peer(source)}".rstrip()
+        return f"{device}, {layout.name}: {layout.size} bytes every {source.period_ms:g} ms"
     if job.kind == "emulator":
         return f"{config['kind']} on {config['listen']}, program {config['program']}"
     return f"on {', '.join(config['listen'])}"

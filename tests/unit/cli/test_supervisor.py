@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.cli.supervise import target
+from shmio.cli import target
 from shmio.cli.supervisor import main
 from shmio.config import load
 from shmio.segment import Segment, instances
@@ -19,7 +19,14 @@ from shmio.segment import Segment, instances
 ROOT = Path(__file__).parents[3]
 SEED = ROOT / "tests" / "golden" / "layout" / "db201-as-printed.db"
 
+TYPE = 'TYPE "Axis"\nSTRUCT\na : Real;\nEND_STRUCT;\nEND_TYPE\n'
+
 Edit = Callable[[str, str], None]
+
+
+def block(name: str, kind: str) -> str:
+    """The source of a data block with one register of a type."""
+    return f"DATA_BLOCK {name}\nSTRUCT\nx : {kind};\nEND_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n"
 
 
 @pytest.fixture(autouse=True)
@@ -59,6 +66,12 @@ def test_init_never_overwrites(name: str, capsys: pytest.CaptureFixture[str]) ->
     assert Path(name).read_text() == "mine"
 
 
+def test_init_says_so_before_it_complains_about_the_files(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("supervisor.toml").write_text("mine")
+    assert main(["init", str(SEED)]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
 def test_init_does_not_write_through_a_dangling_link(capsys: pytest.CaptureFixture[str]) -> None:
     Path("supervisor.toml").symlink_to("elsewhere.toml")
     assert main(["init"]) == 1
@@ -74,19 +87,73 @@ def test_init_from_the_files_of_the_java_version(capsys: pytest.CaptureFixture[s
     assert "cell.db:7:7: warning" in capsys.readouterr().err
     config = load(Path("supervisor.toml"))
     [source] = config.source
-    assert (source.layout, source.properties, source.options["host"]) == ("cell.db", "plc.ini", "10.76.0.12")
+    assert (source.layout, source.properties, source.texts["host"]) == ("cell.db", "plc.ini", "10.76.0.12")
     assert main(["check"]) == 0
     output = capsys.readouterr().out
-    assert "DB201, 22 registers, 2180 bytes" in output
+    assert "source cell at 10.76.0.12:102: DB201, 22 registers, 2180 bytes" in output
     assert "optimized access" in output
+    assert output.count("has spaces") == 1, "names that are odd alike share a line"
+    assert "; likewise '" in output
 
 
-def test_init_from_a_layout_alone_leaves_the_address_to_fill_in() -> None:
+def test_init_from_a_layout_alone_leaves_the_address_to_fill_in(capsys: pytest.CaptureFixture[str]) -> None:
     (folder := Path("blocks")).mkdir()
     (folder / "x.db").write_bytes((ROOT / "db201.db").read_bytes())
     assert main(["init", "blocks/x.db", "-c", "other.toml"]) == 0
     [source] = load(Path("other.toml")).source
-    assert (source.layout, source.options) == ("blocks/x.db", {"host": "192.168.0.1"})
+    assert (source.layout, source.options) == ("blocks/x.db", {}), "an address must not be made up"
+    assert "next: fill in host in other.toml, then shmio-supervisor check -c other.toml" in capsys.readouterr().out
+    assert main(["check", "-c", "other.toml"]) == 1
+    assert capsys.readouterr().err == 'other.toml: source[0].host: this key is needed (source "cell")\n'
+
+
+@pytest.mark.parametrize("order", [["cell.db", "types.udt"], ["types.udt", "plc.ini", "cell.db"]])
+def test_a_block_whose_types_are_in_files_of_their_own(order: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    Path("plc.ini").write_text("host=10.76.0.12\n")
+    Path("types.udt").write_text(TYPE)
+    Path("cell.db").write_text(block("DB7", '"Axis"'))
+    assert main(["init", *order]) == 0
+    [source] = load(Path("supervisor.toml")).source
+    assert source.layout == [name for name in order if name != "plc.ini"]
+    if source.properties is None:
+        Path("supervisor.toml").write_text(Path("supervisor.toml").read_text().replace('# host = ""', 'host = "plc"'))
+    capsys.readouterr()
+    assert main(["check"]) == 0
+    assert "DB7, 1 registers, 4 bytes" in capsys.readouterr().out
+
+
+def test_a_block_without_a_number_in_its_name(capsys: pytest.CaptureFixture[str]) -> None:
+    """TIA Portal's default: the name is the user's, the number is elsewhere."""
+    Path("cell.db").write_text(block('"Cell"', "Int"))
+    Path("plc.ini").write_text("host=10.76.0.12\ndbNumber=7\n")
+    assert main(["init", "cell.db", "-c", "bare.toml"]) == 0
+    assert "next: fill in host and dbNumber in bare.toml, then" in capsys.readouterr().out
+    text = Path("bare.toml").read_text().replace('# host = ""', 'host = "plc"')
+    Path("bare.toml").write_text(text)
+    assert main(["check", "-c", "bare.toml"]) == 1
+    assert "source[0].dbNumber: this key is needed, for the layout 'Cell' has no number" in capsys.readouterr().err
+    Path("bare.toml").write_text(text.replace("# dbNumber =", "dbNumber = 7"))
+    assert main(["check", "-c", "bare.toml"]) == 0
+    assert main(["init", "plc.ini", "cell.db"]) == 0
+    assert main(["check"]) == 0
+
+
+def test_an_emulator_plays_a_block_without_a_number(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("db201.db").write_text(Path("db201.db").read_text().replace("DATA_BLOCK DB201", 'DATA_BLOCK "Cell"'))
+    example("port = 1102", "port = 1102\ndbNumber = 7")
+    assert main(["check"]) == 1
+    assert "emulator[0].dbNumber: this key is needed" in capsys.readouterr().err
+    example('program = "a50"', 'program = "a50"\ndbNumber = 7')
+    assert main(["check"]) == 0
+
+
+def test_init_of_several_blocks_takes_the_one_of_the_number(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("two.db").write_text(block('"One"', "Int") + block("DB7", "DInt"))
+    Path("plc.ini").write_text("host=10.76.0.12\ndbNumber=7\n")
+    assert main(["init", "two.db", "plc.ini"]) == 0
+    assert load(Path("supervisor.toml")).source[0].block == "DB7"
+    assert main(["check"]) == 0
+    assert "DB7, 1 registers, 4 bytes" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("files", [["plc.ini"], ["a.db", "b.db"], ["plc.ini", "x.ini", "a.db"], ["no.db"]])
@@ -101,7 +168,7 @@ def test_check_tells_what_the_instance_takes(example: Edit, instance: str, capsy
     assert main(["check"]) == 0
     output = capsys.readouterr().out
     assert f"supervisor.toml: instance {instance}, 3 processes" in output
-    assert "source cell: DB201, 22 registers, 2180 bytes; ring of 512 frames, 10.2 s" in output
+    assert "source cell at 127.0.0.1:1102: DB201, 22 registers, 2180 bytes; ring of 512 frames, 10.2 s" in output
     assert re.search(rf"segment shmio-{instance}: \d\.\d\d MB", output)
     assert output.endswith("no faults found\n")
     assert instance not in instances()
@@ -111,7 +178,19 @@ def test_check_tells_what_the_instance_takes(example: Edit, instance: str, capsy
     ("old", "new", "error"),
     [
         ("port = 1102", "prot = 1102", "source[0].prot: unknown key; did you mean port?"),
-        ("port = 1102", 'port = "eleven"', "source[0].port: Expected `int`, got `str`"),
+        ("port = 1102", 'port = "eleven"', "source[0].port: expected a whole number, got text"),
+        ("port = 1102", 'port = "1102"', "source[0].port: expected a whole number, got text"),
+        ('host = "127.0.0.1"', 'host = "127.0.0.1:1102"', "source[0].host: '127.0.0.1:1102' is no host name"),
+        ('host = "127.0.0.1"  ', "# ", 'source[0].host: this key is needed (source "cell")\n'),
+        ("port = 1102", 'model = "S7_2000"', "source[0].model: 'S7_2000' is none; there are: S7_300, S7_400, S7_1200"),
+        ("period_ms = 20", "options = {}", "source[0].options: unknown key"),
+        ('program = "a50"', 'program = "a50"\nblock = "b"', "emulator[0].block: no data block 'b'; there are: DB201"),
+        ('connector = "s7"', 'connector = "s7"\nstale_ms = 20', "source[0].stale_ms: 20 is less than two periods"),
+        ('name = "a50"', 'name = "a50"\ngroup = "no such"', "instance.group: this host has no group 'no such'"),
+        ('name = "a50"', 'name = "a50"\nlog_dir = "db201.db"', "instance.log_dir: "),
+        ('name = "a50"', 'name = "a50"\nlog_dir = "db201.db/logs"', "instance.log_dir: "),
+        ("[grpc]", '[grpc]\ntls = {certificate = "db201.db", key = "k"}', "grpc.tls.key: "),
+        ("[grpc]", '[grpc]\ntls = {certificate = "db201.db", key = "db201.db"}', "grpc.tls.certificate: "),
         ('connector = "s7"', 'connector = "s8"', "source[0].connector: no connector 's8'; there are:"),
         ('kind = "s7"', 'kind = "s8"', "emulator[0].kind: 's8' is none; there are: s7"),
         ('program = "a50"', 'program = "a51"', "emulator[0].program: 'a51' is none; there are: a50"),
@@ -152,16 +231,17 @@ def test_a_writable_that_names_nothing_is_odd(
     assert ("usable, with 1 warning\n" in output) is odd
 
 
-def test_a_block_is_chosen_by_its_number(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
-    other = "DATA_BLOCK DB7\nSTRUCT\na : Int;\nEND_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n"
-    Path("two.db").write_text(Path("db201.db").read_text() + other)
+@pytest.mark.parametrize("key", ["dbNumber = 7", 'block = "db7"'])
+def test_a_block_is_chosen_by_its_number_or_name(example: Edit, key: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("two.db").write_text(Path("db201.db").read_text() + block("DB7", "Int"))
     example('layout = "db201.db"\nhost', 'layout = "two.db"\nhost')
     assert main(["check"]) == 1
-    assert "two.db holds several data blocks (DB201, DB7); choose one by dbNumber" in capsys.readouterr().err
-    example("port = 1102", "port = 1102\ndbNumber = 7")
+    error = capsys.readouterr().err
+    assert "source[0].layout: it holds several data blocks (DB201, DB7); choose one by block or dbNumber" in error
+    example("port = 1102", f"port = 1102\n{key}")
     example('writable = ["Outputs", "Robot_*/*"]', "")
     assert main(["check"]) == 0
-    assert "source cell: DB7, 1 registers, 2 bytes" in capsys.readouterr().out
+    assert ": DB7, 1 registers, 2 bytes" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("mode", ["log", "replay"])

@@ -1,0 +1,40 @@
+"""What a configuration demands of the host, looked at before anything starts."""
+
+from __future__ import annotations
+
+import grp
+import os
+from pathlib import Path
+
+from shmio.config import Config
+from shmio.config.tls import read_tls
+from shmio.errors import ConfigError
+
+
+def check_host(config: Config) -> None:
+    """Group, folder of the log files, TLS files; ConfigError. Nothing is made."""
+    _check_group(config.instance.group)
+    _check_folder(config.log_dir)
+    if config.grpc and config.grpc.tls:
+        read_tls(config.grpc.tls)
+
+
+def _check_group(name: str | None) -> None:
+    if name is None:
+        return
+    try:
+        gid = grp.getgrnam(name).gr_gid
+    except KeyError:
+        raise ConfigError(f"instance.group: this host has no group {name!r}") from None
+    if os.geteuid() != 0 and gid not in (os.getegid(), *os.getgroups()):
+        raise ConfigError(f"instance.group: this user is not in group {name!r}, and so cannot give it the segment")
+
+
+def _check_folder(folder: Path) -> None:
+    """Whether it is there, or can be made, and can be written."""
+    place = next(path for path in (folder, *folder.parents) if path.exists())
+    if not place.is_dir():
+        raise ConfigError(f"instance.log_dir: {place} is no folder")
+    if not os.access(place, os.W_OK | os.X_OK):
+        why = "cannot be written" if place == folder else f"cannot be made: no permission in {place}"
+        raise ConfigError(f"instance.log_dir: {folder} {why}")
