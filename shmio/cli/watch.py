@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 
 from shmio.cli.readings import Selected, as_json, as_line, choose, topic_path
-from shmio.cli.run import dumps
+from shmio.cli.run import at_least, dumps
 from shmio.errors import NotRunningError
 from shmio.layout.model import Register
 from shmio.segment import Block, Frame, Quality
@@ -17,6 +17,8 @@ from shmio.segment.attach import Attachment, Reading, reading
 
 HELP = "Print the values of registers whenever they change, the present ones first."
 IDLE_S = 0.5
+WAITING_FRAMES = 64
+"""Changes of so many frames may wait for a slow terminal; a block further behind goes on with its newest frame."""
 
 News = tuple[Block, Register, Reading]
 
@@ -24,7 +26,7 @@ News = tuple[Block, Register, Reading]
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the verb's own arguments."""
     parser.add_argument("patterns", nargs="+", metavar="PATH", help="path, array element, structure or glob")
-    parser.add_argument("-n", dest="count", type=int, metavar="N", help="stop after N lines")
+    parser.add_argument("-n", dest="count", type=at_least(1), metavar="N", help="stop after N lines")
 
 
 def execute(cell: Attachment, options: argparse.Namespace) -> int:
@@ -47,7 +49,7 @@ def _news(cell: Attachment, chosen: list[Selected]) -> Iterator[News]:
     registers: dict[str, tuple[Block, list[Register]]] = {}
     for block, register in chosen:
         registers.setdefault(block.source, (block, []))[1].append(register)
-    news: queue.SimpleQueue[list[News]] = queue.SimpleQueue()
+    news: queue.Queue[list[News]] = queue.Queue(WAITING_FRAMES)
     for block, wanted in registers.values():
         threading.Thread(target=_follow, args=(block, wanted, news), daemon=True).start()
     while True:
@@ -58,9 +60,9 @@ def _news(cell: Attachment, chosen: list[Selected]) -> Iterator[News]:
                 return
 
 
-def _follow(block: Block, registers: list[Register], news: queue.SimpleQueue[list[News]]) -> None:
+def _follow(block: Block, registers: list[Register], news: queue.Queue[list[News]]) -> None:
     """Report each register's reading, then every change of value or quality."""
-    shown: list[tuple[object, Quality, str] | None] = [None] * len(registers)
+    shown: list[tuple[str, Quality, str] | None] = [None] * len(registers)
     cursor = block.cursor()
     frame: Frame | None = block.latest()
     while True:
@@ -68,12 +70,14 @@ def _follow(block: Block, registers: list[Register], news: queue.SimpleQueue[lis
         for index, register in enumerate(registers):
             now = reading(block, register, frame)
             # A stale reason holds the age: its text changes, the fact does not.
-            state = (now.value, now.quality, now.reason.partition(":")[0])
+            state = (repr(now.value), now.quality, now.reason.partition(":")[0])  # repr: a NaN equals itself
             if state != shown[index]:
                 shown[index] = state
                 changes.append((block, register, now))
         if changes:
             news.put(changes)
+        if cursor.behind > WAITING_FRAMES:
+            cursor = block.cursor(after=block.ring.head() - 1)
         frame = cursor.next(timeout_s=min(IDLE_S, block.stale_ns / 1e9)) or block.latest()
 
 
