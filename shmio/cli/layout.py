@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from shmio import __version__
 from shmio.cli.run import dumps, run
 from shmio.errors import LayoutError
 from shmio.layout.compiler import Source, compile_sources
@@ -28,8 +29,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("file", metavar="FILE.db", help="the source with the data blocks")
     parser.add_argument("types", metavar="UDT", nargs="*", help="further sources, with the PLC data types it uses")
     parser.add_argument("--json", action="store_true", help="print JSON: one object, or a list for several blocks")
+    parser.add_argument("--version", action="version", version=f"shmio {__version__}")
     options = parser.parse_intermixed_args(arguments)
-    return run(lambda: _compile([options.file, *options.types], as_json=options.json))
+    return run(parser.prog, lambda: _compile([options.file, *options.types], as_json=options.json))
 
 
 def _compile(names: Sequence[str], *, as_json: bool) -> int:

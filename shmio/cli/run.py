@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import io
 import json
 import os
@@ -13,8 +14,11 @@ from shmio.errors import ShmioError
 from shmio.logs import printable
 
 
-def run(command: Callable[[], int | None]) -> int:
-    """Run a command: 0 done, 1 failed with one line on standard error (argparse exits with 2 on wrong usage)."""
+def run(program: str, command: Callable[[], int | None]) -> int:
+    """Run a command: 0 done, 1 failed with one line on standard error, 128 + n ended by signal n as shells have it.
+
+    Wrong usage is argparse's, which exits with 2.
+    """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a terminal that is not UTF-8
     try:
@@ -26,13 +30,32 @@ def run(command: Callable[[], int | None]) -> int:
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        # Who read our output went away (`| head`); keep the interpreter from complaining when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _give_up_output()  # who read it went away (`| head`)
         return 141
     except OSError as error:
-        sys.stderr.write(f"{error.filename or 'shmio'}: {error.strerror}\n")
+        sys.stderr.write(f"{printable(str(error.filename or program))}: {error.strerror}\n")
+        _give_up_output()
         return 1
     return status
+
+
+def _give_up_output() -> None:
+    """Keep the interpreter from failing once more when it flushes at its exit."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def at_least(least: int) -> Callable[[str], int]:
+    """An argument's type: a whole number from ``least`` on."""
+
+    def convert(text: str) -> int:
+        if not text.isascii() or not text.isdecimal() or len(text) > 7 or int(text) < least:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least} on")
+        return int(text)
+
+    return convert
 
 
 def dumps(value: Any, indent: int | None = None) -> str:

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from shmio import __version__
-from shmio.cli.run import run
+from shmio.cli.run import at_least, run
 
+PROGRAM = "shmio-supervisor"
 MODES = ("live", "log", "replay")
 
 
@@ -23,11 +24,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         status: int = verb.execute(arguments)
         return status
 
-    return run(command)
+    return run(PROGRAM, command)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="shmio-supervisor", description="Start, watch and stop an instance.")
+    parser = argparse.ArgumentParser(prog=PROGRAM, description="Start, watch and stop an instance.")
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
 
@@ -39,28 +40,29 @@ def _parser() -> argparse.ArgumentParser:
     def verb(name: str, text: str, parent: argparse.ArgumentParser) -> argparse.ArgumentParser:
         return verbs.add_parser(name, help=text, description=text, parents=[parent])
 
-    up = verb("up", "start the instance; Ctrl-C or SIGTERM stops it", file)
-    up.add_argument("--mode", choices=MODES, default="live", help="default: live")
+    up = verb("up", "start the instance; Ctrl-C, SIGTERM or closing the terminal stops it", file)
+    up.add_argument(
+        "--mode", choices=MODES, default="live", help="live (default); log and replay are not in this version"
+    )
     up.add_argument("--detach", action="store_true", help="return when it runs, and leave it running")
     up.add_argument("--report", type=int, help=argparse.SUPPRESS)  # descriptor on which a detached one tells its start
     verb("down", "stop the instance", target)
     status = verb("status", "tell how the instance and its processes are", target)
     status.add_argument("--json", action="store_true", help="print one JSON object")
-    verb("restart", "restart one process", target).add_argument("name", metavar="NAME")
+    verb("restart", "restart one process, as it was configured at the start", target).add_argument(
+        "name", metavar="NAME"
+    )
     verb("check", "validate the configuration and its layouts; start nothing", file)
     logs = verb("logs", "print the end of the log files", target)
     logs.add_argument("name", metavar="NAME", nargs="?", help="a process, or supervisor (default: all)")
     logs.add_argument("-f", "--follow", action="store_true", help="go on with what is added")
-    logs.add_argument("-n", "--lines", type=_count, default=20, metavar="LINES", help="default: 20")
+    logs.add_argument("-n", "--lines", type=at_least(0), default=20, metavar="LINES", help="default: 20")
     init = verb("init", "write a configuration: the A50 example, or one for the files given", file)
-    init.add_argument("files", metavar="plc.ini|FILE.db", nargs="*", type=Path, help="the controller's two files")
+    init.usage = f"{PROGRAM} init [-h] [-c FILE] [plc.ini] [FILE.db [FILE.udt ...]]"
+    init.add_argument(
+        "files", metavar="FILE", nargs="*", type=Path, help="the block's sources (.db, .udt, .scl), and a plc.ini"
+    )
     return parser
-
-
-def _count(text: str) -> int:
-    if not text.isascii() or not text.isdecimal() or len(text) > 7:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of lines")
-    return int(text)
 
 
 if __name__ == "__main__":

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import tomllib
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
-from shmio.config.model import Name
+from shmio.config.model import NAME_RULE, Name
+from shmio.config.read import read_tables
 from shmio.errors import ConfigError, ControlError, NotRunningError
-from shmio.segment import Segment, instances
+from shmio.segment import Segment, running_instances
+from shmio.supervisor import control
+from shmio.supervisor.status import supervisor_silence
 
 DEFAULT_CONFIG = Path("supervisor.toml")
-MAX_FILE_BYTES = 1 << 20
 
 
 def config_file(arguments: argparse.Namespace) -> Path:
@@ -30,7 +32,7 @@ def instance_name(arguments: argparse.Namespace) -> str:
         return _checked("--instance", arguments.instance)
     if arguments.config is not None or DEFAULT_CONFIG.exists():
         return _named_in(config_file(arguments))
-    running = instances()
+    running = running_instances()
     if not running:
         raise NotRunningError("no instance is running, and there is no supervisor.toml here")
     if len(running) > 1:
@@ -44,23 +46,23 @@ def open_supervised(name: str) -> Segment:
     if not segment.supervised:
         segment.close()
         raise NotRunningError(
-            f"the supervisor of instance {name!r} is dead: shmio-supervisor up takes over, down clears what it left"
+            f"the supervisor of instance {name!r} is dead: shmio-supervisor up starts anew, down clears what it left"
         )
     return segment
 
 
+def ask(segment: Segment, request: control.Request, timeout_s: float) -> dict[str, Any]:
+    """The answer of the instance's supervisor; ControlError as soon as it shows no sign of life."""
+    return control.request(segment.header.control, request, timeout_s, lambda: supervisor_silence(segment))
+
+
 def _named_in(file: Path) -> str:
     """The name alone: an instance must be stoppable when its file has been spoilt since."""
+    tables = read_tables(file)
     try:
-        with file.open("rb") as stream:
-            tables = tomllib.loads(stream.read(MAX_FILE_BYTES).decode())
         name = tables["instance"]["name"]
-    except OSError as error:
-        raise ConfigError(f"{file}: {error.strerror}") from None
-    except (ValueError, RecursionError) as error:
-        raise ConfigError(f"{file}: not TOML: {error}; --instance NAME does without it") from None
     except (KeyError, TypeError):
-        raise ConfigError(f"{file}: instance.name: this key is needed; --instance NAME does without it") from None
+        raise ConfigError(f"{file}: instance.name: this key is needed") from None
     return _checked(f"{file}: instance.name", name)
 
 
@@ -68,4 +70,4 @@ def _checked(key: str, name: object) -> str:
     try:
         return msgspec.convert(name, Name)
     except msgspec.ValidationError:
-        raise ConfigError(f"{key}: {name!r} is not a name: at most 40 letters, digits and _ . -") from None
+        raise ConfigError(f"{key}: {name!r} is not a name: {NAME_RULE}") from None

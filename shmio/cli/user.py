@@ -9,10 +9,10 @@ from pathlib import Path
 from shmio import __version__
 from shmio.cli import get, registers, watch
 from shmio.cli.run import run
-from shmio.config import load
+from shmio.cli.target import instance_name
 from shmio.segment.attach import Attachment, attach
 
-DEFAULT_CONFIG = Path("supervisor.toml")
+PROGRAM = "shmio"
 
 Verb = Callable[[Attachment, argparse.Namespace], int]
 
@@ -22,24 +22,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
 
     def command() -> int:
-        with attach(_instance(arguments)) as cell:
+        with attach(instance_name(arguments)) as cell:
             verb: Verb = arguments.verb
             return verb(cell, arguments)
 
-    return run(command)
-
-
-def _instance(arguments: argparse.Namespace) -> str | None:
-    """Name the instance: as asked, else as the configuration here says, else the only running one."""
-    if arguments.instance is not None:
-        return str(arguments.instance)
-    if arguments.config is not None:
-        return load(arguments.config).instance.name
-    return load(DEFAULT_CONFIG).instance.name if DEFAULT_CONFIG.exists() else None
+    return run(PROGRAM, command)
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="shmio", description="Look at the registers of a running instance.")
+    parser = argparse.ArgumentParser(prog=PROGRAM, description="Look at the registers of a running instance.")
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("-c", dest="config", type=Path, metavar="FILE", help="the instance of this supervisor.toml")

@@ -34,6 +34,8 @@ MAX_ANSWER_BYTES: Final = 65536
 MAX_CLIENTS: Final = 8
 REQUEST_S: Final = 2.0
 """Time that a client has to send its request."""
+TURN_S: Final = 0.5
+"""How often a waiting client looks whether the supervisor still is."""
 MAX_PATH_BYTES: Final = 107  # sun_path holds 108 with the final zero, unix(7)
 _CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
@@ -87,6 +89,7 @@ class ControlServer:
         try:
             remove_socket(path)
             self._listener.bind(path)
+            self._inode = os.lstat(path).st_ino
             Path(path).chmod(0o600)
             self._listener.listen(MAX_CLIENTS)
         except OSError as error:
@@ -159,11 +162,13 @@ class ControlServer:
 
     def retire(self) -> None:
         """Remove the socket, which a successor may then make anew; those who wait can still be answered."""
-        if self._listener.fileno() >= 0:
-            self._selector.unregister(self._listener)
-            self._listener.close()
-            with suppress(OSError):
+        if self._listener.fileno() < 0:
+            return
+        self._selector.unregister(self._listener)
+        with suppress(OSError):
+            if os.lstat(self._path).st_ino == self._inode:  # not a successor's
                 remove_socket(self._path)
+        self._listener.close()  # only now may the inode's number be given to another
 
     def close(self) -> None:
         """Retire, and drop all clients."""
@@ -172,10 +177,13 @@ class ControlServer:
             self._drop(client)
 
 
-def request(path: str, message: Request, timeout_s: float) -> dict[str, Any]:
+def request(
+    path: str, message: Request, timeout_s: float, lost: Callable[[], str | None] = lambda: None
+) -> dict[str, Any]:
     """Ask the supervisor at ``path`` and return its answer.
 
-    ControlError: no such socket, no answer within ``timeout_s``, or the supervisor's refusal.
+    ``lost`` is called now and then while waiting: why there is no point in it, or None.
+    ControlError: no such socket, no answer within ``timeout_s`` or ever, or the supervisor's refusal.
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
         deadline = time.monotonic() + timeout_s
@@ -185,8 +193,7 @@ def request(path: str, message: Request, timeout_s: float) -> dict[str, Any]:
             client.connect(path)
             client.sendall(msgspec.json.encode(message) + b"\n")
             while not received.endswith(b"\n"):
-                client.settimeout(max(0.001, deadline - time.monotonic()))
-                data = client.recv(MAX_ANSWER_BYTES)
+                data = _wait(client, deadline, lost)
                 if not data or len(received) > MAX_ANSWER_BYTES:
                     raise ControlError("the supervisor ended without an answer")
                 received += data
@@ -201,6 +208,19 @@ def request(path: str, message: Request, timeout_s: float) -> dict[str, Any]:
     if "error" in answer:
         raise ControlError(str(answer["error"]))
     return answer
+
+
+def _wait(client: socket.socket, deadline: float, lost: Callable[[], str | None]) -> bytes:
+    """Some more of the answer; TimeoutError, ControlError."""
+    while True:
+        client.settimeout(max(0.001, min(TURN_S, deadline - time.monotonic())))
+        try:
+            return client.recv(MAX_ANSWER_BYTES)
+        except TimeoutError:
+            if reason := lost():
+                raise ControlError(reason) from None
+            if time.monotonic() >= deadline:
+                raise
 
 
 def socket_path(instance: str) -> str:

@@ -31,6 +31,8 @@ START_TICK_S: Final = 0.01
 """The same while a process starts: its report has no bell to ring."""
 QUALITY_S: Final = 0.5
 """How often the sources' quality is looked at, once the start is over."""
+NAME_S: Final = 1.0
+"""How often it is made sure that the segment can still be found."""
 
 
 class Supervisor:
@@ -59,12 +61,13 @@ class Supervisor:
         self._qualities: list[Quality | None] = []
         self._qualities_ns = 0
         self._ticked_ns = 0
+        self._found_ns = 0
 
     def run(self) -> None:
         """Start everything, watch it, and return when all is stopped as asked.
 
         AlreadyRunningError: another supervisor has the instance. SegmentError, ControlError: no room for the segment,
-        no place for the socket. ShmioError: a process could not be started; all others are stopped again.
+        no place for the socket. ShmioError: a process could not be started, or the segment was removed; all is stopped.
         """
         for line in leftover.clear(self._plan.instance):
             log.warning("%s", line)
@@ -106,15 +109,17 @@ class Supervisor:
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
-        """SIGINT and SIGTERM wake the selector; nothing is done in a handler."""
+        """Signals wake the selector; nothing is done in a handler. SIGHUP counts unless it is ignored, as by nohup."""
         receiver, sender = socket.socketpair()
         with receiver, sender:
             receiver.setblocking(False)
             sender.setblocking(False)
             self._selector.register(receiver, selectors.EVENT_READ, lambda: self._on_signal(receiver.recv(64)))
             old_fd = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
-            old = {sign: signal.signal(sign, _wake) for sign in (signal.SIGINT, signal.SIGTERM)}
-            old[signal.SIGHUP] = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+            heeded = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+            if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+                heeded.remove(signal.SIGHUP)
+            old = {sign: signal.signal(sign, _wake) for sign in heeded}
             try:
                 yield
             finally:
@@ -126,7 +131,7 @@ class Supervisor:
     def _on_signal(self, numbers: bytes) -> None:
         for number in numbers:
             log.info("%s", signal.Signals(number).name)
-            if self._stopping:
+            if self._stopping and number != signal.SIGHUP:  # shell and kernel send one each
                 self._hasten()
             self._stopping = True
 
@@ -174,6 +179,9 @@ class Supervisor:
             if event is not None:
                 self._apply(managed, event)
         self._control.expire()
+        if not self._stopping and now_ns - self._found_ns >= NAME_S * 1e9:
+            self._found_ns = now_ns
+            self._follow_name()
         if not self._stopping and not self._started:
             self._follow_start(now_ns)
         if self._stopping:
@@ -185,6 +193,14 @@ class Supervisor:
     @property
     def _ranked(self) -> list[tuple[int, Life]]:
         return [(managed.job.rank, managed.life) for managed in self._managed]
+
+    def _follow_name(self) -> None:
+        """Without its name nobody finds the segment: the instance could not even be stopped."""
+        if not self._segment.shared.current():
+            name = self._segment.shared.name
+            self._failure = f"the shared memory {name} was removed while the instance ran: all is stopped"
+            log.error("%s", self._failure)
+            self._stopping = True
 
     def _follow_start(self, now_ns: int) -> None:
         for managed in self._managed:

@@ -7,9 +7,13 @@ import time
 import msgspec
 
 from shmio.errors import NotRunningError, SegmentError
-from shmio.segment import Phase, ProcessSlot, Quality, Segment
+from shmio.segment import Phase, ProcessSlot, Quality, Segment, _atomics
 from shmio.segment import State as InstanceState
+from shmio.segment.header import HEARTBEAT_OFFSET
 from shmio.supervisor.policy import assess
+
+SILENT_S = 5.0
+"""A supervisor without a heartbeat for this long is stopped, or hangs."""
 
 
 class ProcessStatus(msgspec.Struct, kw_only=True):
@@ -85,13 +89,29 @@ def _read(segment: Segment) -> InstanceStatus:
         if not any(process.pid for process in processes):
             status.note = "its supervisor died and left the segment; the next up or down clears it"
             return status
-        status.note = "its supervisor is dead, nothing watches the processes; up takes over, down stops them"
+        status.note = (
+            "its supervisor is dead, nothing watches the processes; up stops them and starts anew, down stops them"
+        )
         status.state = str(InstanceState.DEGRADED)
     else:
         status.supervisor = SupervisorStatus(pid, _seconds(now_ns - segment.header.started_ns))
         status.state = str(_state(state, processes))
+        if silence := supervisor_silence(segment):
+            status.state, status.note = str(InstanceState.DEGRADED), silence
     status.processes = processes
     return status
+
+
+def supervisor_silence(segment: Segment) -> str | None:
+    """What to say about a living supervisor that shows no sign of life; None if it does."""
+    silent_s = (time.monotonic_ns() - _atomics.load64(segment.memory, HEARTBEAT_OFFSET)) / 1e9
+    if silent_s < SILENT_S:
+        return None
+    pid = segment.supervisor[0]
+    return (
+        f"supervisor pid {pid} has shown no sign of life for {silent_s:.0f} s: if it was stopped, kill -CONT {pid} "
+        f"lets it go on; else kill -KILL {pid}, then shmio-supervisor down clears what is left"
+    )
 
 
 def _state(told: InstanceState, processes: list[SourceStatus | ProcessStatus]) -> InstanceState:
@@ -107,6 +127,7 @@ def _process(segment: Segment, slot: ProcessSlot, supervised: bool, now_ns: int)
     phase = told.phase
     if not supervised:
         phase = Phase.RUNNING if alive else Phase.STOPPED
+    counters = slot.counters
     current = alive and report.pid != 0 and report.started_ns >= told.spawned_ns  # not a predecessor's report
     values = ProcessStatus(
         name=slot.name,
@@ -116,7 +137,7 @@ def _process(segment: Segment, slot: ProcessSlot, supervised: bool, now_ns: int)
         restarts=told.restarts,
         uptime_s=_seconds(now_ns - report.started_ns) if current else 0.0,
         note=told.note or (report.note if current else ""),
-        counters=slot.counters,
+        counters={name: value for name, value in counters.items() if name != "rate_mhz"},
     )
     block = segment.blocks.get(slot.name)
     if slot.kind != "source" or block is None:
@@ -130,7 +151,6 @@ def _process(segment: Segment, slot: ProcessSlot, supervised: bool, now_ns: int)
         if frame is not None:
             cycle = frame.cycle
             quality, reason = frame.assess(block.stale_ns, time.monotonic_ns())
-    counters = values.counters
     return SourceStatus(
         **msgspec.structs.asdict(values),
         quality=str(quality),

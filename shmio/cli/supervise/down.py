@@ -7,9 +7,9 @@ import os
 import select
 from contextlib import suppress
 
-from shmio.cli.target import instance_name
-from shmio.errors import ControlError
-from shmio.segment import Segment, leftover
+from shmio.cli.target import ask, instance_name
+from shmio.errors import NotRunningError
+from shmio.segment import Segment, instances, leftover
 from shmio.supervisor import control
 
 STOP_S = 30.0
@@ -19,28 +19,33 @@ EXIT_S = 5.0
 def execute(arguments: argparse.Namespace) -> int:
     """Ask the supervisor to stop; clear what is there if it is dead."""
     name = instance_name(arguments)
+    if name not in instances():
+        raise NotRunningError(f"no instance {name!r} is running: there is nothing to stop")
     with Segment.open(name) as segment:
-        supervised, pid, path = segment.supervised, segment.supervisor[0], segment.header.control
-    if not supervised:
-        print(f"{name}: its supervisor is dead; clearing what it left")
-        for line in leftover.clear(name):
-            print(line)
-        if path == control.socket_path(name):  # never what somebody else's segment names
-            control.remove_socket(path)
-        return 0
-    print(f"stopping {name}, supervisor pid {pid}", flush=True)
+        if segment.supervised:
+            _stop(segment)
+            return 0
+        path = segment.header.control
+    print(f"{name}: its supervisor is dead; clearing what it left")
+    for line in leftover.clear(name):
+        print(line)
+    if path == control.socket_path(name):  # never what somebody else's segment names
+        control.remove_socket(path)
+    return 0
+
+
+def _stop(segment: Segment) -> None:
+    pid = segment.supervisor[0]
+    print(f"stopping {segment.instance}, supervisor pid {pid}", flush=True)
     pidfd = _pidfd(pid)
     try:
-        control.request(path, control.Stop(), STOP_S)
+        ask(segment, control.Stop(), STOP_S)
         if pidfd is not None:
             select.select([pidfd], [], [], EXIT_S)
-    except ControlError as error:
-        raise ControlError(f"{error}; kill -TERM {pid} stops it as well") from None
     finally:
         if pidfd is not None:
             os.close(pidfd)
-    print(f"{name} is stopped")
-    return 0
+    print(f"{segment.instance} is stopped")
 
 
 def _pidfd(pid: int) -> int | None:

@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
+from pathlib import Path
 
-from shmio.cli.target import instance_name, open_supervised
+from shmio.cli.target import ask, instance_name, open_supervised
+from shmio.segment import Segment
 from shmio.supervisor import control
 
 RESTART_S = 40.0
+WHERE_S = 5.0
 
 
 def execute(arguments: argparse.Namespace) -> int:
     """Return when the process runs again."""
     with open_supervised(instance_name(arguments)) as segment:
-        path = segment.header.control
-    control.request(path, control.Restart(arguments.name), RESTART_S)
-    print(f"{arguments.name} runs again")
+        ask(segment, control.Restart(arguments.name), RESTART_S)
+        print(f"{arguments.name} runs again")
+        file = Path(ask(segment, control.Where(), WHERE_S)["config"])
+        if _changed(file, segment):
+            print(f"{file} has changed since the start; restart keeps the old configuration, down and up take the new")
     return 0
+
+
+def _changed(file: Path, segment: Segment) -> bool:
+    with suppress(OSError):
+        return file.stat().st_mtime_ns > segment.header.started_utc_ns
+    return False

@@ -32,8 +32,12 @@ def execute(arguments: argparse.Namespace) -> int:
 
 def _table(status: InstanceStatus) -> list[str]:
     supervisor = status.supervisor
-    by = f"supervisor pid {supervisor.pid}, up {_duration(supervisor.uptime_s)}" if supervisor else status.note
-    lines = [f"{status.instance}: {status.state}, mode {status.mode}, segment {status.segment}, {by}"]
+    facts = [f"{status.instance}: {status.state}", f"mode {status.mode}", f"segment {status.segment}"]
+    if supervisor:
+        facts.append(f"supervisor pid {supervisor.pid}, up {_duration(supervisor.uptime_s)}")
+    lines = [", ".join(facts)]
+    if status.note:
+        lines.append(status.note)
     rows = [_HEADINGS, *(_row(process) for process in status.processes)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(_HEADINGS) - 1)]
     for row in rows:
@@ -47,8 +51,10 @@ def _row(process: ProcessStatus) -> tuple[str, ...]:
     if isinstance(process, SourceStatus):
         details.append(f"{process.quality}: {process.reason}" if process.reason else process.quality)
         if process.cycle is not None:
-            details.append(f"cycle {process.cycle}, {process.rate_hz:.1f} Hz, {process.overruns} overruns")
-    if process.note and process.note not in details[:1] and not _said(process):
+            rate = f"{process.rate_hz:.1f}" if process.rate_hz else "-"
+            overruns = f"{process.overruns} overrun{'s' * (process.overruns != 1)}"
+            details.append(f"cycle {process.cycle}, {rate} Hz, {overruns}")
+    if process.note and not _said(process):
         details.append(process.note)
     pid = "-" if process.pid is None else str(process.pid)
     uptime = _duration(process.uptime_s)
@@ -56,8 +62,10 @@ def _row(process: ProcessStatus) -> tuple[str, ...]:
 
 
 def _said(process: ProcessStatus) -> bool:
-    """Whether the note only repeats why the source is bad."""
-    return isinstance(process, SourceStatus) and process.note == process.reason
+    """Whether the note only repeats why the source is bad, in full or cut to fit."""
+    return isinstance(process, SourceStatus) and (
+        process.reason.startswith(process.note) or bool(process.reason and process.note.startswith(process.reason))
+    )
 
 
 def _duration(seconds: float) -> str:

@@ -6,6 +6,7 @@ import argparse
 import logging
 import os
 import select
+import signal
 import subprocess
 import sys
 import time
@@ -18,7 +19,7 @@ from shmio.cli.supervise.prepare import Prepared, peer, prepare
 from shmio.cli.target import config_file
 from shmio.errors import AlreadyRunningError, ConfigError, ControlError, SegmentError, ShmioError
 from shmio.logs import printable
-from shmio.segment import PREFIX, Segment, State
+from shmio.segment import PREFIX, Segment, State, leftover
 from shmio.supervisor.main import Supervisor
 from shmio.supervisor.plan import MODES, Job
 from shmio.supervisor.process import child_environment
@@ -44,7 +45,7 @@ def execute(arguments: argparse.Namespace) -> int:
 def _foreground(prepared: Prepared) -> int:
     _refuse_second(prepared.plan.instance)
     _announce(prepared)
-    _say("Ctrl-C stops it")
+    _say("Ctrl-C stops it, and so does closing the terminal")
     console = logging.StreamHandler(sys.stderr)
     console.setFormatter(_Console())
     logs.setup(prepared.plan.log_dir / "supervisor.log", "supervisor")
@@ -99,6 +100,7 @@ def _detached(file: Path, mode: str, report: int) -> int:
             os.close(report)
 
     try:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
         prepared = prepare(file, mode)
         logs.setup(prepared.plan.log_dir / "supervisor.log", "supervisor")
         Supervisor(prepared.plan, on_state=lambda state: tell("ok") if state is not State.STOPPING else None).run()
@@ -114,6 +116,9 @@ def _detach(prepared: Prepared) -> int:
     _refuse_second(plan.instance)
     log_file = plan.log_dir / "supervisor.log"
     logs.setup(log_file, "supervisor")
+    for line in leftover.clear(plan.instance):  # here, where it can be said
+        logging.getLogger("shmio.supervisor").warning("%s", line)
+        _say(line)
     command = (sys.executable, "-P", "-m", "shmio.cli.supervisor", "up")
     reader, writer = os.pipe()
     with os.fdopen(reader, "rb") as answers, log_file.open("ab") as log:

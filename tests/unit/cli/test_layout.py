@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from shmio import __version__
 from shmio.cli.layout import main
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "layout"
@@ -108,3 +109,10 @@ def test_a_reader_that_leaves_early(tmp_path: Path) -> None:
         process.stdout.close()
         assert process.stderr.read() == b""
         assert process.wait() == 141  # as of a program that the signal ended
+
+
+def test_it_tells_its_version(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["--version"])
+    assert stop.value.code == 0
+    assert capsys.readouterr().out == f"shmio {__version__}\n"

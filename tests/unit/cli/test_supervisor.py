@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import socket
 import subprocess
 import sys
 from collections.abc import Callable
@@ -14,7 +16,9 @@ import pytest
 from shmio.cli import target
 from shmio.cli.supervisor import main
 from shmio.config import load
-from shmio.segment import Segment, instances
+from shmio.layout.model import Layout, Register
+from shmio.segment import Activity, BlockSpec, ProcessSpec, Quality, Report, Segment, instances
+from shmio.supervisor import control, status
 
 ROOT = Path(__file__).parents[3]
 SEED = ROOT / "tests" / "golden" / "layout" / "db201-as-printed.db"
@@ -244,6 +248,16 @@ def test_a_block_is_chosen_by_its_number_or_name(example: Edit, key: str, capsys
     assert ": DB7, 1 registers, 2 bytes" in capsys.readouterr().out
 
 
+def test_help_tells_what_init_takes_and_which_modes_there_are(capsys: pytest.CaptureFixture[str]) -> None:
+    for verb, said in (
+        ("init", "init [-h] [-c FILE] [plc.ini] [FILE.db [FILE.udt ...]]"),
+        ("up", "not in this version"),
+    ):
+        with pytest.raises(SystemExit):
+            main([verb, "--help"])
+        assert said in " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.parametrize("mode", ["log", "replay"])
 def test_modes_to_come_are_refused(example: Edit, mode: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["up", "--mode", mode]) == 1
@@ -265,11 +279,75 @@ def test_with_nothing_running_verbs_say_so(verb: list[str], instance: str, capsy
     assert error.count("\n") == 1
 
 
+def test_nothing_to_stop_is_not_a_reason_to_start(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["down", "--instance", instance]) == 1
+    assert capsys.readouterr().err == f"no instance {instance!r} is running: there is nothing to stop\n"
+
+
+@pytest.mark.parametrize("verb", [["down"], ["restart", "cell"], ["logs"]])
+def test_a_supervisor_that_does_not_answer(
+    verb: list[str],
+    instance: str,
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(status, "SILENT_S", 0.0)
+    monkeypatch.setattr(control, "TURN_S", 0.01)
+    path = str(folder / "c.sock")
+    with socket.socket(socket.AF_UNIX) as silent, Segment.create(instance, [], [], control=path) as segment:
+        silent.bind(path)
+        silent.listen()
+        assert main([*verb, "--instance", instance]) == 1
+        assert f"supervisor pid {os.getpid()} has shown no sign of life for 0 s" in capsys.readouterr().err
+        segment.unlink()
+
+
+def test_a_folder_is_no_configuration(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "-c", str(folder)]) == 1
+    assert capsys.readouterr().err == f"{folder}: Is a directory; name the file, such as {folder}/supervisor.toml\n"
+
+
+def test_a_full_disk_is_the_programs_failure() -> None:
+    command = [sys.executable, "-m", "shmio.cli.layout", str(ROOT / "db201.db")]
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            command, cwd=ROOT, stdout=full, stderr=subprocess.PIPE, text=True, check=False, timeout=60
+        )
+    assert (done.returncode, done.stderr) == (1, "shmio-layout: No space left on device\n")
+
+
+@pytest.mark.parametrize(
+    ("reason", "note", "shown"),
+    [
+        ("no answer", "no answer", "bad: no answer; cycle 3, - Hz, 1 overrun"),
+        ("no answer", "no answer within", "bad: no answer; cycle 3, - Hz, 1 overrun"),
+        ("no answer within", "no answer", "bad: no answer within; cycle 3, - Hz, 1 overrun"),
+        ("no answer", "disk full", "bad: no answer; cycle 3, - Hz, 1 overrun; disk full"),
+    ],
+)
+def test_status_says_why_once(
+    instance: str, reason: str, note: str, shown: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    layout = Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
+    blocks = [BlockSpec("cell", layout, 20_000_000, 3600 * 10**9, 1 << 16)]
+    with Segment.create(instance, blocks, [ProcessSpec("cell", "source")]) as segment:
+        worker = Segment.open(instance, writable=True)
+        slot = worker.processes.find("cell")
+        assert slot.take()
+        slot.report = Report(os.getpid(), Activity.RUNNING, segment.header.started_ns, (7, 1), note)
+        worker.writer("cell").publish(b"ab", cycle=3, quality=Quality.BAD, reason=reason)
+        assert main(["status", "--instance", instance]) == 0
+        assert capsys.readouterr().out.splitlines()[-1].endswith(f"  {shown}")
+        worker.close()
+        segment.unlink()
+
+
 def test_status_of_nothing_is_an_object(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["status", "--json", "--instance", instance]) == 1
     output = capsys.readouterr()
-    status = json.loads(output.out)
-    assert (status["state"], status["processes"], status["instance"]) == ("stopped", [], instance)
+    found = json.loads(output.out)
+    assert (found["state"], found["processes"], found["instance"]) == ("stopped", [], instance)
     assert output.err == ""
 
 
@@ -301,7 +379,7 @@ class TestTarget:
         self, instance: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
     ) -> None:
         running: list[str] = []
-        monkeypatch.setattr(target, "instances", lambda: running)
+        monkeypatch.setattr(target, "running_instances", lambda: running)
         assert main(["status"]) == 1
         assert "no instance is running, and there is no supervisor.toml here" in capsys.readouterr().err
         running.append(instance)

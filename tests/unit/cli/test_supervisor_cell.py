@@ -109,7 +109,13 @@ def test_a_day_in_the_life_of_the_cell(cell: Cell) -> None:
     assert cell.run("restart", "cell", status=0).stdout == "cell runs again\n"
     assert cell.of("cell")["pid"] != pids["cell"]
     assert "there are: plc, cell, grpc" in cell.run("restart", "nobody", status=1).stderr
+    file = cell.folder / "supervisor.toml"
+    moved = file.rename(cell.folder / "elsewhere.toml")
     assert cell.run("logs", "--instance", cell.instance, "cell", status=0).stdout
+    moved.rename(file)
+    file.write_text(file.read_text())
+    changed = cell.run("restart", "grpc", status=0).stdout
+    assert changed.startswith(f"grpc runs again\n{file} has changed since the start; restart keeps the old")
 
     down = cell.run("down", status=0).stdout
     assert down.splitlines()[-1] == f"{cell.instance} is stopped"
@@ -129,6 +135,28 @@ def test_down_clears_what_a_killed_supervisor_left(cell: Cell) -> None:
         assert f"stopped {process['name']}, pid {process['pid']}" in lines
     assert cell.instance not in instances()
     assert not list((cell.folder / "run" / "shmio").iterdir())
+
+
+def test_up_tells_what_it_clears_of_a_killed_supervisor(cell: Cell) -> None:
+    cell.run("up", "--detach", status=0)
+    status = cell.status()
+    os.kill(status["supervisor"]["pid"], signal.SIGKILL)
+    cell.until(lambda: cell.status()["supervisor"] is None)
+    assert "up stops them and starts anew" in cell.run("status", status=0).stdout
+    lines = cell.run("up", "--detach", status=0).stdout
+    for process in status["processes"]:
+        assert f"stopped {process['name']}, pid {process['pid']}, which had lost its supervisor\n" in lines
+    cell.run("down", status=0)
+
+
+def test_a_block_without_a_number_is_played_and_read(cell: Cell) -> None:
+    block = cell.folder / "db201.db"
+    block.write_text(block.read_text().replace("DATA_BLOCK DB201", 'DATA_BLOCK "Cell"'))
+    file = cell.folder / "supervisor.toml"
+    file.write_text(file.read_text().replace('layout = "db201.db"', 'layout = ["db201.db"]\ndbNumber = 7'))
+    cell.run("up", "--detach", status=0)
+    cell.until(lambda: bool(cell.of("cell")["quality"] == "good"))
+    cell.run("down", status=0)
 
 
 def test_a_device_that_is_not_there_is_told_but_does_not_hold_up_the_start(cell: Cell) -> None:
@@ -152,7 +180,7 @@ def test_a_start_that_fails_tells_why_and_leaves_nothing(cell: Cell) -> None:
     assert cell.instance not in instances()
 
 
-@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_in_the_foreground_a_signal_stops_it_cleanly(cell: Cell, sign: signal.Signals) -> None:
     with subprocess.Popen(
         cell.command("up"),

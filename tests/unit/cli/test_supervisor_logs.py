@@ -110,7 +110,7 @@ def test_logs_before_the_first_start(instance_logs: Path, capsys: pytest.Capture
     assert "no log file in" in capsys.readouterr().err
 
 
-def test_following_ends_with_ctrl_c_as_done(
+def test_following_ends_with_ctrl_c(
     instance_logs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rounds = iter([[b"more"]])
@@ -121,5 +121,5 @@ def test_following_ends_with_ctrl_c_as_done(
         raise KeyboardInterrupt
 
     monkeypatch.setattr(Follower, "wait", wait)
-    assert main(["logs", "-f", "-n", "0"]) == 0
+    assert main(["logs", "-f", "-n", "0"]) == 130
     assert capsys.readouterr().out == "more\n"

@@ -76,6 +76,23 @@ def test_a_request_arrives_as_it_was_sent(served: Served, request_: Request) -> 
     assert answer_to(client) == {"ok": True, "more": 1}
 
 
+def test_a_successors_socket_is_left_to_it(served: Served) -> None:
+    successor = Served(served.path)
+    served.server.retire()
+    client = successor.client(b'{"do": "where"}\n')
+    assert [request for request, _ in successor.requests] == [Where()]
+    client.close()
+    successor.close()
+
+
+def test_a_client_stops_waiting_when_there_is_no_point(tmp_path: Path) -> None:
+    with socket.socket(socket.AF_UNIX) as silent:
+        silent.bind(str(tmp_path / "s"))
+        silent.listen()
+        with pytest.raises(ControlError, match="it is asleep"):
+            control.request(str(tmp_path / "s"), Where(), 3600, lambda: "it is asleep")
+
+
 def test_a_request_may_come_in_pieces(served: Served) -> None:
     client = served.client(b'{"do": ')
     assert served.requests == []

@@ -175,11 +175,38 @@ def test_a_killed_supervisor_leaves_the_processes_and_the_next_one_takes_over(la
     assert successor.stop() == 0
 
 
-def test_sighup_is_ignored(launch: Launch) -> None:
-    cell = launch()
+def test_a_closed_terminal_stops_it_in_good_order(launch: Launch, tmp_path: Path) -> None:
+    cell = launch([("plc", "emulator", ["no end"])], grace_s=0.5)
+    cell.wait_state("running")
+    cell.process.send_signal(signal.SIGHUP)
+    cell.wait_state("stopping")
+    cell.process.send_signal(signal.SIGHUP)  # the shell sends one, too
+    assert cell.wait_end() == 0
+    assert "killing what has not stopped yet" not in cell.log()
+    assert cell.instance not in instances()
+
+
+def test_sighup_that_is_ignored_stays_so(launch: Launch) -> None:
+    """As ``nohup`` has it."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        cell = launch()
+    finally:
+        signal.signal(signal.SIGHUP, before)
     cell.wait_state("running")
     cell.process.send_signal(signal.SIGHUP)
     assert cell.request(Restart("plc")) == {"ok": True}
+
+
+def test_a_removed_segment_stops_the_instance(launch: Launch, tmp_path: Path) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    Path(f"/dev/shm/shmio-{cell.instance}").unlink()
+    assert cell.wait_end() == 1
+    error = f"the shared memory shmio-{cell.instance} was removed while the instance ran: all is stopped\n"
+    assert cell.errors() == error
+    assert error in cell.log()
+    assert (tmp_path / "ends").read_text().split() == ["grpc", "cell", "plc"]
 
 
 def test_processes_are_out_of_reach_of_ctrl_c(launch: Launch) -> None:

@@ -21,6 +21,7 @@ from shmio.segment import (
     State,
     Supervised,
 )
+from shmio.supervisor import status as status_module
 from shmio.supervisor.status import ProcessStatus, SourceStatus, read_status
 
 LAYOUT = Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
@@ -93,6 +94,7 @@ def test_all_is_well(cell: Cell, instance: str) -> None:
     assert isinstance(source, SourceStatus)
     assert (source.quality, source.reason, source.cycle) == ("good", "", 5)
     assert (source.rate_hz, source.overruns) == (49.9, 3)
+    assert "rate_mhz" not in source.counters
     assert grpc.counters == {"streams": 7, "messages": 3, "dropped": 0}
     assert type(grpc) is ProcessStatus, "quality is for sources"
 
@@ -141,6 +143,18 @@ def test_a_process_that_does_not_run(cell: Cell, instance: str, phase: Phase) ->
     assert (grpc.state, grpc.pid, grpc.uptime_s) == (str(phase), None, 0.0)
     assert (grpc.restarts, grpc.note) == (4, "address in use")
     assert status.state == "degraded"
+
+
+def test_a_silent_supervisor_is_degraded(cell: Cell, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    cell.run("cell")
+    cell.run("grpc")
+    cell.segment.set_state(os.getpid(), State.RUNNING)
+    cell.publish(5)
+    monkeypatch.setattr(status_module, "SILENT_S", 0.0)
+    status = read_status(instance)
+    assert status.state == "degraded"
+    assert status.supervisor is not None
+    assert f"supervisor pid {os.getpid()} has shown no sign of life for 0 s" in status.note
 
 
 def test_a_predecessors_pid_is_not_shown(cell: Cell, instance: str) -> None:

@@ -1,0 +1,63 @@
+"""``shmio``: which instance it looks at, and how it ends. What it prints is in tests/system."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shmio.cli import target, watch
+from shmio.cli.user import main
+from shmio.layout.model import Layout, Register
+from shmio.segment import BlockSpec, Segment
+
+LAYOUT = Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def running(instance: str) -> Iterator[str]:
+    blocks = [BlockSpec("cell", LAYOUT, 20_000_000, 3600 * 10**9, 1 << 16)]
+    with Segment.create(instance, blocks, []) as segment:
+        segment.writer("cell").publish(b"\0\7", cycle=1, source_ns=1)
+        yield instance
+        segment.unlink()
+
+
+def test_the_instance_is_that_of_the_file_here_even_if_spoilt(running: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("supervisor.toml").write_text(f'wings = 2\n[instance]\nname = "{running}"\n')
+    assert main(["get", "cell/a"]) == 0
+    assert capsys.readouterr().out == "cell/a  7\n"
+
+
+@pytest.mark.parametrize("name", ["../../etc", "", "a b"])
+def test_what_is_no_name_is_refused(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["list", "--instance", name]) == 1
+    assert capsys.readouterr().err.startswith(f"--instance: {name!r} is not a name: at most 40 letters")
+
+
+def test_of_several_one_must_be_chosen(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(target, "running_instances", lambda: ["one", "two"])
+    assert main(["list"]) == 1
+    assert "choose one by --instance (one, two)" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("count", ["0", "-1", "x", "1.5", "٣"])
+def test_a_number_of_lines_is_one_or_more(count: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["watch", "-n", count, "cell/a"])
+    assert stop.value.code == 2
+    assert "is not a whole number from 1 on" in capsys.readouterr().err
+
+
+def test_watch_ends_with_ctrl_c(running: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def news(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(watch, "_news", news)
+    assert main(["watch", "--instance", running, "cell/a"]) == 130
