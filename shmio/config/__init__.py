@@ -2,6 +2,6 @@
 
 from shmio.config.address import Address
 from shmio.config.model import Config, Emulator, Grpc, Instance, Source, Tls
-from shmio.config.read import load
+from shmio.config.read import RESERVED_SOURCES, load
 
-__all__ = ["Address", "Config", "Emulator", "Grpc", "Instance", "Source", "Tls", "load"]
+__all__ = ["RESERVED_SOURCES", "Address", "Config", "Emulator", "Grpc", "Instance", "Source", "Tls", "load"]

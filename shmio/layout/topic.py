@@ -13,12 +13,12 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Literal, cast
 
+from shmio.config import RESERVED_SOURCES
 from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
 
 Direction = Literal["in", "out"]
 
-RESERVED_SOURCES = frozenset({"simlog", "model", "shmio"})
 MAX_TOPIC = 16_384
 _NEAR_CANDIDATES = 500
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from shmio.errors import AlreadyRunningError, SegmentError
 from shmio.segment import shm
 from shmio.segment.processes import SUPERVISOR_LOCK
-from shmio.segment.segment import PREFIX, Segment
+from shmio.segment.segment import PREFIX, Segment, refuse_second
 from shmio.segment.shm import SharedObject
 
 GRACE_S = 3.0
@@ -31,7 +31,8 @@ def clear(instance: str) -> list[str]:
         return []
     try:
         if not shared.try_lock(SUPERVISOR_LOCK):
-            raise AlreadyRunningError(_supervisor(instance))
+            refuse_second(instance)
+            raise AlreadyRunningError(f"another supervisor is just starting instance {instance!r}")
         if not shared.current():
             return []
         done = _stop_orphans(instance, shared)
@@ -39,14 +40,6 @@ def clear(instance: str) -> list[str]:
         return [*done, f"removed the left-over segment {name}"]
     finally:
         shared.close()
-
-
-def _supervisor(instance: str) -> str:
-    try:
-        with Segment.open(instance) as segment:
-            return f"instance {instance!r} is already running, supervisor pid {segment.supervisor[0]}"
-    except SegmentError:
-        return f"another supervisor is just starting instance {instance!r}"
 
 
 def _stop_orphans(instance: str, shared: SharedObject) -> list[str]:

@@ -93,7 +93,8 @@ class Segment:
         try:
             shared = SharedObject.create(name, group)
         except FileExistsError:
-            raise AlreadyRunningError(_holder(instance)) from None
+            refuse_second(instance)
+            raise AlreadyRunningError(f"a segment of instance {instance!r} is left over or just being made") from None
         try:
             # Whoever opens the name between creation and this lock sees no magic, and takes it for half-made.
             if not shared.try_lock(SUPERVISOR_LOCK) or not shared.current():
@@ -274,15 +275,17 @@ def write_ring_header(memory: memoryview, offset: int, block: BlockSpec) -> None
     )  # fmt: skip
 
 
-def _holder(instance: str) -> str:
-    """Say who has the instance's segment."""
+def refuse_second(instance: str) -> None:
+    """AlreadyRunningError, with the supervisor's pid, if the instance has a living one."""
     try:
-        with Segment.open(instance) as segment:
-            if segment.supervised:
-                return f"instance {instance!r} is already running, supervisor pid {segment.supervisor[0]}"
+        segment = Segment.open(instance)
     except SegmentError:
-        pass
-    return f"a segment of instance {instance!r} is left over or just being made"
+        return
+    with segment:
+        if segment.supervised:
+            raise AlreadyRunningError(
+                f"instance {instance!r} is already running, supervisor pid {segment.supervisor[0]}"
+            )
 
 
 def _align(size: int, to: int) -> int:
