@@ -77,7 +77,6 @@ def summarize(warnings: Iterable[Diagnostic]) -> list[str]:
         if name is None or kind not in alike:
             alike[kind] = len(lines)
             lines.append(str(warning))
-        else:
-            at = alike[kind]
+        elif name[0] not in lines[at := alike[kind]]:
             lines[at] += f"{',' if '; likewise ' in lines[at] else '; likewise'} {name[0]}"
     return lines

@@ -98,6 +98,7 @@ def test_init_from_the_files_of_the_java_version(capsys: pytest.CaptureFixture[s
     assert "optimized access" in output
     assert output.count("has spaces") == 1, "names that are odd alike share a line"
     assert "; likewise '" in output
+    assert output.count("'Axs4 Pos'") == 1
 
 
 def test_init_from_a_layout_alone_leaves_the_address_to_fill_in(capsys: pytest.CaptureFixture[str]) -> None:
