@@ -17,7 +17,7 @@ from shmio.config.wording import explain, named
 from shmio.errors import ConfigError
 
 RESERVED_SOURCES = frozenset({"simlog", "model", "shmio"})
-SECTION_PROCESSES = frozenset({"grpc", "mqtt", "recorder", "web"})
+SECTION_PROCESSES = frozenset({"grpc", "mqtt", "recorder", "supervisor", "web"})
 MAX_FILE_BYTES = 1 << 20
 
 _TABLES: dict[str, type[Section]] = {
@@ -137,7 +137,7 @@ def _check_names(config: Config) -> None:
             if folded in RESERVED_SOURCES:
                 raise ConfigError(f"{key}: {section.name!r} is reserved")
             if folded in SECTION_PROCESSES:
-                raise ConfigError(f"{key}: {section.name!r} is the name of a section's process")
+                raise ConfigError(f"{key}: {section.name!r} is the name of a process of ours")
             if folded in seen:
                 raise ConfigError(
                     f"{key}: {section.name!r} is already the name of {seen[folded]} (case does not count)"

@@ -161,6 +161,11 @@ class Segment:
         return header.read_supervisor(self.memory)
 
     @property
+    def supervisor_heartbeat_ns(self) -> int:
+        """CLOCK_MONOTONIC of the supervisor's last beat."""
+        return _atomics.load64(self.memory, header.HEARTBEAT_OFFSET)
+
+    @property
     def supervised(self) -> bool:
         """Whether a supervisor is alive."""
         return self.shared.locked(SUPERVISOR_LOCK)

@@ -6,10 +6,9 @@ import time
 
 import msgspec
 
-from shmio.errors import NotRunningError, SegmentError
-from shmio.segment import Phase, ProcessSlot, Quality, Segment, _atomics
+from shmio.errors import FormatError, NotRunningError, SegmentError
+from shmio.segment import Phase, ProcessSlot, Quality, Segment
 from shmio.segment import State as InstanceState
-from shmio.segment.header import HEARTBEAT_OFFSET
 from shmio.supervisor.policy import assess
 
 SILENT_S = 5.0
@@ -65,10 +64,10 @@ class InstanceStatus(msgspec.Struct):
 
 
 def read_status(instance: str) -> InstanceStatus:
-    """The status of an instance, running or not. SegmentError: a segment that cannot be read."""
+    """The status of an instance, running or not. SegmentError: a segment that may not be read."""
     try:
         segment = Segment.open(instance)
-    except NotRunningError as error:
+    except (NotRunningError, FormatError) as error:
         return InstanceStatus(instance, note=str(error))
     with segment:
         return _read(segment)
@@ -104,7 +103,7 @@ def _read(segment: Segment) -> InstanceStatus:
 
 def supervisor_silence(segment: Segment) -> str | None:
     """What to say about a living supervisor that shows no sign of life; None if it does."""
-    silent_s = (time.monotonic_ns() - _atomics.load64(segment.memory, HEARTBEAT_OFFSET)) / 1e9
+    silent_s = (time.monotonic_ns() - segment.supervisor_heartbeat_ns) / 1e9
     if silent_s < SILENT_S:
         return None
     pid = segment.supervisor[0]
@@ -124,9 +123,11 @@ def _state(told: InstanceState, processes: list[SourceStatus | ProcessStatus]) -
 
 def _process(segment: Segment, slot: ProcessSlot, supervised: bool, now_ns: int) -> SourceStatus | ProcessStatus:
     told, report, alive = slot.supervised, slot.report, slot.alive()
-    phase = told.phase
+    phase, note = told.phase, told.note
     if not supervised:
         phase = Phase.RUNNING if alive else Phase.STOPPED
+    elif phase is Phase.RUNNING and not alive:  # a supervisor that lives soon says so itself
+        phase, note = Phase.STOPPED, "dead"
     counters = slot.counters
     current = alive and report.pid != 0 and report.started_ns >= told.spawned_ns  # not a predecessor's report
     values = ProcessStatus(
@@ -136,7 +137,7 @@ def _process(segment: Segment, slot: ProcessSlot, supervised: bool, now_ns: int)
         state=str(phase),
         restarts=told.restarts,
         uptime_s=_seconds(now_ns - report.started_ns) if current else 0.0,
-        note=told.note or (report.note if current else ""),
+        note=note or (report.note if current else ""),
         counters={name: value for name, value in counters.items() if name != "rate_mhz"},
     )
     block = segment.blocks.get(slot.name)

@@ -8,7 +8,7 @@ import select
 from contextlib import suppress
 
 from shmio.cli.target import ask, instance_name
-from shmio.errors import NotRunningError
+from shmio.errors import FormatError, NotRunningError
 from shmio.segment import Segment, instances, leftover
 from shmio.supervisor import control
 
@@ -21,7 +21,9 @@ def execute(arguments: argparse.Namespace) -> int:
     name = instance_name(arguments)
     if name not in instances():
         raise NotRunningError(f"no instance {name!r} is running: there is nothing to stop")
-    with Segment.open(name) as segment:
+    path = None
+    # Suppressed: a segment that was never finished.
+    with suppress(NotRunningError, FormatError), Segment.open(name) as segment:
         if segment.supervised:
             _stop(segment)
             return 0

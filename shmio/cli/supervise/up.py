@@ -17,9 +17,10 @@ from typing import TextIO
 from shmio import logs
 from shmio.cli.supervise.prepare import Prepared, peer, prepare
 from shmio.cli.target import config_file
-from shmio.errors import AlreadyRunningError, ConfigError, ControlError, SegmentError, ShmioError
+from shmio.errors import ConfigError, ControlError, ShmioError
 from shmio.logs import printable
-from shmio.segment import PREFIX, Segment, State, leftover
+from shmio.segment import PREFIX, State, leftover
+from shmio.segment.segment import refuse_second
 from shmio.supervisor.main import Supervisor
 from shmio.supervisor.plan import MODES, Job
 from shmio.supervisor.process import child_environment
@@ -43,7 +44,7 @@ def execute(arguments: argparse.Namespace) -> int:
 
 
 def _foreground(prepared: Prepared) -> int:
-    _refuse_second(prepared.plan.instance)
+    refuse_second(prepared.plan.instance)
     _announce(prepared)
     _say("Ctrl-C stops it, and so does closing the terminal")
     console = logging.StreamHandler(sys.stderr)
@@ -52,18 +53,6 @@ def _foreground(prepared: Prepared) -> int:
     logging.getLogger("shmio.supervisor").addHandler(console)
     Supervisor(prepared.plan).run()
     return 0
-
-
-def _refuse_second(instance: str) -> None:
-    """Say so before anything else is said; what decides is the lock that the supervisor takes."""
-    try:
-        segment = Segment.open(instance)
-    except SegmentError:
-        return
-    with segment:
-        if segment.supervised:
-            pid = segment.supervisor[0]
-            raise AlreadyRunningError(f"instance {instance!r} is already running, supervisor pid {pid}")
 
 
 def _announce(prepared: Prepared) -> None:
@@ -113,7 +102,7 @@ def _detached(file: Path, mode: str, report: int) -> int:
 
 def _detach(prepared: Prepared) -> int:
     plan = prepared.plan
-    _refuse_second(plan.instance)
+    refuse_second(plan.instance)
     log_file = plan.log_dir / "supervisor.log"
     logs.setup(log_file, "supervisor")
     for line in leftover.clear(plan.instance):  # here, where it can be said

@@ -402,3 +402,14 @@ def test_looking_needs_no_heavy_imports() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.stderr.strip() == ""
+
+
+@pytest.mark.parametrize("content", [b"", b"0123456789", bytes(8192)])
+def test_down_clears_a_segment_that_was_never_finished(
+    instance: str, content: bytes, capsys: pytest.CaptureFixture[str]
+) -> None:
+    left = Path(f"/dev/shm/shmio-{instance}")
+    left.write_bytes(content)
+    assert main(["down", "--instance", instance]) == 0
+    assert f"removed the left-over segment shmio-{instance}" in capsys.readouterr().out
+    assert not left.exists()

@@ -126,7 +126,7 @@ def test_tls_files_are_relative_to_the_config(folder: Path) -> None:
         ("armed = false", "armed = 1", r"source\[0\]\.armed: expected true or false, got a whole number"),
         ("armed = false", "stale_ms = 30", r"source\[0\]\.stale_ms: 30 is less than two periods of 20 ms"),
         ('name = "cell"', 'name = "Model"', r"source\[0\]\.name: 'Model' is reserved"),
-        ('name = "cell"', 'name = "grpc"', r"source\[0\]\.name: 'grpc' is the name of a section's process"),
+        ('name = "cell"', 'name = "grpc"', r"source\[0\]\.name: 'grpc' is the name of a process of ours"),
         ('name = "plc"', 'name = "CELL"', r"emulator\[0\]\.name: 'CELL' is already the name of source\[0\]"),
         ("period_ms = 20", "period_ms = 0", r"source\[0\]\.period_ms: expected"),
         ("period_ms = 20", "period_ms = nan", r"source\[0\]\.period_ms: "),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -178,3 +179,22 @@ def test_a_left_over_segment_is_nothing_running(cell: Cell, instance: str) -> No
     status = read_status(instance)
     assert (status.state, status.processes, status.running) == ("stopped", [], False)
     assert "left" in status.note
+
+
+def test_a_process_that_died_is_not_running_whatever_was_told_of_it(cell: Cell) -> None:
+    cell.run("cell")
+    cell.run("grpc")
+    cell.publish(1)
+    cell.segment.set_state(os.getpid(), State.RUNNING)
+    assert read_status(cell.segment.instance).state == "running"
+    cell.workers.pop().close()
+    status = read_status(cell.segment.instance)
+    assert (status.state, status.processes[1].state, status.processes[1].note) == ("degraded", "stopped", "dead")
+
+
+@pytest.mark.parametrize("content", [b"", b"0123456789", bytes(8192)])
+def test_a_segment_that_was_never_finished_is_no_instance(instance: str, content: bytes) -> None:
+    Path(f"/dev/shm/shmio-{instance}").write_bytes(content)
+    status = read_status(instance)
+    assert (status.state, status.processes) == ("stopped", [])
+    assert status.note
