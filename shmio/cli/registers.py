@@ -28,7 +28,7 @@ def execute(cell: Attachment, options: argparse.Namespace) -> int:
                     {
                         "path": topic_path(block, r),
                         "type": r.type,
-                        "dims": [list(d) for d in r.dims],
+                        "dims": [list(d) for d in r.dims] or None,
                         "comment": r.comment,
                     }
                     for block, r in found
