@@ -9,12 +9,14 @@
     ├── PathError          no such source or register
     ├── SegmentError       the shared memory cannot be used
     │   ├── NotRunningError      no running instance of that name
+    │   │   └── UnfinishedError      its segment is just being made, or its maker died
     │   ├── AlreadyRunningError  another supervisor holds the instance
     │   └── FormatError          the segment's format is not one this version knows
     ├── QualityError       the value exists but is not good
     ├── ConnectorError     the device did not answer as it should; carries a reason code
     ├── EndpointError      an address cannot be served
     └── ControlError       the supervisor refused or did not answer
+        └── UnreachableError     its socket cannot be connected to
 
 The command-line tools print the message of any of these as one line and exit with status 1.
 """
@@ -67,6 +69,10 @@ class NotRunningError(SegmentError):
     """No running instance has this name."""
 
 
+class UnfinishedError(NotRunningError):
+    """The instance's segment is just being made, or its maker died before it was whole."""
+
+
 class AlreadyRunningError(SegmentError):
     """Another supervisor holds this instance; the message has its pid."""
 
@@ -92,3 +98,7 @@ class EndpointError(ShmioError):
 
 class ControlError(ShmioError):
     """The supervisor refused a control request or did not answer it."""
+
+
+class UnreachableError(ControlError):
+    """The supervisor's control socket cannot be connected to."""

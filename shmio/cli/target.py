@@ -10,7 +10,7 @@ import msgspec
 
 from shmio.config.model import NAME_RULE, Name
 from shmio.config.read import read_tables
-from shmio.errors import ConfigError, ControlError, NotRunningError
+from shmio.errors import ConfigError, ControlError, NotRunningError, UnreachableError
 from shmio.segment import Segment, running_instances
 from shmio.supervisor import control
 from shmio.supervisor.status import supervisor_silence
@@ -53,7 +53,10 @@ def open_supervised(name: str) -> Segment:
 
 def ask(segment: Segment, request: control.Request, timeout_s: float) -> dict[str, Any]:
     """The answer of the instance's supervisor; ControlError as soon as it shows no sign of life."""
-    return control.request(segment.header.control, request, timeout_s, lambda: supervisor_silence(segment))
+    try:
+        return control.request(segment.header.control, request, timeout_s, lambda: supervisor_silence(segment))
+    except UnreachableError as error:
+        raise ControlError(f"{error}; kill -TERM {segment.supervisor[0]} stops the instance") from None
 
 
 def _named_in(file: Path) -> str:

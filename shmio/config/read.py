@@ -70,6 +70,7 @@ def _resolve(tables: dict[str, Any], folder: Path) -> Config:
     for name in ("source", "emulator"):
         if isinstance(tables.get(name), dict):
             raise ConfigError(f"{name}: write [[{name}]], in two brackets: there can be several")
+    _check_text(tables, "")
     sources = tables.get("source", [])
     if isinstance(sources, list):
         tables = {**tables, "source": [_with_options(source, i, folder) for i, source in enumerate(sources)]}
@@ -126,6 +127,18 @@ def unknown_option(index: int, key: str, known: list[str]) -> str:
 def _hint(key: str, names: list[str], otherwise: str) -> str:
     near = difflib.get_close_matches(key, names, 1)
     return f"did you mean {near[0]}?" if near else otherwise
+
+
+def _check_text(value: Any, key: str) -> None:
+    """No control characters: no file name or terminal takes them. (Not a pattern: msgspec 0.22 crashes at exit.)."""
+    if isinstance(value, str) and any(char < " " or char == "\x7f" for char in value):
+        raise ConfigError(f"{key}: must not hold control characters")
+    if isinstance(value, dict):
+        for name, item in value.items():
+            _check_text(item, f"{key}.{name}".lstrip("."))
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            _check_text(item, f"{key}[{index}]")
 
 
 def _check_names(config: Config) -> None:

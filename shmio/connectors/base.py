@@ -25,6 +25,8 @@ from shmio.segment import BlockWriter, Quality
 STABLE_NS = 1_000_000_000
 """A connection that has lasted this long has put its failures behind it."""
 
+_MEASURES = re.compile(r"\b[0-9]+(?= (?:ms|s|bytes)\b)")  # what varies in a reason; codes and addresses do not
+
 log = logging.getLogger("shmio.source")
 
 
@@ -139,7 +141,7 @@ class SourceLoop:
             read_ns = time.time_ns()  # the device had these values then, or later
             raw = self._timed_read()
         except ConnectorError as error:
-            return self._fail(cycle, str(error))
+            return self._fail(cycle, str(error) or "the connector gave no reason")
         self._raw, self._read_ns = raw, read_ns
         self._writer.publish(raw, cycle=cycle, source_ns=read_ns)
         self.counters.polls += 1
@@ -184,9 +186,9 @@ class SourceLoop:
         return not stop
 
     def _bad(self, cycle: int, reason: str) -> None:
-        """Publish one bad frame for each new reason, with the last bytes known; another number in it is none."""
+        """Publish one bad frame for each new reason, with the last bytes known; other measures are none."""
         self.note = reason
-        kind = re.sub(r"[0-9]+", "#", reason)
+        kind = _MEASURES.sub("#", reason)
         if kind == self._reason:
             return
         self._reason = kind

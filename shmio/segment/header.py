@@ -8,7 +8,7 @@ from enum import IntEnum
 from typing import Final
 
 from shmio import __version__
-from shmio.errors import FormatError
+from shmio.errors import FormatError, UnfinishedError
 from shmio.segment import _atomics
 
 MAGIC: Final = int.from_bytes(b"SHMIOSEG", "little")
@@ -79,9 +79,9 @@ class Header:
 
     @classmethod
     def read(cls, memory: memoryview, name: str) -> Header:
-        """Read and check; FormatError names what this version does not know."""
+        """Read and check; UnfinishedError, and FormatError, which names what this version does not know."""
         if len(memory) < HEADER_SIZE or _atomics.load64(memory, 0) != MAGIC:
-            raise FormatError(f"{name} is not a whole shmio segment")
+            raise UnfinishedError(f"{name} is not a whole shmio segment: it is just being made, or its maker died")
         # fmt: off
         (_, abi, header_size, epoch, size, utc_ns, started_ns, _, _, sections, section_capacity, section_size,
          processes, process_capacity, slot_size, _, mode, instance, version, control) = _HEADER.unpack_from(memory)

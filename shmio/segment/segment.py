@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from shmio import __version__
-from shmio.errors import AlreadyRunningError, FormatError, LayoutError, NotRunningError, SegmentError
+from shmio.errors import AlreadyRunningError, FormatError, LayoutError, NotRunningError, SegmentError, UnfinishedError
 from shmio.layout.model import Layout
 from shmio.segment import _atomics, header, shm
 from shmio.segment.block import Block, BlockWriter
@@ -122,7 +122,7 @@ class Segment:
             ) from None
         try:
             if shared.size < HEADER_SIZE:
-                raise NotRunningError(f"instance {instance!r} is just starting, or died while it did")
+                raise UnfinishedError(f"instance {instance!r} is just starting, or died while it did")
             return cls(shared, instance)
         except BaseException:
             shared.close()

@@ -27,7 +27,7 @@ from typing import Any, Final
 
 import msgspec
 
-from shmio.errors import ControlError
+from shmio.errors import ControlError, UnreachableError
 
 MAX_REQUEST_BYTES: Final = 4096
 MAX_ANSWER_BYTES: Final = 65536
@@ -200,7 +200,9 @@ def request(
         except TimeoutError:
             raise ControlError(f"the supervisor has not answered within {timeout_s:g} s") from None
         except OSError as error:
-            raise ControlError(f"the supervisor cannot be reached at {path or '(no path)'}: {error.strerror}") from None
+            raise UnreachableError(
+                f"the supervisor cannot be reached at {path or '(no path)'}: {error.strerror}"
+            ) from None
     try:
         answer = msgspec.json.decode(received, type=dict[str, Any])
     except msgspec.DecodeError:

@@ -6,7 +6,7 @@ import time
 
 import msgspec
 
-from shmio.errors import FormatError, NotRunningError, SegmentError
+from shmio.errors import NotRunningError, SegmentError
 from shmio.segment import Phase, ProcessSlot, Quality, Segment
 from shmio.segment import State as InstanceState
 from shmio.supervisor.policy import assess
@@ -67,7 +67,7 @@ def read_status(instance: str) -> InstanceStatus:
     """The status of an instance, running or not. SegmentError: a segment that may not be read."""
     try:
         segment = Segment.open(instance)
-    except (NotRunningError, FormatError) as error:
+    except NotRunningError as error:
         return InstanceStatus(instance, note=str(error))
     with segment:
         return _read(segment)

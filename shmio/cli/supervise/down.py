@@ -8,7 +8,7 @@ import select
 from contextlib import suppress
 
 from shmio.cli.target import ask, instance_name
-from shmio.errors import FormatError, NotRunningError
+from shmio.errors import NotRunningError, UnfinishedError
 from shmio.segment import Segment, instances, leftover
 from shmio.supervisor import control
 
@@ -21,19 +21,19 @@ def execute(arguments: argparse.Namespace) -> int:
     name = instance_name(arguments)
     if name not in instances():
         raise NotRunningError(f"no instance {name!r} is running: there is nothing to stop")
-    path = None
-    # Suppressed: a segment that was never finished.
-    with suppress(NotRunningError, FormatError), Segment.open(name) as segment:
+    with suppress(UnfinishedError), Segment.open(name) as segment:
         if segment.supervised:
             _stop(segment)
             return 0
-        path = segment.header.control
     print(f"{name}: its supervisor is dead; clearing what it left")
-    for line in leftover.clear(name):
+    for line in leftover.clear(name, forget_control=lambda path: _forget(path, name)):
         print(line)
+    return 0
+
+
+def _forget(path: str, name: str) -> None:
     if path == control.socket_path(name):  # never what somebody else's segment names
         control.remove_socket(path)
-    return 0
 
 
 def _stop(segment: Segment) -> None:

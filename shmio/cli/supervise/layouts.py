@@ -49,6 +49,8 @@ def _choose(key: str, section: Source | Emulator, layouts: Sequence[Layout], num
     if len(layouts) > 1:
         layouts = [layout for layout in layouts if layout.number is not None and layout.number == number]
     if len(layouts) != 1:
+        if number is not None:
+            raise ConfigError(f"{key}.dbNumber: no data block has the number {number} ({held}); choose one by block")
         raise ConfigError(f"{key}.layout: it holds several data blocks ({held}); choose one by block or dbNumber")
     return layouts[0]
 

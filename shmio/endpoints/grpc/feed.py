@@ -126,14 +126,14 @@ class Feed:
                     listener.deliver(message)
         self._settle()
 
-    def _turn(self, good: bool) -> None:
-        """Tell a change of quality, in its place between the messages."""
-        if not good:
-            for channel in self._channels.values():
-                for listener in channel.listeners:
+    def _turn_bad(self, frame: int) -> None:
+        """Quality is bad from ``frame`` on, for all who have not joined later."""
+        for channel in self._channels.values():
+            for listener in channel.listeners:
+                if listener.since < frame:
                     listener.lose()
                     listener.since = 0  # it may have lost this very value
-        self._on_quality(self.block.source, good)
+        self._on_quality(self.block.source, False)
 
     def _rebuild(self) -> None:
         channels = tuple(self._channels.values())
@@ -161,8 +161,9 @@ class Feed:
             until_ns = frame.publish_ns if frame else time.monotonic_ns()
             stale = shown is not None and shown.age_ns(until_ns) > block.stale_ns
             if shown is not None and (stale or (frame is not None and not good)):
+                since = shown.number + 1 if frame is None else frame.number
                 shown = None
-                self._loop.call_soon_threadsafe(self._turn, False)
+                self._loop.call_soon_threadsafe(self._turn_bad, since)
             if frame is not None and good:
                 self._show(shown, frame)
                 shown = frame
@@ -171,7 +172,7 @@ class Feed:
         """Encode what has changed since the frame shown before; everything, if there is none."""
         table = self._table
         if shown is None:
-            self._loop.call_soon_threadsafe(self._turn, True)
+            self._loop.call_soon_threadsafe(self._on_quality, self.block.source, True)
             news: Sequence[Channel] = table.channels
         else:
             news = [table.channels[i] for i in table.scan.changed(shown.image, frame.image)]

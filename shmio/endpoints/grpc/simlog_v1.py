@@ -8,7 +8,7 @@ from typing import Any
 
 import grpc
 
-from shmio.endpoints.grpc.feed import Feed
+from shmio.endpoints.grpc.feed import CATCH_UP_FRAMES, Feed
 from shmio.endpoints.grpc.queue import ConflatingQueue
 from shmio.errors import PathError
 from shmio.layout.codec import codec
@@ -19,7 +19,7 @@ from shmio.segment import Frame
 from shmio.wire import simlog_v1_pb2 as wire
 
 SERVICE = wire.DESCRIPTOR.services_by_name["SimlogAPI"].full_name
-QUEUE_BOUND = 16
+QUEUE_BOUND = 2 * CATCH_UP_FRAMES  # a feed that catches up delivers so many at once
 
 Context = grpc.aio.ServicerContext[Any, Any]
 
@@ -58,8 +58,8 @@ class SimlogV1:
     async def subscribe(self, request: wire.TopicDescriptor, context: Context) -> AsyncIterator[bytes]:
         """Stream a topic's values: the current one if it is good, then every change.
 
-        While quality is bad nothing is sent; on recovery the value is sent again. A slow client loses
-        the oldest values.
+        While quality is bad nothing is sent; on recovery the value is sent again. A slow client is
+        given the newest value in place of those that wait.
         """
         topic, register = await self._resolve(request.path, context)
         if topic.direction == "in":

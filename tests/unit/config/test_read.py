@@ -151,6 +151,7 @@ def test_tls_files_are_relative_to_the_config(folder: Path) -> None:
         ("[grpc]", "[mqtt]\nprefix = 'x'\n[grpc]", r"mqtt: unknown key"),
         ("[instance]", 'folder = "/"\n[instance]', r"folder: unknown key"),
         ("[instance]", "[instance", r"not TOML"),
+        ('"var/log"', '"var\\u0000log"', r"instance\.log_dir: must not hold control characters"),
     ],
 )
 def test_what_is_wrong_is_refused_by_its_full_key(folder: Path, old: str, new: str, message: str) -> None:

@@ -248,3 +248,14 @@ def test_a_number_in_a_reason_makes_no_new_frame(segment: Segment) -> None:
 
     _, _, frames = run(segment, varies, 100)
     assert [frame.reason for frame in frames] == ["frame of 1 bytes", "the source was stopped"]
+
+
+def test_an_error_without_words_is_bad_too_and_another_code_is_another_reason(segment: Segment) -> None:
+    reasons = iter(["", "error 0x8104", "error 0x8304"])
+
+    def fails(hook: str, reads: int) -> None:
+        if hook == "read" and reads > 1 and (reason := next(reasons, None)) is not None:
+            raise ConnectorError(reason)
+
+    _, _, frames = run(segment, fails, 100)
+    assert [frame.reason for frame in frames[1:4]] == ["the connector gave no reason", "error 0x8104", "error 0x8304"]

@@ -450,3 +450,33 @@ def test_what_waits_is_dropped_when_the_source_turns_bad(segment: Segment) -> No
         feed.leave(step, listener)
 
     serve(segment, test)
+
+
+def test_who_joins_around_a_change_of_quality_is_shown_no_past(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        step = LAYOUT.registers[4]
+        feed = served.feeds["cell"]
+        first = Recorder()
+        served.publish(image(step=1))
+        feed.listen(step, lambda f: f.image[12:14], first)
+        for value in (2, 3):
+            served.publish(image(step=value))
+        served.publish(image(step=3), Quality.BAD)
+        for value in (4, 5, 6):
+            served.publish(image(step=value))
+        published = served.writer.block.ring.head()
+        joiner = Recorder()
+        feed.listen(step, lambda f: f.image[12:14], joiner)
+        assert joiner.since == published
+        served.publish(image(step=7))
+
+        async def seven() -> bool:
+            return first.got[-1:] == [b"\0\x07"] and joiner.got[-1:] == [b"\0\x07"]
+
+        await served.until(seven)
+        assert joiner.got == [b"\0\x06", b"\0\x07"]
+        assert first.got == sorted(first.got)
+        for listener in (first, joiner):
+            feed.leave(step, listener)
+
+    serve(segment, test)

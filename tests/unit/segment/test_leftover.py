@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.errors import AlreadyRunningError, NotRunningError
+from shmio.errors import AlreadyRunningError, FormatError, NotRunningError
 from shmio.segment import ProcessSpec, Segment, instances
 from shmio.segment.leftover import clear
 
@@ -43,6 +43,14 @@ def test_a_living_supervisor_is_left_alone(instance: str) -> None:
         with pytest.raises(AlreadyRunningError, match=f"pid {os.getpid()}"):
             clear(instance)
         segment.unlink()
+
+
+def test_another_versions_segment_is_left_alone(instance: str) -> None:
+    with Segment.create(instance, [], [ProcessSpec("cell", "source")]) as segment:
+        segment.memory[8:12] = (7).to_bytes(4, "little")
+    with pytest.raises(FormatError, match=r"ABI 7.*use one version"):
+        clear(instance)
+    assert instance in instances()
 
 
 def test_an_unfinished_segment_is_removed(instance: str) -> None:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from shmio.errors import AlreadyRunningError, FormatError, NotRunningError, SegmentError
+from shmio.errors import AlreadyRunningError, FormatError, NotRunningError, SegmentError, UnfinishedError
 from shmio.layout.model import Layout, Register
 from shmio.segment import (
     Activity,
@@ -114,7 +114,7 @@ def test_something_else_by_that_name_is_refused(instance: str) -> None:
     with pytest.raises(NotRunningError, match="just starting"):
         Segment.open(instance)
     path.write_bytes(bytes(HEADER_SIZE))
-    with pytest.raises(FormatError, match="not a whole shmio segment"):
+    with pytest.raises(UnfinishedError, match="not a whole shmio segment"):
         Segment.open(instance)
 
 
