@@ -49,7 +49,7 @@ def expected(value: Any, register: Register) -> Any:
     if base in ("LTIME", "LTOD"):
         return np.timedelta64("NaT", "ns") if value is None or value == -(1 << 63) else value * NS
     if base in ("DATE", "DATE_AND_TIME", "LDT", "DTL"):
-        return np.datetime64("NaT" if value is None else value)
+        return np.datetime64("NaT", "ns") if value is None else np.datetime64(value)
     return bytes.fromhex(value) if base in ("POINTER", "ANY") else value
 
 
