@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import secrets
 import struct
@@ -259,9 +258,7 @@ def _build(
         for block in blocks:
             described = block.layout.to_json()
             memory[at : at + len(described)] = described
-            entry = SectionEntry(
-                SectionKind.LAYOUT, False, at, len(described), 0, block.source, hashlib.sha256(described).digest()
-            )
+            entry = SectionEntry(SectionKind.LAYOUT, False, at, len(described), 0, block.source, block.layout.hash)
             layout = header.write_section(memory, head, entry)
             at += _align(len(described), 64)
             write_ring_header(memory, at, block)
