@@ -11,8 +11,10 @@ from functools import lru_cache
 from typing import Protocol
 
 from shmio.errors import ValueRangeError
+from shmio.layout.checks import brief, to_bool
 from shmio.layout.model import ByteOrder, Register, element_position
-from shmio.layout.scalar import Buffer, Scalar, brief, scalar_codec, to_bool
+from shmio.layout.moment import Buffer
+from shmio.layout.scalar import Scalar, scalar_codec
 
 Value = Scalar | list["Value"]
 

@@ -14,9 +14,10 @@ from fractions import Fraction
 
 from shmio.errors import ValueRangeError
 from shmio.layout import calendar
+from shmio.layout.checks import brief
 from shmio.layout.codec import Value, nest
 from shmio.layout.model import ByteOrder, Register
-from shmio.layout.scalar import Scalar, brief, scalar_codec
+from shmio.layout.scalar import Scalar, scalar_codec
 from shmio.layout.types import ElementType
 
 MAX_LITERAL = 100  # characters of anything but text

@@ -16,9 +16,10 @@ import msgspec
 import numpy as np
 
 from shmio.errors import ValueRangeError
+from shmio.layout.checks import brief, to_bool
 from shmio.layout.codec import Value, flatten
 from shmio.layout.model import Register
-from shmio.layout.scalar import Scalar, brief, scalar_codec, to_bool
+from shmio.layout.scalar import Scalar, scalar_codec
 from shmio.layout.types import ElementType
 
 WireType = Literal["double", "int", "bool", "string"]
