@@ -12,6 +12,7 @@
     │   │   └── UnfinishedError      its segment is just being made, or its maker died
     │   ├── AlreadyRunningError  another supervisor holds the instance
     │   └── FormatError          the segment's format is not one this version knows
+    ├── CommandError       a command cannot be sent to its source, or was not carried out
     ├── QualityError       the value exists but is not good
     ├── ConnectorError     the device did not answer as it should; carries a reason code
     ├── EndpointError      an address cannot be served
@@ -79,6 +80,10 @@ class AlreadyRunningError(SegmentError):
 
 class FormatError(SegmentError):
     """The segment's magic, ABI version or structure is not one this version knows."""
+
+
+class CommandError(ShmioError):
+    """A command cannot be sent to its source, or the source or its device did not carry it out; says which and why."""
 
 
 class QualityError(ShmioError):

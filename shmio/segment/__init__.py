@@ -1,31 +1,46 @@
-"""The shared-memory segment of an instance: header, process table, one frame ring for each source.
+"""The shared-memory segment of an instance: header, process table, for each source rings of frames, events, commands.
 
 The byte format is docs/reference/segment-format.md; a local program starts with :func:`shmio.attach`.
 """
 
-from shmio.segment.block import Block, BlockWriter, Cursor
+from shmio.layout.write import Write
+from shmio.segment.block import Attributes, Block, BlockWriter
+from shmio.segment.build import BlockSpec
+from shmio.segment.commands import Command, CommandSender
+from shmio.segment.cursor import Cursor
+from shmio.segment.events import ENDS, NO_WRITER, Event, EventKind, EventRing, Record
 from shmio.segment.frame import Frame, Provenance, Quality
 from shmio.segment.header import State
 from shmio.segment.processes import Activity, Phase, ProcessSlot, ProcessSpec, Report, Supervised
-from shmio.segment.segment import PREFIX, BlockSpec, Segment, instances, running_instances, segment_size
+from shmio.segment.segment import PREFIX, Segment, instances, running_instances, segment_size
 
 __all__ = [
+    "ENDS",
+    "NO_WRITER",
     "PREFIX",
     "Activity",
+    "Attributes",
     "Block",
     "BlockSpec",
     "BlockWriter",
+    "Command",
+    "CommandSender",
     "Cursor",
+    "Event",
+    "EventKind",
+    "EventRing",
     "Frame",
     "Phase",
     "ProcessSlot",
     "ProcessSpec",
     "Provenance",
     "Quality",
+    "Record",
     "Report",
     "Segment",
     "State",
     "Supervised",
+    "Write",
     "instances",
     "running_instances",
     "segment_size",

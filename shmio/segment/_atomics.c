@@ -1,4 +1,4 @@
-/* Python binding of ring.h (limited API: one build serves CPython 3.11 and later).
+/* Python binding of ring.h and queue.h (limited API: one build serves CPython 3.11 and later).
  *
  * Everything here runs under the GIL except the wait on a doorbell. A Ring keeps its buffer exported, so the mapping
  * cannot be closed under it.
@@ -6,6 +6,7 @@
 #include <Python.h>
 #include <stdlib.h>
 
+#include "queue.h"
 #include "ring.h"
 
 /* ---- Ring ---------------------------------------------------------------------------------------------------------- */
@@ -84,10 +85,10 @@ static PyObject *Ring_publish(Ring *self, PyObject *args)
     Py_buffer raw, reason, effective = {0};
     PyObject *effective_object, *result = NULL;
     slot_info info = {0};
-    unsigned long long cycle;
+    unsigned long long cycle, event;
     long long publish_ns, clock_ns, source_ns;
-    if (!PyArg_ParseTuple(args, "y*OKLLLBBy*", &raw, &effective_object, &cycle, &publish_ns, &clock_ns, &source_ns,
-                          &info.quality, &info.provenance, &reason))
+    if (!PyArg_ParseTuple(args, "y*OKLLLBBKy*", &raw, &effective_object, &cycle, &publish_ns, &clock_ns, &source_ns,
+                          &info.quality, &info.provenance, &event, &reason))
         return NULL;
     if (effective_object != Py_None && PyObject_GetBuffer(effective_object, &effective, PyBUF_SIMPLE) < 0) goto done;
     if (!Ring_writable(self)) goto done;
@@ -103,8 +104,13 @@ static PyObject *Ring_publish(Ring *self, PyObject *args)
     info.publish_ns = publish_ns;
     info.clock_ns = clock_ns;
     info.source_ns = source_ns;
+    info.event = event;
     info.incarnation = self->incarnation;
     info.reason_size = (uint16_t)(reason.len < (Py_ssize_t)REASON_SIZE ? reason.len : (Py_ssize_t)REASON_SIZE);
+    if (effective.obj && !self->ring.effective_offset) {
+        PyErr_SetString(PyExc_ValueError, "this ring has no room for an effective image");
+        goto done;
+    }
     result = PyLong_FromUnsignedLongLong(ring_publish(&self->ring, info, reason.buf, raw.buf, effective.buf));
 done:
     if (effective.obj) PyBuffer_Release(&effective);
@@ -181,6 +187,14 @@ static PyObject *Ring_doorbell(Ring *self, PyObject *unused)
     return PyLong_FromUnsignedLong(atomic_load_explicit(&ring_head(&self->ring)->doorbell, memory_order_acquire));
 }
 
+static PyObject *Ring_wake(Ring *self, PyObject *unused)
+{
+    (void)unused;
+    if (!Ring_writable(self)) return NULL;
+    doorbell_ring(&ring_head(&self->ring)->doorbell);
+    Py_RETURN_NONE;
+}
+
 /* Waits with the GIL released; returns the word's value, after a signal too (its Python handler has then run). */
 static PyObject *wait_on(const a32 *word, unsigned int seen, long long timeout_ns)
 {
@@ -213,11 +227,19 @@ static PyObject *Ring_get(Ring *self, void *field)
 }
 
 #define FIELD(name, doc) {#name, (getter)Ring_get, NULL, doc, (void *)offsetof(ring_header, name)}
+static PyObject *Ring_incarnation(Ring *self, void *unused)
+{
+    (void)unused;
+    if (!Ring_ready(self)) return NULL;
+    return PyLong_FromUnsignedLong(atomic_load_explicit(&ring_head(&self->ring)->incarnation, memory_order_relaxed));
+}
+
 static PyGetSetDef Ring_fields[] = {
     FIELD(slot_count, "Frames that the ring holds."),
     FIELD(frame_size, "Bytes of one image."),
     FIELD(period_ns, "Time between two cycles of the source."),
     FIELD(stale_ns, "Age from which a frame is no longer good."),
+    {"incarnation", (getter)Ring_incarnation, NULL, "Processes that have written here, one after another.", NULL},
     {0},
 };
 
@@ -229,6 +251,7 @@ static PyMethodDef Ring_methods[] = {
     METHOD(Ring, latest, METH_NOARGS, "A validated copy of the newest frame, or None."),
     METHOD(Ring, read, METH_O, "A validated copy of one frame, or None when it is not in the ring."),
     METHOD(Ring, doorbell, METH_NOARGS, "Value of the futex word; read it before looking for news."),
+    METHOD(Ring, wake, METH_NOARGS, "Ring the doorbell without a frame: there is other news."),
     METHOD(Ring, wait, METH_VARARGS, "Wait until the doorbell differs from `seen`, at most `timeout_ns`."),
     {0},
 };
@@ -322,6 +345,98 @@ static PyObject *atomics_cell_read(PyObject *module, PyObject *args)
     return data;
 }
 
+/* ---- doorbells and queues ------------------------------------------------------------------------------------------- */
+
+static PyObject *atomics_bell(PyObject *module, PyObject *args)
+{
+    (void)module;
+    Py_buffer buffer;
+    Py_ssize_t offset;
+    if (!PyArg_ParseTuple(args, "y*n", &buffer, &offset)) return NULL;
+    a32 *at = (a32 *)(void *)place(&buffer, offset, 4, 4);
+    uint32_t value = at ? atomic_load_explicit(at, memory_order_acquire) : 0;
+    PyBuffer_Release(&buffer);
+    return at ? PyLong_FromUnsignedLong(value) : NULL;
+}
+
+static PyObject *atomics_bell_ring(PyObject *module, PyObject *args)
+{
+    (void)module;
+    Py_buffer buffer;
+    Py_ssize_t offset;
+    if (!PyArg_ParseTuple(args, "w*n", &buffer, &offset)) return NULL;
+    a32 *at = (a32 *)(void *)place(&buffer, offset, 4, 4);
+    if (at) doorbell_ring(at);
+    PyBuffer_Release(&buffer);
+    if (!at) return NULL;
+    Py_RETURN_NONE;
+}
+
+static PyObject *atomics_bell_wait(PyObject *module, PyObject *args)
+{
+    (void)module;
+    Py_buffer buffer;
+    Py_ssize_t offset;
+    unsigned int seen;
+    long long timeout_ns;
+    if (!PyArg_ParseTuple(args, "y*nIL", &buffer, &offset, &seen, &timeout_ns)) return NULL;
+    const a32 *at = (const a32 *)(void *)place(&buffer, offset, 4, 4);
+    PyObject *value = at ? wait_on(at, seen, timeout_ns) : NULL; /* the buffer is held meanwhile */
+    PyBuffer_Release(&buffer);
+    return value;
+}
+
+/* The queue at `offset`, whose data are `capacity` bytes, or NULL with an exception. */
+static uint8_t *queue_place(const Py_buffer *buffer, Py_ssize_t offset, Py_ssize_t capacity)
+{
+    if (capacity < 64 || capacity > (1 << 30) || (capacity & (capacity - 1)) != 0) {
+        PyErr_SetString(PyExc_ValueError, "capacity is not a power of two in 64..2^30");
+        return NULL;
+    }
+    return place(buffer, offset, (Py_ssize_t)QUEUE_HEADER_SIZE + capacity, 8);
+}
+
+static PyObject *atomics_queue_push(PyObject *module, PyObject *args)
+{
+    (void)module;
+    Py_buffer buffer, record;
+    Py_ssize_t offset, capacity;
+    if (!PyArg_ParseTuple(args, "w*nny*", &buffer, &offset, &capacity, &record)) return NULL;
+    uint8_t *queue = queue_place(&buffer, offset, capacity);
+    bool room = queue && record.len <= capacity && queue_push(queue, (uint64_t)capacity, record.buf, (uint32_t)record.len);
+    PyBuffer_Release(&buffer);
+    PyBuffer_Release(&record);
+    return queue ? PyBool_FromLong(room) : NULL;
+}
+
+static PyObject *atomics_queue_pop(PyObject *module, PyObject *args)
+{
+    (void)module;
+    Py_buffer buffer;
+    Py_ssize_t offset, capacity;
+    if (!PyArg_ParseTuple(args, "w*nn", &buffer, &offset, &capacity)) return NULL;
+    PyObject *record = NULL;
+    uint32_t size = 0;
+    uint8_t *queue = queue_place(&buffer, offset, capacity);
+    if (!queue) goto done;
+    switch (queue_peek(queue, (uint64_t)capacity, &size)) {
+    case QUEUE_EMPTY:
+        Py_INCREF(Py_None);
+        record = Py_None;
+        break;
+    case QUEUE_RECORD:
+        record = PyBytes_FromStringAndSize(NULL, size);
+        if (record) queue_drop(queue, (uint64_t)capacity, (uint8_t *)PyBytes_AsString(record), size);
+        break;
+    case QUEUE_BROKEN:
+        queue_clear(queue);
+        PyErr_SetString(PyExc_ValueError, "the queue contradicted itself and was emptied");
+    }
+done:
+    PyBuffer_Release(&buffer);
+    return record;
+}
+
 /* ---- changed registers --------------------------------------------------------------------------------------------- */
 
 #define CHUNK 64u
@@ -400,6 +515,11 @@ static PyMethodDef functions[] = {
     METHOD(atomics, store64, METH_VARARGS, "Release store of an aligned 64-bit word."),
     METHOD(atomics, cell_write, METH_VARARGS, "Write a cell; one writer."),
     METHOD(atomics, cell_read, METH_VARARGS, "A consistent copy of a cell, or None while it is being written."),
+    METHOD(atomics, bell, METH_VARARGS, "Value of a futex word; read it before looking for news."),
+    METHOD(atomics, bell_ring, METH_VARARGS, "Bump a futex word and wake all who wait on it."),
+    METHOD(atomics, bell_wait, METH_VARARGS, "Wait until a futex word differs from `seen`, at most `timeout_ns`."),
+    METHOD(atomics, queue_push, METH_VARARGS, "Put a record into a queue; False when there is no room."),
+    METHOD(atomics, queue_pop, METH_VARARGS, "Take the oldest record, None if there is none; ValueError: it was broken, all is dropped."),
     METHOD(atomics, changed, METH_VARARGS, "Indices in a table of (offset, size, mask, index) whose bytes differ between two images."),
     {0},
 };
@@ -412,6 +532,7 @@ static int module_exec(PyObject *module)
     Py_DECREF(type);
     if (result < 0) return -1;
     return PyModule_AddIntConstant(module, "RING_HEADER_SIZE", RING_HEADER_SIZE) < 0 ||
+                   PyModule_AddIntConstant(module, "QUEUE_HEADER_SIZE", QUEUE_HEADER_SIZE) < 0 ||
                    PyModule_AddIntConstant(module, "RAW_OFFSET", RAW_OFFSET) < 0 ||
                    PyModule_AddIntConstant(module, "REASON_SIZE", REASON_SIZE) < 0
                ? -1

@@ -13,18 +13,23 @@ It maps the segment read-only and needs nothing from the instance: no lock, no r
 
 from __future__ import annotations
 
+import os
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
 
-from shmio.errors import NotRunningError, PathError, QualityError, SegmentError
+from shmio.errors import CommandError, NotRunningError, PathError, QualityError, SegmentError
 from shmio.layout.codec import Value, codec
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import find, parse_topic
-from shmio.segment.block import Block, Cursor
+from shmio.segment.block import Block
+from shmio.segment.commander import TIMEOUT_S, Commander, Outcome
+from shmio.segment.cursor import Cursor
 from shmio.segment.frame import Frame, Provenance, Quality
+from shmio.segment.processes import Activity, Report
 from shmio.segment.segment import Segment, running_instances
 
 if TYPE_CHECKING:
@@ -106,10 +111,14 @@ class Attachment:
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
+        self._turn = threading.Lock()
+        self._guest: int | None = None
+        self._commanders: dict[str, Commander] = {}
 
     def _blocks(self) -> dict[str, Block]:
         if self._segment.closed:
             raise SegmentError(f"detached from instance {self.instance!r}")
+        self._segment.refresh()
         return self._segment.blocks
 
     @property
@@ -175,19 +184,33 @@ class Attachment:
         block = self.block(source)
         return self._views(block, block.cursor(), timeout_s)
 
-    def _views(self, block: Block, cursor: Cursor, timeout_s: float | None) -> Iterator[View]:
+    def _views(self, block: Block, cursor: Cursor[Frame], timeout_s: float | None) -> Iterator[View]:
         missed = 0
-        while (frame := self._next(cursor, timeout_s)) is not None:
-            yield View(block.source, frame, block.layout, block.stale_ns, cursor.missed - missed)
-            missed = cursor.missed
+        while True:
+            frame = self._next(block, cursor, timeout_s)
+            if frame is not None:
+                yield View(block.source, frame, block.layout, block.stale_ns, cursor.missed - missed)
+                missed = cursor.missed
+            elif block.retired:
+                block = self._successor(block)
+                cursor, missed = block.cursor(after=0), 0
+            else:
+                return
 
-    def _next(self, cursor: Cursor, timeout_s: float | None) -> Frame | None:
+    def _successor(self, block: Block) -> Block:
+        """The block that a reload has put in the place of a retired one."""
+        successor = self._blocks().get(block.source)
+        if successor is None:
+            raise NotRunningError(f"source {block.source!r} was removed from instance {self.instance!r} by a reload")
+        return successor
+
+    def _next(self, block: Block, cursor: Cursor[Frame], timeout_s: float | None) -> Frame | None:
         """Wait for a frame in turns: a stopped instance rings no bell."""
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             rest_s = TURN_S if deadline_s is None else deadline_s - time.monotonic()
             frame = cursor.next(min(rest_s, TURN_S))
-            if frame is not None:
+            if frame is not None or block.retired:
                 return frame
             if not self.current:
                 raise NotRunningError(f"instance {self.instance!r} has stopped")
@@ -197,11 +220,48 @@ class Attachment:
     def wait(
         self, source: str | None = None, *, after: View | None = None, timeout_s: float | None = None
     ) -> View | None:
-        """The newest frame as soon as it is newer than ``after`` (default: than now); None when the time is over."""
+        """The newest frame as soon as it is newer than ``after`` (default: than now); None when the time is over.
+
+        None at once too when a reload ends the block meanwhile.
+        """
         block = self.block(source)
         cursor = block.cursor(after=None if after is None else max(after.frame.number, block.ring.head() - 1))
-        frame = self._next(cursor, timeout_s)
+        frame = self._next(block, cursor, timeout_s)
         return None if frame is None else View(block.source, frame, block.layout, block.stale_ns)
+
+    def write(self, values: Mapping[str, object], timeout_s: float = TIMEOUT_S) -> list[Outcome]:
+        """Write registers, arrays or elements of one source by their paths, as one command; what became of each.
+
+        The attachment must be ``writable``. All values are accepted by the source or none; what the device says is
+        told for each. PathError, ValueRangeError, CommandError: nothing has been sent.
+        """
+        blocks = self._blocks()
+        default = next(iter(blocks)) if len(blocks) == 1 else None
+        topics = [parse_topic(path, blocks, default) for path in values]
+        for path, topic in zip(values, topics, strict=True):
+            if topic.direction == "out":
+                raise PathError(f"{path}: what comes out of a source is not written; leave out /out")
+            if topic.source not in blocks:
+                raise PathError(f"{path}: nothing is served under {topic.source} in this version")
+        sources = {topic.source for topic in topics}
+        if len(sources) != 1:
+            raise PathError(f"one write is for one source, these are for {', '.join(sorted(sources)) or 'none'}")
+        commander = self._commander(blocks[sources.pop()])
+        return commander.write(
+            {topic.path: value for topic, value in zip(topics, values.values(), strict=True)}, timeout_s
+        )
+
+    def _commander(self, block: Block) -> Commander:
+        """The commander for a block, in the name of one of the guests' places, kept from the first write on."""
+        if not self._segment.shared.writable:
+            raise CommandError("this attachment only reads: attach with writable=True")
+        with self._turn:
+            if self._guest is None:
+                self._guest = take_guest(self._segment)
+            known = self._commanders.get(block.source)
+            if known is None or known.block is not block:
+                known = self._commanders[block.source] = Commander(block, self._guest)
+            return known
 
     def close(self) -> None:
         """Detach."""
@@ -233,8 +293,24 @@ def _holds_none(value: Value) -> bool:
     return any(map(_holds_none, value)) if isinstance(value, list) else value is None
 
 
-def attach(instance: str | None = None) -> Attachment:
-    """Attach to a running instance, by default the only one; NotRunningError, FormatError, SegmentError."""
+def take_guest(segment: Segment) -> int:
+    """Take a free guest's place for life; the number of its command queue. SegmentError: none is free."""
+    places = [slot for slot in segment.processes if slot.kind == "guest" and slot.writer is not None]
+    for slot in places:
+        if slot.writer is not None and slot.take():
+            slot.report = Report(os.getpid(), Activity.RUNNING, time.monotonic_ns())
+            return slot.writer
+    pids = ", ".join(str(slot.report.pid) for slot in places)
+    raise SegmentError(
+        f"instance {segment.instance!r} has places for {len(places)} writing programs; end one of pids {pids}"
+    )
+
+
+def attach(instance: str | None = None, *, writable: bool = False) -> Attachment:
+    """Attach to a running instance, by default the only one; NotRunningError, FormatError, SegmentError.
+
+    ``writable``: to write registers too, which only the instance's own user can.
+    """
     if instance is None:
         running = running_instances()
         if not running:
@@ -242,4 +318,4 @@ def attach(instance: str | None = None) -> Attachment:
         if len(running) > 1:
             raise NotRunningError(f"several instances are running, name one of them: {', '.join(running)}")
         instance = running[0]
-    return Attachment(Segment.open(instance))
+    return Attachment(Segment.open(instance, writable=writable))

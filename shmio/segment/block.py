@@ -1,19 +1,24 @@
-"""A source's block: its layout and its frame ring, for readers and for its one writer."""
+"""A source's block: its layout, its rings of frames, events and commands; for readers and for its one writer."""
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from shmio.errors import SegmentError
 from shmio.segment._atomics import REASON_SIZE, Ring
+from shmio.segment.cursor import Cursor
+from shmio.segment.events import EventRing, Record
 from shmio.segment.frame import Frame, Provenance, Quality
 from shmio.segment.header import cut
 
 if TYPE_CHECKING:
     from shmio.layout.model import Layout
     from shmio.segment._atomics import FrameTuple
+    from shmio.segment.commands import CommandQueues
 
 Bytes = bytes | bytearray | memoryview
 
@@ -42,16 +47,50 @@ def _frame(fields: FrameTuple) -> Frame:
     )
 
 
+@dataclass(frozen=True, slots=True)
+class Attributes:
+    """What the configuration says of a source, as far as others want to know."""
+
+    connector: str = ""
+    writable: tuple[str, ...] = ()
+    """Patterns of what may be written."""
+    armed: bool = False
+    """Whether an injection may reach the device."""
+
+
 class Block:
     """Reading side of a block. Needs nothing from the writer and leaves no trace with it.
 
     A Block may be used from several threads; a :class:`Cursor` belongs to one.
     """
 
-    def __init__(self, source: str, layout: Layout, ring: Ring) -> None:
+    def __init__(
+        self,
+        source: str,
+        layout: Layout,
+        ring: Ring,
+        events: Ring,
+        commands: CommandQueues,
+        attributes: Attributes,
+        retired: Callable[[], bool] = lambda: False,
+    ) -> None:
         self.source = source
         self.layout = layout
         self.ring = ring
+        self.events = EventRing(events, retired)
+        self.commands = commands
+        self.attributes = attributes
+        self._retired = retired
+
+    @property
+    def retired(self) -> bool:
+        """Whether a reload has ended this block: nothing is written to it any more."""
+        return self._retired()
+
+    @property
+    def incarnation(self) -> int:
+        """How many processes have written here, one after another; commands name the one they are for."""
+        return self.ring.incarnation
 
     @property
     def period_ns(self) -> int:
@@ -82,73 +121,23 @@ class Block:
         fields = self.ring.read(number)
         return None if fields is None else _frame(fields)
 
-    def cursor(self, *, after: int | None = None) -> Cursor:
+    def cursor(self, *, after: int | None = None) -> Cursor[Frame]:
         """A stream position behind frame ``after`` (default: the newest one, so that the next frame is news)."""
-        return Cursor(self, self.ring.head() if after is None else after)
-
-
-class Cursor:
-    """A stream reader's own position in a ring: every frame once, in order, losses counted exactly.
-
-    >>> cursor = block.cursor()
-    >>> while (frame := cursor.next(timeout_s=1.0)) is not None:
-    ...     print(frame.number, cursor.missed)
-    """
-
-    def __init__(self, block: Block, after: int) -> None:
-        self._block = block
-        self._last = after
-        self.missed = 0
-        """Frames that were overwritten before this cursor read them, in all."""
-
-    @property
-    def behind(self) -> int:
-        """Frames that wait to be read."""
-        return max(0, self._block.ring.head() - self._last)
-
-    def poll(self) -> Frame | None:
-        """The next frame if there is one; never waits."""
-        ring = self._block.ring
-        while ring.head() > self._last:
-            fields = ring.read(self._last + 1)
-            if fields is not None:
-                self._last += 1
-                return _frame(fields)
-            # Lapped. The oldest frames are about to go too: resume a quarter of the ring further on.
-            resume = max(self._last + 1, ring.head() - ring.slot_count * 3 // 4)
-            self.missed += resume - self._last
-            self._last = resume
-        return None
-
-    def next(self, timeout_s: float | None = None) -> Frame | None:
-        """The next frame, waited for at most ``timeout_s`` (None: for ever); None when the time is over."""
-        ring = self._block.ring
-        deadline_ns = None if timeout_s is None else time.monotonic_ns() + round(timeout_s * 1e9)
-        while True:
-            seen = ring.doorbell()  # before looking, so that no ring of the bell is lost
-            frame = self.poll()
-            if frame is not None:
-                return frame
-            rest_ns = -1 if deadline_ns is None else deadline_ns - time.monotonic_ns()
-            if deadline_ns is not None and rest_ns <= 0:
-                return None
-            ring.wait(seen, rest_ns)
-
-    def __iter__(self) -> Iterator[Frame]:
-        while True:
-            frame = self.next()
-            if frame is not None:
-                yield frame
+        return Cursor(self.ring, _frame, self.ring.head() if after is None else after, self._retired)
 
 
 class BlockWriter:
-    """Writing side of a block: exactly one, in its source's process, from one thread at a time."""
+    """Writing side of a block: exactly one, in its source's process; its threads take turns."""
 
     def __init__(self, block: Block, clock_ns: Callable[[int], int]) -> None:
         """``clock_ns`` turns CLOCK_MONOTONIC into the instance's clock."""
         self.block = block
         self._clock_ns = clock_ns
+        self._turn = threading.Lock()  # so that frames and events are in one order
+        self._cycle = 0
+        self._quality = Quality.BAD
         self.incarnation = block.ring.begin()
+        block.events.ring.begin()
 
     def publish(
         self,
@@ -166,15 +155,40 @@ class BlockWriter:
         ``source_ns`` is UTC, default now; 0: no image yet. ``reason`` says why quality is not
         good; it is cut at 256 bytes.
         """
-        now_ns = time.monotonic_ns()
-        return self.block.ring.publish(
-            raw,
-            effective,
-            cycle,
-            now_ns,
-            self._clock_ns(now_ns),
-            time.time_ns() if source_ns is None else source_ns,
-            quality,
-            provenance,
-            cut(reason, REASON_SIZE) if reason else b"",
-        )
+        with self._turn:
+            now_ns = time.monotonic_ns()
+            self._cycle, self._quality = cycle, quality
+            return self.block.ring.publish(
+                raw,
+                effective,
+                cycle,
+                now_ns,
+                self._clock_ns(now_ns),
+                time.time_ns() if source_ns is None else source_ns,
+                quality,
+                provenance,
+                self.block.events.head(),
+                cut(reason, REASON_SIZE) if reason else b"",
+            )
+
+    def event(self, record: Record, *, quality: Quality | None = None) -> int:
+        """Publish one event and wake the readers of frames and events; returns its number.
+
+        ``quality``: the new one, for QUALITY; default: that of the last frame.
+        """
+        with self._turn:
+            now_ns = time.monotonic_ns()
+            number = self.block.events.ring.publish(
+                record.pack(),
+                None,
+                self._cycle,
+                now_ns,
+                self._clock_ns(now_ns),
+                time.time_ns(),
+                self._quality if quality is None else quality,
+                Provenance.LIVE,
+                self.block.ring.head(),
+                cut(record.text, REASON_SIZE),
+            )
+            self.block.ring.wake()
+            return number

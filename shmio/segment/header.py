@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
@@ -27,6 +28,7 @@ SUPERVISOR_CELL: Final = 512
 _HEADER: Final = struct.Struct("<QIIQQqqII QII QIII 4x 16s64s32s256s")
 _SECTION: Final = struct.Struct("<IIQQII64s32s")
 _SUPERVISOR: Final = struct.Struct("<II")
+_RETIRED: Final = 1 << 32  # bit 0 of the flags, in one word with the kind
 
 
 class State(IntEnum):
@@ -47,6 +49,9 @@ class SectionKind(IntEnum):
 
     LAYOUT = 1
     FRAMES = 2
+    EVENTS = 3
+    COMMANDS = 4
+    SOURCE = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +117,7 @@ class Header:
 
 @dataclass(frozen=True, slots=True)
 class SectionEntry:
-    """One line of the section table. ``layout``: index of the layout's section, for FRAMES."""
+    """One line of the section table. ``layout``: index of the layout's section, for all others of a block."""
 
     kind: int
     retired: bool
@@ -123,23 +128,37 @@ class SectionEntry:
     digest: bytes
 
 
-def write_section(memory: memoryview, header: Header, entry: SectionEntry) -> int:
-    """Append an entry; its index. The entry is whole before generation and count show it."""
-    generation, count = _counts(memory)
-    if count >= header.section_capacity:
-        raise FormatError("the section table is full")
-    packed = _SECTION.pack(
-        entry.kind, int(entry.retired), entry.offset, entry.size, entry.layout, 0, entry.name.encode(), entry.digest
-    )
-    at = header.sections_offset + count * SECTION_SIZE
-    memory[at : at + len(packed)] = packed
-    _atomics.store64(memory, GENERATION_OFFSET, (count + 1) << 32 | generation + 1)
-    return count
+def change_sections(
+    memory: memoryview, header: Header, append: Sequence[SectionEntry], retire: Sequence[int] = ()
+) -> None:
+    """Append entries and retire others, by their indices: readers see all of it or nothing. FormatError: no room."""
+    generation, count = table_state(memory)
+    if count + len(append) > header.section_capacity:
+        raise FormatError(f"the section table is full: {count} of {header.section_capacity}")
+    for index, entry in enumerate(append, count):
+        at = header.sections_offset + index * SECTION_SIZE
+        fields = (entry.kind, int(entry.retired), entry.offset, entry.size, entry.layout, 0)
+        _SECTION.pack_into(memory, at, *fields, entry.name.encode(), entry.digest)
+    for index in retire:
+        at = header.sections_offset + index * SECTION_SIZE
+        _atomics.store64(memory, at, _atomics.load64(memory, at) | _RETIRED)
+    word = (count + len(append)) << 32 | (generation + 1) & 0xFFFFFFFF
+    _atomics.store64(memory, GENERATION_OFFSET, word)
 
 
-def read_sections(memory: memoryview, header: Header, name: str) -> list[SectionEntry]:
-    """All entries, checked to lie within the object."""
-    _, count = _counts(memory)
+def table_state(memory: memoryview) -> tuple[int, int]:
+    """(generation, which changes whenever the section table does; entries that are whole)."""
+    word = _atomics.load64(memory, GENERATION_OFFSET)
+    return word & 0xFFFFFFFF, word >> 32
+
+
+def retired(memory: memoryview, header: Header, index: int) -> bool:
+    """Whether an entry is retired by now."""
+    return _atomics.load64(memory, header.sections_offset + index * SECTION_SIZE) & _RETIRED != 0
+
+
+def read_sections(memory: memoryview, header: Header, count: int, name: str) -> list[SectionEntry]:
+    """The first ``count`` entries, checked to lie within the object."""
     if count > header.section_capacity:
         raise FormatError(f"{name}: more sections than the table holds")
     entries = []
@@ -180,8 +199,3 @@ def text(field: bytes) -> str:
 def cut(message: str, size: int) -> bytes:
     """At most ``size`` bytes of UTF-8, whole characters only."""
     return message.encode()[:size].decode("utf-8", "ignore").encode()
-
-
-def _counts(memory: memoryview) -> tuple[int, int]:
-    word = _atomics.load64(memory, GENERATION_OFFSET)
-    return word & 0xFFFFFFFF, word >> 32

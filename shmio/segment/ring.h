@@ -42,7 +42,7 @@ typedef struct {
     uint32_t frame_size; /* bytes of one image */
     uint32_t status_size;
     uint32_t raw_offset; /* within a slot; RAW_OFFSET */
-    uint32_t effective_offset;
+    uint32_t effective_offset; /* 0: slots have one image only */
     uint32_t status_offset;
     uint32_t reserved0;
     int64_t period_ns;
@@ -73,7 +73,7 @@ typedef struct {
     uint16_t reason_size;
     uint16_t reserved0;
     uint32_t reserved1;
-    uint64_t event; /* number of the last event before this frame */
+    uint64_t event; /* of a frame: number of the last event before it; of an event: of the last frame */
 } slot_info;
 _Static_assert(sizeof(slot_info) == SLOT_HEADER_SIZE - 8, "slot info");
 
@@ -104,8 +104,8 @@ static inline const char *ring_open(ring_view *ring, uint8_t *base, uint64_t siz
     if (header.frame_size == 0 || header.frame_size > MAX_FRAME_SIZE) return "frame size out of range";
     if (header.raw_offset != RAW_OFFSET || (header.effective_offset & 7u) != 0 || (header.slot_stride & 7u) != 0)
         return "slot offsets are wrong";
-    uint64_t image = align8(header.frame_size);
-    if (header.effective_offset < RAW_OFFSET + image || header.slot_stride < header.effective_offset + image)
+    uint64_t image = align8(header.frame_size), last = header.effective_offset ? header.effective_offset : RAW_OFFSET;
+    if (header.slot_stride < last + image || (header.effective_offset && header.effective_offset < RAW_OFFSET + image))
         return "images overlap or do not fit in a slot";
     if (RING_HEADER_SIZE + (uint64_t)header.slot_count * header.slot_stride > size) return "slots do not fit in the section";
     *ring = (ring_view){base, header.slot_count, header.slot_stride, header.frame_size, header.effective_offset};
@@ -160,7 +160,8 @@ static inline int doorbell_wait(const a32 *word, uint32_t seen, int64_t timeout_
     return result == 0 || errno == EAGAIN ? 0 : errno;
 }
 
-/* One writer only. `effective` may be NULL: what consumers see is then raw. Returns the frame's number. */
+/* One writer only. `effective` is NULL if what consumers see is raw, and where slots have no room for it. Returns the
+ * frame's number. */
 static inline uint64_t ring_publish(const ring_view *ring, slot_info info, const uint8_t *reason, const uint8_t *raw,
                                     const uint8_t *effective)
 {
@@ -197,6 +198,7 @@ static inline bool ring_read(const ring_view *ring, uint64_t frame, slot_info *i
     if (info->reason_size > REASON_SIZE) info->reason_size = REASON_SIZE; /* torn or hostile; checked below */
     if (info->reason_size) words_load(reason, base + SLOT_HEADER_SIZE, info->reason_size);
     words_load(raw, base + RAW_OFFSET, ring->frame_size);
+    if (!ring->effective_offset) info->flags &= (uint16_t)~FLAG_EFFECTIVE;
     if (info->flags & FLAG_EFFECTIVE) words_load(effective, base + ring->effective_offset, ring->frame_size);
     /* Pairs with the release fence in ring_publish. */
     atomic_thread_fence(memory_order_acquire);

@@ -4,58 +4,27 @@ from __future__ import annotations
 
 import os
 import secrets
-import struct
 import time
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+
+import msgspec
 
 from shmio import __version__
 from shmio.errors import AlreadyRunningError, FormatError, LayoutError, NotRunningError, SegmentError, UnfinishedError
 from shmio.layout.model import Layout
 from shmio.segment import _atomics, header, shm
-from shmio.segment.block import Block, BlockWriter
+from shmio.segment.block import Attributes, Block, BlockWriter
+from shmio.segment.build import SECTIONS_PER_BLOCK, BlockSpec, align, write_blocks
+from shmio.segment.commands import CommandQueues
+from shmio.segment.events import EVENT_SIZE
 from shmio.segment.header import HEADER_SIZE, SECTION_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
 from shmio.segment.processes import SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
 from shmio.segment.shm import SharedObject
 
 PREFIX = "shmio-"
-RING_SECONDS = 8
-SPARE_SECTIONS = 32
+SPARE_SECTIONS = 40 * SECTIONS_PER_BLOCK
 SPARE_PROCESSES = 16
-
-_RING = struct.Struct("<8Iqq")
-
-
-@dataclass(frozen=True, slots=True)
-class BlockSpec:
-    """What a source's block is built from."""
-
-    source: str
-    layout: Layout
-    period_ns: int
-    stale_ns: int
-    ring_bytes: int
-    """The most memory its frame ring may take."""
-
-    @property
-    def slot_bytes(self) -> int:
-        """Bytes of one slot: header, reason, room for raw and effective."""
-        return _align(_atomics.RAW_OFFSET + 2 * _align(self.layout.size, 8), 64)
-
-    @property
-    def slots(self) -> int:
-        """Frames in the ring: 8 s of them, rounded up to a power of two, at least 8, as far as the memory allows."""
-        wanted = max(8, RING_SECONDS * 1_000_000_000 // self.period_ns)
-        slots: int = 1 << (wanted - 1).bit_length()
-        while slots > 8 and slots * self.slot_bytes > self.ring_bytes:
-            slots //= 2
-        return slots
-
-    @property
-    def size(self) -> int:
-        """Bytes of the ring's section."""
-        return _atomics.RING_HEADER_SIZE + self.slots * self.slot_bytes
 
 
 class Segment:
@@ -70,6 +39,7 @@ class Segment:
         self.memory = memoryview(shared.map())
         self.header = Header.read(self.memory, shared.name)
         self.processes = ProcessTable(shared, self.memory, self.header)
+        self._known: dict[int, Block] = {}  # by the section of its layout
         self.blocks = self._find_blocks()
 
     @classmethod
@@ -128,23 +98,89 @@ class Segment:
             raise
 
     def _find_blocks(self) -> dict[str, Block]:
-        entries = header.read_sections(self.memory, self.header, self.shared.name)
+        self._generation, count = header.table_state(self.memory)
+        if len(self.memory) < self.shared.size:  # it grew before the table did; what holds the old mapping keeps it
+            self.memory = memoryview(self.shared.map())
+        entries = header.read_sections(self.memory, self.header, count, self.shared.name)
         blocks = {}
-        for entry in entries:
-            if entry.kind != SectionKind.FRAMES or entry.retired:
+        for layout, described in enumerate(entries):
+            if described.kind != SectionKind.LAYOUT or described.retired:
                 continue
-            if entry.layout >= len(entries) or entries[entry.layout].kind != SectionKind.LAYOUT:
-                raise FormatError(f"{self.shared.name}: the ring of {entry.name} names no layout")
-            described = entries[entry.layout]
-            try:
-                layout = Layout.from_json(bytes(self.memory[described.offset : described.offset + described.size]))
-                ring = _atomics.Ring(self.memory, entry.offset, entry.size)
-            except (LayoutError, ValueError) as error:
-                raise FormatError(f"{self.shared.name}: block {entry.name}: {error}") from None
-            if ring.frame_size != layout.size:
-                raise FormatError(f"{self.shared.name}: block {entry.name}: ring and layout differ in size")
-            blocks[entry.name] = Block(entry.name, layout, ring)
+            parts = {
+                entry.kind: index for index, entry in enumerate(entries) if entry.layout == layout and index != layout
+            }
+            known = self._known.get(layout)
+            self._known[layout] = blocks[described.name] = known or self._block(entries, layout, parts)
         return blocks
+
+    def _block(self, entries: list[SectionEntry], layout_at: int, parts: dict[int, int]) -> Block:
+        memory, name = self.memory, self.shared.name
+        described = entries[layout_at]
+
+        def part(kind: SectionKind) -> tuple[int, int]:
+            if kind not in parts:
+                raise FormatError(f"{name}: block {described.name} has no {kind.name.lower()}")
+            entry = entries[parts[kind]]
+            return entry.offset, entry.size
+
+        try:
+            layout = Layout.from_json(bytes(memory[described.offset : described.offset + described.size]))
+            at, size = part(SectionKind.SOURCE)
+            attributes = msgspec.json.decode(bytes(memory[at : at + size]), type=Attributes)
+            frames = _atomics.Ring(memory, *part(SectionKind.FRAMES))
+            events = _atomics.Ring(memory, *part(SectionKind.EVENTS))
+            queues = CommandQueues(memory, *part(SectionKind.COMMANDS))
+        except (LayoutError, ValueError, msgspec.MsgspecError) as error:
+            raise FormatError(f"{name}: block {described.name}: {error}") from None
+        if frames.frame_size != layout.size or events.frame_size != EVENT_SIZE:
+            raise FormatError(f"{name}: block {described.name}: rings and layout differ in size")
+        head = self.header
+        return Block(
+            described.name, layout, frames, events, queues, attributes,
+            lambda: header.retired(memory, head, layout_at),
+        )  # fmt: skip
+
+    @property
+    def generation(self) -> int:
+        """Changes whenever a reload adds or ends blocks; then :meth:`refresh` has something to do."""
+        return header.table_state(self.memory)[0]
+
+    def refresh(self) -> bool:
+        """Look again what blocks there are, if a reload has changed that. Blocks that go on stay the same objects.
+
+        The process table is read anew too. FormatError.
+        """
+        if self.generation == self._generation:
+            return False
+        self.blocks = self._find_blocks()
+        self.processes = ProcessTable(self.shared, self.memory, self.header)
+        return True
+
+    def change(self, add: Sequence[BlockSpec] = (), retire: Sequence[str] = ()) -> None:
+        """Add blocks and end others, in one step for all readers; the supervisor's alone.
+
+        A name in both gets a new block in place of the old. Nothing has changed after SegmentError: no room in shared
+        memory or in the section table.
+        """
+        at = align(self.shared.size, 64)
+        size = at + sum(block.size for block in add)
+        count = header.table_state(self.memory)[1]
+        entries = header.read_sections(self.memory, self.header, count, self.shared.name)
+        if len(entries) + len(add) * SECTIONS_PER_BLOCK > self.header.section_capacity:
+            raise SegmentError(
+                f"segment {self.shared.name} has no room for more changes: stop the instance and start it anew"
+            )
+        if add:
+            self.shared.allocate(size)
+        memory = memoryview(self.shared.map())
+        ending = [self.blocks[name] for name in retire]
+        indices = [i for i, entry in enumerate(entries) if not entry.retired and entry.name in retire]
+        header.change_sections(memory, self.header, write_blocks(memory, at, len(entries), add), indices)
+        self.refresh()
+        for block in ending:  # who waits there is to look
+            block.ring.wake()
+            block.events.ring.wake()
+            block.commands.wake()
 
     def clock_ns(self, now_ns: int) -> int:
         """The instance's clock, ns since its start, at a time of CLOCK_MONOTONIC."""
@@ -186,7 +222,7 @@ class Segment:
 
     def close(self) -> None:
         """Give up mapping and locks; blocks taken from here keep the mapping as long as they are held."""
-        self.blocks = {}
+        self.blocks, self._known = {}, {}
         with suppress(BufferError):  # a Ring is still held somewhere
             self.memory.release()
         self.shared.close()
@@ -215,13 +251,12 @@ def running_instances() -> list[str]:
 
 def segment_size(blocks: Sequence[BlockSpec], processes: int) -> int:
     """Bytes of a segment built from these; what ``check`` prints."""
-    sections, process_table = _table_sizes(len(blocks), processes)
-    data = sum(_align(len(block.layout.to_json()), 64) + _align(block.size, 64) for block in blocks)
-    return HEADER_SIZE + sections + process_table + data
+    return HEADER_SIZE + sum(_table_sizes(len(blocks), processes)) + sum(block.size for block in blocks)
 
 
 def _table_sizes(blocks: int, processes: int) -> tuple[int, int]:
-    return (2 * blocks + SPARE_SECTIONS) * SECTION_SIZE, (processes + SPARE_PROCESSES) * SLOT_SIZE
+    sections = SECTIONS_PER_BLOCK * blocks + SPARE_SECTIONS
+    return align(sections * SECTION_SIZE, 64), (processes + SPARE_PROCESSES) * SLOT_SIZE
 
 
 def _build(
@@ -254,27 +289,9 @@ def _build(
         ProcessTable.write(memory, head, processes)
         header.write_supervisor(memory, os.getpid(), State.STARTING)
         supervisor_beat(memory)
-        at = HEADER_SIZE + sections_size + processes_size
-        for block in blocks:
-            described = block.layout.to_json()
-            memory[at : at + len(described)] = described
-            entry = SectionEntry(SectionKind.LAYOUT, False, at, len(described), 0, block.source, block.layout.hash)
-            layout = header.write_section(memory, head, entry)
-            at += _align(len(described), 64)
-            write_ring_header(memory, at, block)
-            entry = SectionEntry(SectionKind.FRAMES, False, at, block.size, layout, block.source, bytes(32))
-            header.write_section(memory, head, entry)
-            at += _align(block.size, 64)
+        entries = write_blocks(memory, HEADER_SIZE + sections_size + processes_size, 0, blocks)
+        header.change_sections(memory, head, entries)
         header.finish(memory)
-
-
-def write_ring_header(memory: memoryview, offset: int, block: BlockSpec) -> None:
-    """Write the fixed line of a ring's header (ring.h: ring_header)."""
-    effective = _atomics.RAW_OFFSET + _align(block.layout.size, 8)
-    _RING.pack_into(
-        memory, offset, block.slots, block.slot_bytes, block.layout.size, 0, _atomics.RAW_OFFSET, effective, 0, 0,
-        block.period_ns, block.stale_ns,
-    )  # fmt: skip
 
 
 def refuse_second(instance: str) -> None:
@@ -288,7 +305,3 @@ def refuse_second(instance: str) -> None:
             raise AlreadyRunningError(
                 f"instance {instance!r} is already running, supervisor pid {segment.supervisor[0]}"
             )
-
-
-def _align(size: int, to: int) -> int:
-    return -(-size // to) * to

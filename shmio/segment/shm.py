@@ -74,7 +74,7 @@ class SharedObject:
         return cls(name, memory.fd, writable=writable)
 
     def allocate(self, size: int) -> None:
-        """Reserve all pages now, so that a full file system is an error here and not a SIGBUS later."""
+        """Reserve all pages up to ``size`` now: a full file system is an error here, not a SIGBUS later."""
         try:
             os.posix_fallocate(self._fd, 0, size)
         except OSError as error:
@@ -93,8 +93,11 @@ class SharedObject:
         return os.fstat(self._fd).st_size
 
     def map(self) -> mmap.mmap:
-        """The whole object as memory: read-only unless opened writable. The same mapping at each call."""
-        if self._map is None:
+        """The whole object as memory: read-only unless opened writable. The same mapping at each call, until it grew.
+
+        What was mapped before stays valid as long as it is held.
+        """
+        if self._map is None or len(self._map) < self.size:
             access = mmap.PROT_READ | (mmap.PROT_WRITE if self.writable else 0)
             self._map = mmap.mmap(self._fd, self.size, mmap.MAP_SHARED, access)
         return self._map

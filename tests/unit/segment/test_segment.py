@@ -35,7 +35,7 @@ PROCESSES = [ProcessSpec("cell", "source"), ProcessSpec("grpc", "grpc")]
 
 def block(source: str = "cell", **changes: int) -> BlockSpec:
     fields = {"period_ns": 20_000_000, "stale_ns": 500_000_000, "ring_bytes": 1 << 26} | changes
-    return BlockSpec(source, LAYOUT, **fields)
+    return BlockSpec(source, LAYOUT, fields["period_ns"], fields["stale_ns"], fields["ring_bytes"])
 
 
 def test_who_opens_a_segment_finds_what_its_supervisor_built(instance: str) -> None:

@@ -1,0 +1,92 @@
+"""What a block is built from, and its sections: layout, frames, events, commands, attributes."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import msgspec
+
+from shmio.layout.model import Layout
+from shmio.segment import _atomics, commands
+from shmio.segment.block import Attributes
+from shmio.segment.events import EVENT_SIZE, EVENT_SLOTS
+from shmio.segment.header import SectionEntry, SectionKind
+
+RING_SECONDS = 8
+EVENT_STRIDE = -(-(_atomics.RAW_OFFSET + EVENT_SIZE) // 64) * 64
+
+_RING = struct.Struct("<8Iqq")
+
+
+@dataclass(frozen=True, slots=True)
+class BlockSpec:
+    """What a source's block is built from."""
+
+    source: str
+    layout: Layout
+    period_ns: int
+    stale_ns: int
+    ring_bytes: int
+    """The most memory its frame ring may take."""
+    attributes: Attributes = field(default_factory=Attributes)
+
+    @property
+    def slot_bytes(self) -> int:
+        """Bytes of one slot: header, reason, room for raw and effective."""
+        return align(_atomics.RAW_OFFSET + 2 * align(self.layout.size, 8), 64)
+
+    @property
+    def slots(self) -> int:
+        """Frames in the ring: 8 s of them, rounded up to a power of two, at least 8, as far as the memory allows."""
+        wanted = max(8, RING_SECONDS * 1_000_000_000 // self.period_ns)
+        slots: int = 1 << (wanted - 1).bit_length()
+        while slots > 8 and slots * self.slot_bytes > self.ring_bytes:
+            slots //= 2
+        return slots
+
+    @property
+    def size(self) -> int:
+        """Bytes of all its sections."""
+        return sum(align(size, 64) for _, size, _ in self.sections())
+
+    def sections(self) -> list[tuple[SectionKind, int, bytes]]:
+        """Kind, bytes, and how they begin, of each section; the rest is zeros."""
+        layout, attributes = self.layout.to_json(), msgspec.json.encode(self.attributes)
+        effective = _atomics.RAW_OFFSET + align(self.layout.size, 8)
+        frames = _RING.pack(
+            self.slots, self.slot_bytes, self.layout.size, 0, _atomics.RAW_OFFSET, effective, 0, 0,
+            self.period_ns, self.stale_ns,
+        )  # fmt: skip
+        events = _RING.pack(EVENT_SLOTS, EVENT_STRIDE, EVENT_SIZE, 0, _atomics.RAW_OFFSET, 0, 0, 0, 0, 0)
+        queues = commands.section_header(self.layout.size)
+        return [
+            (SectionKind.LAYOUT, len(layout), layout),
+            (SectionKind.FRAMES, _atomics.RING_HEADER_SIZE + self.slots * self.slot_bytes, frames),
+            (SectionKind.EVENTS, _atomics.RING_HEADER_SIZE + EVENT_SLOTS * EVENT_STRIDE, events),
+            (SectionKind.COMMANDS, commands.section_size(self.layout.size), queues),
+            (SectionKind.SOURCE, len(attributes), attributes),
+        ]
+
+
+SECTIONS_PER_BLOCK = 5
+
+
+def write_blocks(memory: memoryview, at: int, first: int, blocks: Sequence[BlockSpec]) -> list[SectionEntry]:
+    """Write the sections of blocks from offset ``at`` on; their entries, from number ``first`` on."""
+    entries: list[SectionEntry] = []
+    for block in blocks:
+        layout = first + len(entries)
+        for kind, size, begin in block.sections():
+            memory[at : at + len(begin)] = begin
+            digest = block.layout.hash if kind is SectionKind.LAYOUT else bytes(32)
+            of = 0 if kind is SectionKind.LAYOUT else layout
+            entries.append(SectionEntry(kind, False, at, size, of, block.source, digest))
+            at += align(size, 64)
+    return entries
+
+
+def align(size: int, to: int) -> int:
+    """The next multiple."""
+    return -(-size // to) * to

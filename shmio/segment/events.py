@@ -1,0 +1,137 @@
+"""What happened to a block between frames: commands and their outcomes, changes of quality, starts and ends.
+
+An event ring works like a frame ring and is written by the same process. An event names the frame it follows, a frame
+the event it follows, so that both together are one order.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import IntEnum
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+from shmio.segment.cursor import Cursor
+from shmio.segment.frame import Quality
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from shmio.segment._atomics import FrameTuple, Ring
+
+EVENT_DATA_SIZE: Final = 256
+"""Most data bytes in one event; a longer write is several events with consecutive parts."""
+EVENT_SLOTS: Final = 2048
+NO_WRITER: Final = 0xFFFFFFFF
+
+_RECORD: Final = struct.Struct("<HHIQIIB3xI")
+EVENT_SIZE: Final = _RECORD.size + EVENT_DATA_SIZE
+
+
+class EventKind(IntEnum):
+    """What happened. A command's item is accepted or rejected; if accepted, one of the four ends follows."""
+
+    STARTED = 1
+    STOPPED = 2
+    QUALITY = 3
+    ACCEPTED = 4
+    REJECTED = 5
+    """By the source, before anything was done; of a command as a whole."""
+    WRITTEN = 6
+    """The device confirmed it."""
+    REFUSED = 7
+    """The device said no."""
+    EXPIRED = 8
+    """Not sent, and will not be."""
+    UNKNOWN = 9
+    """Sent, but no answer came."""
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
+ENDS: Final = frozenset(
+    {EventKind.REJECTED, EventKind.WRITTEN, EventKind.REFUSED, EventKind.EXPIRED, EventKind.UNKNOWN}
+)
+"""Kinds after which nothing more is said of an item; REJECTED: of a command."""
+
+
+class Event(NamedTuple):
+    """A copy of one event. Times in ns as in a frame: CLOCK_MONOTONIC, the instance's clock, UTC.
+
+    ``frame``: number of the last frame before it. ``kind`` is a plain number where this version does not know it.
+    ``writer``: the command ring it is about, or NO_WRITER; ``command``: the writer's number of the command, ``item``
+    the place within it; ``offset``, ``mask``, ``size``: what it writes (mask 0: whole bytes); ``data``: these bytes,
+    with ACCEPTED only. ``text``: the reason.
+    """
+
+    number: int
+    kind: int
+    frame: int
+    cycle: int
+    publish_ns: int
+    clock_ns: int
+    utc_ns: int
+    incarnation: int
+    quality: Quality
+    writer: int
+    command: int
+    item: int
+    offset: int
+    mask: int
+    size: int
+    data: bytes
+    text: str
+
+
+class Record(NamedTuple):
+    """The part of an event that its writer chooses."""
+
+    kind: EventKind
+    text: str = ""
+    writer: int = NO_WRITER
+    command: int = 0
+    item: int = 0
+    offset: int = 0
+    mask: int = 0
+    size: int = 0
+    data: bytes = b""
+
+    def pack(self) -> bytes:
+        """The payload, EVENT_SIZE bytes."""
+        packed = _RECORD.pack(
+            self.kind, len(self.data), self.writer, self.command, self.item, self.offset, self.mask, self.size
+        )
+        return packed + self.data.ljust(EVENT_DATA_SIZE, b"\0")
+
+
+def decode(fields: FrameTuple) -> Event:
+    """An event from a ring's copy; bounds are checked, for the bytes are another process's."""
+    number, cycle, publish_ns, clock_ns, utc_ns, incarnation, quality, _, frame, text, raw, _ = fields
+    kind, data_size, writer, command, item, offset, mask, size = _RECORD.unpack_from(raw)
+    data = raw[_RECORD.size : _RECORD.size + min(data_size, EVENT_DATA_SIZE)]
+    known = Quality(quality) if quality <= Quality.GOOD else Quality.BAD
+    return Event(
+        number, kind, frame, cycle, publish_ns, clock_ns, utc_ns, incarnation, known,
+        writer, command, item, offset, mask, size, data, text,
+    )  # fmt: skip
+
+
+class EventRing:
+    """Reading side of a block's events."""
+
+    def __init__(self, ring: Ring, retired: Callable[[], bool]) -> None:
+        self.ring = ring
+        self._retired = retired
+
+    def head(self) -> int:
+        """Number of the newest event; 0: none yet."""
+        return self.ring.head()
+
+    def read(self, number: int) -> Event | None:
+        """A copy of one event by its number; None when the ring does not hold it."""
+        fields = self.ring.read(number)
+        return None if fields is None else decode(fields)
+
+    def cursor(self, *, after: int | None = None) -> Cursor[Event]:
+        """A stream position behind event ``after`` (default: the newest one)."""
+        return Cursor(self.ring, decode, self.head() if after is None else after, self._retired)
