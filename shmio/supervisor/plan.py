@@ -12,7 +12,7 @@ import msgspec
 from shmio.config import Config
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout
-from shmio.segment import BlockSpec, ProcessSpec, segment_size
+from shmio.segment import Attributes, BlockSpec, ProcessSpec, segment_size
 
 RANKS: Final[Mapping[str, int]] = {"emulator": 0, "source": 1, "grpc": 2}
 """Order of start by kind: what plays a device, what reads devices, what serves the readings."""
@@ -86,7 +86,14 @@ def make_plan(config: Config, layouts: Mapping[str, Layout], *, config_file: Pat
     """
     ring_bytes = round(config.instance.ring_mb * 1e6)
     blocks = tuple(
-        BlockSpec(source.name, layouts[source.name], source.period_ns, source.stale_ns, ring_bytes)
+        BlockSpec(
+            source.name,
+            layouts[source.name],
+            source.period_ns,
+            source.stale_ns,
+            ring_bytes,
+            Attributes(source.connector, tuple(source.writable), source.armed),
+        )
         for source in config.source
     )
     sections: list[tuple[str, str, dict[str, Any]]] = []
