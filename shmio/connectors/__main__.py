@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import logging
+import sys
 import threading
 import time
+from collections.abc import Callable
 
 from shmio import worker
 from shmio.connectors import registry
-from shmio.connectors.base import SourceLoop, WallClock
+from shmio.connectors.loop import SourceLoop, WallClock
 from shmio.connectors.schedule import Schedule
 from shmio.errors import ConnectorError
 from shmio.worker import BEAT_S, Worker
 
+SWITCH_S = 0.0005  # the poll thread is not to wait Python's usual 5 ms for the others
 HANG_MARGIN_S = 30.0  # beyond its time-outs: looking up a host name has none of ours
 
 
 def run(worker: Worker) -> None:
-    """Poll in a thread of its own; this one reports. A device that blocks the one cannot hold up the other."""
+    """Poll and take commands in threads of their own; this one reports. A device that blocks one holds up no other."""
+    sys.setswitchinterval(SWITCH_S)
     segment = worker.segment
     writer = segment.writer(worker.name)
     block = writer.block
@@ -25,14 +29,16 @@ def run(worker: Worker) -> None:
     options = registry.convert_options(worker.config["connector"], worker.config["options"])
     connector = connector_class(options, block.layout)
     schedule = Schedule(segment.header.started_ns, block.period_ns)
-    loop = SourceLoop(connector, writer, schedule, WallClock(worker.stopping))
-    thread = threading.Thread(target=_poll, args=(loop,), name="poll", daemon=True)
+    loop = SourceLoop(connector, writer, schedule, WallClock(worker.stopping), worker.config["writable"])
+    thread = threading.Thread(target=_guarded, args=(loop.run,), name="poll", daemon=True)
+    desk = threading.Thread(target=_guarded, args=(loop.desk.run,), name="commands", daemon=True)
     thread.start()
+    desk.start()
     worker.running()
     rate = _Rate()
     while not worker.stopping.wait(BEAT_S):
-        if not thread.is_alive():
-            raise ConnectorError("the poll loop ended by itself; its traceback is in the log")
+        if not thread.is_alive() or not desk.is_alive():
+            raise ConnectorError("the poll loop or the commands' thread ended by itself; its traceback is in the log")
         busy_s = _busy_s(loop.counters.busy_since_ns)
         if busy_s > connector.timeout_s + HANG_MARGIN_S:
             continue  # no beat: the supervisor replaces a process whose device call does not return
@@ -49,13 +55,15 @@ def run(worker: Worker) -> None:
             note=loop.note,
         )
     thread.join(timeout=1.0)
+    loop.desk.stop()
+    desk.join(timeout=1.0)
 
 
-def _poll(loop: SourceLoop) -> None:
+def _guarded(run: Callable[[], None]) -> None:
     try:
-        loop.run()
+        run()
     except Exception:
-        logging.getLogger("shmio").exception("the poll loop failed")
+        logging.getLogger("shmio").exception("failed")
 
 
 def _busy_s(since_ns: int) -> float:

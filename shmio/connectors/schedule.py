@@ -33,7 +33,11 @@ class Schedule:
             cycle = max(self._last + 1, current)
             skipped = cycle - self._last - 1
         self._last = cycle
-        return Due(cycle, self._start_ns + cycle * self._period_ns, skipped)
+        return Due(cycle, self.due_ns(cycle), skipped)
+
+    def due_ns(self, cycle: int) -> int:
+        """When a cycle is due."""
+        return self._start_ns + cycle * self._period_ns
 
     def restart(self) -> None:
         """Forget the last cycle: what passes until the next one is an outage, not an overrun."""

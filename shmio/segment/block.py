@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING
 from shmio.errors import SegmentError
 from shmio.segment._atomics import REASON_SIZE, Ring
 from shmio.segment.cursor import Cursor
-from shmio.segment.events import EventRing, Record
+from shmio.segment.events import EventKind, EventRing, Record
 from shmio.segment.frame import Frame, Provenance, Quality
 from shmio.segment.header import cut
 
@@ -138,6 +139,7 @@ class BlockWriter:
         self._quality = Quality.BAD
         self.incarnation = block.ring.begin()
         block.events.ring.begin()
+        self.event(Record(EventKind.STARTED, f"pid {os.getpid()}"))
 
     def publish(
         self,

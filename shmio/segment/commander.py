@@ -97,9 +97,10 @@ class Commander:
         while open_items and (event := self._next(ticket)) is not None:
             if event.kind == EventKind.REJECTED:
                 return [Outcome(path, EventKind.REJECTED, event.text) for path in ticket.paths]
-            if event.kind in ENDS and event.item in open_items:
-                open_items.remove(event.item)
-                ends[event.item] = event
+            if event.kind in ENDS:
+                ended = open_items.intersection(range(event.item, event.item + event.items))
+                open_items -= ended
+                ends |= dict.fromkeys(ended, event)
         return [self._outcome(ticket, place, path, ends) for place, path in enumerate(ticket.paths)]
 
     def write(self, values: Mapping[str, object], timeout_s: float = TIMEOUT_S) -> list[Outcome]:

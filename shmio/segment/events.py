@@ -23,7 +23,7 @@ EVENT_DATA_SIZE: Final = 256
 EVENT_SLOTS: Final = 2048
 NO_WRITER: Final = 0xFFFFFFFF
 
-_RECORD: Final = struct.Struct("<HHIQIIB3xI")
+_RECORD: Final = struct.Struct("<HHIQIIBxHI")
 EVENT_SIZE: Final = _RECORD.size + EVENT_DATA_SIZE
 
 
@@ -59,9 +59,9 @@ class Event(NamedTuple):
     """A copy of one event. Times in ns as in a frame: CLOCK_MONOTONIC, the instance's clock, UTC.
 
     ``frame``: number of the last frame before it. ``kind`` is a plain number where this version does not know it.
-    ``writer``: the command ring it is about, or NO_WRITER; ``command``: the writer's number of the command, ``item``
-    the place within it; ``offset``, ``mask``, ``size``: what it writes (mask 0: whole bytes); ``data``: these bytes,
-    with ACCEPTED only. ``text``: the reason.
+    ``writer``: the command ring it is about, or NO_WRITER; ``command``: the writer's number of the command. It tells
+    of ``items`` of its items from ``item`` on; ``offset``, ``mask``, ``size``: what the first of them writes (mask 0:
+    whole bytes); ``data``: these bytes, with ACCEPTED only. ``text``: the reason.
     """
 
     number: int
@@ -76,6 +76,7 @@ class Event(NamedTuple):
     writer: int
     command: int
     item: int
+    items: int
     offset: int
     mask: int
     size: int
@@ -91,6 +92,7 @@ class Record(NamedTuple):
     writer: int = NO_WRITER
     command: int = 0
     item: int = 0
+    items: int = 0
     offset: int = 0
     mask: int = 0
     size: int = 0
@@ -98,21 +100,20 @@ class Record(NamedTuple):
 
     def pack(self) -> bytes:
         """The payload, EVENT_SIZE bytes."""
-        packed = _RECORD.pack(
-            self.kind, len(self.data), self.writer, self.command, self.item, self.offset, self.mask, self.size
-        )
+        what = (self.kind, len(self.data), self.writer, self.command)
+        packed = _RECORD.pack(*what, self.item, self.offset, self.mask, self.items, self.size)
         return packed + self.data.ljust(EVENT_DATA_SIZE, b"\0")
 
 
 def decode(fields: FrameTuple) -> Event:
     """An event from a ring's copy; bounds are checked, for the bytes are another process's."""
     number, cycle, publish_ns, clock_ns, utc_ns, incarnation, quality, _, frame, text, raw, _ = fields
-    kind, data_size, writer, command, item, offset, mask, size = _RECORD.unpack_from(raw)
+    kind, data_size, writer, command, item, offset, mask, items, size = _RECORD.unpack_from(raw)
     data = raw[_RECORD.size : _RECORD.size + min(data_size, EVENT_DATA_SIZE)]
     known = Quality(quality) if quality <= Quality.GOOD else Quality.BAD
     return Event(
         number, kind, frame, cycle, publish_ns, clock_ns, utc_ns, incarnation, known,
-        writer, command, item, offset, mask, size, data, text,
+        writer, command, item, items, offset, mask, size, data, text,
     )  # fmt: skip
 
 

@@ -14,7 +14,8 @@ from typing import Any, Protocol
 
 import pytest
 
-from shmio.connectors.base import Connector, SourceLoop, WallClock
+from shmio.connectors.base import Connector
+from shmio.connectors.loop import SourceLoop, WallClock
 from shmio.connectors.schedule import Schedule
 from shmio.layout.model import Layout
 from shmio.segment import BlockSpec, Frame, ProcessSpec, Quality, Segment

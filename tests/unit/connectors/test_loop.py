@@ -8,7 +8,8 @@ from itertools import pairwise
 import msgspec
 import pytest
 
-from shmio.connectors.base import Connector, SourceLoop
+from shmio.connectors.base import Connector
+from shmio.connectors.loop import SourceLoop
 from shmio.connectors.schedule import Schedule
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register

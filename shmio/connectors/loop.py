@@ -1,0 +1,209 @@
+"""The loop that runs a connector.
+
+It owns time, quality and recovery, so that every connector behaves alike: an absolute schedule, overruns counted, one
+bad frame when quality changes, the connection dropped on any error, back-off, recovery without a restart.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, TypeVar
+
+from shmio.connectors.base import Connector
+from shmio.connectors.desk import CommandDesk
+from shmio.connectors.schedule import Backoff, Schedule
+from shmio.errors import ConnectorError
+from shmio.logs import fields
+from shmio.segment import BlockWriter, EventKind, Quality, Record
+
+STABLE_NS = 1_000_000_000
+"""A connection that has lasted this long has put its failures behind it."""
+
+_MEASURES = re.compile(r"\b[0-9]+(?= (?:ms|s|bytes)\b)")  # what varies in a reason; codes and addresses do not
+_Result = TypeVar("_Result")
+
+log = logging.getLogger("shmio.source")
+
+
+class Clock(Protocol):
+    """Time as the loop sees it; tests bring their own."""
+
+    def now_ns(self) -> int:
+        """CLOCK_MONOTONIC."""
+
+    def wait_ns(self, duration_ns: int) -> bool:
+        """Wait; True as soon as the loop is to stop."""
+
+
+class WallClock:
+    """The loop's clock in a live instance."""
+
+    def __init__(self, stopping: threading.Event) -> None:
+        self._stopping = stopping
+
+    def now_ns(self) -> int:
+        """CLOCK_MONOTONIC."""
+        return time.monotonic_ns()
+
+    def wait_ns(self, duration_ns: int) -> bool:
+        """Wait; True as soon as the process is to stop."""
+        return self._stopping.wait(duration_ns / 1e9) if duration_ns > 0 else self._stopping.is_set()
+
+
+@dataclass(slots=True)
+class Counters:
+    """What ``status`` shows of a source; one writer, the loop."""
+
+    polls: int = 0
+    overruns: int = 0
+    failures: int = 0
+    connects: int = 0
+    round_trip_us: int = 0
+    busy_since_ns: int = 0
+    """When the hook that runs now was called; 0 between hooks."""
+
+
+class _Submitted(NamedTuple):
+    """A cycle that the device has been asked for."""
+
+    cycle: int
+    asked_ns: int
+    utc_ns: int
+    """The device had what it will answer then, or later."""
+
+
+class SourceLoop:
+    """Polls one connector on schedule, publishes every frame, and hands on what is to be written."""
+
+    def __init__(
+        self,
+        connector: Connector,
+        writer: BlockWriter,
+        schedule: Schedule,
+        clock: Clock,
+        writable: Iterable[str] = (),
+    ) -> None:
+        """``writable``: patterns of what commands may write."""
+        self._connector = connector
+        self._writer = writer
+        self._schedule = schedule
+        self._clock = clock
+        self.desk = CommandDesk(writer, writable if connector.can_write else None, clock.now_ns)
+        self._backoff = Backoff()
+        self._connected_ns: int | None = None
+        self._under_way: deque[_Submitted] = deque()
+        self._state: tuple[Quality, str] | None = None  # as last told; the reason without its numbers
+        last = writer.block.latest()
+        self._raw = last.raw if last else bytes(writer.block.layout.size)
+        self._read_ns = last.source_ns if last else 0  # UTC of the last good image; 0: there was none
+        self.counters = Counters()
+        self.note = ""
+
+    def run(self) -> None:
+        """Poll until the clock says stop; then tell the readers."""
+        try:
+            while True:
+                due = self._schedule.next(self._clock.now_ns())
+                self.counters.overruns += due.skipped
+                if self._clock.wait_ns(due.due_ns - self._clock.now_ns()) or not self.poll(due.cycle):
+                    break
+        finally:
+            self._connector.close()
+            cycle = self._schedule.next(self._clock.now_ns()).cycle
+            self._disconnected(cycle, "the source was stopped")
+            self._writer.event(Record(EventKind.STOPPED))
+
+    def poll(self, cycle: int) -> bool:
+        """One cycle: connect if need be, write, ask, publish what comes. False: told to stop while backing off."""
+        try:
+            if self._connected_ns is None:
+                self._connect()
+            if self.desk.waiting:
+                self._call(lambda: self.desk.carry_out(self._connector.write))
+            if len(self._under_way) < self._connector.depth:
+                self._under_way.append(_Submitted(cycle, self._clock.now_ns(), time.time_ns()))
+                self._call(self._connector.submit)
+            else:
+                self.counters.overruns += 1  # the device is behind by all that may be under way
+            self._collect(self._schedule.due_ns(cycle + 1))
+        except ConnectorError as error:
+            return self._fail(cycle, str(error) or "the connector gave no reason")
+        return True
+
+    def _collect(self, until_ns: int) -> None:
+        """Publish the images that come until the next cycle is due."""
+        while self._under_way:
+            raw = self._call(lambda: self._connector.collect(until_ns))
+            if raw is None:
+                return
+            asked = self._under_way.popleft()
+            took_ns = self._clock.now_ns() - asked.asked_ns
+            self.counters.round_trip_us = took_ns // 1000
+            if took_ns > self._writer.block.stale_ns:  # nobody knows when, in a long wait, the device had it
+                limit_ms = self._writer.block.stale_ns / 1e6
+                raise ConnectorError(
+                    f"the answer took {took_ns / 1e6:.0f} ms: older than stale_ms ({limit_ms:.0f}) allows"
+                )
+            self._publish(asked, raw)
+            if self._clock.now_ns() >= until_ns:
+                return
+
+    def _publish(self, asked: _Submitted, raw: bytes) -> None:
+        doubt = self._connector.doubt
+        quality = Quality.UNCERTAIN if doubt else Quality.GOOD
+        self._tell(quality, doubt, asked.cycle)
+        self._raw, self._read_ns = raw, asked.utc_ns
+        self._writer.publish(raw, cycle=asked.cycle, source_ns=asked.utc_ns, quality=quality, reason=doubt)
+        self.counters.polls += 1
+        if self._connected_ns is not None and self._clock.now_ns() - self._connected_ns > STABLE_NS:
+            self._backoff.reset()
+
+    def _connect(self) -> None:
+        self._call(self._connector.connect)
+        self._connected_ns = self._clock.now_ns()
+        self.counters.connects += 1
+        self.desk.open()
+
+    def _call(self, hook: Callable[[], _Result]) -> _Result:
+        """Call a hook, and let the main thread see since when."""
+        self.counters.busy_since_ns = self._clock.now_ns()
+        try:
+            return hook()
+        finally:
+            self.counters.busy_since_ns = 0
+
+    def _fail(self, cycle: int, reason: str) -> bool:
+        self.counters.failures += 1
+        self._connected_ns = None
+        self._under_way.clear()
+        self._connector.close()
+        self._disconnected(cycle, reason)
+        stop = self._clock.wait_ns(round(self._backoff.next_s() * 1e9))
+        self._schedule.restart()
+        return not stop
+
+    def _disconnected(self, cycle: int, reason: str) -> None:
+        """Publish one bad frame for each new reason, with the last bytes known; other measures are none."""
+        self.desk.close(reason)
+        if self._tell(Quality.BAD, reason, cycle):
+            self._writer.publish(self._raw, cycle=cycle, source_ns=self._read_ns, quality=Quality.BAD, reason=reason)
+
+    def _tell(self, quality: Quality, reason: str, cycle: int) -> bool:
+        """Log and write down a change of quality or of its reason; whether it was one."""
+        self.note = reason
+        state = quality, _MEASURES.sub("#", reason)
+        if state == self._state:
+            return False
+        self._state = state
+        self._writer.event(Record(EventKind.QUALITY, reason), quality=quality)
+        if quality is Quality.GOOD:
+            log.info("quality good, connected %s", self._connector.describe(), extra=fields(cycle=cycle))
+        else:
+            log.warning("quality %s: %s", quality, reason, extra=fields(cycle=cycle))
+        return True
