@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from shmio.connectors.base import Connector
 from shmio.connectors.s7.client import S7Client
 from shmio.connectors.s7.options import S7Options
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout
+from shmio.layout.write import Write
 
 
 class S7Connector(Connector):
     """Reads the whole block each cycle. A read of several PDUs is not one instant of the PLC (docs/how-to)."""
 
     Options = S7Options
+    can_write = True
 
     def __init__(self, options: S7Options, layout: Layout) -> None:
         number = options.dbNumber if options.dbNumber is not None else layout.number
@@ -23,8 +27,18 @@ class S7Connector(Connector):
 
     @property
     def timeout_s(self) -> float:
-        """``timeout``; connecting and reading have it each."""
+        """``timeout``; connecting, reading and writing have it each."""
         return self._timeout_s
+
+    @property
+    def depth(self) -> int:
+        """Reads for which the controller granted jobs enough."""
+        return self._client.depth
+
+    @property
+    def doubt(self) -> str:
+        """Whether the PLC is in STOP."""
+        return self._client.doubt
 
     def connect(self) -> None:
         """Open a session."""
@@ -34,6 +48,18 @@ class S7Connector(Connector):
         """The whole block."""
         return self._client.read()
 
+    def submit(self) -> None:
+        """Ask for the whole block."""
+        self._client.submit()
+
+    def collect(self, until_ns: int) -> bytes | None:
+        """The whole block, of the oldest ``submit``."""
+        return self._client.collect(until_ns)
+
+    def write(self, writes: Sequence[Write]) -> list[str]:
+        """Write bytes and single bits."""
+        return self._client.write(writes)
+
     def close(self) -> None:
         """Drop the session."""
         self._client.close()
@@ -41,4 +67,5 @@ class S7Connector(Connector):
     def describe(self) -> str:
         """Peer and session, as granted."""
         client = self._client
-        return f"to {client.options.peer} DB{client.db_number} pdu={client.pdu_size} jobs={client.jobs}"
+        granted = f"pdu={client.pdu_size} jobs={client.jobs} depth={client.depth}"
+        return f"to {client.options.peer} DB{client.db_number} {granted}"

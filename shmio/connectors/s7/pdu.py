@@ -1,4 +1,4 @@
-"""The bytes of S7 over ISO-on-TCP: building requests, checking answers. No I/O.
+"""The bytes of S7 over ISO-on-TCP: frames, sessions, reads of one item. No I/O.
 
 A frame is ``TPKT | COTP | S7``: RFC 1006, section 6 (TPKT: version 3, length of the whole), ISO 8073 class 0
 (COTP: CR and CC open, DT carries data), and the S7 job (ROSCTR 1), which a controller answers with Ack-Data (3),
@@ -17,9 +17,9 @@ import struct
 from typing import NamedTuple
 
 from snap7.datatypes import S7Area, S7WordLen
-from snap7.error import S7_PROTOCOL_ERROR_CODES
-from snap7.s7protocol import S7_RETURN_CODES, S7Protocol
+from snap7.s7protocol import S7Protocol
 
+from shmio.connectors.s7.explain import ITEM_OK, RefusedError, explain_error
 from shmio.errors import ConnectorError
 
 FRAME_OVERHEAD = 7  # TPKT 4, COTP DT 3
@@ -28,30 +28,25 @@ READ_REQUEST_SIZE = 31
 REFERENCE_OFFSET = 11  # of the PDU reference in a frame
 MAX_BLOCK_SIZE = 65536  # of a standard data block; also, one byte a read, the number of references there are
 
-WANTED_JOBS = 8
+WANTED_JOBS = 24  # four reads of a block of 2 kB at once, and some to spare; real controllers grant 1 to 16
 WANTED_PDU_SIZE = 960
 MIN_PDU_SIZE = 64  # the smallest known controllers grant 240; less than this is not one
 DEFAULT_TPDU_SIZE = 65531  # if the peer names none: RFC 1006
 _TPDU_SIZE_CODE = 0x0A  # 2 ** 10
 
 _TPKT = struct.Struct(">BxH")
-_HEADER = struct.Struct(">BxH BBB BB2xHHH")  # up to what all S7 PDUs share
+_HEADER = struct.Struct(">4x 3s BB2x2xHH")  # what all S7 PDUs share
 _ITEM = struct.Struct(">BB BBH")
-_USUAL = struct.Struct(">4x 5s2xH HHH 4sH")  # an answer to a read, cut so that what is always the same is in one piece
+_USUAL = struct.Struct(">4x 5s2x2x HHH 4sH")  # an answer to a read, cut so that what is always the same is in one piece
 _USUAL_HEAD, _USUAL_ITEM = b"\x02\xf0\x80\x32\x03", b"\x04\x01\xff\x04"
-_HEADER_END = 19
+HEADER_END = 19  # of the headers of an answer to a job, after which its parameters begin
+USERDATA_END = 17  # the same of userdata, whose header has no error
 _ITEM_END = 25
+_COTP_DATA = b"\x02\xf0\x80"  # header length, DT, end of the message
 _COTP_CR, _COTP_CC, _COTP_DR, _COTP_DT = 0xE0, 0xD0, 0x80, 0xF0
 _ACK, _ACK_DATA = 2, 3
 _READ, _SETUP = 0x04, 0xF0
-ITEM_OK = 0xFF
 _BITS, _OCTETS = 0x04, 0x09  # transport sizes: whether an item's length counts bits or bytes
-
-_ACCESS_REMEDY = (
-    "access denied: PUT/GET is disabled, or the protection level or an optimized block forbids it; enable "
-    "'Permit access with PUT/GET communication from remote partner' and 'Full access' in the CPU's protection "
-    "settings, and clear 'Optimized block access' in the block's attributes"
-)
 
 
 class Session(NamedTuple):
@@ -66,7 +61,6 @@ class Session(NamedTuple):
 class ReadAnswer(NamedTuple):
     """An answer to a read of one item."""
 
-    reference: int
     code: int
     """The item's return code; without ITEM_OK there is no data."""
     data: memoryview
@@ -85,39 +79,55 @@ def frame_length(head: memoryview, longest: int) -> int:
     return int(length)
 
 
+def data_frame(pdu: bytes) -> bytes:
+    """Wrap an S7 PDU that fits one TPDU."""
+    return _frame(_COTP_DATA + pdu)
+
+
 def _frame(payload: bytes) -> bytes:
     return _TPKT.pack(3, 4 + len(payload)) + payload
 
 
-def _data_frame(pdu: bytes) -> bytes:
-    return _frame(b"\x02\xf0\x80" + pdu)  # header length, DT, end of the message
-
-
-def _check_data_header(frame: memoryview) -> tuple[int, int]:
-    """Check all headers of an answer; its reference and the length of its data part, which follows the parameters."""
-    if len(frame) < _HEADER_END:
+def reference_of(frame: memoryview) -> int:
+    """Tell which request an answer names; what else is wrong with it, its parser finds."""
+    if len(frame) < USERDATA_END:
         _check_cotp(frame)
         raise ConnectorError(f"answer of {len(frame)} bytes is too short")
-    fields = _HEADER.unpack_from(frame)
-    _, _, cotp_length, cotp_type, cotp_end, protocol, kind, reference, parameter_length, data_length = fields
-    if (cotp_length, cotp_type, cotp_end) != (2, _COTP_DT, 0x80):
+    return frame[REFERENCE_OFFSET] << 8 | frame[REFERENCE_OFFSET + 1]
+
+
+def check_envelope(frame: memoryview) -> tuple[int, int, int]:
+    """Check what all S7 PDUs share; ROSCTR, and the lengths of the parameters and of the data that follow them."""
+    if len(frame) < USERDATA_END:
+        _check_cotp(frame)
+        raise ConnectorError(f"answer of {len(frame)} bytes is too short")
+    cotp, protocol, kind, parameter_length, data_length = _HEADER.unpack_from(frame)
+    if cotp != _COTP_DATA:
         _check_cotp(frame)
         # With the TPDU size agreed on, no answer needs more than one TPDU.
         raise ConnectorError("answer in several parts, though one holds it")
     if protocol != 0x32:
         raise ConnectorError(f"the peer does not speak S7 (protocol 0x{protocol:02X}, expected 0x32)")
-    error = frame[17] << 8 | frame[18]
+    return kind, parameter_length, data_length
+
+
+def check_answer(frame: memoryview) -> int:
+    """Check all headers of an answer to a job; the length of its data part. RefusedError: it holds an error."""
+    kind, parameter_length, data_length = check_envelope(frame)
     if kind not in {_ACK, _ACK_DATA}:
         raise ConnectorError(f"not an answer: ROSCTR {kind}")
-    if error:
-        raise ConnectorError(_explain_error(error))
-    if kind != _ACK_DATA:
-        raise ConnectorError("answer without data")
-    if _HEADER_END + parameter_length + data_length != len(frame):
+    if len(frame) < HEADER_END:
+        raise ConnectorError(f"answer of {len(frame)} bytes is too short")
+    error = frame[17] << 8 | frame[18]
+    if HEADER_END + parameter_length + data_length != len(frame):
         raise ConnectorError(
             f"answer of {len(frame)} bytes names {parameter_length} of parameters and {data_length} of data"
         )
-    return reference, data_length
+    if error:
+        raise RefusedError(explain_error(error))
+    if kind != _ACK_DATA:
+        raise ConnectorError("answer without data")
+    return data_length
 
 
 def _check_cotp(frame: memoryview) -> None:
@@ -126,26 +136,6 @@ def _check_cotp(frame: memoryview) -> None:
         raise ConnectorError("the controller ended the session")
     if kind != _COTP_DT:
         raise ConnectorError(f"unexpected COTP TPDU 0x{kind:02X}")
-
-
-def _explain_error(error: int) -> str:
-    if error == 0x8104:  # what S7-1200 and S7-1500 answer to all jobs with PUT/GET off, and for optimized blocks
-        return f"{_ACCESS_REMEDY} (error 0x8104)"
-    known = S7_PROTOCOL_ERROR_CODES.get(error)
-    return f"the controller refused the request: {known or 'no text known'} (error 0x{error:04X})"
-
-
-def explain_item(code: int, db_number: int, size: int) -> str:
-    """Say what an item's return code means for a read of this block of ``size`` bytes, and what to do about it."""
-    where = f"(item code 0x{code:02X})"
-    if code in {0x05, 0x0A}:
-        return (
-            f"DB{db_number} is shorter than {size} bytes or does not exist {where}; on an S7-1200 or S7-1500 also: "
-            "the block is optimized, clear 'Optimized block access' in its attributes"
-        )
-    if code == 0x03:
-        return f"DB{db_number}: {_ACCESS_REMEDY} {where}"
-    return f"DB{db_number} cannot be read: {S7_RETURN_CODES.get(code, 'no text known')} {where}"
 
 
 # -- session -----------------------------------------------------------------------------------------------------------
@@ -182,17 +172,17 @@ def setup_request(reference: int, jobs: int, pdu_size: int) -> bytes:
     """Build "setup communication": asks for so many jobs in parallel, and for PDUs of this size in bytes."""
     encoder = S7Protocol()
     encoder.sequence = (reference - 1) & 0xFFFF
-    return _data_frame(encoder.build_setup_communication_request(jobs, jobs, pdu_size))
+    return data_frame(encoder.build_setup_communication_request(jobs, jobs, pdu_size))
 
 
 def parse_setup_answer(frame: memoryview, reference: int, asked: Session) -> Session:
     """Check what the controller grants; it is never more than was asked."""
-    answered, data_length = _check_data_header(frame)
-    if answered != reference:
+    data_length = check_answer(frame)
+    if (answered := reference_of(frame)) != reference:
         raise ConnectorError(f"answer to a request that was not made (reference {answered})")
-    if len(frame) != _HEADER_END + 8 or data_length or frame[_HEADER_END] != _SETUP:
+    if len(frame) != HEADER_END + 8 or data_length or frame[HEADER_END] != _SETUP:
         raise ConnectorError("not an answer to 'setup communication'")
-    calling, called, pdu_size = struct.unpack_from(">HHH", frame, _HEADER_END + 2)
+    calling, called, pdu_size = struct.unpack_from(">HHH", frame, HEADER_END + 2)
     if pdu_size < MIN_PDU_SIZE:
         raise ConnectorError(f"the controller grants PDUs of only {pdu_size} bytes")
     return Session(min(pdu_size, asked.pdu_size), max(1, min(calling, called, asked.jobs)))
@@ -203,17 +193,17 @@ def parse_setup_answer(frame: memoryview, reference: int, asked: Session) -> Ses
 
 def read_request(db_number: int, start: int, size: int) -> bytes:
     """Build a read of ``size`` bytes at byte ``start``; the PDU reference is left to the caller to fill in."""
-    frame = _data_frame(S7Protocol().build_read_request(S7Area.DB, db_number, start, S7WordLen.BYTE, size))
+    frame = data_frame(S7Protocol().build_read_request(S7Area.DB, db_number, start, S7WordLen.BYTE, size))
     if len(frame) != READ_REQUEST_SIZE:
         raise AssertionError("python-snap7 encodes read requests in another way than shmio knows")
     return frame
 
 
 def parse_read_answer(frame: memoryview) -> ReadAnswer:
-    """Check an answer to a read of one item of bytes; ``data`` is a view of the frame."""
+    """Check an answer to a read of one item of bytes; ``data`` is a view of the frame. RefusedError: the job was."""
     if len(frame) >= _ITEM_END:
         # Nearly all answers look like this; what does not is looked at field by field below, to say why.
-        head, reference, parameter_length, data_length, error, item, bits = _USUAL.unpack_from(frame)
+        head, parameter_length, data_length, error, item, bits = _USUAL.unpack_from(frame)
         if (
             head == _USUAL_HEAD
             and item == _USUAL_ITEM
@@ -222,18 +212,18 @@ def parse_read_answer(frame: memoryview) -> ReadAnswer:
             and bits == (data_length - 4) * 8
             and data_length == len(frame) - 21
         ):
-            return ReadAnswer(reference, ITEM_OK, frame[_ITEM_END:])
-    reference, data_length = _check_data_header(frame)
-    if len(frame) < _HEADER_END + 3:
+            return ReadAnswer(ITEM_OK, frame[_ITEM_END:])
+    data_length = check_answer(frame)
+    if len(frame) < HEADER_END + 3:
         raise ConnectorError(f"answer of {len(frame)} bytes is too short for a read")
-    if frame[_HEADER_END] != _READ or frame[_HEADER_END + 1] != 1 or data_length != len(frame) - _HEADER_END - 2:
+    if frame[HEADER_END] != _READ or frame[HEADER_END + 1] != 1 or data_length != len(frame) - HEADER_END - 2:
         raise ConnectorError("not an answer to a read of one item")
-    code = frame[_HEADER_END + 2]
+    code = frame[HEADER_END + 2]
     if code != ITEM_OK:
-        return ReadAnswer(reference, code, frame[:0])
+        return ReadAnswer(code, frame[:0])
     if len(frame) < _ITEM_END:
         raise ConnectorError(f"answer of {len(frame)} bytes is too short for data")
-    _, _, _, transport, length = _ITEM.unpack_from(frame, _HEADER_END)
+    _, _, _, transport, length = _ITEM.unpack_from(frame, HEADER_END)
     if transport == _BITS and not length & 7:
         length >>= 3
     elif transport != _OCTETS:
@@ -241,4 +231,4 @@ def parse_read_answer(frame: memoryview) -> ReadAnswer:
     # Some servers pad an odd length, though only items that others follow need it.
     if len(frame) - _ITEM_END not in {length, length + (length & 1)}:
         raise ConnectorError(f"answer with {len(frame) - _ITEM_END} bytes of data names {length}")
-    return ReadAnswer(reference, code, frame[_ITEM_END : _ITEM_END + length])
+    return ReadAnswer(code, frame[_ITEM_END : _ITEM_END + length])

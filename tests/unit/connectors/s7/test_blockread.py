@@ -1,4 +1,4 @@
-"""Any order of answers, any depth, any size: the block comes out whole, or not at all."""
+"""Any order of answers, any split, any size: the block comes out whole, or not at all."""
 
 from __future__ import annotations
 
@@ -31,65 +31,52 @@ def split(requests: memoryview) -> list[bytes]:
 @given(
     block=st.binary(min_size=1, max_size=600),
     chunk=st.integers(1, 222),
-    depth=st.integers(1, 9),
     first=st.integers(0, 65535),
     data=st.data(),
 )
-def test_answers_in_any_order_make_the_block(
-    block: bytes, chunk: int, depth: int, first: int, data: st.DataObject
-) -> None:
-    reading = BlockRead(201, len(block), chunk, depth)
+def test_answers_in_any_order_make_the_block(block: bytes, chunk: int, first: int, data: st.DataObject) -> None:
+    reading = BlockRead(201, len(block), chunk)
     for _ in range(2):
-        waiting = split(reading.begin(first))
+        reading.begin(0)
+        waiting: list[tuple[int, bytes]] = []
         while not reading.complete:
-            assert len(waiting) <= depth
-            reading.accept(answer(waiting.pop(data.draw(st.integers(0, len(waiting) - 1))), block))
-            waiting += split(reading.more())
+            left = reading.count - reading.sent
+            if left and (not waiting or data.draw(st.booleans())):
+                index = reading.sent
+                requests = split(reading.take(data.draw(st.integers(1, left)), first + index & 0xFFFF))
+                for request in requests:
+                    assert pdu.reference_of(memoryview(request)) == first + index & 0xFFFF
+                    waiting.append((index, request))
+                    index += 1
+            else:
+                index, request = waiting.pop(data.draw(st.integers(0, len(waiting) - 1)))
+                reading.accept(index, answer(request, block))
         assert not waiting
+        assert reading.sent == reading.count
         assert reading.data == block
         first = first + reading.count & 0xFFFF
 
 
-def test_keeps_as_many_under_way_as_allowed() -> None:
-    reading = BlockRead(201, 10, 1, 4)
-    waiting = split(reading.begin(0))
-    assert len(waiting) == 4
-    assert not reading.more()
-    reading.accept(answer(waiting[2], bytes(10)))
-    assert len(split(reading.more())) == 1
-    assert not reading.complete
-
-
-def test_refuses_references_that_are_not_under_way() -> None:
-    block = bytes(range(10))
-    reading = BlockRead(201, 10, 4, 2)
-    old = split(reading.begin(100))
-    reading.accept(answer(old[0], block))
-    with pytest.raises(ConnectorError, match="not under way"):  # twice
-        reading.accept(answer(old[0], block))
-    fresh = split(reading.begin(103))
-    with pytest.raises(ConnectorError, match="not under way"):  # of the pass before
-        reading.accept(answer(old[1], block))
-    third = bytearray(fresh[1])
-    third[pdu.REFERENCE_OFFSET + 1] += 1
-    with pytest.raises(ConnectorError, match="not under way"):  # not sent yet
-        reading.accept(answer(bytes(third), block))
-
-
 def test_refuses_less_or_more_data_than_asked() -> None:
-    reading = BlockRead(201, 10, 4, 8)
-    requests = split(reading.begin(0))
+    reading = BlockRead(201, 10, 4)
+    requests = split(reading.take(3, 0))
     for count in (3, 5):
         other = bytearray(requests[0])
         struct.pack_into(">H", other, 23, count)
         with pytest.raises(ConnectorError, match=rf"{count} bytes of data, 4 were asked for"):
-            reading.accept(answer(bytes(other), bytes(range(10))))
+            reading.accept(0, answer(bytes(other), bytes(range(10))))
 
 
-def test_explains_an_item_error() -> None:
-    reading = BlockRead(7, 10, 4, 8)
-    request = split(reading.begin(0))[0]
+def test_a_refusal_ends_the_pass_and_only_that() -> None:
+    reading = BlockRead(7, 10, 4)
+    request = split(reading.take(3, 0))[0]
     frame = bytearray(answer(request, bytes(10)))
     frame[21] = 0x0A
-    with pytest.raises(ConnectorError, match="DB7 is shorter than 10 bytes or does not exist"):
-        reading.accept(memoryview(frame))
+    reading.accept(0, memoryview(frame))
+    assert reading.complete
+    assert "DB7: the block does not exist" in str(reading.refusal)
+    reading.begin(0)
+    assert not reading.complete
+    for index, request in enumerate(split(reading.take(3, 3))):
+        reading.accept(index, answer(request, bytes(range(10))))
+    assert (reading.refusal, reading.data) == (None, bytes(range(10)))

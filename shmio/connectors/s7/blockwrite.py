@@ -1,0 +1,121 @@
+"""A batch of writes as jobs of several items, and what came of each write. No I/O.
+
+Jobs under way at once may be served in any order. So writes that touch the same bits never are: the batch is cut into
+waves, each of which is confirmed before the next is sent. What is in no other's way goes out at once.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right, insort
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+from shmio.connectors.s7 import writepdu
+from shmio.connectors.s7.explain import ITEM_OK, RefusedError, explain_write
+from shmio.layout.write import Write
+
+
+class _Item(NamedTuple):
+    write: int
+    """Index of the write it is a part of."""
+    last: int
+    """The last byte it touches."""
+    encoded: tuple[bytes, bytes]
+
+
+class BlockWrite:
+    """Jobs that may all be under way at once. Says into ``outcomes`` what the controller refused."""
+
+    def __init__(self, db_number: int, pdu_size: int, items: Sequence[_Item], outcomes: list[str]) -> None:
+        self._db_number = db_number
+        self._outcomes = outcomes
+        self._jobs = list(_fill(items, pdu_size))
+        self.count = len(self._jobs)
+        self.sent = self._answered = 0
+
+    @property
+    def complete(self) -> bool:
+        """Whether every job is answered."""
+        return self._answered == self.count
+
+    def take(self, count: int, first: int) -> bytes:
+        """Give the next requests, with the references from ``first`` on (16 bits, wrapping)."""
+        begin, self.sent = self.sent, self.sent + count
+        return b"".join(
+            writepdu.write_request((first + place) & 0xFFFF, [item.encoded for item in job])
+            for place, job in enumerate(self._jobs[begin : self.sent])
+        )
+
+    def accept(self, index: int, frame: memoryview) -> None:
+        """Take the answer to request ``index``; ConnectorError if it is not exactly one."""
+        job = self._jobs[index]
+        try:
+            codes = writepdu.parse_write_answer(frame, len(job))
+        except RefusedError as refusal:
+            for item in job:
+                self._refuse(item, str(refusal))
+        else:
+            for item, code in zip(job, codes, strict=True):
+                if code != ITEM_OK:
+                    self._refuse(item, explain_write(code, self._db_number, item.last))
+        self._answered += 1
+
+    def _refuse(self, item: _Item, reason: str) -> None:
+        self._outcomes[item.write] = self._outcomes[item.write] or reason
+
+
+def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list[str]) -> Iterator[BlockWrite]:
+    """Cut a batch into waves, in order. ``outcomes``: a text for each write, in which refusals are put down."""
+    wave: list[_Item] = []
+    spans: list[tuple[int, int]] = []  # of bits of the block that the wave touches, in order
+    for place, write in enumerate(writes):
+        span = _span(write)
+        if wave and _touches(spans, span):
+            yield BlockWrite(db_number, pdu_size, wave, outcomes)
+            wave, spans = [], []
+        insort(spans, span)
+        wave += _items(db_number, pdu_size, place, write)
+    if wave:
+        yield BlockWrite(db_number, pdu_size, wave, outcomes)
+
+
+def _span(write: Write) -> tuple[int, int]:
+    if write.mask:
+        bit = 8 * write.offset + write.mask.bit_length() - 1
+        return bit, bit + 1
+    return 8 * write.offset, 8 * (write.offset + len(write.data))
+
+
+def _touches(spans: list[tuple[int, int]], span: tuple[int, int]) -> bool:
+    """Whether a span has a bit in common with any of these, which have none among them."""
+    after = bisect_right(spans, span)
+    return (after > 0 and spans[after - 1][1] > span[0]) or (after < len(spans) and spans[after][0] < span[1])
+
+
+def _items(db_number: int, pdu_size: int, place: int, write: Write) -> Iterator[_Item]:
+    if write.mask:
+        bit = write.mask.bit_length() - 1
+        value = bool(write.data[0] & write.mask)
+        yield _Item(place, write.offset, writepdu.bit_item(db_number, write.offset, bit, value))
+        return
+    most = pdu_size - writepdu.JOB_OVERHEAD - writepdu.ITEM_OVERHEAD
+    for start in range(0, len(write.data), most):
+        data = write.data[start : start + most]
+        offset = write.offset + start
+        yield _Item(place, offset + len(data) - 1, writepdu.byte_item(db_number, offset, data))
+
+
+def _fill(items: Sequence[_Item], pdu_size: int) -> Iterator[list[_Item]]:
+    """Put as many items into each job as its PDU holds, in order."""
+    job: list[_Item] = []
+    size = writepdu.JOB_OVERHEAD
+    for item in items:
+        address, value = item.encoded
+        size += size & 1  # values begin at even places
+        if job and (size + len(address) + len(value) > pdu_size or len(job) == writepdu.MAX_ITEMS):
+            yield job
+            job, size = [], writepdu.JOB_OVERHEAD
+        job.append(item)
+        size += len(address) + len(value)
+    if job:
+        yield job

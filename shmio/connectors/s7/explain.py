@@ -1,0 +1,100 @@
+"""What a controller's refusal means, and what to do about it, in words for the person at the cell.
+
+Which code which family sends when is not in any public standard. What is said here follows reports of users with real
+CPUs; docs/how-to/connect-an-s7-plc.md names them.
+"""
+
+from __future__ import annotations
+
+from snap7.error import S7_PROTOCOL_ERROR_CODES
+from snap7.s7protocol import S7_RETURN_CODES
+
+from shmio.errors import ConnectorError
+
+# Return codes of an item.
+ITEM_OK = 0xFF
+ACCESS_DENIED, OUT_OF_RANGE, NO_SUCH_TYPE, OTHER_SIZE, NO_SUCH_OBJECT = 0x03, 0x05, 0x06, 0x07, 0x0A
+
+_NO_OPTIMIZED = "clear 'Optimized block access' in the block's attributes, compile and load"
+_ACCESS_REMEDY = (
+    "access denied: PUT/GET is disabled, or the protection level or an optimized block forbids it; enable "
+    "'Permit access with PUT/GET communication from remote partner' and 'Full access' in the CPU's protection "
+    f"settings, and {_NO_OPTIMIZED}"
+)
+_PROTECTION_REMEDY = (
+    "the CPU's protection level forbids it: choose 'Full access' in its protection settings, for it asks for a password"
+)
+
+# Errors of a whole job for which the table of python-snap7 has less to say.
+_ERRORS = {
+    0x8104: _ACCESS_REMEDY,  # S7-1200 and S7-1500 to all jobs with PUT/GET off, and for optimized blocks
+    0x8304: _ACCESS_REMEDY,  # S7-1200 and S7-1500 to writes with PUT/GET off
+    0xD241: _PROTECTION_REMEDY,
+    0xD602: _PROTECTION_REMEDY,
+}
+
+
+class RefusedError(ConnectorError):
+    """The controller understood the job, and said no.
+
+    ``code`` is the item's return code; 0 when the job was refused as a whole.
+    """
+
+    def __init__(self, message: str, code: int = 0) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+def explain_error(error: int) -> str:
+    """Say what the error class and code in an answer's header mean."""
+    if error in _ERRORS:
+        return f"{_ERRORS[error]} (error 0x{error:04X})"
+    known = S7_PROTOCOL_ERROR_CODES.get(error)
+    return f"the controller refused the request: {known or 'no text known'} (error 0x{error:04X})"
+
+
+def explain_read(code: int, db_number: int, size: int) -> str:
+    """Say what an item's return code means for a read of this block of ``size`` bytes."""
+    if code == OUT_OF_RANGE:
+        return (
+            f"DB{db_number} has no {size} bytes (item code 0x05): the layout is of another version of the block, "
+            f"export it again; or the block is optimized, then {_NO_OPTIMIZED}"
+        )
+    return f"DB{db_number}: {_explain_item(code)}"
+
+
+def explain_size(db_number: int, size: int, found: int) -> str:
+    """Say why a block of ``size`` bytes cannot be read whose first ``found`` bytes can."""
+    if not found:
+        return (
+            f"DB{db_number} has no byte that can be addressed (item code 0x05): it is optimized, {_NO_OPTIMIZED}; "
+            "or it is empty"
+        )
+    return (
+        f"DB{db_number} has no {size} bytes but {found} bytes (item code 0x05): the layout is of another version of "
+        "the block; export it again"
+    )
+
+
+def explain_write(code: int, db_number: int, last: int) -> str:
+    """Say what an item's return code means for a write up to the byte ``last``."""
+    if code == OUT_OF_RANGE:
+        return (
+            f"DB{db_number} has no byte {last} (item code 0x05): the layout is of another version of the block; export "
+            "it again"
+        )
+    return f"DB{db_number}: {_explain_item(code)}"
+
+
+def _explain_item(code: int) -> str:
+    where = f"(item code 0x{code:02X})"
+    if code == ACCESS_DENIED:
+        return f"{_ACCESS_REMEDY} {where}"
+    if code == NO_SUCH_OBJECT:
+        return (
+            f"the block does not exist {where}: check dbNumber, and that it is loaded; on an S7-1200 or S7-1500 it may "
+            f"be optimized, then {_NO_OPTIMIZED}"
+        )
+    if code in {NO_SUCH_TYPE, OTHER_SIZE}:
+        return f"the controller does not take data of this type or length {where}"
+    return f"the controller refused it: {S7_RETURN_CODES.get(code, 'no text known')} {where}"

@@ -1,0 +1,129 @@
+"""The controller's operating mode: one more job about once a second, which says when a PLC is in STOP. No I/O.
+
+The mode is in SZL W#16#0424 (Siemens, System Software for S7-300/400, reference manual, chapter on the system status
+list): the low half of the record's fourth byte; the high half is the mode before. Not every controller knows it; one
+that does not is asked no more, and goes unwatched.
+"""
+
+from __future__ import annotations
+
+import logging
+import struct
+
+from snap7.s7protocol import S7Protocol
+
+from shmio.connectors.s7 import pdu
+from shmio.connectors.s7.explain import ITEM_OK, RefusedError
+from shmio.errors import ConnectorError
+
+INTERVAL_NS = 1_000_000_000
+_PATIENCE = 2  # connections that may end while the question is open, before it is asked no more
+_SZL = 0x0424
+_USERDATA = 7
+_PARAMETERS = b"\x00\x01\x12\x08\x12\x84\x01"  # three bytes head, eight follow, an answer, of the group SZL, "read SZL"
+_PARAMETERS_SIZE = 12
+_DATA = struct.Struct(">BBH HH HH")  # return code, transport size, length; SZL and index; size and number of records
+
+_MODES = {
+    **dict.fromkeys((1, 2, 3, 4), "in STOP: its program does not run; switch it to RUN"),
+    **dict.fromkeys((5, 6, 7), "starting up: its program does not run yet"),
+    0xA: "on HOLD: its program stands at a breakpoint; end the test in the programming tool",
+    0xD: "DEFECTIVE; see its diagnostics buffer",
+    0xE: "in its self-test: its program does not run yet",
+    0xF: "without power",
+}
+"""Modes in which values do not change, in words. RUN is 8; a redundant pair's are 9, and B and C while it couples."""
+
+log = logging.getLogger("shmio.source")
+
+
+class ModeQuestion:
+    """Asks for the operating mode, and remembers the answer."""
+
+    count = 1
+
+    def __init__(self) -> None:
+        self._due_ns = self._deadline_ns = 0
+        self._known = False  # it has answered at least once
+        self._failures = 0
+        self._supported = True
+        self.sent = 0
+        self.complete = True
+        self.doubt = ""
+        """Why the values may stand still; empty while the program runs, or that is not known."""
+
+    def due(self, now_ns: int) -> bool:
+        """Whether to ask now."""
+        return self._supported and self.complete and now_ns >= self._due_ns
+
+    def overdue(self, now_ns: int) -> bool:
+        """Whether the answer should have come."""
+        return not self.complete and now_ns >= self._deadline_ns
+
+    def begin(self, now_ns: int, deadline_ns: int) -> None:
+        """Start a question."""
+        self._due_ns = now_ns + INTERVAL_NS
+        self._deadline_ns = deadline_ns
+        self.sent = 0
+        self.complete = False
+
+    def take(self, count: int, first: int) -> bytes:
+        """Give the request."""
+        self.sent = count
+        encoder = S7Protocol()
+        encoder.sequence = (first - 1) & 0xFFFF
+        return pdu.data_frame(encoder.build_read_szl_request(_SZL, 0))
+
+    def accept(self, index: int, frame: memoryview) -> None:  # noqa: ARG002 - there is one request
+        """Take the answer; ConnectorError if it is not one."""
+        self.complete = True
+        mode = parse_mode_answer(frame)
+        if mode is None:
+            self._give_up("does not tell it")
+            return
+        self._known = True
+        words = _MODES.get(mode)
+        self.doubt = f"the PLC is {words}" if words else ""
+
+    def lost(self) -> None:
+        """Note that the connection is gone: what it said is no longer known, nor, if it ends so again, is it asked."""
+        self.doubt = ""
+        self._due_ns = 0
+        if self.complete:
+            return
+        self.complete = True
+        self._failures += 1
+        if not self._known and self._failures == _PATIENCE:
+            self._give_up("does not answer when asked for it")
+
+    def _give_up(self, why: str) -> None:
+        self._supported = False
+        self.doubt = ""
+        log.debug("the controller %s: its operating mode; STOP will not be noticed", why)
+
+
+def parse_mode_answer(frame: memoryview) -> int | None:
+    """Check an answer to the question for SZL 0x0424; the operating mode, None if the controller has none to tell."""
+    kind, parameters_size, data_size = pdu.check_envelope(frame)
+    if kind != _USERDATA:
+        try:
+            pdu.check_answer(frame)
+        except RefusedError:
+            return None
+        raise ConnectorError("not an answer to 'read SZL'")
+    begin = pdu.USERDATA_END + _PARAMETERS_SIZE
+    if parameters_size != _PARAMETERS_SIZE or begin + data_size != len(frame) or data_size < 4:
+        raise ConnectorError("not an answer to 'read SZL': lengths that contradict each other")
+    parameters = frame[pdu.USERDATA_END : begin]
+    if parameters[:7] != _PARAMETERS:
+        raise ConnectorError("not an answer to 'read SZL'")
+    if parameters[10] or parameters[11] or frame[begin] != ITEM_OK:
+        return None
+    if data_size < _DATA.size:
+        raise ConnectorError("answer to 'read SZL' without its head")
+    _, _, length, szl, _, record_size, records = _DATA.unpack_from(frame, begin)
+    if length != data_size - 4 or szl != _SZL:
+        raise ConnectorError(f"not an answer to 'read SZL' 0x{_SZL:04X}")
+    if not records or record_size < 4 or data_size < _DATA.size + 4:
+        return None
+    return frame[begin + _DATA.size + 3] & 0x0F

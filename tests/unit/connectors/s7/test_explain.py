@@ -1,0 +1,49 @@
+"""Every refusal that a user meets must say what to do."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from shmio.connectors.s7 import explain
+
+
+@pytest.mark.parametrize(
+    ("code", "text"),
+    [
+        (0x0A, r"^DB201: the block does not exist \(item code 0x0A\).*dbNumber.*optimized"),
+        (0x05, r"^DB201 has no 2180 bytes \(item code 0x05\).*export it again.*Optimized"),
+        (0x03, r"access denied: PUT/GET is disabled.*Full access.*0x03"),
+        (0x06, "type or length"),
+        (0x07, "type or length"),
+        (0x01, "Hardware error"),
+        (0x77, "no text known"),
+    ],
+)
+def test_items_that_are_read(code: int, text: str) -> None:
+    assert re.search(text, explain.explain_read(code, 201, 2180))
+
+
+def test_items_that_are_written() -> None:
+    assert re.search(r"^DB201 has no byte 99 .*export it again", explain.explain_write(0x05, 201, 99))
+    assert re.search("access denied: PUT/GET", explain.explain_write(0x03, 201, 99))
+
+
+def test_the_size_of_a_block() -> None:
+    assert re.search(r"no 2180 bytes but 100 bytes .*export it again$", explain.explain_size(201, 2180, 100))
+    assert re.search("optimized, clear 'Optimized block access'", explain.explain_size(201, 2180, 0))
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (0x8104, r"PUT/GET.*\(error 0x8104\)$"),
+        (0x8304, "PUT/GET"),
+        (0xD241, "protection level.*Full access"),
+        (0x8500, "0x8500"),
+        (0xEEEE, "no text known"),
+    ],
+)
+def test_jobs(error: int, text: str) -> None:
+    assert re.search(text, explain.explain_error(error))
