@@ -131,7 +131,10 @@ class SectionEntry:
 def change_sections(
     memory: memoryview, header: Header, append: Sequence[SectionEntry], retire: Sequence[int] = ()
 ) -> None:
-    """Append entries and retire others, by their indices: readers see all of it or nothing. FormatError: no room."""
+    """Append entries, then retire others, by their indices. FormatError: no room.
+
+    Readers see all the new entries before any old one ends; of two blocks of one name the later one counts.
+    """
     generation, count = table_state(memory)
     if count + len(append) > header.section_capacity:
         raise FormatError(f"the section table is full: {count} of {header.section_capacity}")
@@ -139,11 +142,13 @@ def change_sections(
         at = header.sections_offset + index * SECTION_SIZE
         fields = (entry.kind, int(entry.retired), entry.offset, entry.size, entry.layout, 0)
         _SECTION.pack_into(memory, at, *fields, entry.name.encode(), entry.digest)
+    _set_table_state(memory, generation + 1, count + len(append))
+    if not retire:
+        return
     for index in retire:
         at = header.sections_offset + index * SECTION_SIZE
         _atomics.store64(memory, at, _atomics.load64(memory, at) | _RETIRED)
-    word = (count + len(append)) << 32 | (generation + 1) & 0xFFFFFFFF
-    _atomics.store64(memory, GENERATION_OFFSET, word)
+    _set_table_state(memory, generation + 2, count + len(append))
 
 
 def table_state(memory: memoryview) -> tuple[int, int]:
@@ -199,3 +204,7 @@ def text(field: bytes) -> str:
 def cut(message: str, size: int) -> bytes:
     """At most ``size`` bytes of UTF-8, whole characters only."""
     return message.encode()[:size].decode("utf-8", "ignore").encode()
+
+
+def _set_table_state(memory: memoryview, generation: int, count: int) -> None:
+    _atomics.store64(memory, GENERATION_OFFSET, count << 32 | generation & 0xFFFFFFFF)

@@ -98,10 +98,7 @@ class Segment:
             raise
 
     def _find_blocks(self) -> dict[str, Block]:
-        self._generation, count = header.table_state(self.memory)
-        if len(self.memory) < self.shared.size:  # it grew before the table did; what holds the old mapping keeps it
-            self.memory = memoryview(self.shared.map())
-        entries = header.read_sections(self.memory, self.header, count, self.shared.name)
+        entries = self._sections()
         blocks = {}
         for layout, described in enumerate(entries):
             if described.kind != SectionKind.LAYOUT or described.retired:
@@ -112,6 +109,16 @@ class Segment:
             known = self._known.get(layout)
             self._known[layout] = blocks[described.name] = known or self._block(entries, layout, parts)
         return blocks
+
+    def _sections(self) -> list[SectionEntry]:
+        """The section table of one generation."""
+        while True:
+            self._generation, count = header.table_state(self.memory)
+            if len(self.memory) < self.shared.size:  # it grew before the table did; blocks keep their old mapping
+                self.memory = memoryview(self.shared.map())
+            entries = header.read_sections(self.memory, self.header, count, self.shared.name)
+            if self.generation == self._generation:  # or else a change came between; there are at most a few
+                return entries
 
     def _block(self, entries: list[SectionEntry], layout_at: int, parts: dict[int, int]) -> Block:
         memory, name = self.memory, self.shared.name
@@ -157,15 +164,14 @@ class Segment:
         return True
 
     def change(self, add: Sequence[BlockSpec] = (), retire: Sequence[str] = ()) -> None:
-        """Add blocks and end others, in one step for all readers; the supervisor's alone.
+        """Add blocks and end others, which readers see in this order; the supervisor's alone.
 
         A name in both gets a new block in place of the old. Nothing has changed after SegmentError: no room in shared
         memory or in the section table.
         """
         at = align(self.shared.size, 64)
         size = at + sum(block.size for block in add)
-        count = header.table_state(self.memory)[1]
-        entries = header.read_sections(self.memory, self.header, count, self.shared.name)
+        entries = self._sections()
         if len(entries) + len(add) * SECTIONS_PER_BLOCK > self.header.section_capacity:
             raise SegmentError(
                 f"segment {self.shared.name} has no room for more changes: stop the instance and start it anew"

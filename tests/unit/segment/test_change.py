@@ -1,0 +1,137 @@
+"""A segment changed under its readers: blocks added, ended, and put in the place of others."""
+
+from __future__ import annotations
+
+import struct
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+import shmio
+from shmio.errors import NotRunningError, PathError, SegmentError
+from shmio.layout.model import Layout, Register
+from shmio.segment import BlockSpec, ProcessSpec, Quality, Segment, shm
+
+OLD = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))
+NEW = Layout(
+    "DB1", 1, 6, False, (Register("speed", "REAL", (), 0, None, 4, 1), Register("count", "INT", (), 4, None, 2, 1))
+)
+
+
+def spec(source: str, layout: Layout = OLD) -> BlockSpec:
+    return BlockSpec(source, layout, 20_000_000, 60_000_000_000, 1 << 16)
+
+
+@pytest.fixture
+def segment(instance: str) -> Iterator[Segment]:
+    with Segment.create(instance, [spec("cell"), spec("press")], [ProcessSpec("cell", "source")]) as segment:
+        yield segment
+        segment.unlink()
+
+
+def test_a_new_source_is_seen_by_who_is_attached(segment: Segment) -> None:
+    with shmio.attach(segment.instance) as reader:
+        before = reader.block("cell")
+        segment.change(add=[spec("robot")])
+        segment.writer("robot").publish(b"\0\7", cycle=1)
+        assert reader["robot/count"] == 7
+        assert reader.sources == ["cell", "press", "robot"]
+        assert reader.block("cell") is before, "what goes on stays the same object"
+
+
+def test_a_stream_goes_on_with_the_new_layout(segment: Segment) -> None:
+    old = segment.writer("cell")
+    with shmio.attach(segment.instance) as reader:
+        stream = reader.stream("cell", timeout_s=20)
+        old.publish(struct.pack(">h", 1), cycle=1)
+        assert next(stream)["count"] == 1
+        old.publish(struct.pack(">h", 2), cycle=2)
+        segment.change(add=[spec("cell", NEW)], retire=["cell"])
+        new = segment.writer("cell")
+        new.publish(struct.pack(">fh", 2.5, 3), cycle=3)
+        views = [next(stream), next(stream)]
+        assert [(view["count"], view.layout.size, view.missed) for view in views] == [(2, 2, 0), (3, 6, 0)]
+        assert reader["cell/speed"] == 2.5
+
+
+def test_who_waits_on_an_ended_block_is_woken_and_told(segment: Segment) -> None:
+    with shmio.attach(segment.instance) as reader:
+        stream = reader.stream("press")
+        problems: list[Exception] = []
+
+        def wait() -> None:
+            try:
+                next(stream)
+            except NotRunningError as error:
+                problems.append(error)
+
+        waiter = threading.Thread(target=wait)
+        waiter.start()
+        segment.change(retire=["press"])
+        waiter.join(20)
+        assert not waiter.is_alive()
+        assert "source 'press' was removed" in str(problems[0])
+        with pytest.raises(PathError, match="no source 'press'"):
+            reader.block("press")
+
+
+def test_a_held_block_says_that_it_is_over_and_keeps_its_last_frame(segment: Segment) -> None:
+    segment.writer("press").publish(b"\0\5", cycle=1)
+    with shmio.attach(segment.instance) as reader:
+        held = reader.block("press")
+        cursor = held.cursor(after=0)
+        segment.change(retire=["press"])
+        assert held.retired
+        frames = list(cursor)
+        assert [(frame.raw, frame.quality) for frame in frames] == [(b"\0\5", Quality.GOOD)]
+
+
+def test_no_room_changes_nothing(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    size, generation = segment.shared.size, segment.generation
+
+    def full(*_: object) -> None:
+        raise SegmentError("no room")
+
+    monkeypatch.setattr(shm.SharedObject, "allocate", full)
+    with pytest.raises(SegmentError, match="no room"):
+        segment.change(add=[spec("robot")], retire=["cell"])
+    assert (segment.shared.size, segment.generation) == (size, generation)
+    assert list(segment.blocks) == ["cell", "press"]
+    assert not segment.blocks["cell"].retired
+
+
+def test_changes_have_a_bound(segment: Segment) -> None:
+    for _ in range(40):
+        segment.change(add=[spec("cell")], retire=["cell"])
+    with pytest.raises(SegmentError, match="no room for more changes: stop the instance"):
+        segment.change(add=[spec("cell")], retire=["cell"])
+    with Segment.open(segment.instance) as late:
+        assert sorted(late.blocks) == ["cell", "press"]
+
+
+def test_readers_and_changes_at_once(segment: Segment) -> None:
+    """Whoever opens or refreshes sees whole tables only, though the object grows meanwhile."""
+    stop = threading.Event()
+    problems: list[BaseException] = []
+
+    def read() -> None:
+        try:
+            with Segment.open(segment.instance) as reader:
+                while not stop.is_set():
+                    reader.refresh()
+                    assert set(reader.blocks) >= {"cell"}
+                    with Segment.open(segment.instance) as other:
+                        assert set(other.blocks) >= {"cell"}
+        except BaseException as error:  # noqa: BLE001
+            problems.append(error)
+
+    readers = [threading.Thread(target=read) for _ in range(3)]
+    for reader in readers:
+        reader.start()
+    for turn in range(20):
+        segment.change(add=[spec("cell", (OLD, NEW)[turn % 2])], retire=["cell"])
+    stop.set()
+    for reader in readers:
+        reader.join()
+    assert problems == []

@@ -1,0 +1,133 @@
+"""Commands in their queues: whole or not at all, in order, never a wait, and nothing hostile gets through."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmio.errors import CommandError
+from shmio.layout.model import Layout, Register
+from shmio.segment import BlockSpec, Command, CommandSender, ProcessSpec, Segment, Write
+from shmio.segment._atomics import QUEUE_HEADER_SIZE, queue_pop, queue_push, store64
+from shmio.segment.commands import MAX_WRITES, CommandQueues, capacity_for
+
+LAYOUT = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))
+writes_strategy = st.lists(
+    st.one_of(
+        st.builds(Write, st.integers(0, 2**32 - 1), st.just(0), st.binary(min_size=1, max_size=40)),
+        st.builds(
+            Write,
+            st.integers(0, 2**32 - 1),
+            st.sampled_from([1 << bit for bit in range(8)]),
+            st.binary(min_size=1, max_size=1),
+        ),
+    ),
+    min_size=1,
+    max_size=20,
+)
+
+
+@pytest.fixture
+def segment(instance: str) -> Iterator[Segment]:
+    block = BlockSpec("cell", LAYOUT, 20_000_000, 10**9, 1 << 16)
+    with Segment.create(instance, [block], [ProcessSpec("cell", "source")]) as segment:
+        yield segment
+        segment.unlink()
+
+
+@given(writes_strategy, st.integers(0, 2**64 - 1), st.integers(0, 2**32 - 1), st.integers(-(2**63), 2**63 - 1))
+def test_a_command_comes_out_as_it_went_in(
+    writes: list[Write], number: int, incarnation: int, deadline_ns: int
+) -> None:
+    command = Command(3, number, incarnation, deadline_ns, tuple(writes))
+    assert Command.unpack(3, command.pack()) == command
+
+
+@given(st.binary(max_size=200))
+def test_what_is_no_command_is_refused(record: bytes) -> None:
+    try:
+        command = Command.unpack(0, record)
+    except ValueError:
+        return
+    assert command.pack()[: len(record)] == record[: len(command.pack())] or command.writes
+
+
+@given(st.lists(st.one_of(st.binary(max_size=120), st.none()), max_size=60))
+def test_a_queue_gives_back_what_it_took_in_order(actions: list[bytes | None]) -> None:
+    """Bytes: push. None: pop. Against a list, in a queue so small that it wraps and fills."""
+    capacity = 256
+    memory = bytearray(QUEUE_HEADER_SIZE + capacity)
+    expected: list[bytes] = []
+    for action in actions:
+        if action is None:
+            assert queue_pop(memory, 0, capacity) == (expected.pop(0) if expected else None)
+            continue
+        used = sum(8 + -(-len(record) // 8) * 8 for record in expected)
+        room = used + 8 + -(-len(action) // 8) * 8 <= capacity
+        assert queue_push(memory, 0, capacity, action) is room
+        if room:
+            expected.append(action)
+
+
+@given(st.integers(0, 2**64 - 1), st.integers(0, 2**64 - 1), st.binary(min_size=256, max_size=256))
+def test_a_broken_queue_is_emptied_and_then_works(head: int, tail: int, data: bytes) -> None:
+    memory = bytearray(QUEUE_HEADER_SIZE) + bytearray(data)
+    store64(memory, 0, head)
+    store64(memory, 64, tail)
+    for _ in range(40):
+        try:
+            if queue_pop(memory, 0, 256) is None:
+                break
+        except ValueError:
+            assert queue_pop(memory, 0, 256) is None
+            break
+    else:
+        raise AssertionError("it never ends")
+    assert queue_push(memory, 0, 256, b"next")
+    assert queue_pop(memory, 0, 256) == b"next"
+
+
+def test_each_writer_has_a_queue_and_all_ring_one_bell(segment: Segment) -> None:
+    queues = segment.blocks["cell"].commands
+    seen = queues.bell()
+    assert queues.push(0, b"zero")
+    assert queues.push(5, b"five")
+    assert queues.bell() != seen
+    assert (queues.pop(0), queues.pop(5), queues.pop(5)) == (b"zero", b"five", None)
+    with pytest.raises(ValueError, match="writer 8"):
+        queues.push(8, b"")
+
+
+def test_a_full_queue_is_an_error_to_the_sender(segment: Segment) -> None:
+    sender = CommandSender(segment.blocks["cell"], 2)
+    write = Write(0, 0, bytes(4000))
+    for _ in range(capacity_for(2) // 4096):
+        sender.submit([write], 0)
+    with pytest.raises(CommandError, match="cell: its command queue is full"):
+        sender.submit([write], 0)
+    with pytest.raises(CommandError, match="are the most"):
+        sender.submit([Write(0, 0, bytes(capacity_for(2)))], 0)
+    with pytest.raises(CommandError, match=f"1 to {MAX_WRITES} items"):
+        sender.submit([], 0)
+
+
+def test_a_command_names_the_process_it_is_for(segment: Segment) -> None:
+    block = segment.blocks["cell"]
+    segment.writer("cell")
+    segment.writer("cell")
+    number = CommandSender(block, 1).submit([Write(0, 0, b"\0\1")], 17)
+    record = block.commands.pop(1)
+    assert record is not None
+    assert Command.unpack(1, record) == Command(1, number, 2, 17, (Write(0, 0, b"\0\1"),))
+
+
+@pytest.mark.parametrize("geometry", [(0, 0, 0, 0), (8, 128, 100, 0), (8, 64, 128, 0), (2000, 256, 128, 0)])
+def test_a_section_that_contradicts_itself_is_refused(geometry: tuple[int, ...]) -> None:
+    memory = bytearray(4096)
+    for place, word in enumerate(geometry):
+        memory[4 * place : 4 * place + 4] = word.to_bytes(4, "little")
+    with pytest.raises(ValueError, match="queues"):
+        CommandQueues(memoryview(memory), 0, len(memory))

@@ -1,0 +1,99 @@
+"""Events and frames of a block are one order."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmio.layout.model import Layout, Register
+from shmio.segment import BlockSpec, BlockWriter, EventKind, ProcessSpec, Quality, Record, Segment
+from shmio.segment.events import EVENT_DATA_SIZE, EVENT_SIZE, EVENT_SLOTS, decode
+
+LAYOUT = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))
+
+
+@pytest.fixture
+def writer(instance: str) -> Iterator[BlockWriter]:
+    block = BlockSpec("cell", LAYOUT, 20_000_000, 10**9, 1 << 22)
+    with Segment.create(instance, [block], [ProcessSpec("cell", "source")]) as segment:
+        yield segment.writer("cell")
+        segment.unlink()
+
+
+def test_a_writer_begins_with_an_event_of_its_own(writer: BlockWriter) -> None:
+    first = writer.block.events.read(1)
+    assert first is not None
+    assert (first.kind, first.text, first.incarnation, first.frame) == (EventKind.STARTED, f"pid {os.getpid()}", 1, 0)
+
+
+def test_an_event_comes_out_as_it_went_in(writer: BlockWriter) -> None:
+    writer.publish(b"\0\1", cycle=7)
+    data = bytes(range(200))
+    number = writer.event(Record(EventKind.ACCEPTED, "grün", 4, 99, 3, 1, 12, 0, 200, data))
+    event = writer.block.events.read(number)
+    assert event is not None
+    assert (event.number, event.frame, event.cycle, event.quality) == (2, 1, 7, Quality.GOOD)
+    assert event[9:] == (4, 99, 3, 1, 12, 0, 200, data, "grün")
+    frame = writer.block.latest()
+    assert frame is not None
+    assert event.publish_ns - event.clock_ns == frame.publish_ns - frame.clock_ns
+
+
+def test_frames_and_events_name_each_other(writer: BlockWriter) -> None:
+    """Two threads write; a reader merges by the numbers alone and finds one order."""
+
+    def events() -> None:
+        for item in range(300):
+            writer.event(Record(EventKind.WRITTEN, command=1, item=item))
+
+    with ThreadPoolExecutor() as pool:
+        done = pool.submit(events)
+        for cycle in range(300):
+            writer.publish(b"\0\0", cycle=cycle)
+        done.result()
+    block = writer.block
+    frames = [block.read(n) for n in range(max(1, block.ring.head() - 250), block.ring.head() + 1)]
+    for frame in frames:
+        assert frame is not None
+        if frame.event:
+            before = block.events.read(frame.event)
+            assert before is not None
+            assert before.frame < frame.number
+        after = block.events.read(frame.event + 1)
+        assert after is None or after.frame >= frame.number
+
+
+def test_an_event_wakes_who_waits_for_frames(writer: BlockWriter) -> None:
+    ring = writer.block.ring
+    seen = ring.doorbell()
+    writer.event(Record(EventKind.QUALITY, "cable out"), quality=Quality.BAD)
+    assert ring.doorbell() != seen
+
+
+def test_a_reader_that_was_too_slow_knows_how_many_it_missed(writer: BlockWriter) -> None:
+    cursor = writer.block.events.cursor()
+    for item in range(EVENT_SLOTS + 500):
+        writer.event(Record(EventKind.WRITTEN, item=item))
+    items = [event.item for event in iter(cursor.poll, None)]
+    assert len(items) + cursor.missed == EVENT_SLOTS + 500
+    assert items == list(range(cursor.missed, EVENT_SLOTS + 500))
+
+
+def test_most_data_of_one_event(writer: BlockWriter) -> None:
+    number = writer.event(Record(EventKind.ACCEPTED, data=b"\xff" * EVENT_DATA_SIZE, size=EVENT_DATA_SIZE))
+    event = writer.block.events.read(number)
+    assert event is not None
+    assert event.data == b"\xff" * EVENT_DATA_SIZE
+
+
+@given(st.binary(min_size=EVENT_SIZE, max_size=EVENT_SIZE), st.integers(0, 255))
+def test_any_bytes_are_some_event(raw: bytes, quality: int) -> None:
+    """The bytes are another process's; a wrong one must not lead outside."""
+    event = decode((5, 1, 2, 3, 4, 1, quality, 0, 9, "", raw, None))
+    assert len(event.data) <= EVENT_DATA_SIZE
+    assert event.quality in Quality
