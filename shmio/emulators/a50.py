@@ -1,12 +1,14 @@
 """The A50 cell (D6.5, section 5.1): three robots, two engine test units, a conveyor for trolleys, a rack of frames.
 
-What moves when is told by the tables below and follows from the time alone. A cycle: a trolley brings two engines and
-is clamped; Robot_825 and Robot_850 carry them to the test units, whose two actuators each take hold; the units' axes
-run the test while Robot_800 fetches a frame from the rack; the engines go back, the frame is put on the trolley, the
-trolley leaves.
+What moves when is told by the tables of ``a50_plant`` and follows from the time alone. A cycle: a trolley brings two
+engines and is clamped; Robot_825 and Robot_850 carry them to the test units, whose two actuators each take hold; the
+units' axes run the test while Robot_800 fetches a frame from the rack; the engines go back, the frame is put on the
+trolley, the trolley leaves. An operator, which is whoever writes the orders below, can hold the cell and drive its
+actuators by hand.
 
 The real cell's I/O assignment is not public. This one is shmio's own, in the first bytes of ``Inputs`` and
-``Outputs``; what follows is left as clients wrote it. Words are big-endian, bits of a byte count from the lowest.
+``Outputs``; what follows, and the orders, are left as clients wrote them. Words are big-endian, bits of a byte count
+from the lowest.
 
 ======  ===========================================================================================================
 Inputs  plant to controller
@@ -23,12 +25,15 @@ Inputs  plant to controller
 =======  ==========================================================================================================
 Outputs  controller to plant
 =======  ==========================================================================================================
-0        heartbeat (0.5 s on, 0.5 s off), automatic mode, cycle runs, first step, test runs
-1        conveyor on, green lamp, white lamp (trolley moves)
+0        heartbeat (0.5 s on, 0.5 s off), automatic mode, cycle runs (off on hold), first step, test runs
+1        conveyor on, green lamp, white lamp (trolley moves), yellow lamp (hold)
 2        number of the step, UINT
 4        cycles finished, UDINT
 8, 9     valves of ``ACTUATORS`` in their order: one bit each
 10 - 12  Robot_800, Robot_825, Robot_850: drives on, task runs, work space released
+13       order: hold, which stops all motion where it is until it is taken back
+14, 15   order: valves of ``ACTUATORS`` to be open whatever the step says; the drive is at its end at once
+16, 17   order: valves to be closed, likewise; it wins over the one before
 =======  ==========================================================================================================
 """
 
@@ -37,143 +42,40 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Mapping
-from itertools import accumulate
 from typing import NamedTuple
 
-from shmio.emulators.motion import Pose, Track, smooth
+from shmio.emulators.a50_plant import (
+    ACTUATORS,
+    BEGINS,
+    CONVEYING,
+    CYCLE_S,
+    GRIPPERS,
+    HOME,
+    NC_AXES,
+    ROBOTS,
+    STEPS,
+    Actuator,
+)
+from shmio.emulators.motion import Pose, smooth
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout, Register
 
-# Number and duration in s of each step, in order.
-STEPS: Mapping[int, float] = {
-    10: 4.0,  # trolley in
-    20: 1.0,  # clamp it
-    30: 2.0,  # close the door
-    40: 8.0,  # Robot_825 loads test unit 1
-    50: 1.5,  # its actuators take hold
-    60: 8.0,  # Robot_850 loads test unit 2
-    70: 1.5,  # its actuators take hold
-    80: 12.0,  # test; Robot_800 fetches a frame
-    90: 1.5,  # actuators let go
-    100: 7.0,  # Robot_825 unloads unit 1
-    110: 7.0,  # Robot_850 unloads unit 2
-    120: 6.0,  # Robot_800 puts the frame on the trolley
-    130: 2.0,  # open the door
-    140: 1.0,  # release the trolley
-    150: 4.0,  # trolley out
-}
-_BEGINS = dict(zip(STEPS, accumulate(STEPS.values(), initial=0.0), strict=False))
-CYCLE_S = sum(STEPS.values())
-_CONVEYING = {10, 150}
-
-
-class Actuator(NamedTuple):
-    """A pneumatic drive: one valve, two limit switches."""
-
-    name: str
-    travel_s: float
-    spans: tuple[tuple[float, float], ...]
-    """Times in a cycle at which the valve opens (the drive extends) and closes (it retracts)."""
-
-    def valve(self, phase_s: float) -> bool:
-        """Whether the valve is open."""
-        return any(extend_s <= phase_s < retract_s for extend_s, retract_s in self.spans)
-
-    def switches(self, phase_s: float) -> int:
-        """Limit switches: bit 0 extended, bit 1 retracted; neither on the way."""
-        travel_s = self.travel_s
-        extended = any(extend_s + travel_s <= phase_s < retract_s for extend_s, retract_s in self.spans)
-        away = any(extend_s <= phase_s < retract_s + travel_s for extend_s, retract_s in self.spans)
-        return extended | (not away) << 1
-
-
-_TROLLEY_HELD = ((_BEGINS[20], _BEGINS[140]),)
-ACTUATORS = (
-    Actuator("trolley clamp left", 0.6, _TROLLEY_HELD),
-    Actuator("trolley clamp right", 0.7, _TROLLEY_HELD),
-    Actuator("door", 1.8, ((_BEGINS[30], _BEGINS[130]),)),
-    Actuator("test unit 1, clamp", 0.5, ((_BEGINS[50], _BEGINS[90] + 0.6),)),
-    Actuator("test unit 1, coupling", 0.5, ((_BEGINS[50] + 0.7, _BEGINS[90]),)),
-    Actuator("test unit 2, clamp", 0.5, ((_BEGINS[70], _BEGINS[90] + 0.6),)),
-    Actuator("test unit 2, coupling", 0.5, ((_BEGINS[70] + 0.7, _BEGINS[90]),)),
-    Actuator("gripper of Robot_800", 0.2, ((_BEGINS[80] + 5.0, _BEGINS[120] + 3.4),)),
-    Actuator(
-        "gripper of Robot_825",
-        0.2,
-        ((_BEGINS[40] + 2.5, _BEGINS[40] + 6.0), (_BEGINS[100] + 2.2, _BEGINS[100] + 5.3)),
-    ),
-    Actuator(
-        "gripper of Robot_850",
-        0.2,
-        ((_BEGINS[60] + 2.5, _BEGINS[60] + 6.0), (_BEGINS[110] + 2.2, _BEGINS[110] + 5.3)),
-    ),
-)
-_GRIPPERS = ACTUATORS[7:]
-
-# Degrees, as the printed limits of a KR 210's axes allow.
-AXIS_LIMITS = ((-185.0, 185.0), (-140.0, -5.0), (-120.0, 168.0), (-350.0, 350.0), (-122.5, 122.5), (-350.0, 350.0))
-HOME: Pose = (0.0, -90.0, 90.0, 0.0, 45.0, 0.0)
-_OVER_RACK: Pose = (96.0, -78.0, 98.0, 12.0, 52.0, -18.0)
-_AT_RACK: Pose = (96.0, -61.0, 112.0, 14.0, 40.0, -20.0)
-_FRAME_OVER_TROLLEY: Pose = (-38.0, -72.0, 96.0, -15.0, 61.0, 34.0)
-_FRAME_ON_TROLLEY: Pose = (-38.0, -54.0, 109.0, -17.0, 44.0, 36.0)
-_OVER_TROLLEY: Pose = (41.0, -80.0, 101.0, 5.0, 55.0, -42.0)
-_AT_TROLLEY: Pose = (41.0, -63.0, 118.0, 6.0, 37.0, -43.0)
-_OVER_UNIT: Pose = (-64.0, -85.0, 104.0, -8.0, 58.0, 72.0)
-_AT_UNIT: Pose = (-64.0, -69.0, 117.0, -9.0, 43.0, 74.0)
-
-
-def _carry(begin_s: float, to: tuple[Pose, Pose], away: tuple[Pose, Pose], slow: float) -> list[tuple[float, Pose]]:
-    """Keys of: from home to the part, hold it, to its place, let go, home. ``slow`` stretches the times."""
-    at = ((0, HOME), (1.5, to[0]), (2.3, to[1]), (2.8, to[1]), (3.5, to[0]), (5.2, away[0]), (5.9, away[1]),
-          (6.3, away[1]), (7.0, away[0]), (8.0, HOME))  # fmt: skip
-    return [(begin_s + time_s * slow, pose) for time_s, pose in at]
-
-
-def _transfers(load_s: float, unload_s: float) -> list[tuple[float, Pose]]:
-    trolley, unit = (_OVER_TROLLEY, _AT_TROLLEY), (_OVER_UNIT, _AT_UNIT)
-    return _carry(load_s, trolley, unit, 1.0) + _carry(unload_s, unit, trolley, 7 / 8)
-
-
-ROBOTS: Mapping[str, Track] = {
-    "Robot_800": Track(
-        [
-            (_BEGINS[80] + 1.0, HOME),
-            (_BEGINS[80] + 3.5, _OVER_RACK),
-            (_BEGINS[80] + 4.8, _AT_RACK),
-            (_BEGINS[80] + 5.3, _AT_RACK),
-            (_BEGINS[80] + 6.5, _OVER_RACK),
-            (_BEGINS[80] + 9.5, HOME),
-            (_BEGINS[120], HOME),
-            (_BEGINS[120] + 1.8, _FRAME_OVER_TROLLEY),
-            (_BEGINS[120] + 3.2, _FRAME_ON_TROLLEY),
-            (_BEGINS[120] + 3.7, _FRAME_ON_TROLLEY),
-            (_BEGINS[120] + 4.6, _FRAME_OVER_TROLLEY),
-            (_BEGINS[120] + 6.0, HOME),
-        ],
-        CYCLE_S,
-        breath=0.03,
-    ),
-    "Robot_825": Track(_transfers(_BEGINS[40], _BEGINS[100]), CYCLE_S, breath=0.03),
-    "Robot_850": Track(_transfers(_BEGINS[60], _BEGINS[110]), CYCLE_S, breath=0.03),
-}
-
-# Millimetres: parked, up to the engine when it is clamped, three strokes under load, back.
-_NC_STROKES = [(1.0, 180.0), (3.5, 320.0), (5.0, 240.0), (7.0, 350.0), (9.0, 210.0), (11.5, 180.0)]
-NC_AXES: Mapping[str, Track] = {
-    name: Track(
-        [(_BEGINS[clamp] + 0.5, (20.0,)), (_BEGINS[clamp] + 1.5, (180.0,))]
-        + [(_BEGINS[80] + time_s, (position,)) for time_s, position in _NC_STROKES]
-        + [(_BEGINS[90] + 0.5, (180.0,)), (_BEGINS[90] + 2.5, (20.0,))],
-        CYCLE_S,
-        breath=0.02,
-    )
-    for name, clamp in (("NCAchse1_Pos", 50), ("NCAchse2_Pos", 70))
-}
-
 _INPUTS = struct.Struct("> BB H BBBx 3sx hh hh")
 _OUTPUTS = struct.Struct("> BB H I 2s BBB")
+_ORDERS = struct.Struct("< B HH")  # behind the outputs; of two bytes, the first has the lower bits
 _REAL = struct.Struct(">f")
+
+
+class _Moment(NamedTuple):
+    time_s: float
+    phase_s: float
+    """Time in the cell's cycle, which stands still on hold."""
+    cycles: int
+    step: int
+    hold: bool
+    rests: list[Pose | None]
+    valves: list[bool]
+    switches: int
 
 
 class A50:
@@ -186,60 +88,88 @@ class A50:
         # The printed DB201 has a space for the underscore in some names.
         registers = {register.path.replace(" ", "_"): register for register in layout.registers}
         self._inputs = _register(registers, "Inputs", "BYTE", _INPUTS.size).offset
-        self._outputs = _register(registers, "Outputs", "BYTE", _OUTPUTS.size).offset
+        self._outputs = _register(registers, "Outputs", "BYTE", _OUTPUTS.size + _ORDERS.size).offset
         self._axes = [
             (track, [_register(registers, f"{robot}/Axs{axis}_Pos", "REAL", 1).offset for axis in range(1, 7)])
             for robot, track in ROBOTS.items()
         ]
         self._axes += [(track, [_register(registers, name, "REAL", 1).offset]) for name, track in NC_AXES.items()]
+        self._before_s: float | None = None
+        self._held_s = 0.0
 
     def step(self, time_s: float, frame: bytearray) -> None:
         """Put axes, inputs and outputs of this time into the frame."""
+        hold, opened, closed = _ORDERS.unpack_from(frame, self._outputs + _OUTPUTS.size)
+        hold &= 1
+        if hold and self._before_s is not None:
+            self._held_s += time_s - self._before_s
+        self._before_s = time_s
+        cell_s = time_s - self._held_s
         for track, offsets in self._axes:
-            for offset, position in zip(offsets, track.pose(time_s), strict=True):
+            for offset, position in zip(offsets, track.pose(cell_s), strict=True):
                 _REAL.pack_into(frame, offset, position)
-        phase_s = time_s % CYCLE_S
-        number = max(number for number, begin_s in _BEGINS.items() if begin_s <= phase_s)
-        self._write_inputs(time_s, phase_s, number, frame)
-        self._write_outputs(time_s, phase_s, number, frame)
+        phase_s = cell_s % CYCLE_S
+        drives = [
+            _drive(actuator, phase_s, opened >> place & 1, closed >> place & 1)
+            for place, actuator in enumerate(ACTUATORS)
+        ]
+        now = _Moment(
+            time_s=time_s,
+            phase_s=phase_s,
+            cycles=int(cell_s // CYCLE_S) & 0xFFFF_FFFF,
+            step=max(number for number, begin_s in BEGINS.items() if begin_s <= phase_s),
+            hold=bool(hold),
+            rests=[track.rest(cell_s) for track in ROBOTS.values()],
+            valves=[valve for valve, _ in drives],
+            switches=sum(switches << 2 * place for place, (_, switches) in enumerate(drives)),
+        )
+        self._write_inputs(now, frame)
+        self._write_outputs(now, frame)
 
-    def _write_inputs(self, time_s: float, phase_s: float, number: int, frame: bytearray) -> None:
-        heartbeat = (time_s - 0.04) % 1 < 0.5  # comes back after the plant's own delay
-        trolley_mm = 3000 * (smooth(phase_s / STEPS[10]) + smooth((phase_s - _BEGINS[150]) / STEPS[150]))
-        rests = [track.rest(time_s) for track in ROBOTS.values()]
-        switches = sum(actuator.switches(phase_s) << 2 * place for place, actuator in enumerate(ACTUATORS))
-        (torque_1, speed_1), (torque_2, speed_2) = (_load(phase_s - _BEGINS[80], scale) for scale in (1.0, 0.93))
+    def _write_inputs(self, now: _Moment, frame: bytearray) -> None:
+        heartbeat = (now.time_s - 0.04) % 1 < 0.5  # comes back after the plant's own delay
+        phase_s = now.phase_s
+        trolley_mm = 3000 * (smooth(phase_s / STEPS[10]) + smooth((phase_s - BEGINS[150]) / STEPS[150]))
+        conveying = now.step in CONVEYING and not now.hold
+        (torque_1, speed_1), (torque_2, speed_2) = (_load(phase_s - BEGINS[80], scale) for scale in (1.0, 0.93))
         _INPUTS.pack_into(
             frame,
             self._inputs,
             _bits(True, True, True, True, heartbeat),
-            _bits(trolley_mm < 50, abs(trolley_mm - 3000) < 50, trolley_mm > 5950, number in _CONVEYING),
+            _bits(trolley_mm < 50, abs(trolley_mm - 3000) < 50, trolley_mm > 5950, conveying),
             round(trolley_mm),
             *(
-                _bits(True, rest is None, rest == HOME, gripper.valve(phase_s))
-                for rest, gripper in zip(rests, _GRIPPERS, strict=True)
+                _bits(True, rest is None and not now.hold, rest == HOME, gripper)
+                for rest, gripper in zip(now.rests, now.valves[GRIPPERS], strict=True)
             ),
-            switches.to_bytes(3, "little"),
+            now.switches.to_bytes(3, "little"),
             torque_1,
             torque_2,
             speed_1,
             speed_2,
         )
 
-    def _write_outputs(self, time_s: float, phase_s: float, number: int, frame: bytearray) -> None:
-        rests = [track.rest(time_s) for track in ROBOTS.values()]
-        valves = _bits(*(actuator.valve(phase_s) for actuator in ACTUATORS))
-        conveying = number in _CONVEYING
+    def _write_outputs(self, now: _Moment, frame: bytearray) -> None:
+        conveying = now.step in CONVEYING
         _OUTPUTS.pack_into(
             frame,
             self._outputs,
-            _bits(time_s % 1 < 0.5, True, True, number == 10, number == 80),
-            _bits(conveying, not conveying, conveying),
-            number,
-            int(time_s // CYCLE_S) & 0xFFFF_FFFF,
-            valves.to_bytes(2, "little"),
-            *(_bits(True, rest != HOME, rest == HOME) for rest in rests),
+            _bits(now.time_s % 1 < 0.5, True, not now.hold, now.step == 10, now.step == 80),
+            _bits(conveying and not now.hold, not conveying and not now.hold, conveying, now.hold),
+            now.step,
+            now.cycles,
+            _bits(*now.valves).to_bytes(2, "little"),
+            *(_bits(True, rest != HOME, rest == HOME) for rest in now.rests),
         )
+
+
+def _drive(actuator: Actuator, phase_s: float, opened: int, closed: int) -> tuple[bool, int]:
+    """Valve and limit switches; an order puts the drive at its end at once, for nobody knows when it was given."""
+    if closed:
+        return False, 0b10
+    if opened:
+        return True, 0b01
+    return actuator.valve(phase_s), actuator.switches(phase_s)
 
 
 def _bits(*flags: bool) -> int:

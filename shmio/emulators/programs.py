@@ -21,8 +21,8 @@ class Program(Protocol):
     def step(self, time_s: float, frame: bytearray) -> None:
         """Run the cycle of time ``time_s`` (since the program's start) on the block, in place.
 
-        The same time on the same frame gives the same frame. What the program does not drive, it leaves as clients
-        wrote it. ``frame`` keeps its length.
+        The same times on the same frames give the same frames. What the program does not drive, it leaves as clients
+        wrote it; it may obey what is written there. ``frame`` keeps its length.
         """
 
 

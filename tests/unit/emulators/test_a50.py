@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from shmio.emulators.a50 import A50, ACTUATORS, AXIS_LIMITS, CYCLE_S, STEPS
+from shmio.emulators.a50 import A50
+from shmio.emulators.a50_plant import ACTUATORS, AXIS_LIMITS, CYCLE_S, STEPS
 from shmio.errors import ConfigError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Layout
@@ -164,3 +165,53 @@ def test_names_the_register_that_is_missing_or_wrong(db201: Layout, path: str) -
     other = replace(db201, registers=tuple(replace(r, type="DINT") if r.path == path else r for r in db201.registers))
     with pytest.raises(ConfigError, match="DINT"):
         A50(other)
+
+
+# -- orders ------------------------------------------------------------------------------------------------------------
+
+
+def follow(layout: Layout, orders: dict[float, bytes], end_s: float) -> dict[float, bytes]:
+    """Run from the start; from each time on, ``orders`` stand in Outputs 13 to 17. Frames by time in ms."""
+    program = A50(layout)
+    frame = bytearray(layout.size)
+    frames = {}
+    for cycle in range(round(end_s / PERIOD_S)):
+        time_ms = round(cycle * PERIOD_S * 1000)
+        frame[1013:1018] = orders.get(time_ms, bytes(frame[1013:1018]))
+        program.step(cycle * PERIOD_S, frame)
+        frames[time_ms] = bytes(frame)
+    return frames
+
+
+HOLD, GO = b"\x01\0\0\0\0", bytes(5)
+
+
+def test_hold_stops_all_motion_until_it_is_taken_back(db201: Layout) -> None:
+    """In the middle of a robot's move: everything stands, the heartbeat goes on, and the move is finished later."""
+    free = follow(db201, {}, 9)
+    held = follow(db201, {8000: HOLD, 10_000: GO}, 11)
+    assert axes(held[8000]) == axes(free[7980])  # the order came before that cycle
+    assert {axes(held[time_ms]) for time_ms in range(8000, 10_000, 20)} == {axes(held[8000])}
+    assert {bit(held[time_ms], 1000, 0) for time_ms in range(8000, 10_000, 20)} == {True, False}
+    assert (bit(free[8000], 5, 1), bit(held[8000], 5, 1)) == (True, False)
+    assert (bit(free[8000], 1000, 2), bit(held[8000], 1000, 2)) == (True, False)
+    assert (bit(free[8000], 1001, 3), bit(held[8000], 1001, 3)) == (False, True)
+    assert axes(held[10_980]) == pytest.approx(axes(free[8980]))
+    assert held[10_980][1000:1013] == free[8980][1000:1013]
+
+
+def test_actuators_obey_orders_and_go_back(db201: Layout) -> None:
+    place = next(place for place, actuator in enumerate(ACTUATORS) if actuator.name == "gripper of Robot_825")
+
+    def state(frame: bytes) -> tuple[bool, int, bool]:
+        switches = int.from_bytes(frame[8:11], "little") >> 2 * place & 3
+        return bit(frame, 1008 + place // 8, place % 8), switches, bit(frame, 5, 3)
+
+    mask = (1 << place).to_bytes(2, "little")
+    frames = follow(
+        db201, {1000: b"\0" + mask + b"\0\0", 2000: b"\0" + mask + mask, 3000: b"\0\0\0" + mask, 4000: GO}, 5
+    )
+    assert state(frames[980]) == (False, 2, False)
+    assert state(frames[1000]) == (True, 1, True)
+    assert [state(frames[time_ms]) for time_ms in (2000, 3000, 4000)] == [(False, 2, False)] * 3
+    assert frames[1500][1008:1010] == mask  # no other
