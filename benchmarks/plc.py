@@ -16,8 +16,8 @@ from collections.abc import Callable
 from common import tell, wait_for_parent
 
 from shmio.config.address import Address
-from shmio.emulators import s7_jobs
 from shmio.emulators.s7 import S7Server
+from shmio.emulators.s7_jobs import MAX_PDU_SIZE, Traits
 
 NUMBER = 201
 SIZE = 2180
@@ -39,11 +39,11 @@ def stamp(server: S7Server, block: bytearray, mean_s: float, wait: Callable[[flo
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--pdu", type=int, default=s7_jobs.MAX_PDU_SIZE, help="largest PDU to grant, in bytes")
+    parser.add_argument("--pdu", type=int, default=MAX_PDU_SIZE, help="largest PDU to grant, in bytes")
+    parser.add_argument("--jobs", type=int, default=8, help="most jobs to grant at once")
     parser.add_argument("--stamp-ms", type=float)
     arguments = parser.parse_args()
-    s7_jobs.MAX_PDU_SIZE = arguments.pdu  # no setting of the emulator, for only a benchmark wants less than it can
-    server = S7Server(Address("127.0.0.1", 0))
+    server = S7Server(Address("127.0.0.1", 0), traits=Traits(arguments.pdu, arguments.jobs))
     block = bytearray(still_block())
     server.add_block(NUMBER, block)
     server.start()

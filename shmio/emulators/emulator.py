@@ -12,6 +12,7 @@ from snap7.server import CPUState
 from shmio.config.address import Address
 from shmio.emulators.programs import program
 from shmio.emulators.s7 import S7Server
+from shmio.emulators.s7_jobs import Traits
 from shmio.errors import ConfigError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
@@ -26,11 +27,19 @@ class Emulator:
     """
 
     def __init__(
-        self, layout: Layout, program_name: str, listen: Address, *, db_number: int | None = None, max_clients: int = 16
+        self,
+        layout: Layout,
+        program_name: str,
+        listen: Address,
+        *,
+        db_number: int | None = None,
+        max_clients: int = 16,
+        traits: Traits | None = None,
     ) -> None:
         """Prepare to serve the block as DB ``db_number``, by default the layout's own.
 
-        ConfigError: no such program, the layout does not suit it, or there is no number.
+        ``traits``: what it grants, and what is wrong with it. ConfigError: no such program, the layout does not suit
+        it, or there is no number.
         """
         number = db_number if db_number is not None else layout.number
         if number is None:
@@ -38,7 +47,7 @@ class Emulator:
         self._program = program(program_name, layout)
         self._period_s = self._program.period_ms / 1000
         self._frame, _ = initial_frame(layout)
-        self._server = S7Server(listen, max_clients=max_clients)
+        self._server = S7Server(listen, max_clients=max_clients, traits=traits)
         self._server.add_block(number, self._frame)
         self._thread = threading.Thread(target=self._run, name=f"program-{program_name}", daemon=True)
         self._stopping = threading.Event()

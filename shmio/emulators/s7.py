@@ -1,7 +1,8 @@
 """An S7 server for emulated controllers: python-snap7's, with what is wrong or missing in it mended.
 
 Kept from python-snap7 3.3: the memory areas, the ISO-on-TCP handshake, system status lists, block lists, clock,
-and the start and stop of the emulated CPU. Replaced, because of what was measured and found:
+and the start and stop of the emulated CPU. Added: the system status list that tells the operating mode. Replaced,
+because of what was measured and found:
 
 - jobs (set-up, read, write) are answered by ``s7_jobs``: the original grants one job and 480 bytes, writes a bit
   as a whole byte, stores only the first item of a write of several, stores the part that fits of a write past the
@@ -27,7 +28,7 @@ from snap7.server import CPUState, Server, ServerISOConnection, ServerState
 from snap7.type import SrvArea
 
 from shmio.config.address import Address
-from shmio.emulators.s7_jobs import MAX_JOBS, MAX_PDU_SIZE, NOT_AVAILABLE, Jobs, Memory, refusal
+from shmio.emulators.s7_jobs import MAX_PDU_SIZE, NOT_AVAILABLE, Jobs, Memory, Traits, refusal
 from shmio.errors import ConfigError, EndpointError, ShmioError
 
 logger = logging.getLogger(__name__)
@@ -36,8 +37,11 @@ _TPKT = struct.Struct(">BxH")
 _DT = b"\x02\xf0\x80"  # COTP data, and the end of the message: PDUs fit a TPDU, so clients have no reason to split them
 _FRAME_OVERHEAD = 7
 _LONGEST_FRAME = MAX_PDU_SIZE + _FRAME_OVERHEAD
-_INBOX_SIZE = MAX_JOBS * _LONGEST_FRAME
+_INBOX_SIZE = 8 * _LONGEST_FRAME
+_ANSWERS_AT_ONCE = 8  # then they are sent, whether or not more requests have come
 _SEND_TIMEOUT_S = 5
+_MODE_LIST = 0x0424
+_RUN, _STOP = 0x08, 0x04  # operating modes in that list
 _JOIN_TIMEOUT_S = 10
 
 
@@ -47,8 +51,9 @@ class S7Server(Server):
     ``lock`` is held over each job: who changes blocks while holding it changes them between jobs.
     """
 
-    def __init__(self, address: Address, *, max_clients: int = 16) -> None:
+    def __init__(self, address: Address, *, max_clients: int = 16, traits: Traits | None = None) -> None:
         super().__init__(log=False, max_clients=max_clients)
+        self._traits = traits or Traits()
         self.host, self.port = address.host, address.port
         self._memory = Memory(self.memory_areas)
         self.lock = self._memory.lock
@@ -186,7 +191,7 @@ class S7Server(Server):
             return
         client.setblocking(True)  # a quiet client may stay, but one that takes no answers may not
         client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", _SEND_TIMEOUT_S, 0))
-        jobs = Jobs(self._memory)
+        jobs = Jobs(self._memory, self._traits)
         inbox = memoryview(bytearray(_INBOX_SIZE))
         end = 0
         while received := client.recv_into(inbox[end:]):
@@ -207,7 +212,7 @@ class S7Server(Server):
                     return
                 answers += (_TPKT.pack(3, len(answer) + _FRAME_OVERHEAD), _DT, answer)
                 start += length
-                if len(answers) >= 3 * MAX_JOBS:
+                if len(answers) >= 3 * _ANSWERS_AT_ONCE:
                     client.sendall(b"".join(answers))
                     answers.clear()
             if answers:
@@ -227,3 +232,12 @@ class S7Server(Server):
         if kind == S7PDUType.REQUEST:
             return refusal(int.from_bytes(request_data[4:6], "big"), NOT_AVAILABLE)
         return None
+
+    def _get_szl_data(self, szl_id: int, szl_index: int) -> bytes | None:
+        """Tell the operating mode as the reference manual of S7-300/400 has it: one record of 20 bytes."""
+        if szl_id != _MODE_LIST:
+            found: bytes | None = super()._get_szl_data(szl_id, szl_index)
+            return found
+        mode, before = (_RUN, _STOP) if self.cpu_state == CPUState.RUN else (_STOP, _RUN)
+        record = struct.pack(">HBB16x", 0x4302 if mode == _RUN else 0x4303, 0xFF, before << 4 | mode)
+        return struct.pack(">HH", len(record), 1) + record

@@ -2,6 +2,7 @@
 
 Names and codes follow Wireshark's S7 dissector; behaviour follows an S7-1500: items fail one by one, each with a return
 code of its own, while a job that is wrong as a whole, or whose answer does not fit the PDU, fails with a header error.
+:class:`Traits` makes it grant less, or refuse as a controller does that is not set up for such clients.
 """
 
 from __future__ import annotations
@@ -9,18 +10,20 @@ from __future__ import annotations
 import struct
 import threading
 from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
 from typing import NamedTuple
 
 from snap7.datatypes import S7Area, S7WordLen
 
-MAX_JOBS = 8
+MAX_JOBS = 32
 MAX_PDU_SIZE = 960
 
 JOB = 1
 READ, WRITE, SETUP = 0x04, 0x05, 0xF0
 NOT_AVAILABLE, BAD_JOB = 0x8104, 0x8500  # header errors: function not available, PDU of a wrong size
 
-_OK, _OUT_OF_RANGE, _NO_SUCH_TYPE, _TYPE_MISMATCH, _NO_SUCH_OBJECT = 0xFF, 0x05, 0x06, 0x07, 0x0A
+_OK, _DENIED, _OUT_OF_RANGE, _NO_SUCH_TYPE, _TYPE_MISMATCH, _NO_SUCH_OBJECT = 0xFF, 0x03, 0x05, 0x06, 0x07, 0x0A
 
 _JOB = struct.Struct(">BB2xHHH")
 _ANSWER = struct.Struct(">BBHHHHH")
@@ -41,6 +44,32 @@ _TYPES = {
 }
 _LENGTH_IN_BITS = {0x04, 0x05}
 _AREAS = {int(area): area for area in S7Area}
+
+
+class Fault(Enum):
+    """What keeps clients from the data."""
+
+    PUT_GET_OFF = "PUT/GET is not permitted"
+    PROTECTED = "the protection level allows no access"
+    WRITE_PROTECTED = "the protection level allows reading only"
+    OPTIMIZED = "the blocks are optimized: they have no addresses"
+
+
+@dataclass(frozen=True)
+class Traits:
+    """How an emulated controller differs from a willing S7-1500."""
+
+    max_pdu_size: int = MAX_PDU_SIZE
+    """The largest PDU it grants, in bytes."""
+    max_jobs: int = 8
+    """The most jobs it grants to be under way at once."""
+    fault: Fault | None = None
+    block_size: int | None = None
+    """Bytes that a data block seems to have at most, as one of an older version; None: all."""
+
+    def __post_init__(self) -> None:
+        if not (100 <= self.max_pdu_size <= MAX_PDU_SIZE and 1 <= self.max_jobs <= MAX_JOBS):
+            raise ValueError(f"a PDU has 100 to {MAX_PDU_SIZE} bytes, and 1 to {MAX_JOBS} jobs are granted: {self}")
 
 
 class _MalformedJobError(Exception):
@@ -70,8 +99,9 @@ class Memory:
 class Jobs:
     """Answers one client's jobs; holds what was agreed with that client."""
 
-    def __init__(self, memory: Memory) -> None:
+    def __init__(self, memory: Memory, traits: Traits) -> None:
         self._memory = memory
+        self._traits = traits
         self.pdu_size = 0  # until set up, no answer fits
 
     def answer(self, pdu: memoryview) -> bytes | None:
@@ -84,6 +114,8 @@ class Jobs:
             return None
         if len(pdu) != 10 + parameter_size + data_size or parameter_size < 2:
             return refusal(reference, BAD_JOB)
+        if function != SETUP and self._traits.fault is Fault.PUT_GET_OFF:
+            return refusal(reference, NOT_AVAILABLE)
         parameters, data = pdu[10 : 10 + parameter_size], pdu[10 + parameter_size :]
         try:
             if function == READ:
@@ -98,15 +130,16 @@ class Jobs:
         if len(parameters) != 8:
             raise _MalformedJobError
         calling, called, pdu_size = struct.unpack_from(">HHH", parameters, 2)
-        self.pdu_size = min(pdu_size, MAX_PDU_SIZE)
-        granted = struct.pack(">BxHHH", SETUP, min(calling, MAX_JOBS), min(called, MAX_JOBS), self.pdu_size)
+        self.pdu_size = min(pdu_size, self._traits.max_pdu_size)
+        jobs = self._traits.max_jobs
+        granted = struct.pack(">BxHHH", SETUP, min(calling, jobs), min(called, jobs), self.pdu_size)
         return _ack(reference, granted)
 
     def _read(self, reference: int, parameters: memoryview) -> bytes:
         parts = []
         size = 14  # of the answer's PDU
         with self._memory.lock:
-            for item in self._items(parameters):
+            for item in self._items(parameters, Fault.PROTECTED):
                 if size & 1:  # items begin at even places
                     parts.append(b"\0")
                     size += 1
@@ -119,16 +152,19 @@ class Jobs:
     def _write(self, reference: int, parameters: memoryview, data: memoryview) -> bytes:
         codes = bytearray()
         with self._memory.lock:
-            items = self._items(parameters)
+            items = self._items(parameters, Fault.PROTECTED, Fault.WRITE_PROTECTED)
             values = _values(data, len(items))  # all of them, so that a malformed job stores nothing
             for item, value in zip(items, values, strict=True):
                 codes.append(_write_item(item, value))
         return _ack(reference, bytes((WRITE, len(items))), codes)
 
-    def _items(self, parameters: memoryview) -> list[_Item]:
+    def _items(self, parameters: memoryview, *denials: Fault) -> list[_Item]:
         if not parameters[1] or len(parameters) != 2 + _ITEM.size * parameters[1]:
             raise _MalformedJobError
-        return [self._item(_ITEM.unpack_from(parameters, at)) for at in range(2, len(parameters), _ITEM.size)]
+        items = [self._item(_ITEM.unpack_from(parameters, at)) for at in range(2, len(parameters), _ITEM.size)]
+        if self._traits.fault in denials:
+            return [_Item(_DENIED, bytearray(), 0, 0, 0, item.type) for item in items]
+        return items
 
     def _item(self, fields: tuple[int, ...]) -> _Item:
         specification, length, syntax, kind, count, number, place = fields
@@ -143,9 +179,16 @@ class Jobs:
         size = count * _TYPES[S7WordLen(kind)][0]
         if not count or (kind == _BIT and count != 1):
             return _Item(_TYPE_MISMATCH, nothing, 0, 0, 0, kind)
-        if start + size > len(area) or (bit and kind != _BIT):
+        if start + size > self._size(known, area) or (bit and kind != _BIT):
             return _Item(_OUT_OF_RANGE, nothing, 0, 0, 0, kind)
         return _Item(_OK, area, start, size, bit, kind)
+
+    def _size(self, kind: S7Area | None, area: bytearray) -> int:
+        if kind is not S7Area.DB:
+            return len(area)
+        if self._traits.fault is Fault.OPTIMIZED:
+            return 0
+        return len(area) if self._traits.block_size is None else min(self._traits.block_size, len(area))
 
 
 def refusal(reference: int, error: int) -> bytes:

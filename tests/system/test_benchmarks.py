@@ -35,3 +35,10 @@ def test_a_benchmark_compares(benchmark: str, tables: int, ours: str, peers: set
     assert [(name, ratio) for name, _, _, ratio in found].count((ours, "")) == tables
     for peer in peers:
         assert sum(name == peer and ratio != "" for name, _, _, ratio in found) == tables
+
+
+def test_cycles_under_way_are_counted() -> None:
+    command = [sys.executable, "benchmarks/s7_cycle.py", "--quick"]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100, check=False)
+    assert (run.returncode, run.stderr) == (0, ""), run.stdout
+    assert len(re.findall(r"^[0-9]+ jobs: [124] under way +[1-9]", run.stdout, re.MULTILINE)) == 3

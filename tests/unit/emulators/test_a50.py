@@ -170,8 +170,8 @@ def test_names_the_register_that_is_missing_or_wrong(db201: Layout, path: str) -
 # -- orders ------------------------------------------------------------------------------------------------------------
 
 
-def follow(layout: Layout, orders: dict[float, bytes], end_s: float) -> dict[float, bytes]:
-    """Run from the start; from each time on, ``orders`` stand in Outputs 13 to 17. Frames by time in ms."""
+def follow(layout: Layout, orders: dict[int, bytes], end_s: float) -> dict[int, bytes]:
+    """Run from the start; from each time in ms on, its orders stand in Outputs 13 to 17. Frames by time in ms."""
     program = A50(layout)
     frame = bytearray(layout.size)
     frames = {}

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from snap7.datatypes import S7Area
 
-from shmio.emulators.s7_jobs import Jobs, Memory
+from shmio.emulators.s7_jobs import Fault, Jobs, Memory, Traits
 
 BIT, BYTE, CHAR, WORD, INT, DWORD, DINT, REAL = range(1, 9)
 DB = 0x84
@@ -46,7 +46,7 @@ def block() -> bytearray:
 
 @pytest.fixture
 def jobs(block: bytearray) -> Jobs:
-    jobs = Jobs(Memory({(S7Area.DB, 1): block, (S7Area.MK, 0): bytearray(b"flags")}))
+    jobs = Jobs(Memory({(S7Area.DB, 1): block, (S7Area.MK, 0): bytearray(b"flags")}), Traits())
     assert jobs.answer(SETUP) == bytes.fromhex("32 03 0000 1234 0008 0000 0000 f0 00 0008 0008 03c0")
     return jobs
 
@@ -69,7 +69,7 @@ def error(answer: bytes | None) -> int:
 
 
 def test_grants_no_more_than_asked() -> None:
-    jobs = Jobs(Memory({}))
+    jobs = Jobs(Memory({}), Traits())
     answer = jobs.answer(job(struct.pack(">BxHHH", 0xF0, 1, 2, 240)))
     assert answer is not None
     assert answer[14:] == struct.pack(">HHH", 1, 2, 240)
@@ -117,7 +117,7 @@ def test_reads_to_the_last_byte_and_not_past_it(jobs: Jobs) -> None:
 
 
 def test_answer_must_fit_the_pdu(block: bytearray) -> None:
-    jobs = Jobs(Memory({(S7Area.DB, 1): block}))
+    jobs = Jobs(Memory({(S7Area.DB, 1): block}), Traits())
     assert error(jobs.answer(read(item(BYTE, 1, 0)))) == 0x8500  # before set-up
     jobs.answer(job(struct.pack(">BxHHH", 0xF0, 1, 1, 100)))
     assert len(payload(jobs.answer(read(item(BYTE, 82, 0))))) == 86
@@ -202,7 +202,7 @@ VALID = [bytes(frame) for frame in (SETUP, read(item(BYTE, 9, 3)), write((item(B
 )
 def test_noise_gives_an_answer_or_none(noise: bytes) -> None:
     block = bytearray(100)
-    jobs = Jobs(Memory({(S7Area.DB, 1): block}))
+    jobs = Jobs(Memory({(S7Area.DB, 1): block}), Traits())
     jobs.answer(SETUP)
     answer = jobs.answer(memoryview(noise))
     assert answer is None or 12 <= len(answer) <= 960

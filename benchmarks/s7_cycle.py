@@ -1,0 +1,88 @@
+"""Polls of DB201 a second, of the 1,000 asked for, over a link of 1 ms: one read under way at a time, and more.
+
+The source's own loop polls into a segment, as in an instance. Controller (PDU 480, so a read is 5 jobs), link and
+source are processes of their own.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+from contextlib import ExitStack
+from functools import partial
+
+from common import Child, begin, db201, interleave, table
+
+from shmio.config.address import Address
+from shmio.connectors.loop import SourceLoop, WallClock
+from shmio.connectors.s7.connector import S7Connector
+from shmio.connectors.s7.options import S7Options
+from shmio.connectors.schedule import Schedule
+from shmio.segment import BlockSpec, ProcessSpec, Segment
+
+PERIOD_NS = 1_000_000
+JOBS = (5, 10, 20)  # granted and used; 5 are one read
+
+
+class Source:
+    """A source's loop in a thread of this process."""
+
+    def __init__(self, segment: Segment, name: str, address: Address, jobs: int) -> None:
+        options = S7Options(host=address.host, port=address.port, maxJobs=jobs)
+        self._connector = S7Connector(options, db201())
+        self._segment = segment
+        self._name = name
+
+    def polls_and_overruns(self, duration_s: float) -> tuple[float, float]:
+        """Run for a while; both a second, the first 0.2 s left out."""
+        stopping = threading.Event()
+        block = self._segment.blocks[self._name]
+        schedule = Schedule(self._segment.header.started_ns, block.period_ns)
+        loop = SourceLoop(self._connector, self._segment.writer(self._name), schedule, WallClock(stopping))
+        thread = threading.Thread(target=loop.run)
+        thread.start()
+        stopping.wait(0.2)
+        before = loop.counters.polls, loop.counters.overruns
+        stopping.wait(duration_s)
+        after = loop.counters.polls, loop.counters.overruns
+        stopping.set()
+        thread.join()
+        return (after[0] - before[0]) / duration_s, (after[1] - before[1]) / duration_s
+
+
+def main() -> None:
+    quick = begin("S7: polls of DB201 at 1 kHz, PDU 480, 1 ms round trip added")
+    logging.getLogger("shmio").addHandler(logging.NullHandler())  # each round ends with a bad frame, as it should
+    rounds, round_s = (2, 0.3) if quick else (5, 4.0)
+    with ExitStack() as stack:
+        plc = stack.enter_context(Child("plc.py", "--pdu", 480, "--jobs", max(JOBS)))
+        address = Address.parse(stack.enter_context(Child("link.py", plc.hello, 1)).hello)
+        names = {jobs: f"jobs{jobs}" for jobs in JOBS}
+        blocks = [BlockSpec(name, db201(), PERIOD_NS, 10**9, 1 << 24) for name in names.values()]
+        processes = [ProcessSpec(name, "source") for name in names.values()]
+        segment = stack.enter_context(Segment.create(f"bench-{os.getpid()}", blocks, processes))
+        stack.callback(segment.unlink)
+        overruns: dict[int, list[float]] = {jobs: [] for jobs in JOBS}
+
+        def sample(jobs: int) -> float:
+            polls, over = Source(segment, names[jobs], address, jobs).polls_and_overruns(round_s)
+            overruns[jobs].append(over)
+            return polls
+
+        polls = interleave({names[jobs]: partial(sample, jobs) for jobs in JOBS}, rounds)
+        rows = []
+        for jobs in JOBS:
+            seen = sorted(polls[names[jobs]])
+            rows.append(
+                [
+                    f"{jobs} jobs: {jobs // JOBS[0]} under way",
+                    *(f"{value:.0f}" for value in (seen[0], seen[len(seen) // 2], seen[-1])),
+                    f"{sorted(overruns[jobs])[len(seen) // 2]:.0f}",
+                ]
+            )
+    table(["polls/s", "least", "median", "most", "overruns/s, median"], rows)
+
+
+if __name__ == "__main__":
+    main()
