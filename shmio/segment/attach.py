@@ -295,7 +295,7 @@ def _holds_none(value: Value) -> bool:
 
 def take_guest(segment: Segment) -> int:
     """Take a free guest's place for life; the number of its command queue. SegmentError: none is free."""
-    places = [slot for slot in segment.processes if slot.kind == "guest" and slot.writer is not None]
+    places = segment.processes.guests
     for slot in places:
         if slot.writer is not None and slot.take():
             slot.report = Report(os.getpid(), Activity.RUNNING, time.monotonic_ns())

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from shmio.segment.block import Block
 
 WRITERS: Final = 8
-"""Queues toward a block: the guests', then those of the instance's own writers."""
-GUESTS: Final = 4
+"""Queues toward a block; processes.py says whose they are."""
 MIN_CAPACITY: Final = 1 << 14
 MAX_WRITES: Final = 4096
 """Most items in one command."""

@@ -53,7 +53,7 @@ def clear(instance: str, forget_control: Callable[[str], object] = lambda _: Non
 def _stop_orphans(segment: Segment, shared: SharedObject) -> list[str]:
     """Terminate every process that holds a role, and take all roles, so that a late one gets none."""
     stopped: dict[int, tuple[str, int]] = {}
-    held = {index: slot for index, slot in enumerate(segment.processes) if not shared.try_lock(index + 1)}
+    held = {slot.index: slot for slot in segment.processes if not shared.try_lock(slot.index + 1)}
     deadline = time.monotonic() + GRACE_S
     try:
         while held and time.monotonic() < deadline:

@@ -19,7 +19,9 @@ from shmio.segment.shm import SharedObject
 
 SUPERVISOR_LOCK: Final = 0  # lock byte of the instance; slot i has byte i + 1
 
-_FIXED: Final = struct.Struct("<64s16s")
+_FIXED: Final = struct.Struct("<64s16sI")
+_DIGEST_AT: Final = 96
+_DIGEST_SIZE: Final = 32
 _SUPERVISED_AT: Final = 128
 _SUPERVISED: Final = struct.Struct("<IIq352s")
 _HEARTBEAT_AT: Final = 512
@@ -32,6 +34,13 @@ COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "grpc": ("streams", "messages", "dropped"),
 }
 """Names of a worker's counters by its kind, in the order of their slots (at most 8)."""
+
+
+GUESTS: Final = 4
+"""Places for programs from outside that write; the last slots of the table, with the first command queues."""
+
+WRITERS: Final[Mapping[str, int]] = {"grpc": 4, "mqtt": 5}
+"""The command queue of a process that writes, by its kind."""
 
 
 class Phase(IntEnum):
@@ -92,10 +101,24 @@ class ProcessSlot:
         self._shared = shared
         self._memory = memory
         self._offset = offset
-        self._lock = index + 1
-        name, kind = _FIXED.unpack_from(memory, offset)
+        self.index = index
+        """Place in the table; the role's lock is byte ``index + 1``."""
+        name, kind, writer = _FIXED.unpack_from(memory, offset)
         self.name = text(name)
         self.kind = text(kind)
+        self.writer: int | None = writer - 1 if writer else None
+        """The command queue that this role fills, in every block."""
+
+    @property
+    def digest(self) -> bytes:
+        """What the supervisor started the process from, as a SHA-256; zeros before the first start."""
+        at = self._offset + _DIGEST_AT
+        return bytes(self._memory[at : at + _DIGEST_SIZE])
+
+    @digest.setter
+    def digest(self, value: bytes) -> None:
+        at = self._offset + _DIGEST_AT
+        self._memory[at : at + _DIGEST_SIZE] = value
 
     @property
     def supervised(self) -> Supervised:
@@ -142,30 +165,34 @@ class ProcessSlot:
 
     def take(self) -> bool:
         """Take the role's lock for life; False while another process holds it."""
-        return self._shared.try_lock(self._lock)
+        return self._shared.try_lock(self.index + 1)
 
     def alive(self) -> bool:
         """Whether some process holds the role's lock."""
-        return self._shared.locked(self._lock)
+        return self._shared.locked(self.index + 1)
 
 
 class ProcessTable(Sequence[ProcessSlot]):
-    """All slots, in the order of the configuration."""
+    """The instance's own processes, in the order of the table; ``guests``: the places for others."""
 
     def __init__(self, shared: SharedObject, memory: memoryview, header: Header) -> None:
         slots = (
             ProcessSlot(shared, memory, i, header.processes_offset + i * SLOT_SIZE)
             for i in range(header.process_capacity)
         )
-        self._slots = [slot for slot in slots if slot.name]
+        named = [slot for slot in slots if slot.name]
+        self._slots = [slot for slot in named if slot.kind != "guest"]
+        self.guests = [slot for slot in named if slot.kind == "guest"]
 
     @staticmethod
     def write(memory: memoryview, header: Header, specs: Sequence[ProcessSpec]) -> None:
-        """Name the slots of a new segment."""
-        for index, spec in enumerate(specs):
-            _FIXED.pack_into(
-                memory, header.processes_offset + index * SLOT_SIZE, spec.name.encode(), spec.kind.encode()
-            )
+        """Name the slots of a new segment, the guests' included."""
+        first = header.process_capacity - GUESTS
+        slots = [(index, spec.name, spec.kind, WRITERS.get(spec.kind)) for index, spec in enumerate(specs)]
+        slots += [(first + guest, f"guest-{guest + 1}", "guest", guest) for guest in range(GUESTS)]
+        for index, name, kind, writer in slots:
+            at = header.processes_offset + index * SLOT_SIZE
+            _FIXED.pack_into(memory, at, name.encode(), kind.encode(), 0 if writer is None else writer + 1)
 
     def __getitem__(self, index: int) -> ProcessSlot:  # type: ignore[override]  # no slices
         return self._slots[index]

@@ -19,12 +19,12 @@ from shmio.segment.build import SECTIONS_PER_BLOCK, BlockSpec, align, write_bloc
 from shmio.segment.commands import CommandQueues
 from shmio.segment.events import EVENT_SIZE
 from shmio.segment.header import HEADER_SIZE, SECTION_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
-from shmio.segment.processes import SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
+from shmio.segment.processes import GUESTS, SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
 from shmio.segment.shm import SharedObject
 
 PREFIX = "shmio-"
 SPARE_SECTIONS = 40 * SECTIONS_PER_BLOCK
-SPARE_PROCESSES = 16
+SPARE_PROCESSES = 16 + GUESTS
 
 
 class Segment:
