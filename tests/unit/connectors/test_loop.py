@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 
 import msgspec
@@ -13,7 +13,7 @@ from shmio.connectors.loop import SourceLoop
 from shmio.connectors.schedule import Schedule
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
-from shmio.segment import BlockSpec, Frame, ProcessSpec, Quality, Segment
+from shmio.segment import BlockSpec, CommandSender, EventKind, Frame, ProcessSpec, Quality, Segment, Write
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("count", "UDINT", (), 0, None, 4, 1),))
 PERIOD_NS = 20_000_000
@@ -260,3 +260,157 @@ def test_an_error_without_words_is_bad_too_and_another_code_is_another_reason(se
 
     _, _, frames = run(segment, fails, 100)
     assert [frame.reason for frame in frames[1:4]] == ["the connector gave no reason", "error 0x8104", "error 0x8304"]
+
+
+class Pipe(Device):
+    """A device that answers after ``answer_ns`` and takes ``cycles`` requests at once."""
+
+    def __init__(self, clock: VirtualClock, answer_ns: int, cycles: int) -> None:
+        super().__init__(lambda *_: None)
+        self.clock = clock
+        self.answer_ns = answer_ns
+        self.cycles = cycles
+        self.asked_ns: list[int] = []
+        self.most = 0
+
+    @property
+    def depth(self) -> int:
+        return self.cycles
+
+    def submit(self) -> None:
+        self.asked_ns.append(self.clock.time_ns)
+        self.most = max(self.most, len(self.asked_ns))
+
+    def collect(self, until_ns: int) -> bytes | None:
+        due_ns = self.asked_ns[0] + self.answer_ns
+        if due_ns > until_ns:
+            self.clock.time_ns = max(self.clock.time_ns, until_ns)
+            return None
+        self.clock.time_ns = max(self.clock.time_ns, due_ns)
+        self.asked_ns.pop(0)
+        return self.read()
+
+
+def pipe(segment: Segment, cycles: int, answer_ns: int) -> tuple[Pipe, SourceLoop, list[Frame]]:
+    clock = VirtualClock(100 * PERIOD_NS)
+    device = Pipe(clock, answer_ns, cycles)
+    loop = SourceLoop(device, segment.writer("cell"), Schedule(0, PERIOD_NS), clock)
+    cursor = segment.blocks["cell"].cursor()
+    loop.run()
+    return device, loop, [frame for frame in iter(cursor.poll, None) if frame.quality is Quality.GOOD]
+
+
+def test_with_two_cycles_under_way_every_cycle_has_its_frame_though_answers_take_longer(segment: Segment) -> None:
+    device, loop, frames = pipe(segment, 2, 3 * PERIOD_NS // 2)
+    assert device.most == 2
+    assert loop.counters.overruns == 0
+    assert [frame.cycle for frame in frames] == list(range(1, len(frames) + 1))
+    assert len(frames) >= 97
+    assert all(b.publish_ns >= a.publish_ns for a, b in pairwise(frames))
+
+
+def test_with_one_cycle_under_way_what_the_device_cannot_keep_up_with_is_overrun(segment: Segment) -> None:
+    device, loop, frames = pipe(segment, 1, 3 * PERIOD_NS // 2)
+    assert device.most == 1
+    assert [frame.cycle for frame in frames[:3]] == [1, 3, 5]
+    assert loop.counters.overruns + loop.counters.polls == 99
+
+
+def test_what_was_under_way_is_forgotten_with_its_connection(segment: Segment) -> None:
+    clock = VirtualClock(60 * PERIOD_NS)
+    device = Pipe(clock, PERIOD_NS // 2, 2)
+    collect = device.collect
+
+    def cut_once(until_ns: int) -> bytes | None:
+        if device.reads == 3 and device.connected and "cut" not in device.calls:
+            device.calls.append("cut")
+            device.asked_ns.clear()
+            raise ConnectorError("cut")
+        return collect(until_ns)
+
+    device.collect = cut_once  # type: ignore[method-assign]
+    cursor = segment.blocks["cell"].cursor()
+    SourceLoop(device, segment.writer("cell"), Schedule(0, PERIOD_NS), clock).run()
+    values = [(int.from_bytes(frame.raw, "big"), frame.quality) for frame in iter(cursor.poll, None)]
+    assert values[:5] == [
+        (1, Quality.GOOD),
+        (2, Quality.GOOD),
+        (3, Quality.GOOD),
+        (3, Quality.BAD),
+        (4, Quality.GOOD),
+    ]
+
+
+class Writing(Device):
+    """A device whose count can be set."""
+
+    can_write = True
+
+    def write(self, writes: Sequence[Write]) -> list[str]:
+        self.calls.append("write")
+        self.trouble("write", self.reads)
+        self.reads = int.from_bytes(writes[-1].data, "big")
+        return [""] * len(writes)
+
+
+def test_a_write_is_done_before_the_read_so_that_the_frame_shows_it(segment: Segment) -> None:
+    sender = CommandSender(segment.blocks["cell"], 4)
+
+    def command_before_read_4(hook: str, reads: int) -> None:
+        if hook == "read" and reads == 3:
+            sender.submit([Write(0, 0, (1000).to_bytes(4, "big"))], 10**18)
+            loop.desk._take_one(4)  # what the commands' thread does
+
+    clock = VirtualClock(8 * PERIOD_NS)
+    loop = SourceLoop(Writing(command_before_read_4), segment.writer("cell"), Schedule(0, PERIOD_NS), clock, ["count"])
+    block = segment.blocks["cell"]
+    cursor = block.cursor()
+    loop.run()
+    frames = list(iter(cursor.poll, None))
+    assert [int.from_bytes(frame.raw, "big") for frame in frames[:5]] == [1, 2, 3, 1001, 1002]
+    events = [event for n in range(1, block.events.head() + 1) if (event := block.events.read(n))]
+    assert [(event.kind, event.frame) for event in events] == [
+        (EventKind.STARTED, 0),
+        (EventKind.QUALITY, 0),
+        (EventKind.ACCEPTED, 2),
+        (EventKind.WRITTEN, 3),
+        (EventKind.QUALITY, len(frames) - 1),
+        (EventKind.STOPPED, len(frames)),
+    ]
+    assert frames[3].event == 4
+
+
+def test_a_write_lost_with_the_connection_is_unknown_and_never_repeated(segment: Segment) -> None:
+    sender = CommandSender(segment.blocks["cell"], 4)
+
+    def trouble(hook: str, reads: int) -> None:
+        if hook == "read" and reads == 3:
+            sender.submit([Write(0, 0, bytes(4))], 10**18)
+            loop.desk._take_one(4)
+        if hook == "write":
+            raise ConnectorError("cut")
+
+    clock = VirtualClock(60 * PERIOD_NS)
+    device = Writing(trouble)
+    loop = SourceLoop(device, segment.writer("cell"), Schedule(0, PERIOD_NS), clock, ["count"])
+    loop.run()
+    block = segment.blocks["cell"]
+    kinds = [event.kind for n in range(1, block.events.head() + 1) if (event := block.events.read(n))]
+    assert kinds.count(EventKind.UNKNOWN) == 1
+    assert device.calls.count("write") == 1
+    assert device.reads > 10, "it recovered"
+
+
+def test_a_doubtful_image_is_uncertain_with_its_reason(segment: Segment) -> None:
+    class Stopped(Device):
+        @property
+        def doubt(self) -> str:
+            return "the PLC is in STOP" if 3 <= self.reads <= 5 else ""
+
+    cursor = segment.blocks["cell"].cursor()
+    SourceLoop(
+        Stopped(lambda *_: None), segment.writer("cell"), Schedule(0, PERIOD_NS), VirtualClock(9 * PERIOD_NS)
+    ).run()
+    frames = list(iter(cursor.poll, None))[:-1]
+    assert [frame.quality for frame in frames] == [Quality.GOOD] * 2 + [Quality.UNCERTAIN] * 3 + [Quality.GOOD] * 3
+    assert {frame.reason for frame in frames[2:5]} == {"the PLC is in STOP"}
