@@ -20,7 +20,7 @@ LAYOUT = Layout(
     (
         Register("speed", "REAL", (), 0, None, 4, 1),
         Register("on", "BOOL", (), 4, 3, 1, 1),
-        Register("bits", "BOOL", ((1, 11),), 6, None, 2, 11),
+        Register("bits", "BOOL", ((1, 11),), 6, 0, 2, 11),
         Register("axes/1/counts", "INT", ((0, 3),), 8, None, 8, 4),
         Register("axes/1/name", "STRING[4]", (), 16, None, 6, 1),
     ),

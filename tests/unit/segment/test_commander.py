@@ -21,18 +21,18 @@ LAYOUT = Layout(
     False,
     (
         Register("count", "INT", (), 0, None, 2, 1),
-        Register("bits", "BOOL", ((0, 10),), 2, None, 2, 11),
+        Register("bits", "BOOL", ((0, 10),), 2, 0, 2, 11),
         Register("secret", "INT", (), 4, None, 2, 1),
     ),
 )
-GUESTS = [ProcessSpec("cell", "source"), *(ProcessSpec(f"guest-{n + 1}", "guest", n) for n in range(4))]
+PROCESSES = [ProcessSpec("cell", "source")]
 
 
 @pytest.fixture
 def writer(instance: str) -> Iterator[BlockWriter]:
     attributes = Attributes("s7", ("count", "bits"))
     block = BlockSpec("cell", LAYOUT, 20_000_000, 10**9, 1 << 16, attributes)
-    with Segment.create(instance, [block], GUESTS) as segment:
+    with Segment.create(instance, [block], PROCESSES) as segment:
         yield segment.writer("cell")
         segment.unlink()
 
