@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Final
 
-from shmio.errors import CommandError
+from shmio.errors import CommandError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
 from shmio.layout.write import Write, bit_mask, cover, encode
@@ -73,7 +73,10 @@ class Commander:
         owners: list[int] = []
         for place, (path, value) in enumerate(values.items()):
             register = self._register(path)
-            items = encode(register, value, self.block.layout.byte_order)
+            try:
+                items = encode(register, value, self.block.layout.byte_order)
+            except ValueRangeError as error:
+                raise ValueRangeError(f"{self.block.source}/{path}: {error}") from None
             writes += items
             owners += [place] * len(items)
         deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)

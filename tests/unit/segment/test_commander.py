@@ -141,7 +141,7 @@ def test_what_cannot_be_written_is_refused_before_it_is_sent(writer: BlockWriter
         commander.submit({"count": 1, "secret": 1})
     with pytest.raises(PathError):
         commander.submit({"nothing": 1})
-    with pytest.raises(ValueRangeError):
+    with pytest.raises(ValueRangeError, match="cell/count: "):
         commander.submit({"count": 70_000})
     assert writer.block.commands.pop(5) is None
 
