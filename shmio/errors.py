@@ -15,6 +15,7 @@
     ├── CommandError       a command cannot be sent to its source, or was not carried out
     ├── QualityError       the value exists but is not good
     ├── ConnectorError     the device did not answer as it should; carries a reason code
+    ├── RecordingError     a recording cannot be written, or is none that this version can read
     ├── EndpointError      an address cannot be served
     └── ControlError       the supervisor refused or did not answer
         └── UnreachableError     its socket cannot be connected to
@@ -99,6 +100,10 @@ class ConnectorError(ShmioError):
 
 class EndpointError(ShmioError):
     """An address cannot be listened on, or its TLS files cannot be used."""
+
+
+class RecordingError(ShmioError):
+    """A recording cannot be written, or a file is no recording that this version can read; names the file."""
 
 
 class ControlError(ShmioError):

@@ -42,7 +42,10 @@ def _parser() -> argparse.ArgumentParser:
 
     up = verb("up", "start the instance; Ctrl-C, SIGTERM or closing the terminal stops it", file)
     up.add_argument(
-        "--mode", choices=MODES, default="live", help="live (default); log and replay are not in this version"
+        "--mode",
+        choices=MODES,
+        default="live",
+        help="live (default), or log: record, serve nothing; replay is not in this version",
     )
     up.add_argument("--detach", action="store_true", help="return when it runs, and leave it running")
     up.add_argument("--report", type=int, help=argparse.SUPPRESS)  # descriptor on which a detached one tells its start

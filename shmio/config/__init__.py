@@ -1,7 +1,7 @@
 """``supervisor.toml``: read, checked, resolved (architecture: *Config*)."""
 
 from shmio.config.address import Address
-from shmio.config.model import Config, Emulator, Grpc, Instance, Source, Tls
+from shmio.config.model import Config, Emulator, Grpc, Instance, Recorder, Source, Tls
 from shmio.config.read import RESERVED_SOURCES, load
 
-__all__ = ["RESERVED_SOURCES", "Address", "Config", "Emulator", "Grpc", "Instance", "Source", "Tls", "load"]
+__all__ = ["RESERVED_SOURCES", "Address", "Config", "Emulator", "Grpc", "Instance", "Recorder", "Source", "Tls", "load"]

@@ -89,6 +89,19 @@ class Grpc(Section):
     tls: Tls | None = None
 
 
+class Recorder(Section):
+    """``[recorder]``: the process that records all sources to ``.mem`` files."""
+
+    directory: Text = "dumps"
+    fsync_s: Annotated[float, Meta(ge=0, le=3600)] = 0.0
+    buffer_mb: Annotated[float, Meta(gt=0, le=65536)] = 16.0
+
+    @property
+    def buffer_bytes(self) -> int:
+        """The most that waits in memory for a disk that is slow or full."""
+        return round(self.buffer_mb * 1e6)
+
+
 class Config(Section):
     """The whole file, with the folder that its paths are relative to."""
 
@@ -96,6 +109,7 @@ class Config(Section):
     source: list[Source] = []
     emulator: list[Emulator] = []
     grpc: Grpc | None = None
+    recorder: Recorder | None = None
     folder: str = "."
 
     def path(self, text: str) -> Path:

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from shmio.config.address import Address
-from shmio.config.model import Config, Emulator, Grpc, Instance, Section, Source, Tls
+from shmio.config.model import Config, Emulator, Grpc, Instance, Recorder, Section, Source, Tls
 from shmio.config.properties import read_properties
 from shmio.config.wording import explain, named
 from shmio.errors import ConfigError
@@ -27,6 +27,7 @@ _TABLES: dict[str, type[Section]] = {
     "emulator": Emulator,
     "grpc": Grpc,
     "grpc.tls": Tls,
+    "recorder": Recorder,
 }
 _DERIVED = ("folder", "options", "texts")  # fields that are no keys of the file
 

@@ -31,7 +31,8 @@ _REPORT: Final = struct.Struct("<IIq8Q408s")
 COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "source": ("polls", "overruns", "failures", "connects", "round_trip_us", "rate_mhz"),
     "emulator": ("cycles", "overruns"),
-    "grpc": ("streams", "messages", "dropped"),
+    "grpc": ("streams", "messages", "dropped", "published", "refused"),
+    "recorder": ("frames", "events", "missed", "bytes"),
 }
 """Names of a worker's counters by its kind, in the order of their slots (at most 8)."""
 
@@ -67,7 +68,7 @@ class Activity(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class ProcessSpec:
-    """A process the instance has a slot for. ``kind``: source, emulator, grpc."""
+    """A process the instance has a slot for. ``kind``: source, emulator, grpc, recorder."""
 
     name: str
     kind: str

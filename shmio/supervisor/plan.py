@@ -14,18 +14,23 @@ from shmio.errors import ConfigError
 from shmio.layout.model import Layout
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, segment_size
 
-RANKS: Final[Mapping[str, int]] = {"emulator": 0, "source": 1, "grpc": 2}
-"""Order of start by kind: what plays a device, what reads devices, what serves the readings."""
+RANKS: Final[Mapping[str, int]] = {"emulator": 0, "recorder": 0, "source": 1, "grpc": 2}
+"""Order of start by kind: what plays a device, what reads devices, what serves the readings.
+
+The recorder is there before the sources and after them: their last frames and events are recorded, too.
+"""
 
 MODULES: Final[Mapping[str, str]] = {
     "source": "shmio.connectors",
     "emulator": "shmio.emulators",
     "grpc": "shmio.endpoints.grpc",
+    "recorder": "shmio.recording",
 }
 """The module that is a process of each kind."""
 
 MAX_PROCESSES = 200
-MODES = ("live",)
+MODES = ("live", "log")
+"""What this version can be started as; log: what serves others is left out."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +106,12 @@ def make_plan(config: Config, layouts: Mapping[str, Layout], *, config_file: Pat
         layout = layouts[emulator.name].to_json().decode()
         sections.append((emulator.name, "emulator", msgspec.to_builtins(emulator) | {"layout": layout}))
     sections += [(source.name, "source", msgspec.to_builtins(source)) for source in config.source]
-    if config.grpc:
+    if config.grpc and mode != "log":
         sections.append(("grpc", "grpc", msgspec.to_builtins(config.grpc)))
+    if config.recorder:
+        paths = {"directory": config.path(config.recorder.directory), "config_file": config_file.resolve()}
+        recorder = msgspec.to_builtins(config.recorder) | {key: str(path) for key, path in paths.items()}
+        sections.append(("recorder", "recorder", recorder))
     if len(sections) > MAX_PROCESSES:
         raise ConfigError(f"{len(sections)} processes; an instance has at most {MAX_PROCESSES}")
     log_dir = config.log_dir

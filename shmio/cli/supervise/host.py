@@ -12,9 +12,11 @@ from shmio.errors import ConfigError
 
 
 def check_host(config: Config) -> None:
-    """Group, folder of the log files, TLS files; ConfigError. Nothing is made."""
+    """Group, folders of log files and recordings, TLS files; ConfigError. Nothing is made."""
     _check_group(config.instance.group)
-    _check_folder(config.log_dir)
+    _check_folder("instance.log_dir", config.log_dir)
+    if config.recorder:
+        _check_folder("recorder.directory", config.path(config.recorder.directory))
     if config.grpc and config.grpc.tls:
         read_tls(config.grpc.tls)
 
@@ -30,11 +32,11 @@ def _check_group(name: str | None) -> None:
         raise ConfigError(f"instance.group: this user is not in group {name!r}, and so cannot give it the segment")
 
 
-def _check_folder(folder: Path) -> None:
+def _check_folder(key: str, folder: Path) -> None:
     """Whether it is there, or can be made, and can be written."""
     place = next(path for path in (folder, *folder.parents) if path.exists())
     if not place.is_dir():
-        raise ConfigError(f"instance.log_dir: {place} is no folder")
+        raise ConfigError(f"{key}: {place} is no folder")
     if not os.access(place, os.W_OK | os.X_OK):
         why = "cannot be written" if place == folder else f"cannot be made: no permission in {place}"
-        raise ConfigError(f"instance.log_dir: {folder} {why}")
+        raise ConfigError(f"{key}: {folder} {why}")

@@ -43,7 +43,7 @@ def _where(arguments: argparse.Namespace) -> tuple[Path, list[str]]:
     if arguments.instance is None and (arguments.config is not None or DEFAULT_CONFIG.exists()):
         config = load(config_file(arguments))
         names = [emulator.name for emulator in config.emulator] + [source.name for source in config.source]
-        return config.log_dir, [*names, "grpc"] if config.grpc else names
+        return config.log_dir, names + [name for name in ("grpc", "recorder") if getattr(config, name)]
     with open_supervised(instance_name(arguments)) as segment:
         names = [slot.name for slot in segment.processes]
         return Path(ask(segment, control.Where(), WHERE_S)["log_dir"]), names

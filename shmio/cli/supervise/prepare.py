@@ -34,6 +34,11 @@ class Prepared:
 def prepare(file: Path, mode: str = "live") -> Prepared:
     """Read and check everything that can be checked without starting anything; ConfigError, LayoutError."""
     config = load(file)
+    if mode == "log" and config.recorder is None:
+        raise ConfigError(
+            f"{file}: --mode log reads the sources and records them, and there is no [recorder] section: "
+            'add one, such as [recorder] with directory = "dumps", or leave out --mode log'
+        )
     files = LayoutFiles(config)
     try:
         check_host(config)

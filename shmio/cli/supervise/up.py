@@ -33,7 +33,7 @@ DETACH_S = 120.0
 def execute(arguments: argparse.Namespace) -> int:
     """Start the instance; return when it has stopped, or with ``--detach`` when it runs."""
     if arguments.mode not in MODES:
-        raise ConfigError(f"--mode {arguments.mode}: this version of shmio has the mode live only")
+        raise ConfigError(f"--mode {arguments.mode}: this version of shmio has the modes {', '.join(MODES)} only")
     file = config_file(arguments)
     if arguments.report is not None:
         return _detached(file, arguments.mode, arguments.report)
@@ -73,6 +73,8 @@ def _describe(job: Job, prepared: Prepared) -> str:
         return f"{device}, {layout.name}: {layout.size} bytes every {source.period_ms:g} ms"
     if job.kind == "emulator":
         return f"{config['kind']} on {config['listen']}, program {config['program']}"
+    if job.kind == "recorder":
+        return f"to {config['directory']}"
     return f"on {', '.join(config['listen'])}"
 
 

@@ -131,6 +131,12 @@ def test_tls_files_are_relative_to_the_config(folder: Path) -> None:
         ("period_ms = 20", "period_ms = 0", r"source\[0\]\.period_ms: expected"),
         ("period_ms = 20", "period_ms = nan", r"source\[0\]\.period_ms: "),
         ('"Robot_*/*"', "5", r"source\[0\]\.writable\[1\]: expected text, got a whole number"),
+        (
+            "[instance]",
+            "[recorder]\ndirectroy = 'x'\n[instance]",
+            r"recorder\.directroy: unknown key; did you mean directory",
+        ),
+        ("[instance]", "[recorder]\nbuffer_mb = 0\n[instance]", r"recorder\.buffer_mb: expected a number > 0"),
         ('program = "a50"\n', "", r'emulator\[0\]\.program: this key is needed \(emulator "plc"\)$'),
         (
             'program = "a50"',

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.config import Config, Emulator, Grpc, Instance, Source
+from shmio.config import Config, Emulator, Grpc, Instance, Recorder, Source
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout, Register
 from shmio.supervisor.plan import MAX_PROCESSES, MODULES, RANKS, make_plan
@@ -48,6 +48,23 @@ def test_a_process_is_told_what_it_needs(tmp_path: Path) -> None:
     assert source["config"]["connector"] == "s7"
     assert Layout.from_json(emulator["config"]["layout"].encode()) == LAYOUT
     assert grpc["config"]["listen"] == ["127.0.0.1:0"]
+
+
+def test_log_mode_records_and_serves_nothing(tmp_path: Path) -> None:
+    recorded = config(tmp_path)
+    recorded.recorder = Recorder(directory="dumps", fsync_s=2)
+    layouts = {"cell0": LAYOUT, "plc": LAYOUT}
+    live, log = (make_plan(recorded, layouts, config_file=tmp_path / "s.toml", mode=mode) for mode in ("live", "log"))
+    assert [job.kind for job in live.jobs] == ["emulator", "source", "grpc", "recorder"]
+    assert [job.kind for job in log.jobs] == ["emulator", "source", "recorder"]
+    recorder = log.jobs[-1]
+    assert recorder.rank < log.jobs[1].rank, "it sees the sources begin and end"
+    assert recorder.config == {
+        "directory": str(tmp_path / "dumps"),
+        "fsync_s": 2,
+        "buffer_mb": 16,
+        "config_file": str(tmp_path / "s.toml"),
+    }
 
 
 def test_too_many_processes_are_refused(tmp_path: Path) -> None:
