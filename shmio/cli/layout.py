@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from shmio import __version__
@@ -12,22 +12,30 @@ from shmio.cli.run import dumps, run
 from shmio.errors import LayoutError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.document import describe
+from shmio.layout.image import unread
 from shmio.layout.lexer import MAX_SOURCE_BYTES
+from shmio.layout.literal import default_text
 from shmio.layout.model import Layout, Register
 from shmio.logs import printable
 
 _HEADINGS = ("offset", "size", "type", "path", "initial", "comment")
+_MAX_UNREAD = 20
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return its exit status: 0 done, 1 failed, 2 wrong usage."""
     parser = argparse.ArgumentParser(
         prog="shmio-layout",
-        description="Compile the data blocks of a source exported by TIA Portal and print each register: "
+        description="Compile the data blocks of a source exported by TIA Portal or STEP 7 and print each register: "
         "path, type, byte offset, bit, size.",
     )
-    parser.add_argument("file", metavar="FILE.db", help="the source with the data blocks")
-    parser.add_argument("types", metavar="UDT", nargs="*", help="further sources, with the PLC data types it uses")
+    parser.add_argument("file", metavar="FILE", help="the source with the data blocks (.db, .awl, .scl)")
+    parser.add_argument(
+        "types",
+        metavar="SOURCE",
+        nargs="*",
+        help="further sources, with the PLC data types, function blocks and constants it uses",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON: one object, or a list for several blocks")
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")
     options = parser.parse_intermixed_args(arguments)
@@ -41,6 +49,8 @@ def _compile(names: Sequence[str], *, as_json: bool) -> int:
         _complain(error.diagnostics)
         return 1
     _complain(compiled.warnings)
+    for layout in compiled.layouts:
+        _complain(_unread(layout))
     _print(compiled.layouts, as_json=as_json)
     return 0
 
@@ -54,6 +64,19 @@ def _read(name: str) -> Source:
 def _complain(lines: Iterable[object]) -> None:
     for line in lines:
         print(printable(str(line)), file=sys.stderr)
+
+
+def _unread(layout: Layout) -> Iterator[str]:
+    """Say which initial values mean nothing here; an emulated PLC would start without them."""
+    registers = unread(layout)
+    for register in registers[:_MAX_UNREAD]:
+        value = _short(register.initial or "")
+        yield (
+            f"{layout.name}: warning: the initial value {value} of {register.path} cannot be read as {register.type}; "
+            f"an emulated PLC starts it at {default_text(register.element)}"
+        )
+    if len(registers) > _MAX_UNREAD:
+        yield f"{layout.name}: warning: {len(registers) - _MAX_UNREAD} more initial values cannot be read"
 
 
 def _print(layouts: Sequence[Layout], *, as_json: bool) -> None:
@@ -84,10 +107,12 @@ def _row(register: Register) -> tuple[str, ...]:
     place = str(register.offset) if register.bit is None else f"{register.offset}.{register.bit}"
     bounds = ", ".join(f"{low}..{high}" for low, high in register.dims)
     kind = f"ARRAY[{bounds}] OF {register.type}" if register.dims else register.type
-    initial = " ".join((register.initial or "").split())
-    if len(initial) > 40:
-        initial = f"{initial[:39]}…"
-    return place, str(register.size), kind, register.path, initial, register.comment
+    return place, str(register.size), kind, register.path, _short(register.initial or ""), register.comment
+
+
+def _short(text: str) -> str:
+    text = " ".join(text.split())
+    return text if len(text) <= 40 else f"{text[:39]}…"
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Data-block sources to layouts: read, parse, place, emit.
 
-No I/O: the caller reads the files. Sources are those TIA Portal exports (``.db``, ``.udt``, ``.scl``), given
-together when one uses types of another.
+No I/O: the caller reads the files. Sources are those TIA Portal exports (``.db``, ``.udt``, ``.scl``) and those of
+STEP 7 classic (``.awl``), given together when one uses types, function blocks or constants of another.
 """
 
 from __future__ import annotations
@@ -9,15 +9,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 from shmio.layout import emit, lexer, parser
+from shmio.layout.constants import Constants
+from shmio.layout.encoding import decode
 from shmio.layout.model import MAX_BLOCK_BYTES, MAX_STANDARD_BYTES, Diagnostic, Layout
-from shmio.layout.place import Group, Placer
+from shmio.layout.place import MAX_TEXT, Placer
+from shmio.layout.placed import Group
 from shmio.layout.report import Report, TooManyErrors
-from shmio.layout.syntax import Array, BlockDeclaration, Named, Position, Struct, TypeDeclaration, Unit
+from shmio.layout.syntax import Array, BlockDeclaration, ConstantDeclaration, Named, Struct, TypeDeclaration, Unit
 
-_Declaration = TypeVar("_Declaration", TypeDeclaration, BlockDeclaration)
+_Declaration = TypeVar("_Declaration", TypeDeclaration, BlockDeclaration, ConstantDeclaration)
 
 _OPTIMIZED = (
     "the block {name} has optimized access: its values have no fixed addresses and the classic S7 protocol cannot "
@@ -52,17 +55,22 @@ def compile_sources(sources: Sequence[Source]) -> Compiled:
     with suppress(TooManyErrors):
         units = [_read(source, report) for source in sources]
         types = _by_name([declaration for unit in units for declaration in unit.types], report)
-        skipped = frozenset(name.lower() for unit in units for name in unit.skipped)
-        placer = Placer(types, skipped, report)
+        given = _by_name([declaration for unit in units for declaration in unit.constants], report)
+        constants = Constants(given.values())
+        placer = Placer(types, constants, report)
         for declaration in types.values():
-            placer.named(Named(declaration.name, True, declaration.position))
+            if not declaration.is_function_block:
+                placer.named(Named(declaration.name, True, declaration.position))
         blocks = [declaration for unit in units for declaration in unit.blocks]
         if not blocks and not report.errors:
             file = sources[0].file if sources else "<none>"
             report.add(Diagnostic(file, 1, 1, "expected a DATA_BLOCK, found none"))
         _by_name(blocks, report)
         for block in blocks:
-            layout = _layout(block, placer, report)
+            optimized = block.optimized
+            if isinstance(block.body, Named) and (instance_of := types.get(block.body.name.lower())):
+                optimized |= instance_of.optimized
+            layout = _layout(block, optimized, Constants(block.constants, constants), placer, report)
             if layout is not None:
                 layouts.append(layout)
     report.raise_errors()
@@ -70,22 +78,16 @@ def compile_sources(sources: Sequence[Source]) -> Compiled:
 
 
 def _read(source: Source, report: Report) -> Unit:
-    data = source.text.removeprefix(b"\xef\xbb\xbf")
-    if len(data) > lexer.MAX_SOURCE_BYTES:
+    if len(source.text) > lexer.MAX_SOURCE_BYTES:
         report.add(Diagnostic(source.file, 1, 1, f"the file is larger than {lexer.MAX_SOURCE_BYTES} bytes"))
         return Unit()
-    try:
-        text = data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        before = data[: error.start].decode("utf-8").splitlines() or [""]
-        message = "expected UTF-8, found bytes that are not; export the source again, or save it as UTF-8"
-        report.add(Diagnostic(source.file, len(before), len(before[-1]) + 1, message))
+    decoded = decode(source.text)
+    if decoded.problem:
+        severity: Literal["error", "warning"] = "error" if decoded.fatal else "warning"
+        report.add(Diagnostic(source.file, decoded.line, decoded.column, decoded.problem, severity))
+    if decoded.fatal:
         return Unit()
-
-    def problem(line: int, column: int, message: str) -> None:
-        report.add(Diagnostic(source.file, line, column, message))
-
-    return parser.parse(source.file, text, lexer.tokenize(text, problem), report)
+    return parser.parse(source.file, decoded.text, lexer.tokenize(decoded.text), report)
 
 
 def _by_name(declarations: Sequence[_Declaration], report: Report) -> dict[str, _Declaration]:
@@ -98,32 +100,41 @@ def _by_name(declarations: Sequence[_Declaration], report: Report) -> dict[str, 
     return found
 
 
-def _layout(block: BlockDeclaration, placer: Placer, report: Report) -> Layout | None:
-    group = _body(block, placer, report)
+def _layout(
+    block: BlockDeclaration, optimized: bool, constants: Constants, placer: Placer, report: Report
+) -> Layout | None:
+    group = _body(block, constants, placer, report)
     if group is None:
         return None
-    limit = MAX_BLOCK_BYTES if block.optimized else MAX_STANDARD_BYTES
+    limit = MAX_BLOCK_BYTES if optimized else MAX_STANDARD_BYTES
     if group.size > limit:
         report.add(block.position.error(f"expected at most {limit} bytes, found a block of {group.size}"))
         return None
-    registers = tuple(emit.registers(group))
-    if block.assignments:
-        registers = emit.assign(group, registers, block.assignments, report)
-    if block.optimized:
+    registers, characters = [], 0
+    for register in emit.registers(group, report):
+        registers.append(register)
+        characters += len(register.path) + len(register.comment) + len(register.initial or "")
+        if characters > MAX_TEXT:
+            what = f"expected at most {MAX_TEXT} characters of names, comments and values"
+            report.add(block.position.error(what))
+            return None
+    assigned = emit.assign(group, registers, block.assignments, constants, report)
+    if optimized:
         report.add(block.position.warning(_OPTIMIZED.format(name=block.name)))
-    return Layout(block.name, block.number, group.size, block.optimized, registers)
+    return Layout(block.name, block.number, group.size, optimized, assigned)
 
 
-def _body(block: BlockDeclaration, placer: Placer, report: Report) -> Group | None:
+def _body(block: BlockDeclaration, constants: Constants, placer: Placer, report: Report) -> Group | None:
     body = block.body
     if isinstance(body, Struct):
-        return placer.struct(body)
-    position: Position = body.position
+        return placer.block(body, constants)
     if isinstance(body, Array):
-        report.add(position.error("expected STRUCT, VAR or the name of a type; ARRAY data blocks are not supported"))
+        what = "expected STRUCT, VAR or the name of a type; ARRAY data blocks are not supported"
+        report.add(body.position.error(what))
         return None
     found = placer.named(body)
     if found is None or isinstance(found, Group):
         return found
-    report.add(position.error(f"expected STRUCT, VAR or the name of a PLC data type, found {body.name}"))
+    what = f"expected STRUCT, VAR or the name of a PLC data type or function block, found {body.name}"
+    report.add(body.position.error(what))
     return None

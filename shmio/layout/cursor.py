@@ -5,6 +5,7 @@ from __future__ import annotations
 from shmio.errors import ShmioError
 from shmio.layout.lexer import Kind, Token
 from shmio.layout.model import Diagnostic
+from shmio.layout.report import Report
 from shmio.layout.syntax import Position
 
 _OPENING, _CLOSING = "([", ")]"
@@ -20,14 +21,19 @@ class SyntaxFault(ShmioError):  # noqa: N818  (the parser reports and goes on; i
 
 
 class Cursor:
-    """Walks over the tokens of one file; the last is ``Kind.END`` and is never passed."""
+    """Walks over the tokens of one file; the last is ``Kind.END`` and is never passed.
 
-    def __init__(self, file: str, text: str, tokens: list[Token]) -> None:
+    Faults are reported when they are come to, and are never the current token.
+    """
+
+    def __init__(self, file: str, text: str, tokens: list[Token], report: Report) -> None:
         self.file = file
+        self.report = report
         self._text = text
         self._tokens = tokens
         self.index = 0
         self.token = tokens[0]
+        self._pass_faults()
 
     @property
     def position(self) -> Position:
@@ -55,8 +61,28 @@ class Cursor:
         token = self.token
         if token.kind is not Kind.END:
             self.index += 1
-            self.token = self._tokens[self.index]
+            self._pass_faults()
         return token
+
+    def rewind(self, index: int) -> None:
+        """Go back to a token that was the current one."""
+        self.index = index
+        self.token = self._tokens[index]
+
+    def skip_to(self, word: str) -> bool:
+        """Go to this keyword, without a word about faults on the way; return whether there is one."""
+        for index in range(self.index, len(self._tokens)):
+            if self._tokens[index].is_word(word):
+                self.rewind(index)
+                return True
+        self.rewind(len(self._tokens) - 1)
+        return False
+
+    def _pass_faults(self) -> None:
+        while (token := self._tokens[self.index]).kind is Kind.FAULT:
+            self.report.add(self.at(token).error(token.text))
+            self.index += 1
+        self.token = token
 
     def accept(self, punct: str) -> bool:
         """Step over this punctuation if it is there."""
@@ -106,7 +132,7 @@ class Cursor:
         ``;`` is missing.
         """
         first = last = self.token
-        depth = 0
+        start, depth = self.index, 0
         while not (depth == 0 and self.token.is_punct(";")):
             token = self.token
             moved_on = token.line != last.line and last.text != ","
@@ -119,7 +145,20 @@ class Cursor:
             last = self.advance()
         if last is self.token:
             raise self.expected("a value")
-        text = self._text[first.start : last.stop]
+        text = self._between(start, self.index)
         if len(text) > MAX_INITIAL:
             raise self.fault(first, f"the value is longer than {MAX_INITIAL} characters")
         return text
+
+    def _between(self, start: int, stop: int) -> str:
+        """Return the text of these tokens as written, without the comments between them."""
+        tokens = self._tokens[start:stop]
+        if not any(token.comment for token in tokens[:-1]):
+            return self._text[tokens[0].start : tokens[-1].stop]
+        pieces: list[str] = []
+        position = tokens[0].start
+        for token in tokens:
+            gap = self._text[position : token.start]
+            pieces += [" " if gap.strip() else gap, self._text[token.start : token.stop]]
+            position = token.stop
+        return "".join(pieces)

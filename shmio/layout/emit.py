@@ -4,31 +4,78 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from shmio.errors import ValueRangeError
+from shmio.layout.constants import Constants
 from shmio.layout.initial import DTL_PARTS, InitialTexts
 from shmio.layout.model import Dims, Register
-from shmio.layout.place import Field, Group, Leaf, Repeat
+from shmio.layout.placed import Field, Group, Leaf, Repeat
 from shmio.layout.report import Report
-from shmio.layout.syntax import Assignment
+from shmio.layout.structured import element_values, member_values
+from shmio.layout.syntax import Assignment, Position
+
+Layers = tuple[Mapping[str, str], ...]
 
 
-def registers(group: Group, prefix: str = "", base: int = 0) -> Iterator[Register]:
-    """Yield the registers of a structure that begins at byte ``base``, in address order."""
-    for field in group.fields.values():
-        path, offset = prefix + field.segment, base + field.offset
-        if isinstance(field.type, Leaf):
-            yield _register(field, field.type, path, offset)
-        elif isinstance(field.type, Group):
-            yield from registers(field.type, f"{path}/", offset)
-        else:
-            inner = field.type.group
-            for flat, index in enumerate(_indices(field.type.dims)):
-                yield from registers(inner, f"{path}/{index}/", offset + flat * inner.size)
+def registers(group: Group, report: Report) -> Iterator[Register]:
+    """Yield the registers of a placed block in address order."""
+    return _Expansion(report).registers(group, "", 0, ())
 
 
-def _register(field: Field, leaf: Leaf, path: str, offset: int) -> Register:
+class _Expansion:
+    """Flattens structures. Values given to a structure as a whole come down in layers, the outermost first."""
+
+    def __init__(self, report: Report) -> None:
+        self._report = report
+        # Each text is read once, however often its structure is expanded.
+        self._split: dict[tuple[int, str], dict[str, str]] = {}
+        self._listed: dict[tuple[int, str], list[str | None]] = {}
+        self._told: set[Position] = set()
+
+    def registers(self, group: Group, prefix: str, base: int, layers: Layers) -> Iterator[Register]:
+        for key, field in group.fields.items():
+            path, offset = prefix + field.segment, base + field.offset
+            given = [layer[key] for layer in layers if key in layer]
+            if field.member.initial is not None:
+                given.append(field.member.initial)
+            if isinstance(field.type, Leaf):
+                yield _register(field, field.type, path, offset, given[0] if given else None)
+            elif isinstance(field.type, Group):
+                inner = tuple(self._members(text, field.type, field) for text in given)
+                yield from self.registers(field.type, f"{path}/", offset, inner)
+            else:
+                yield from self._elements(field, field.type, path, offset, given)
+
+    def _elements(self, field: Field, array: Repeat, path: str, offset: int, given: list[str]) -> Iterator[Register]:
+        texts = []
+        for text in given:
+            key = id(array), text
+            if key not in self._listed:
+                self._listed[key] = element_values(text, array.dims)
+            texts.append(self._listed[key])
+        for flat, index in enumerate(_indices(array.dims)):
+            own = [values[flat] for values in texts]
+            layers = tuple(self._members(text, array.group, field) for text in own if text is not None)
+            yield from self.registers(array.group, f"{path}/{index}/", offset + flat * array.group.size, layers)
+
+    def _members(self, text: str, group: Group, field: Field) -> dict[str, str]:
+        key = id(group), text
+        if key not in self._split:
+            try:
+                self._split[key] = member_values(text, group)
+            except ValueRangeError as error:
+                self._split[key] = {}
+                position = field.member.position
+                if position not in self._told:
+                    self._told.add(position)
+                    what = f"the initial value of the structure {field.member.name!r} is not read: {error}"
+                    self._report.add(position.warning(what))
+        return self._split[key]
+
+
+def _register(field: Field, leaf: Leaf, path: str, offset: int, initial: str | None) -> Register:
     is_bool = leaf.element.base == "BOOL"
     return Register(
         path=path,
@@ -39,7 +86,7 @@ def _register(field: Field, leaf: Leaf, path: str, offset: int) -> Register:
         size=leaf.size,
         count=math.prod(leaf.shape),
         comment=field.member.comment,
-        initial=field.member.initial,
+        initial=initial,
     )
 
 
@@ -49,12 +96,18 @@ def _indices(dims: Dims) -> Iterator[str]:
 
 
 def assign(
-    group: Group, found: Sequence[Register], assignments: Sequence[Assignment], report: Report
+    group: Group,
+    found: Sequence[Register],
+    assignments: Sequence[Assignment],
+    constants: Constants,
+    report: Report,
 ) -> tuple[Register, ...]:
     """Return the registers with the values assigned after BEGIN as their initial ones.
 
     Elements of one array are gathered into one array literal.
     """
+    if not assignments:
+        return tuple(found)
     by_path = {register.path: index for index, register in enumerate(found)}
     texts: dict[int, InitialTexts] = {}
     for assignment in assignments:
@@ -64,9 +117,10 @@ def assign(
             continue
         index = by_path[target.path]
         text = texts.setdefault(index, InitialTexts(found[index]))
+        value = constants.substitute(assignment.value) or ""
         if not target.part:
-            text.set(target.index, assignment.value)
-        elif not text.set_part(target.index, target.part, assignment.value):
+            text.set(target.index, value)
+        elif not text.set_part(target.index, target.part, value):
             report.add(assignment.position.error(f"expected a whole number for {target.part}"))
     result = list(found)
     for index, text in texts.items():

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from shmio.errors import ValueRangeError
-from shmio.layout.codec import codec
+from shmio.layout.codec import Value, codec
 from shmio.layout.literal import default_text, parse_literal
-from shmio.layout.model import Layout
+from shmio.layout.model import Layout, Register
 
 
 def initial_frame(layout: Layout) -> tuple[bytearray, tuple[str, ...]]:
@@ -16,13 +16,26 @@ def initial_frame(layout: Layout) -> tuple[bytearray, tuple[str, ...]]:
     frame = bytearray(layout.size)
     unread: list[str] = []
     for register in layout.registers:
-        default = default_text(register.element)
-        if register.dims:
-            default = f"[{register.count}({default})]"
-        try:
-            value = parse_literal(default if register.initial is None else register.initial, register)
-            codec(register, layout.byte_order).encode_into(value, frame)
-        except ValueRangeError:
+        value = _default(register) if register.initial is None else _given(register)
+        if value is None:
             unread.append(register.path)
-            codec(register, layout.byte_order).encode_into(parse_literal(default, register), frame)
+            value = _default(register)
+        codec(register, layout.byte_order).encode_into(value, frame)
     return frame, tuple(unread)
+
+
+def unread(layout: Layout) -> tuple[Register, ...]:
+    """Return the registers whose initial value cannot be read."""
+    return tuple(r for r in layout.registers if r.initial is not None and _given(r) is None)
+
+
+def _given(register: Register) -> Value | None:
+    try:
+        return parse_literal(register.initial or "", register)
+    except ValueRangeError:
+        return None
+
+
+def _default(register: Register) -> Value:
+    text = default_text(register.element)
+    return parse_literal(f"[{register.count}({text})]" if register.dims else text, register)

@@ -7,7 +7,8 @@ from bisect import bisect_left
 from itertools import groupby
 
 from shmio.layout import calendar
-from shmio.layout.literal import default_text, split_array
+from shmio.layout.lists import split_array
+from shmio.layout.literal import default_text
 from shmio.layout.model import Register
 
 DTL_PARTS = ("YEAR", "MONTH", "DAY", "WEEKDAY", "HOUR", "MINUTE", "SECOND", "NANOSECOND")

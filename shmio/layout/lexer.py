@@ -1,13 +1,13 @@
 """Source text to tokens.
 
 The lexer knows nothing of grammar except one thing: the text after ``TITLE =`` is free and ends with the line.
-Comments are not tokens; each hangs on the token it follows on the same line.
+Comments are not tokens; each hangs on the token it follows on the same line. What is no token is one of kind
+``FAULT``, so that it matters only where somebody reads: the code of a function block may hold anything.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -25,6 +25,7 @@ class Kind(Enum):
     NUMBER = "number"
     STRING = "string"
     PUNCT = "punctuation"
+    FAULT = "fault"  # its text is what to report
     END = "end of file"
 
 
@@ -84,49 +85,51 @@ _KINDS = {
 _NEWLINE = re.compile(r"\r\n|\r|\n")
 
 
-def tokenize(text: str, report: Callable[[int, int, str], None]) -> list[Token]:
+def tokenize(text: str) -> list[Token]:
     """Split a whole source; the last token is ``Kind.END``.
 
-    ``report(line, column, message)`` is called for each character sequence that is no token; it is skipped.
-    A source with more than ``MAX_TOKENS`` is cut there and reported.
+    A source with more than ``MAX_TOKENS`` is cut there, with a fault.
     """
     tokens: list[Token] = []
     position, line, line_start = 0, 1, 0
     while position < len(text):
         match = _TOKEN.match(text, position)
         column = position - line_start + 1
-        if match is None:
-            report(line, column, f"a control character ({ord(text[position]):#04x}) is not allowed here")
-            position += 1
-            continue
-        group, stop = str(match.lastgroup), match.end()
-        if group == "newline":
-            line, line_start = line + 1, stop
-        elif group == "line":
-            _attach(tokens, line, match[0].lstrip("/"))
-        elif group == "open":
-            close = _CLOSE[match[0]]
-            end = text.find(close, stop)
-            if end < 0:
-                report(line, column, f"the comment that begins here has no {close!r}")
-                break
-            _attach(tokens, line, text[stop:end])
-            for newline in _NEWLINE.finditer(text, stop, end):
-                line, line_start = line + 1, newline.end()
-            stop = end + len(close)
-        elif kind := _KINDS.get(group):
-            content = match["name"] if kind is Kind.QUOTED else match[0]
-            problem = _problem(kind, content)
-            if problem:
-                report(line, column, problem)
-            if kind is Kind.PUNCT and content in "'\"":
-                end_of_line = _NEWLINE.search(text, stop)
-                stop = end_of_line.start() if end_of_line else len(text)
-            elif len(tokens) == MAX_TOKENS:
-                report(line, column, f"the file has more than {MAX_TOKENS} tokens")
-                break
-            else:
-                tokens.append(Token(kind, content, line, column, position, stop))
+        fault, kind = "", None
+        if len(tokens) >= MAX_TOKENS:
+            fault = f"the file has more than {MAX_TOKENS} tokens"
+            stop = len(text)
+        elif match is None:
+            fault = f"a control character ({ord(text[position]):#04x}) is not allowed here"
+            stop = position + 1
+        else:
+            group, stop = str(match.lastgroup), match.end()
+            if group == "newline":
+                line, line_start = line + 1, stop
+            elif group == "line":
+                _attach(tokens, line, match[0].lstrip("/"))
+            elif group == "open":
+                close = _CLOSE[match[0]]
+                end = text.find(close, stop)
+                if end < 0:
+                    fault = f"the comment that begins here has no {close!r}"
+                    stop = len(text)
+                else:
+                    _attach(tokens, line, text[stop:end])
+                    for newline in _NEWLINE.finditer(text, stop, end):
+                        line, line_start = line + 1, newline.end()
+                    stop = end + len(close)
+            elif kind := _KINDS.get(group):
+                content = match["name"] if kind is Kind.QUOTED else match[0]
+                fault = _problem(kind, content)
+                if kind is Kind.PUNCT and content in "'\"":
+                    end_of_line = _NEWLINE.search(text, stop)
+                    stop = end_of_line.start() if end_of_line else len(text)
+                    kind = None
+        if fault:
+            tokens.append(Token(Kind.FAULT, fault, line, column, position, stop))
+        if kind:
+            tokens.append(Token(kind, content, line, column, position, stop))
         position = stop
     tokens.append(Token(Kind.END, "", line, position - line_start + 1, position, position))
     return tokens

@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
 from fractions import Fraction
 
 from shmio.errors import ValueRangeError
 from shmio.layout import calendar
 from shmio.layout.checks import brief
 from shmio.layout.codec import Value, nest
+from shmio.layout.lists import split_array, split_items
 from shmio.layout.model import ByteOrder, Register
 from shmio.layout.scalar import Scalar, scalar_codec
-from shmio.layout.types import ElementType
+from shmio.layout.types import INTEGERS, ElementType
 
 MAX_LITERAL = 100  # characters of anything but text
 
@@ -26,7 +26,11 @@ _INTEGER = re.compile(r"([+-]?)(?:(2|8|16)#)?([0-9A-Fa-f]+(?:_[0-9A-Fa-f]+)*)")
 _REAL = re.compile(r"[+-]?[0-9]+(?:_[0-9]+)*(?:\.[0-9]+(?:_[0-9]+)*)?(?:[eE][+-]?[0-9]+)?")
 _DURATION_PART = re.compile(r"([0-9]+(?:\.[0-9]+)?)(d|h|ms|us|ns|m|s)_?", re.IGNORECASE)
 _CLOCK = re.compile(r"([0-9]{1,2}):([0-9]{1,2})(?::([0-9]{1,2})(?:\.([0-9]{1,9}))?)?")
-_REPEAT = re.compile(r"([0-9]{1,10})\s*\((.*)\)", re.DOTALL)
+_SHORT_YEAR = re.compile(r"[0-9]{2}(?=-)")
+_BYTES = re.compile(r"B#\s*\((.*)\)", re.IGNORECASE)
+_BYTES_BITS = {"WORD": 16, "DWORD": 32}
+_COUNT = re.compile(r"C#([0-9]{1,3})", re.IGNORECASE)
+_NUMBERED = re.compile(r"(?:T|C|Z|FB|FC|DB|SDB)\s*([0-9]{1,5})", re.IGNORECASE)
 _ESCAPE = re.compile(r"\$(?:([LlNnPpRrTt$'])|([0-9A-Fa-f]{4})|([0-9A-Fa-f]{2}))")
 _ESCAPED = {"L": "\n", "N": "\r\n", "P": "\f", "R": "\r", "T": "\t", "$": "$", "'": "'"}
 
@@ -44,13 +48,10 @@ _UNIT_NS = {
     **dict.fromkeys(("TIME", "S5TIME", "TIME_OF_DAY"), calendar.NS_PER_MS),
     **dict.fromkeys(("LTIME", "LTOD"), 1),
 }
-_INTEGERS = frozenset(
-    ["BYTE", "WORD", "DWORD", "LWORD", "SINT", "USINT", "INT", "UINT", "DINT", "UDINT", "LINT", "ULINT"]
-)
 _DURATIONS = frozenset({"TIME", "LTIME", "S5TIME"})
 _MOMENTS = frozenset({"DATE", "DATE_AND_TIME", "LDT", "DTL"})
 _PREFIXES = {
-    **dict.fromkeys(_INTEGERS, _INTEGERS | {"B", "W", "DW", "LW", "L"}),
+    **dict.fromkeys(INTEGERS, INTEGERS | {"B", "W", "DW", "LW", "L"}),
     "BOOL": frozenset({"BOOL"}),
     "REAL": frozenset({"REAL", "LREAL"}),
     "LREAL": frozenset({"REAL", "LREAL"}),
@@ -122,6 +123,7 @@ def _read(text: str, element: ElementType) -> Scalar:
         return _text(text, element)
     if len(text) > MAX_LITERAL:
         return None
+    written = text
     prefix, separator, rest = text.partition("#")
     if separator and prefix.upper() in _PREFIXES.get(base, ()):
         text = rest
@@ -129,12 +131,15 @@ def _read(text: str, element: ElementType) -> Scalar:
         return {"TRUE": True, "1": True, "2#1": True, "16#1": True}.get(
             text.upper(), False if text.upper() in ("FALSE", "0", "2#0", "16#0") else None
         )
-    if base in _INTEGERS:
-        return _integer(text, _SIGNED_BITS.get(base))
+    if base in INTEGERS:
+        value = _integer(text, _SIGNED_BITS.get(base))
+        return _classic(written, base) if value is None else value
     if base in ("REAL", "LREAL"):
         number = float(text.replace("_", "")) if _REAL.fullmatch(text) else math.inf
         return number if math.isfinite(number) else None
     if base in _MOMENTS:
+        if short := _SHORT_YEAR.match(text):  # STEP 7 writes 90 to 99 and 00 to 89
+            text = f"{19 if short[0] >= '90' else 20}{text}"
         ns = calendar.parse_moment(text)
         return None if ns is None else _moment(ns, base)
     if base in _UNIT_NS:
@@ -158,6 +163,19 @@ def _integer(text: str, signed_bits: int | None) -> int | None:
     if match[2] and not match[1] and signed_bits and value >> signed_bits - 1 == 1:
         value -= 1 << signed_bits  # a bit pattern: INT#16#FFFF is -1
     return -value if match[1] == "-" else value
+
+
+def _classic(text: str, base: str) -> int | None:
+    """Read what STEP 7 writes for words: ``B#(1, 2)``, ``C#100``; and for parameter types: ``T 5``, ``FB 7``."""
+    if match := _BYTES.fullmatch(text):
+        values = [_integer(item, None) for item in split_items(match[1])]
+        if len(values) * 8 == _BYTES_BITS.get(base) and all(value is not None and 0 <= value < 256 for value in values):
+            return int.from_bytes(bytes(value or 0 for value in values))
+    elif base == "WORD" and (match := _COUNT.fullmatch(text)):
+        return int(match[1], 16)  # BCD
+    elif base == "UINT" and (match := _NUMBERED.fullmatch(text)):
+        return int(match[1])
+    return None
 
 
 def _duration(text: str) -> int | None:
@@ -208,66 +226,3 @@ def _text(text: str, element: ElementType) -> str | None:
         return chr(int(match[3], 16))
 
     return _ESCAPE.sub(unescape, text[1:-1])
-
-
-def split_array(text: str, shape: tuple[int, ...]) -> list[tuple[int, int, str]]:
-    """Return (first element, number, text) of each value in an array literal, in order.
-
-    ``[1, 2, 3(0)]``, the same without brackets, and rows in brackets of their own. What is beyond the array's
-    end is left out.
-    """
-    runs: list[tuple[int, int, str]] = []
-    _fill(text, shape, 0, runs)
-    return runs
-
-
-def _fill(text: str, shape: tuple[int, ...], start: int, runs: list[tuple[int, int, str]]) -> None:
-    text = text.strip()
-    if text.startswith("[") and text.endswith("]"):
-        text = text[1:-1]
-    row = math.prod(shape[1:])
-    position, stop = start, start + math.prod(shape)
-    for item in _items(text):
-        times, inner = 1, [item]
-        if repeat := _REPEAT.fullmatch(item):
-            times, inner = int(repeat[1]), list(_items(repeat[2]))
-        if len(inner) == 1 and not inner[0].startswith("["):
-            count = min(times, stop - position)
-            if count:
-                runs.append((position, count, inner[0]))
-            position += count
-            continue
-        while times and inner and position < stop:
-            times -= 1
-            for part in inner:
-                if position >= stop:
-                    break
-                if part.startswith("[") and len(shape) > 1:
-                    _fill(part, shape[1:], position, runs)
-                    position += row
-                else:
-                    runs.append((position, 1, part))
-                    position += 1
-
-
-def _items(text: str) -> Iterator[str]:
-    """Split at the commas that are outside brackets and strings."""
-    depth, start, quoted = 0, 0, False
-    position = 0
-    while position < len(text):
-        char = text[position]
-        if quoted:
-            position += char == "$"
-            quoted = char != "'"
-        elif char == "'":
-            quoted = True
-        elif char in "([":
-            depth += 1
-        elif char in ")]":
-            depth -= 1
-        elif char == "," and depth == 0:
-            yield text[start:position].strip()
-            start = position + 1
-        position += 1
-    if text[start:].strip():
-        yield text[start:].strip()

@@ -1,4 +1,4 @@
-"""Tokens to declarations, by recursive descent.
+"""Tokens to declarations, by recursive descent: files, blocks and what is assigned after BEGIN.
 
 A syntax error is reported and the parser goes on at the next ``;`` or ``END_…``, so that one run finds them all.
 """
@@ -6,49 +6,45 @@ A syntax error is reported and the parser goes on at the next ``;`` or ``END_…
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
 
 from shmio.layout.cursor import Cursor, SyntaxFault
+from shmio.layout.declarations import BLOCK_SECTIONS, SECTIONS, TOP, Declarations
+from shmio.layout.expression import integer
 from shmio.layout.lexer import Kind, Token
-from shmio.layout.model import MAX_DEPTH, MAX_DIMENSIONS, Dims
-from shmio.layout.report import Report
-from shmio.layout.syntax import (
-    Array,
-    Assignment,
-    BlockDeclaration,
-    Member,
-    Named,
-    Position,
-    Struct,
-    Type,
-    TypeDeclaration,
-    Unit,
-)
-from shmio.layout.types import DEFAULT_STRING, string_limit
+from shmio.layout.report import Report, TooManyErrors
+from shmio.layout.syntax import Assignment, BlockDeclaration, ConstantDeclaration, Struct, Type, TypeDeclaration, Unit
 
 _HEADER = (
-    *("AUTHOR", "FAMILY", "NAME", "VERSION"),
+    *("AUTHOR", "FAMILY", "NAME", "VERSION", "CODE_VERSION1", "STANDARD"),
     *("KNOW_HOW_PROTECT", "UNLINKED", "READ_ONLY", "NON_RETAIN", "RETAIN"),
 )
-_SECTION = ("VAR", "VAR_RETAIN")
-_SECTION_WORDS = ("RETAIN", "NON_RETAIN", "CONSTANT", "DB_SPECIFIC")
-_TOP = ("DATA_BLOCK", "TYPE", "FUNCTION", "FUNCTION_BLOCK", "ORGANIZATION_BLOCK")
-_STOPS = ("END_STRUCT", "END_VAR", "END_TYPE", "END_DATA_BLOCK", "BEGIN", *_TOP)
-_SPACED = "the name {!r} has spaces and no quotes (as in print, where underscores can be lost); it is kept as written"
+_NUMBERED = ("DB", "UDT", "FB", "FC", "OB", "SFB")
 _DB_NUMBER = re.compile(r"DB([1-9][0-9]{0,4})", re.IGNORECASE)
+_PROTECTED = (
+    "the block {!r} is know-how protected and its declaration is not in the source: remove the protection in its "
+    "properties and export it again, or write its members here"
+)
 
 
 def parse(file: str, text: str, tokens: list[Token], report: Report) -> Unit:
     """Parse one file; what could not be understood is in the report and left out of the result."""
-    return _Parser(Cursor(file, text, tokens), report).unit()
+    return _Parser(Cursor(file, text, tokens, report)).unit()
+
+
+@dataclass(slots=True)
+class _Header:
+    """What stands between a block's name and its body."""
+
+    optimized: bool = False
+    protected: bool = False
 
 
 class _Parser:
-    def __init__(self, cursor: Cursor, report: Report) -> None:
+    def __init__(self, cursor: Cursor) -> None:
         self.at = cursor
-        self.report = report
-
-    # -- files and blocks ------------------------------------------------------------------------------------
+        self.declare = Declarations(cursor)
 
     def unit(self) -> Unit:
         unit = Unit()
@@ -58,13 +54,18 @@ class _Parser:
                     unit.blocks.append(self.block())
                 elif self.at.accept_word("TYPE"):
                     unit.types.append(self.type_declaration())
-                elif self.at.token.is_word("FUNCTION", "FUNCTION_BLOCK", "ORGANIZATION_BLOCK"):
-                    self.code_block(unit)
+                elif self.at.accept_word("FUNCTION_BLOCK"):
+                    unit.types.append(self.function_block())
+                elif self.at.token.is_word("FUNCTION", "ORGANIZATION_BLOCK"):
+                    self.code_block()
+                elif self.at.accept_word("VAR"):
+                    self.at.expect_word("CONSTANT")
+                    unit.constants += self.declare.constants("END_VAR")
                 elif not self.at.accept(";"):
-                    raise self.at.expected("DATA_BLOCK or TYPE")
+                    raise self.at.expected("DATA_BLOCK, TYPE or FUNCTION_BLOCK")
             except SyntaxFault as fault:
-                self.report.add(fault.diagnostic)
-                while not self.at.at_end() and not self.at.token.is_word(*_TOP):
+                self.at.report.add(fault.diagnostic)
+                while not self.at.at_end() and not self.at.token.is_word(*TOP):
                     self.at.advance()
         return unit
 
@@ -73,29 +74,73 @@ class _Parser:
         name, quoted = self.block_name("the block's name")
         match = None if quoted else _DB_NUMBER.fullmatch(name)
         number = int(match[1]) if match and int(match[1]) <= 65_535 else None
-        optimized = self.header()
-        body = self.sections() if self.at.token.is_word("STRUCT", *_SECTION) else self.type_(0)
+        header = self.header()
+        if header.protected and self.at.token.is_word("BEGIN", "END_DATA_BLOCK"):
+            raise SyntaxFault(position.error(_PROTECTED.format(name)))
+        body: Type
+        constants: tuple[ConstantDeclaration, ...] = ()
+        if self.at.token.is_word("STRUCT", *BLOCK_SECTIONS):
+            body, constants = self.declare.sections()
+        else:
+            body = self.declare.body_type()
+            header = self.header(header)  # STEP 7 takes it on either side of the type's name
         self.at.accept(";")
         assignments: list[Assignment] = []
         if self.at.accept_word("BEGIN"):
-            while not self.at.token.is_word("END_DATA_BLOCK", *_TOP) and self.at.token.kind is not Kind.END:
-                self.recovering(lambda: self.assignment(assignments))
+            while not self.at.token.is_word("END_DATA_BLOCK", *TOP) and self.at.token.kind is not Kind.END:
+                self.declare.recovering(lambda: self.assignment(assignments))
         self.at.expect_word("END_DATA_BLOCK")
-        return BlockDeclaration(name, number, optimized, body, tuple(assignments), position)
+        return BlockDeclaration(name, number, header.optimized, body, constants, tuple(assignments), position)
 
     def type_declaration(self) -> TypeDeclaration:
         position = self.at.position
         name, _ = self.block_name("the type's name")
-        self.header()
+        header = self.header()
+        if header.protected and self.at.token.is_word("END_TYPE"):
+            raise SyntaxFault(position.error(_PROTECTED.format(name)))
         if not self.at.token.is_word("STRUCT"):
             raise self.at.expected("STRUCT")
-        errors = len(self.report.errors)
-        body = self.sections()
-        if not body.members and len(self.report.errors) == errors:
-            self.report.add(position.error(f"expected at least one member in the type {name!r}"))
+        errors = len(self.at.report.errors)
+        body, _ = self.declare.sections()
+        if not body.members and len(self.at.report.errors) == errors:
+            self.at.report.add(position.error(f"expected at least one member in the type {name!r}"))
         self.at.accept(";")
         self.at.expect_word("END_TYPE")
         return TypeDeclaration(name, body, position)
+
+    def function_block(self) -> TypeDeclaration:
+        """Read the interface; the code is passed over. Faults go with the declaration: not every one is used."""
+        position = self.at.position
+        name, _ = self.block_name("the function block's name")
+        outer, inner = self.at.report, Report([self.at.file])
+        self.at.report, self.declare.interface = inner, True
+        body, header = Struct((), position), _Header()
+        constants: tuple[ConstantDeclaration, ...] = ()
+        try:
+            with suppress(TooManyErrors):
+                header = self.header()
+                if header.protected and self.at.token.is_word("BEGIN", "END_FUNCTION_BLOCK"):
+                    raise SyntaxFault(position.error(_PROTECTED.format(name)))
+                body, constants = self.declare.sections()
+                if self.at.token.kind is Kind.PUNCT and self.at.token.text not in "#;":  # no statement begins so
+                    raise self.at.expected("a section of variables or BEGIN")
+        except SyntaxFault as fault:
+            with suppress(TooManyErrors):
+                inner.add(fault.diagnostic)
+        self.at.report, self.declare.interface = outer, False
+        if not self.at.skip_to("END_FUNCTION_BLOCK"):
+            raise SyntaxFault(position.error(f"the function block {name!r} has no END_FUNCTION_BLOCK"))
+        self.at.advance()
+        faults = tuple(inner.errors)
+        return TypeDeclaration(name, body, position, constants, True, header.optimized, faults)
+
+    def code_block(self) -> None:
+        start = self.at.advance()
+        end, name = f"END_{start.text.upper()}", self.at.token.text
+        if not self.at.skip_to(end):
+            raise self.at.fault(start, f"{start.text} has no {end}")
+        self.at.advance()
+        self.at.report.add(self.at.at(start).warning(f"{start.text} {name!r} declares no data block and is skipped"))
 
     def block_name(self, what: str) -> tuple[str, bool]:
         token = self.at.token
@@ -103,209 +148,25 @@ class _Parser:
             raise self.at.expected(what)
         self.at.advance()
         name = token.text
-        if token.is_word("DB", "UDT") and self.at.token.kind is Kind.NUMBER:
+        if token.is_word(*_NUMBERED) and self.at.token.kind is Kind.NUMBER:
             name += self.at.advance().text  # DB 10 is DB10
         return name, token.kind is Kind.QUOTED
 
-    def header(self) -> bool:
-        """Skip what stands between a block's name and its body; return whether it says optimized."""
-        optimized = False
+    def header(self, header: _Header | None = None) -> _Header:
+        """Skip what stands between a block's name and its body; add to what was found before."""
+        header = header or _Header()
         while True:
             if self.at.token.is_punct("{"):
-                optimized |= self.attributes().get("S7_OPTIMIZED_ACCESS", "").upper() == "TRUE"
+                header.optimized |= self.declare.attributes().get("S7_OPTIMIZED_ACCESS", "").upper() == "TRUE"
             elif self.at.token.is_word(*_HEADER):
                 word = self.at.advance()
+                header.protected |= word.is_word("KNOW_HOW_PROTECT")
                 if self.at.accept(":") or self.at.accept("="):
-                    while self.at.token.line == word.line and not self.at.token.is_word("STRUCT", "VAR", "BEGIN"):
+                    while self.at.token.line == word.line and not self.at.token.is_word("STRUCT", "BEGIN", *SECTIONS):
                         if self.at.advance().kind is Kind.END:
                             break
             else:
-                return optimized
-
-    def attributes(self) -> dict[str, str]:
-        """Read ``{ name := 'value'; … }``; names in upper case, values without quotes."""
-        opening = self.at.advance()
-        values: dict[str, str] = {}
-        while not self.at.accept("}"):
-            token = self.at.token
-            if token.kind is Kind.END or token.is_punct("{") or token.is_word(*_STOPS):
-                raise self.at.fault(opening, "the attributes that begin here have no '}'")
-            self.at.advance()
-            if token.kind in (Kind.WORD, Kind.QUOTED) and self.at.accept(":="):
-                values[token.text.upper()] = self.at.token.text.strip("'")
-        return values
-
-    def code_block(self, unit: Unit) -> None:
-        start = self.at.token
-        end = f"END_{self.at.advance().text.upper()}"
-        name = self.at.token.text
-        while not self.at.accept_word(end):
-            if self.at.token.kind is Kind.END:
-                raise self.at.fault(start, f"{start.text} has no {end}")
-            self.at.advance()
-        unit.skipped.append(name)
-        self.report.add(self.at.at(start).warning(f"{start.text} {name!r} declares no data block and is skipped"))
-
-    # -- members ---------------------------------------------------------------------------------------------
-
-    def sections(self) -> Struct:
-        """Read a body: one STRUCT, or VAR sections one after the other."""
-        position = self.at.position
-        if self.at.accept_word("STRUCT"):
-            return Struct(self.members("END_STRUCT", 0), position)
-        members: list[Member] = []
-        while self.at.accept_word(*_SECTION):
-            while self.at.token.is_word(*_SECTION_WORDS) and not self.at.names_member():
-                if self.at.advance().text.upper() == "CONSTANT":
-                    raise self.at.expected("a section of variables, not of constants")
-            members += self.members("END_VAR", 0)
-            self.at.accept(";")
-        return Struct(tuple(members), position)
-
-    def members(self, end: str, depth: int) -> tuple[Member, ...]:
-        members: list[Member] = []
-        while self.at.names_member() or not self.at.accept_word(end):
-            if self.stops():
-                raise self.at.expected(f"a member or {end}")
-            self.recovering(lambda: self.member(members, depth))
-        return tuple(members)
-
-    def stops(self) -> bool:
-        """Whether a list of members ends here for want of its END."""
-        token = self.at.token
-        return token.kind is Kind.END or (token.is_word(*_STOPS) and not self.at.names_member())
-
-    def recovering(self, read: Callable[[], None]) -> None:
-        """Run one production; on a fault report it and skip to the end of the statement."""
-        start = self.at.index
-        try:
-            read()
-        except SyntaxFault as fault:
-            self.report.add(fault.diagnostic)
-            if self.at.index == start:
-                self.at.advance()
-            depth = 0
-            while not (self.stops() if depth == 0 else self.at.token.kind is Kind.END):
-                token = self.at.advance()
-                depth += token.is_word("STRUCT") - token.is_word("END_STRUCT")
-                if token.is_punct(";") and depth == 0:
-                    return
-
-    def member(self, members: list[Member], depth: int) -> None:
-        if self.at.accept(";"):
-            return
-        names = [self.member_name()]
-        while self.at.accept(","):
-            names.append(self.member_name())
-        if self.at.token.is_punct("{"):
-            self.attributes()
-        self.at.expect(":", "':' and the type")
-        for name, position, quoted in names:
-            if not quoted and " " in name:
-                self.report.add(position.warning(_SPACED.format(name)))
-        first = self.at.index
-        type_ = self.type_(depth)
-        if self.at.token.is_punct("{"):
-            self.attributes()
-        initial = self.at.value() if self.at.accept(":=") else None
-        closing = self.at.token
-        if not self.at.accept(";") and not (isinstance(type_, Struct) and closing.is_word("END_STRUCT")):
-            raise self.at.expected("';' at the end of the declaration")
-        inner = isinstance(type_, Struct) or (isinstance(type_, Array) and isinstance(type_.element, Struct))
-        comment = "" if inner else closing.comment or self.at.last_comment(first)
-        members += [Member(name, type_, comment, initial, position) for name, position, _ in names]
-
-    def member_name(self) -> tuple[str, Position, bool]:
-        """Read a name; return it, its place, and whether it was in quotes."""
-        position, token = self.at.position, self.at.token
-        if token.kind is Kind.QUOTED:
-            return self.at.advance().text, position, True
-        if token.kind is not Kind.WORD:
-            raise self.at.expected("a member's name")
-        return self.at.words(), position, False
-
-    # -- types -----------------------------------------------------------------------------------------------
-
-    def type_(self, depth: int) -> Type:
-        position = self.at.position
-        if not self.at.accept_word("ARRAY"):
-            return self.element(depth)
-        dims = self.dimensions()
-        self.at.expect_word("OF")
-        if self.at.token.is_word("ARRAY"):
-            raise self.at.expected("the type of an element; an array of arrays is one array with more dimensions")
-        return Array(dims, self.element(depth), position)
-
-    def element(self, depth: int) -> Named | Struct:
-        position, token = self.at.position, self.at.token
-        if depth + 1 >= MAX_DEPTH and token.is_word("STRUCT"):
-            raise self.at.fault(token, f"structures are nested more than {MAX_DEPTH} deep")
-        if self.at.accept_word("STRUCT"):
-            errors = len(self.report.errors)
-            members = self.members("END_STRUCT", depth + 1)
-            if not members and len(self.report.errors) == errors:
-                raise self.at.fault(token, "expected at least one member in the structure")
-            return Struct(members, position)
-        if token.kind is Kind.QUOTED:
-            self.at.advance()
-            return Named(token.text, True, position)
-        if token.kind is not Kind.WORD or token.is_word(*_STOPS, *_SECTION):
-            raise self.at.expected("a type")
-        self.at.advance()
-        name = token.text
-        if token.is_word("STRING", "WSTRING"):
-            name = f"{name.upper()}[{self.string_length(name.upper())}]"
-        elif token.is_word("UDT") and self.at.token.kind is Kind.NUMBER:
-            name += self.at.advance().text  # UDT 10 is UDT10
-        return Named(name, False, position)
-
-    def string_length(self, base: str) -> int:
-        if not (self.at.token.is_punct("[") or self.at.token.is_punct("(")):
-            return DEFAULT_STRING
-        closing = "]" if self.at.advance().text == "[" else ")"
-        token = self.at.token
-        length = self.integer("the string's length")
-        if not 1 <= length <= string_limit(base):
-            raise self.at.fault(token, f"expected a {base} length of 1 to {string_limit(base)}, found {token}")
-        self.at.expect(closing, f"'{closing}' after the string's length")
-        return length
-
-    def dimensions(self) -> Dims:
-        self.at.expect("[", "'[' and the bounds of the array")
-        dims: list[tuple[int, int]] = []
-        while True:
-            start = self.at.token
-            low = self.integer("the lower bound")
-            self.at.expect("..", "'..' between the bounds")
-            high = self.integer("the upper bound")
-            if low > high:
-                raise self.at.fault(start, f"expected a lower bound not above the upper, found {low}..{high}")
-            dims.append((low, high))
-            if not self.at.accept(","):
-                break
-            if len(dims) == MAX_DIMENSIONS:
-                raise self.at.fault(start, f"an array has at most {MAX_DIMENSIONS} dimensions")
-        self.at.expect("]", "']' after the bounds")
-        return tuple(dims)
-
-    def integer(self, what: str) -> int:
-        """Read a whole number that fits a DINT, as Siemens demands of bounds."""
-        start = self.at.token
-        sign = -1 if self.at.accept("-") else 1
-        if sign == 1:
-            self.at.accept("+")
-        token = self.at.token
-        if token.kind in (Kind.WORD, Kind.QUOTED):
-            raise self.at.expected(f"{what} as a number; constants are not known here")
-        digits = token.text.replace("_", "")
-        if token.kind is not Kind.NUMBER or not digits.isdecimal():
-            raise self.at.expected(f"{what}, a whole number")
-        self.at.advance()
-        if len(digits) > 10 or not -(1 << 31) <= sign * int(digits) < 1 << 31:
-            raise self.at.fault(start, f"expected {what} within 32 bits, found {token}")
-        return sign * int(digits)
-
-    # -- BEGIN -----------------------------------------------------------------------------------------------
+                return header
 
     def assignment(self, assignments: list[Assignment]) -> None:
         if self.at.accept(";"):
@@ -321,9 +182,9 @@ class _Parser:
             else:
                 raise self.at.expected("a member's name")
             if self.at.accept("["):
-                index = [self.integer("an index")]
+                index = [integer(self.at, "an index")]
                 while self.at.accept(","):
-                    index.append(self.integer("an index"))
+                    index.append(integer(self.at, "an index"))
                 self.at.expect("]", "']' after the index")
                 target.append(tuple(index))
             if not self.at.accept("."):

@@ -3,6 +3,8 @@
 - BOOL takes the next bit; anything else begins at the next whole byte.
 - One-byte types take the next byte; all wider types, strings included, begin at an even byte.
 - Arrays and structures begin at an even byte and are padded to an even length.
+- In an instance of a function block, so does each section: inputs, outputs, in-outs, static members. An in-out
+  of a structured type is a POINTER to what the caller gave.
 
 A type is placed once, however often it is used; how much its expansion would need is known, and bounded, before
 anything is expanded. ``docs/reference/layout-rules.md`` gives the rules with their evidence.
@@ -10,88 +12,36 @@ anything is expanded. ``docs/reference/layout-rules.md`` gives the rules with th
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import replace
 
+from shmio.layout import system
+from shmio.layout.constants import BoundFault, Constants
 from shmio.layout.model import MAX_BLOCK_BYTES, MAX_DEPTH, MAX_ELEMENTS, MAX_REGISTERS, Dims, array_size
+from shmio.layout.placed import Cost, Field, Group, Leaf, Repeat, extent_of, round_up
 from shmio.layout.report import Report
-from shmio.layout.syntax import Array, Member, Named, Position, Struct, Type, TypeDeclaration
+from shmio.layout.syntax import Array, Bounds, Member, Named, Position, Section, Struct, Type, TypeDeclaration
 from shmio.layout.topic import encode_segment
-from shmio.layout.types import SYSTEM_TYPES, ElementType, element_type
+from shmio.layout.types import POINTER, STRUCTURED, ElementType, element_type, string_limit
 
 MAX_NAME = 128  # characters, as in TIA Portal
 MAX_TEXT = 32 << 20  # characters of all expanded paths, comments and initial values together
 
 
-@dataclass(frozen=True, slots=True)
-class Leaf:
-    """A register: an elementary type or an array of one. ``size`` is unpadded, in bytes."""
-
-    element: ElementType
-    dims: Dims
-    size: int
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Number of elements in each dimension."""
-        return tuple(high - low + 1 for low, high in self.dims)
-
-
-@dataclass(frozen=True, slots=True)
-class Cost:
-    """What an expansion needs: registers, their elements, and the characters of their texts."""
-
-    registers: int = 0
-    elements: int = 0
-    text: int = 0
-
-    def plus(self, inner: Cost, times: int, text_each: int) -> Cost:
-        """Return the cost with ``times`` the inner one added, each register with so many characters more."""
-        return Cost(
-            self.registers + times * inner.registers,
-            self.elements + times * inner.elements,
-            self.text + times * (inner.text + inner.registers * text_each),
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class Group:
-    """A placed structure. ``size`` is in bytes, even."""
-
-    fields: dict[str, Field]  # by name in lower case: Siemens' names differ by more than case
-    size: int
-    cost: Cost
-    height: int
-
-
-@dataclass(frozen=True, slots=True)
-class Repeat:
-    """An array of structures."""
-
-    group: Group
-    dims: Dims
-
-
-@dataclass(frozen=True, slots=True)
-class Field:
-    """A member with its place in its structure: ``offset`` in bytes, ``bit`` for a single BOOL."""
-
-    segment: str
-    member: Member
-    type: Leaf | Group | Repeat
-    offset: int
-    bit: int | None
-
-
 class Placer:
     """Places structures; types of users are looked up by name and placed at first use."""
 
-    def __init__(self, types: dict[str, TypeDeclaration], skipped: frozenset[str], report: Report) -> None:
+    def __init__(self, types: Mapping[str, TypeDeclaration], constants: Constants, report: Report) -> None:
         self._types = types
-        self._skipped = skipped
+        self._global = self._constants = constants
         self._report = report
         self._placed: dict[str, Group | None] = {}
         self._open: list[str] = []
+
+    def block(self, struct: Struct, constants: Constants) -> Group | None:
+        """Place the body of a block that has constants of its own."""
+        self._constants = constants
+        return self.struct(struct)
 
     def struct(self, struct: Struct, depth: int = 0) -> Group | None:
         """Place a structure; None if anything in it is wrong, which then has been reported.
@@ -107,29 +57,42 @@ class Placer:
         bits = height = 0
         cost = Cost()
         good = True
+        section: Section | None = None
         for member in struct.members:
+            if member.section is not section:
+                section, bits = member.section, round_up(bits, 16)
+            if _takes_no_room(member):
+                continue
             placed = self._member(member, fields, depth)
             if placed is None:
                 good = False
                 continue
-            extent = _extent(placed)
+            extent = extent_of(placed)
             if isinstance(placed, Leaf) and placed.element.base == "BOOL" and not placed.dims:
                 offset, bit = divmod(bits, 8)
                 bits += 1
             else:
-                offset, bit = _up(_up(bits, 8) // 8, extent.align), None
+                offset, bit = round_up(round_up(bits, 8) // 8, extent.align), None
                 bits = (offset + extent.size) * 8
             segment = encode_segment(member.name)
-            own = len(segment) + 1 + len(member.comment) + len(member.initial or "")
+            initial = self._constants.substitute(member.initial)
+            own = len(segment) + 1 + len(member.comment) + (len(initial or "") if isinstance(placed, Leaf) else 0)
             cost = cost.plus(extent.cost, 1, own)
             height = max(height, extent.height + 1)
-            fields[member.name.lower()] = Field(segment, member, placed, offset, bit)
-            good = good and self._fits(member.position, _up(bits, 8) // 8, cost, height)
-        return Group(fields, _up(_up(bits, 8) // 8, 2), cost, height) if good else None
+            fields[member.name.lower()] = Field(segment, replace(member, initial=initial), placed, offset, bit)
+            good = good and self._fits(member.position, round_up(bits, 8) // 8, cost, height)
+        return Group(fields, round_up(round_up(bits, 8) // 8, 2), cost, height) if good else None
 
-    def named(self, name: Named, depth: int = 0) -> ElementType | Group | None:
+    def named(self, name: Named) -> ElementType | Group | None:
         """Look a type up: an elementary one, else a user's; None if it cannot be had, which is reported."""
-        if not name.quoted and (element := element_type(name.name)):
+        try:
+            return self._named(name, 0)
+        except BoundFault as fault:
+            self._report.add(fault.diagnostic)
+            return None
+
+    def _named(self, name: Named, depth: int) -> ElementType | Group | None:
+        if not name.quoted and (element := self._elementary(name)):
             return element
         key = name.name.lower()
         if key in self._open:
@@ -137,14 +100,35 @@ class Placer:
             self._refuse(name.position, f"the type {name.name!r} contains itself: {chain}")
             return None
         if key not in self._placed:
-            declaration = self._types.get(key)
+            declaration = self._types.get(key) or system.declarations().get(key)
             if declaration is None:
                 self._refuse(name.position, self._unknown(name))
                 return None
-            self._open.append(key)
-            self._placed[key] = self.struct(declaration.body, max(depth, 1))
-            self._open.pop()
+            self._placed[key] = self._declared(key, declaration, depth)
         return self._placed[key]
+
+    def _declared(self, key: str, declaration: TypeDeclaration, depth: int) -> Group | None:
+        for fault in declaration.faults:
+            self._report.add(fault)
+        if declaration.faults:
+            return None
+        if not declaration.body.members:  # a function block that keeps nothing
+            return Group({}, 0, Cost(), 0)
+        outside, self._constants = self._constants, Constants(declaration.constants, self._global)
+        self._open.append(key)
+        group = self.struct(declaration.body, max(depth, 1))
+        self._open.pop()
+        self._constants = outside
+        return group
+
+    def _elementary(self, name: Named) -> ElementType | None:
+        if name.length is None:
+            return element_type(name.name)
+        length = self._constants.number(name.length)
+        if not 1 <= length <= string_limit(name.name):
+            what = f"expected a {name.name} length of 1 to {string_limit(name.name)}, found {length}"
+            raise BoundFault(name.position.error(what))
+        return element_type(f"{name.name}[{length}]")
 
     def _member(self, member: Member, fields: dict[str, Field], depth: int) -> Leaf | Group | Repeat | None:
         first = fields.get(member.name.lower())
@@ -155,22 +139,33 @@ class Placer:
         if len(member.name) > MAX_NAME:
             self._refuse(member.position, f"a name is at most {MAX_NAME} characters long")
             return None
-        placed = self._type(member.type, depth + 1)
-        if member.initial is not None and isinstance(placed, Group | Repeat):
-            warning = f"the initial value of the structure {member.name!r} is not read; assign its members"
-            self._report.add(member.position.warning(warning))
-        return placed
+        if member.section is Section.IN_OUT and _is_structured(member.type):
+            return Leaf(POINTER, (), POINTER.size)
+        try:
+            return self._type(member.type, depth + 1)
+        except BoundFault as fault:
+            self._report.add(fault.diagnostic)
+            return None
 
     def _type(self, type_: Type, depth: int) -> Leaf | Group | Repeat | None:
         inner = type_.element if isinstance(type_, Array) else type_
-        dims = type_.dims if isinstance(type_, Array) else ()
-        found = self.named(inner, depth) if isinstance(inner, Named) else self.struct(inner, depth)
+        dims = self._dims(type_.bounds, type_.position) if isinstance(type_, Array) else ()
+        found = self._named(inner, depth) if isinstance(inner, Named) else self.struct(inner, depth)
         if isinstance(found, Group):
             return Repeat(found, dims) if dims else found
         if found is None:
             return None
         leaf = Leaf(found, dims, 0)
         return Leaf(found, dims, array_size(found, leaf.shape))
+
+    def _dims(self, bounds: Bounds, position: Position) -> Dims:
+        if not bounds:
+            raise BoundFault(position.error("expected the bounds of the array, found '*', which has no fixed size"))
+        dims = tuple((self._constants.number(low), self._constants.number(high)) for low, high in bounds)
+        for low, high in dims:
+            if low > high:
+                raise BoundFault(position.error(f"expected a lower bound not above the upper, found {low}..{high}"))
+        return dims
 
     def _fits(self, position: Position, size: int, cost: Cost, height: int) -> bool:
         for what, value, limit in (
@@ -186,16 +181,14 @@ class Placer:
         return True
 
     def _unknown(self, name: Named) -> str:
-        if name.name.upper() in SYSTEM_TYPES:
+        if reason := system.refusal(name.name):
             return (
-                f"the system type {name.name} is not supported: its placement in a block with standard access "
-                "has no public source"
+                f"the system type {name.name} is not supported: {reason}; if you know its members, give it as a PLC "
+                f'data type: TYPE "{name.name}" STRUCT … END_STRUCT; END_TYPE'
             )
-        if name.name.lower() in self._skipped:
-            return f"{name.name!r} is a function block; instance data blocks are not supported"
         return (
-            f"expected a known type, found {name.name!r}; if it is a PLC data type, name its .udt file as well "
-            "(instances of function blocks are not supported)"
+            f"expected a known type, found {name.name!r}; if it is a PLC data type or a function block, name its "
+            "source (.udt, .scl, .awl) as well"
         )
 
     def _refuse(self, position: Position, message: str) -> None:
@@ -203,27 +196,20 @@ class Placer:
         self._report.add(position.error(message))
 
 
-@dataclass(frozen=True, slots=True)
-class _Extent:
-    size: int
-    align: int
-    cost: Cost
-    height: int
+def _is_structured(type_: Type) -> bool:
+    """Whether an in-out of this type is handed over as a pointer."""
+    if not isinstance(type_, Named) or type_.quoted or type_.length is not None:
+        return True
+    element = element_type(type_.name)
+    return element is None or element.base in STRUCTURED
 
 
-def _extent(placed: Leaf | Group | Repeat) -> _Extent:
-    """Return what a member takes: bytes with padding, alignment in bytes, and what its expansion needs."""
-    if isinstance(placed, Leaf):
-        cost = Cost(1, math.prod(placed.shape))
-        if placed.dims:
-            return _Extent(_up(placed.size, 2), 2, cost, 0)
-        return _Extent(placed.size, placed.element.align, cost, 0)
-    if isinstance(placed, Group):
-        return _Extent(placed.size, 2, placed.cost, placed.height)
-    group, count = placed.group, math.prod(high - low + 1 for low, high in placed.dims)
-    index_text = sum(1 + max(len(str(low)), len(str(high))) for low, high in placed.dims)
-    return _Extent(count * group.size, 2, Cost().plus(group.cost, count, index_text), group.height)
-
-
-def _up(value: int, step: int) -> int:
-    return -(-value // step) * step
+def _takes_no_room(member: Member) -> bool:
+    """Whether it is a VARIANT parameter: a reference that an instance does not hold."""
+    type_ = member.type
+    return (
+        member.section in (Section.INPUT, Section.IN_OUT)
+        and isinstance(type_, Named)
+        and not type_.quoted
+        and type_.name.upper() == "VARIANT"
+    )

@@ -49,31 +49,36 @@ _FIXED = {
     name: ElementType(name, name, size, 1 if size == 1 else 2) for size, names in _SIZES.items() for name in names
 }
 
+# Hardware data types and parameter types are numbers that name something; Siemens' help gives the type under each
+# ("Hardware data types"; "Format of the parameter types BLOCK, COUNTER, TIMER": a binary number in a word).
+# fmt: off
+_NAMING = {
+    "UINT": (
+        "HW_ANY", "HW_DEVICE", "HW_DPMASTER", "HW_DPSLAVE", "HW_IO", "HW_IOSYSTEM", "HW_SUBMODULE", "HW_MODULE",
+        "HW_INTERFACE", "HW_IEPORT", "HW_HSC", "HW_PWM", "HW_PTO", "PORT", "RTM", "PIP", "DB_ANY", "DB_WWW", "DB_DYN",
+        "TIMER", "COUNTER", "BLOCK_FB", "BLOCK_FC", "BLOCK_DB", "BLOCK_SDB",
+    ),
+    "INT": (
+        "OB_ANY", "OB_DELAY", "OB_TOD", "OB_CYCLIC", "OB_ATT", "OB_PCYCLE", "OB_HWINT", "OB_DIAG", "OB_TIMEERROR",
+        "OB_STARTUP",
+    ),
+    "WORD": ("CONN_ANY", "CONN_PRG", "CONN_OUC"),
+    "DWORD": ("AOM_IDENT", "EVENT_ANY", "EVENT_ATT", "EVENT_HWINT", "CONN_R_ID", "C_ALARM_S", "C_ALARM_SD"),
+    "ANY": ("REMOTE",),
+}
+# fmt: on
 ALIASES = {
     "TOD": "TIME_OF_DAY",
     "DT": "DATE_AND_TIME",
     "LTIME_OF_DAY": "LTOD",
     "DATE_AND_LTIME": "LDT",
+    **{alias: name for name, aliases in _NAMING.items() for alias in aliases},
 }
-
-# Types the system library defines. Their placement in a standard block has no public source, or depends on
-# the version of the library, so they are refused by name rather than guessed.
-# fmt: off
-SYSTEM_TYPES = frozenset({
-    "IEC_TIMER", "IEC_LTIMER", "IEC_SCOUNTER", "IEC_USCOUNTER", "IEC_COUNTER", "IEC_UCOUNTER", "IEC_DCOUNTER",
-    "IEC_UDCOUNTER", "IEC_LCOUNTER", "IEC_ULCOUNTER", "TON_TIME", "TOF_TIME", "TP_TIME", "TONR_TIME", "TON_LTIME",
-    "TOF_LTIME", "TP_LTIME", "TONR_LTIME", "CTU_INT", "CTD_INT", "CTUD_INT", "CTU_DINT", "CTD_DINT", "CTUD_DINT",
-    "R_TRIG", "F_TRIG", "ERRORSTRUCT", "NREF", "CREF", "VREF", "SSL_HEADER", "CONDITIONS", "TADDR_PARAM",
-    "TCON_PARAM", "TCON_IP_V4", "TCON_IP_RFC", "TCON_PHYS", "HSC_PERIOD", "GEOADDR", "LOG2GEO", "IF_CONF_V4",
-    "HW_ANY", "HW_DEVICE", "HW_DPMASTER", "HW_DPSLAVE", "HW_IO", "HW_IOSYSTEM", "HW_SUBMODULE", "HW_MODULE",
-    "HW_INTERFACE", "HW_IEPORT", "HW_HSC", "HW_PWM", "HW_PTO", "AOM_AID", "AOM_IDENT", "EVENT_ANY", "EVENT_ATT",
-    "EVENT_HWINT", "OB_ANY", "OB_DELAY", "OB_TOD", "OB_CYCLIC", "OB_ATT", "OB_PCYCLE", "OB_HWINT", "OB_DIAG",
-    "OB_TIMEERROR", "OB_STARTUP", "PORT", "RTM", "PIP", "CONN_ANY", "CONN_PRG", "CONN_OUC", "CONN_R_ID", "DB_ANY",
-    "DB_WWW", "DB_DYN", "VARIANT", "REMOTE", "TIMER", "COUNTER", "BLOCK_FB", "BLOCK_FC", "BLOCK_DB", "BLOCK_SDB",
-    "VOID",
-})
-# fmt: on
-
+POINTER = _FIXED["POINTER"]
+STRUCTURED = frozenset({"STRING", "WSTRING", "DATE_AND_TIME", "DTL"})  # made of several values, as Siemens sees it
+INTEGERS = frozenset(
+    ["BYTE", "WORD", "DWORD", "LWORD", "SINT", "USINT", "INT", "UINT", "DINT", "UDINT", "LINT", "ULINT"]
+)
 _STRING = re.compile(r"(W?STRING)(?:\[([0-9]{1,5})\])?")
 
 

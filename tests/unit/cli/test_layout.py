@@ -49,6 +49,28 @@ def test_table(files: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> No
     assert captured.err == ""
 
 
+def test_initial_values_that_cannot_be_read_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    members = "a : Int := \"X\"; b : Array[0..1] of Real := [1.0, 'x']; c : Int := 1;"
+    (tmp_path / "a.db").write_text(f"DATA_BLOCK b STRUCT {members} END_STRUCT; BEGIN END_DATA_BLOCK")
+    assert main([str(tmp_path / "a.db"), "--json"]) == 0
+    captured = capsys.readouterr()
+    assert [register["initial"] for register in json.loads(captured.out)["registers"]] == ['"X"', "[1.0, 'x']", "1"]
+    assert captured.err.splitlines() == [
+        'b: warning: the initial value "X" of a cannot be read as INT; an emulated PLC starts it at 0',
+        "b: warning: the initial value [1.0, 'x'] of b cannot be read as REAL; an emulated PLC starts it at 0.0",
+    ]
+
+
+def test_many_initial_values_that_cannot_be_read_are_counted(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    members = "".join(f"a{i} : Int := X;" for i in range(25))
+    (tmp_path / "a.db").write_text(f"DATA_BLOCK b STRUCT {members} END_STRUCT; BEGIN END_DATA_BLOCK")
+    assert main([str(tmp_path / "a.db")]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert (len(lines), lines[-1]) == (21, "b: warning: 5 more initial values cannot be read")
+
+
 def test_table_hides_control_characters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "a.db").write_text('DATA_BLOCK "b" STRUCT a : Int; // \x1b[2J\u202e\nEND_STRUCT; BEGIN END_DATA_BLOCK')
     assert main([str(tmp_path / "a.db")]) == 0
@@ -66,11 +88,11 @@ def test_errors_name_their_place(files: tuple[str, str], capsys: pytest.CaptureF
 
 
 def test_files_that_cannot_be_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "latin.db").write_bytes(DB.encode() + b"// \xe4")
+    (tmp_path / "utf16.db").write_bytes(b"\xff\xfea")
     for name, message in (
         ("none.db", "No such file"),
         (".", "Is a directory"),
-        ("latin.db", "latin.db:2:4: error: expected UTF-8"),
+        ("utf16.db", "utf16.db:1:1: error: expected UTF-16-LE"),
     ):
         assert main([str(tmp_path / name)]) == 1
         captured = capsys.readouterr()

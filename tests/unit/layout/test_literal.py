@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 
 from shmio.errors import ValueRangeError
 from shmio.layout.codec import Value
-from shmio.layout.literal import default_text, parse_literal, scalar_literal, split_array
+from shmio.layout.lists import split_array
+from shmio.layout.literal import default_text, parse_literal, scalar_literal
 from shmio.layout.model import Dims, Register
 from shmio.layout.scalar import scalar_codec
 from shmio.layout.types import element_type

@@ -1,0 +1,406 @@
+"""Instance data blocks, constants, structured initial values, system types, protected blocks."""
+
+from __future__ import annotations
+
+import pytest
+
+from shmio.errors import LayoutError
+from shmio.layout.compiler import Compiled, Source, compile_sources
+from shmio.layout.model import Layout
+
+TIA_FB = """
+FUNCTION_BLOCK "axis"
+{ S7_Optimized_Access := 'FALSE' }
+VERSION : 0.1
+   VAR_INPUT
+      "in" { S7_SetPoint := 'True'} : Bool;
+      source : Variant;
+   END_VAR
+   VAR CONSTANT
+      N : Int := 2;
+   END_VAR
+   VAR
+      list : Array[0..#N] of Real := [1.5, 2(#N)];
+   END_VAR
+BEGIN
+    #list[0] := SEL(G := #"in", IN0 := 0.0, IN1 := 'not a $'string');
+    // END_FUNCTION_BLOCK
+    #type := #data_block;
+END_FUNCTION_BLOCK
+"""
+INSTANCE = 'DATA_BLOCK "axis_DB"\n{ S7_Optimized_Access := \'FALSE\' }\nVERSION : 0.1\nNON_RETAIN\n"axis"\nBEGIN\n'
+END = "END_DATA_BLOCK\n"
+
+
+def compile_text(*texts: str) -> Compiled:
+    return compile_sources([Source(f"{i}.scl", text.encode()) for i, text in enumerate(texts)])
+
+
+def layout_of(*texts: str) -> Layout:
+    (layout,) = compile_text(*texts).layouts
+    return layout
+
+
+def error(*texts: str) -> str:
+    with pytest.raises(LayoutError) as caught:
+        compile_text(*texts)
+    return str(caught.value).splitlines()[0]
+
+
+def block(members: str) -> str:
+    return f'DATA_BLOCK "b" STRUCT\n{members}\nEND_STRUCT; BEGIN\nEND_DATA_BLOCK\n'
+
+
+def places(layout: Layout) -> dict[str, float]:
+    return {register.path: register.offset + (register.bit or 0) / 10 for register in layout.registers}
+
+
+def initials(members: str, *more: str) -> dict[str, str | None]:
+    return {register.path: register.initial for register in layout_of(block(members), *more).registers}
+
+
+# -- function blocks and their instances ---------------------------------------------------------------------
+
+
+def test_an_instance_has_the_interface_of_its_function_block() -> None:
+    for texts in ((TIA_FB, INSTANCE + END), (INSTANCE + END, TIA_FB), (TIA_FB + INSTANCE + END,)):
+        compiled = compile_text(*texts)
+        (layout,) = compiled.layouts
+        assert [(r.path, r.offset, r.size, r.initial) for r in layout.registers] == [
+            ("%69n", 0, 1, None),
+            ("list", 2, 12, "[1.5, 2(2)]"),
+        ]
+        assert not compiled.warnings
+
+
+def test_an_instance_is_assigned_after_begin() -> None:
+    layout = layout_of(TIA_FB, f'{INSTANCE} "in" := TRUE; list[2] := 3.5;\n{END}')
+    assert [register.initial for register in layout.registers] == ["TRUE", "[1.5, 2, 3.5]"]
+
+
+def test_an_instance_of_an_optimized_function_block_is_optimized() -> None:
+    compiled = compile_text(TIA_FB.replace("FALSE", "TRUE"), f'DATA_BLOCK "d" "axis" BEGIN {END}')
+    assert compiled.layouts[0].optimized
+    assert "Optimized block access" in compiled.warnings[0].message
+
+
+def test_instances_within_instances_and_system_function_blocks() -> None:
+    text = """
+        FUNCTION_BLOCK FB 3 VAR v : INT; END_VAR BEGIN END_FUNCTION_BLOCK
+        FUNCTION_BLOCK FB 2
+          VAR kept : DWORD; inner : FB 3; END_VAR
+          VAR_INPUT given : DINT; END_VAR
+          VAR_OUTPUT taken : WORD; END_VAR
+        BEGIN END_FUNCTION_BLOCK
+        FUNCTION_BLOCK FB 1
+          VAR g0 : WORD; drive : FB 2; g1 : WORD; count : SFB 0; g2 : WORD; wait : TON; END_VAR
+        BEGIN END_FUNCTION_BLOCK
+        DATA_BLOCK DB 1
+          FB 1
+          TITLE = after the name, too
+          AUTHOR : shmio
+        BEGIN
+        END_DATA_BLOCK
+    """
+    # As the CPU sees them, by the absolute addresses in a public test of a soft PLC; TON by Siemens' interface.
+    layout = layout_of(text)
+    assert (layout.number, layout.size) == (1, 50)
+    assert places(layout) == {
+        "g0": 0,
+        "drive/given": 2,
+        "drive/taken": 6,
+        "drive/kept": 8,
+        "drive/inner/v": 12,
+        "g1": 14,
+        "count/CU": 16,
+        "count/R": 16.1,
+        "count/PV": 18,
+        "count/Q": 20,
+        "count/CV": 22,
+        "count/CUO": 24,
+        "g2": 26,
+        "wait/IN": 28,
+        "wait/PT": 30,
+        "wait/Q": 34,
+        "wait/ET": 36,
+        "wait/STATE": 40,
+        "wait/STIME": 42,
+        "wait/ATIME": 46,
+    }
+
+
+def test_a_function_block_matters_only_if_it_has_an_instance() -> None:
+    faulty = 'FUNCTION_BLOCK "odd" VAR_INPUT a : ; b : Nope; END_VAR x := 1; END_FUNCTION_BLOCK '
+    assert layout_of(faulty + block("a : Int;")).size == 2
+    assert "0.scl:1:36: error: expected a type" in error(f'{faulty} DATA_BLOCK "d" "odd" BEGIN {END}')
+    unknown = 'FUNCTION_BLOCK "f" VAR a : "Nope"; END_VAR BEGIN END_FUNCTION_BLOCK '
+    assert layout_of(unknown + block("a : Int;")).size == 2
+    assert "found 'Nope'; if it is a PLC data type or a function block, name its source" in error(
+        f'{unknown} DATA_BLOCK "d" "f" BEGIN {END}'
+    )
+
+
+def test_an_instance_without_members_is_empty() -> None:
+    assert layout_of(f'FUNCTION_BLOCK "f" x := 1; END_FUNCTION_BLOCK DATA_BLOCK "d" "f" BEGIN {END}').size == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('FUNCTION_BLOCK "f" VAR a : Int; END_VAR BEGIN', "the function block 'f' has no END_FUNCTION_BLOCK"),
+        ('FUNCTION_BLOCK "f" VAR_TEMP a : Int; END_FUNCTION_BLOCK', "'f' has no END_FUNCTION_BLOCK"),
+        ("FUNCTION_BLOCK FB 1 : VOID VAR a : Int; END_VAR END_FUNCTION_BLOCK", "section of variables or BEGIN"),
+        ('FUNCTION_BLOCK "f" VAR a : "f"; END_VAR BEGIN END_FUNCTION_BLOCK', "contains itself"),
+    ],
+)
+def test_faulty_function_blocks(text: str, message: str) -> None:
+    name = "FB 1" if "FB 1" in text else '"f"'
+    assert message in error(f'{text} DATA_BLOCK "d" {name} BEGIN {END}')
+
+
+# -- protected blocks ----------------------------------------------------------------------------------------
+
+
+def test_a_protected_block_with_its_declaration_compiles() -> None:
+    assert layout_of(block("a : Int;").replace("STRUCT", "KNOW_HOW_PROTECT STRUCT", 1)).size == 2
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"DATA_BLOCK DB 5 KNOW_HOW_PROTECT BEGIN {END}",
+        f'DATA_BLOCK "DB5"\nVERSION : 0.1\nKNOW_HOW_PROTECT\n{END}',
+        'TYPE "DB5" KNOW_HOW_PROTECT END_TYPE',
+        f'FUNCTION_BLOCK "DB5" KNOW_HOW_PROTECT BEGIN END_FUNCTION_BLOCK DATA_BLOCK "d" "DB5" BEGIN {END}',
+    ],
+)
+def test_a_protected_block_without_its_declaration_is_refused(text: str) -> None:
+    message = error(text)
+    assert "the block 'DB5' is know-how protected and its declaration is not in the source" in message
+    assert "remove the protection" in message
+
+
+# -- constants -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("bounds", "dims"),
+    [
+        ("0..MAX", (0, 4)),
+        ('0.."MAX"', (0, 4)),
+        ("0..#max", (0, 4)),
+        ("-MAX..MAX + 1", (-4, 5)),
+        ("1..2*MAX-LOW", (1, 6)),
+        ("16#A..INT#11", (10, 11)),
+    ],
+)
+def test_constants_as_bounds(bounds: str, dims: tuple[int, int]) -> None:
+    constants = "VAR CONSTANT MAX : Int := 4; LOW : Int := MAX - 2; END_VAR"
+    assert layout_of(constants, block(f"a : Array[{bounds}] of Int;")).registers[0].dims == (dims,)
+
+
+def test_the_constants_of_a_block_come_before_those_of_all() -> None:
+    own = 'DATA_BLOCK "b" VAR CONSTANT N : Int := 3; END_VAR VAR a : Array[1..N] of Byte; t : "t"; END_VAR BEGIN '
+    udt = 'TYPE "t" STRUCT a : String[N]; END_STRUCT; END_TYPE '
+    layout = layout_of("VAR CONSTANT N : Int := 5; END_VAR", own + END, udt)
+    assert [(r.count, r.type) for r in layout.registers] == [(3, "BYTE"), (1, "STRING[5]")]
+
+
+def test_constants_as_initial_values() -> None:
+    constants = "VAR CONSTANT A : Int := 7; B : Int := A; T : Time := T#1s; S : String := 'A'; END_VAR"
+    members = 'a : Int := "A"; b : Int := B; c : Array[0..2] of Int := [#A, 2("B")]; d : Time := T; e : Word := 16#A;'
+    assert initials(members + " f : String := 'A'; g : Int := \"X\"; h : String := S;", constants) == {
+        "a": "7",
+        "b": "7",
+        "c": "[7, 2(7)]",
+        "d": "T#1s",
+        "e": "16#A",
+        "f": "'A'",
+        "g": '"X"',
+        "h": "'A'",
+    }
+
+
+@pytest.mark.parametrize(
+    ("constants", "member", "message"),
+    [
+        ("", 'a : Array[0.."N"] of Int;', "the constant 'N' is not in the sources; write its value here, or give one"),
+        ("N : Int := M;", "a : Array[0..N] of Int;", "the constant 'M' is not in the sources"),
+        ("N : Int := N;", "a : Array[0..N] of Int;", "the constant 'N' is defined by itself"),
+        ("N : Real := 1.5;", "a : Array[0..N] of Int;", "expected a whole number, found the constant 'N'"),
+        ("N : Int := 0;", "a : Array[1..N] of Int;", "expected a lower bound not above the upper, found 1..0"),
+        ("N : Int := 300;", "a : String[N];", "expected a STRING length of 1 to 254, found 300"),
+        ("N : DInt := 2147483647;", "a : Array[0..N+1] of Int;", "expected a whole number within 32 bits"),
+        ("N : DInt := 2147483647;", "a : Array[0..N*N*N*N] of Int;", "expected a whole number within 32 bits"),
+        ("N : Int := 1; N : Int := 2;", "a : Int;", "'N' is declared already"),
+        ("N : Int := ;", "a : Int;", "expected a value"),
+        ("N : Int 1;", "a : Int;", "expected ':=' and the constant's value"),
+        ("N : Int := 1", "a : Int;", "expected ';' after the value"),
+    ],
+)
+def test_constants_that_cannot_be(constants: str, member: str, message: str) -> None:
+    sources = [block(member)]
+    if constants:
+        sources.append(f"VAR CONSTANT\n{constants}\nEND_VAR")
+    assert message in error(*sources)
+
+
+def test_long_sums_and_chains_of_constants_have_an_end() -> None:
+    assert layout_of(block(f"a : Array[0..{'1+' * 50_000}1] of Bool;")).registers[0].count == 50_002
+    chain = "".join(f"C{i} : Int := C{i + 1};\n" for i in range(1000))
+    assert "is defined by itself" in error(f"VAR CONSTANT {chain} END_VAR", block("a : Array[0..C0] of Int;"))
+
+
+def test_constants_within_a_constant_do_not_grow_without_end() -> None:
+    constants = 'VAR CONSTANT G : Int := ["G", "G", "G", "G"]; END_VAR'
+    assert initials('a : Int := "G";', constants) == {"a": '["G", "G", "G", "G"]'}
+    long = f"VAR CONSTANT L : String := '{'x' * 250}'; END_VAR"
+    value = f"[{'#L, ' * 100}#L]"
+    assert initials(f"a : Array[0..100] of String := {value};", long) == {"a": value}
+
+
+# -- initial values of structures ----------------------------------------------------------------------------
+
+POINT = 'TYPE "p" STRUCT x : Int := 1; y : Int; z : Struct u : Int := 3; v : Int; END_STRUCT; END_STRUCT; END_TYPE'
+
+
+@pytest.mark.parametrize(
+    ("value", "found"),
+    [
+        ("(7, 8, (9, 10))", ["7", "8", "9", "10"]),
+        ("(7, (), (()))", ["7", None, "3", None]),
+        ("(7)", ["7", None, "3", None]),
+        ("((), 8, ())", ["1", "8", "3", None]),
+        ("(y := 8, Z := (v := 10))", ["1", "8", "3", "10"]),
+        ('("y" := 8)', ["1", "8", "3", None]),
+        ("(2(7))", ["7", "7", "3", None]),
+        ("[7, 8]", ["7", "8", "3", None]),
+        ("()", ["1", None, "3", None]),
+    ],
+)
+def test_initial_values_of_structures(value: str, found: list[str | None]) -> None:
+    assert list(initials(f'a : "p" := {value};', POINT).values()) == found
+
+
+def test_initial_values_come_from_the_outermost_that_gives_one() -> None:
+    types = 'TYPE "o" STRUCT p : "p" := (4, 5); q : "p"; END_STRUCT; END_TYPE ' + POINT
+    found = initials('a : "o" := (((), 6), (y := 7)); b : "o";', types)
+    assert {path: value for path, value in found.items() if "/z/" not in path} == {
+        "a/p/x": "4",
+        "a/p/y": "6",
+        "a/q/x": "1",
+        "a/q/y": "7",
+        "b/p/x": "4",
+        "b/p/y": "5",
+        "b/q/x": "1",
+        "b/q/y": None,
+    }
+
+
+@pytest.mark.parametrize(
+    ("value", "found"),
+    [
+        ("[(1, 2), (3, 4)]", ["1", "2", "3", "4", "0", None]),
+        ("((1, 2), (3, 4))", ["1", "2", "3", "4", "0", None]),
+        ("[(), 2((b := 5))]", ["0", None, "0", "5", "0", "5"]),
+        ("([()], [7], [])", ["0", None, "7", None, "0", None]),
+    ],
+)
+def test_initial_values_of_arrays_of_structures(value: str, found: list[str | None]) -> None:
+    member = f"s : Array[1..3] of Struct a : Int := 0; b : Int; END_STRUCT := {value};"
+    assert list(initials(member).values()) == found
+
+
+def test_commas_in_texts_of_structures() -> None:
+    assert list(initials("a : Struct s : String; t : String; END_STRUCT := ('a,(', ')');").values()) == ["'a,('", "')'"]
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ("5", "expected a value such as (1, 2) or (a := 1, b := 2), found '5'"),
+        ("(1, 2, 3)", "expected at most 2 values"),
+        ("(9999999999(1))", "expected at most 2 values"),
+        ("(c := 1)", "expected a member of the structure, found 'c'"),
+    ],
+)
+def test_initial_values_that_cannot_be_read_are_reported(value: str, message: str) -> None:
+    compiled = compile_text(block(f"s : Struct a : Int := 4; b : Int; END_STRUCT := {value};"))
+    assert [register.initial for register in compiled.layouts[0].registers] == ["4", None]
+    (warning,) = compiled.warnings
+    assert f"the initial value of the structure 's' is not read: {message}" in warning.message
+
+
+def test_a_large_value_is_read_once_for_all_elements() -> None:
+    value = "(" + "1," * 30_000 + ")"
+    udt = f'TYPE "t" STRUCT s : Array[0..0] of Struct a : Int; END_STRUCT := {value}; END_STRUCT; END_TYPE'
+    assert len(initials('a : Array[1..30000] of "t";', udt)) == 30_000
+
+
+def test_texts_that_a_value_repeats_are_bounded() -> None:
+    value = f"[10000(('{'x' * 4000}'))]"
+    message = error(block(f"a : Array[1..10000] of Struct s : String[1]; END_STRUCT := {value};"))
+    assert "expected at most 33554432 characters of names, comments and values" in message
+
+
+def test_comments_within_a_value_are_left_out() -> None:
+    assert initials("a : Array[0..1] of Int := [1, // one\n (* two *) 2];") == {"a": "[1, 2]"}
+
+
+# -- types of the system -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "last"),
+    [
+        ("ErrorStruct", 28, ("DATA_ADDRESS/OFFSET", 24)),
+        ("CREF", 8, ("OFFSET", 4)),
+        ("NREF", 8, ("OFFSET", 4)),
+        ("TCON_Param", 64, ("spare", 62)),
+        ("TADDR_PARAM", 8, ("reserved", 6)),
+        ("SSL_HEADER", 4, ("N_DR", 2)),
+        ("CTU", 10, ("CUO", 8)),
+        ("CTD", 10, ("CDO", 8)),
+        ("CTUD", 10, ("CDO", 8.1)),
+        ("SFB 3", 22, ("ATIME", 18)),
+        ("TOF", 22, ("ATIME", 18)),
+    ],
+)
+def test_system_types_have_the_length_that_is_stated(name: str, size: int, last: tuple[str, float]) -> None:
+    layout = layout_of(block(f"a : {name}; after : Byte;"))
+    found = list(places(layout).items())
+    assert found[-2:] == [(f"a/{last[0]}", last[1]), ("after", size)]
+
+
+def test_tcon_param_at_its_stated_bytes() -> None:
+    found = places(layout_of(block("a : TCON_PARAM;")))
+    assert list(found.values()) == [0, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12, 28, 34, 40, 56, 62]
+
+
+@pytest.mark.parametrize(
+    ("name", "type_", "size"),
+    [
+        ("HW_ANY", "UINT", 2),
+        ("ob_cyclic", "INT", 2),
+        ("CONN_R_ID", "DWORD", 4),
+        ("Remote", "ANY", 10),
+        ("Timer", "UINT", 2),
+    ],
+)
+def test_types_that_name_something_are_numbers(name: str, type_: str, size: int) -> None:
+    (register,) = layout_of(block(f"a : {name};")).registers
+    assert (register.type, register.size) == (type_, size)
+
+
+@pytest.mark.parametrize(
+    "name", ["IEC_TIMER", "TON_TIME", "CTU_INT", "IEC_LTIMER", "TCON_IP_v4", "R_TRIG", "VARIANT", "TCON"]
+)
+def test_system_types_without_a_public_placement_are_refused_with_the_remedy(name: str) -> None:
+    message = error(block(f"a : {name};"))
+    assert f"the system type {name} is not supported" in message
+    assert f'give it as a PLC data type: TYPE "{name}" STRUCT' in message
+
+
+def test_a_given_type_replaces_the_refusal_and_what_is_known() -> None:
+    given = 'TYPE "IEC_TIMER" STRUCT x : DInt; END_STRUCT; END_TYPE TYPE CREF STRUCT y : Byte; END_STRUCT; END_TYPE '
+    assert places(layout_of(given + block("a : IEC_TIMER; b : CREF;"))) == {"a/x": 0, "b/y": 4}
