@@ -119,7 +119,7 @@ class S7Client:
         if self._transport is None:
             raise ConnectorError("not connected")
         if not self._idle:
-            raise RuntimeError(f"{self.depth} reads are under way, which is all that may be")
+            raise RuntimeError(f"no more than {self.depth} reads may be under way")
         with self._dropping_on_error():
             read = self._idle.pop()
             read.begin(time.monotonic_ns() + self._timeout_ns)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import socket
 import threading
 import tracemalloc
@@ -16,40 +15,7 @@ from shmio.connectors.s7 import S7Client, S7Options
 from shmio.emulators.s7 import S7Server
 from shmio.errors import ConfigError, ConnectorError
 from shmio.testing.ports import reserved_port
-from shmio.testing.proxy import FaultProxy
-
-SIZE = 2180
-
-
-class Plc:
-    """An emulated controller with DB201 of random bytes, behind a proxy."""
-
-    def __init__(self, server: S7Server, block: bytearray, proxy: FaultProxy) -> None:
-        self.server = server
-        self.block = block
-        self.proxy = proxy
-        self._stack = ExitStack()
-
-    def client(self, *, size: int = SIZE, db_number: int = 201, **options: object) -> S7Client:
-        given: dict[str, object] = {"host": self.proxy.address.host, "port": self.proxy.address.port, "timeout": 5000}
-        client = S7Client(S7Options(**{**given, **options}), db_number, size)  # type: ignore[arg-type]
-        return self._stack.enter_context(closing(client))
-
-    def close(self) -> None:
-        self._stack.close()
-
-
-@pytest.fixture
-def plc() -> Iterator[Plc]:
-    block = bytearray(os.urandom(SIZE))
-    with S7Server(Address("127.0.0.1", 0)) as server:
-        server.add_block(201, block)
-        server.start()
-        with FaultProxy(server.address) as proxy:
-            plc = Plc(server, block, proxy)
-            yield plc
-            plc.close()
-
+from tests.unit.connectors.s7.harness import SIZE, Plc, assert_recovers
 
 Scripted = Callable[..., S7Client]
 
@@ -78,16 +44,6 @@ def scripted() -> Iterator[Scripted]:
             return stack.enter_context(closing(S7Client(options, 201, SIZE)))
 
         yield make
-
-
-def assert_recovers(plc: Plc, client: S7Client) -> None:
-    """The error has closed the client; with the fault gone, it connects and reads."""
-    assert not client.connected
-    with pytest.raises(ConnectorError, match="not connected"):
-        client.read()
-    plc.proxy.pass_all()
-    client.connect()
-    assert client.read() == plc.block
 
 
 # -- what works --------------------------------------------------------------------------------------------------------

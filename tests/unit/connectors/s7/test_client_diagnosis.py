@@ -1,0 +1,182 @@
+"""What the client finds out about a controller that does not give what it should."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+import pytest
+import snap7
+
+from shmio.connectors.s7 import S7Client, mode
+from shmio.emulators.s7 import S7Server
+from shmio.emulators.s7_jobs import Fault, Traits
+from shmio.errors import ConnectorError
+from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc
+
+
+@pytest.mark.parametrize(
+    ("traits", "text"),
+    [
+        (Traits(fault=Fault.PUT_GET_OFF), r"enable 'Permit access with PUT/GET.*\(error 0x8104\)"),
+        (Traits(fault=Fault.PROTECTED), r"DB201: access denied.*'Full access'.*\(item code 0x03\)"),
+        (Traits(fault=Fault.OPTIMIZED), r"DB201 has no byte that can be addressed.*clear 'Optimized block access'"),
+        (Traits(block_size=1), r"DB201 has no 2180 bytes but 1 bytes .*export it again"),
+        (Traits(block_size=SIZE - 1), r"DB201 has no 2180 bytes but 2179 bytes"),
+        (Traits(block_size=963, max_pdu_size=240, max_jobs=1), r"DB201 has no 2180 bytes but 963 bytes"),
+        (Traits(block_size=1234, max_pdu_size=240, max_jobs=24), r"DB201 has no 2180 bytes but 1234 bytes"),
+    ],
+)
+def test_a_controller_that_refuses_says_what_to_do(make_plc: MakePlc, traits: Traits, text: str) -> None:
+    client = make_plc(traits).connected()
+    for _ in range(client.depth):
+        client.submit()
+    with pytest.raises(ConnectorError, match=text):
+        client.collect(1 << 62)
+    assert not client.connected
+
+
+def test_if_the_size_cannot_be_found_the_refusal_is_told(make_plc: MakePlc) -> None:
+    plc = make_plc(Traits(block_size=500))
+    client = plc.connected(timeout=300)
+    answers = 0
+
+    def only_the_read(frame: bytes) -> bytes | None:
+        nonlocal answers
+        answers += 1
+        return frame if answers <= 3 else None
+
+    plc.proxy.edit(only_the_read)
+    with pytest.raises(ConnectorError, match=r"^DB201 has no 2180 bytes \(item code 0x05\).*export it again"):
+        client.read()
+    assert not client.connected
+
+
+# -- operating mode ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ask for the mode with every read."""
+    monkeypatch.setattr(mode, "INTERVAL_NS", 0)
+
+
+def read_until(client: S7Client, *, doubt: bool) -> str:
+    for _ in range(10):
+        client.read()
+        if bool(client.doubt) == doubt:
+            return client.doubt
+    raise AssertionError(f"still {client.doubt!r}")
+
+
+@pytest.mark.usefixtures("often")
+@pytest.mark.parametrize("jobs", [1, 8])
+def test_stop_is_noticed_and_run_again(make_plc: MakePlc, jobs: int) -> None:
+    plc = make_plc(Traits(max_jobs=jobs))
+    client = plc.connected()
+    peer = snap7.Client()
+    peer.connect(plc.server.address.host, 0, 1, plc.server.address.port)
+    for _ in range(2):
+        assert read_until(client, doubt=False) == ""
+        peer.plc_stop()
+        assert "the PLC is in STOP: its program does not run; switch it to RUN" in read_until(client, doubt=True)
+        peer.plc_hot_start()
+    peer.disconnect()
+    peer.destroy()
+
+
+def test_stop_is_known_before_the_first_image(plc: Plc) -> None:
+    peer = snap7.Client()
+    peer.connect(plc.server.address.host, 0, 1, plc.server.address.port)
+    peer.plc_stop()
+    client = plc.connected()
+    assert "in STOP" in client.doubt
+    assert client.read() == plc.block
+    client.close()
+    assert client.doubt == ""
+    peer.disconnect()
+    peer.destroy()
+
+
+def test_is_not_asked_with_every_read(plc: Plc) -> None:
+    asked = 0
+
+    def count(frame: bytes) -> bytes:
+        nonlocal asked
+        asked += frame[8] == 7
+        return frame
+
+    plc.proxy.edit(count)
+    client = plc.connected()
+    for _ in range(100):
+        client.read()
+    assert asked == 1
+
+
+class Ignorant(S7Server):
+    """Knows no system status lists, and says so."""
+
+    def _get_szl_data(self, szl_id: int, szl_index: int) -> bytes | None:
+        return None
+
+
+class Touchy(S7Server):
+    """Ends the connection of who asks for what it does not know."""
+
+    def _process_request(self, request_data: bytes, client_address: tuple[str, int]) -> bytes | None:
+        return None
+
+
+@pytest.mark.usefixtures("often")
+def test_a_controller_without_a_mode(make_plc: MakePlc) -> None:
+    plc = make_plc(Traits(), Ignorant)
+    client = plc.connected()
+    for _ in range(5):
+        assert client.read() == plc.block
+        assert client.doubt == ""
+
+
+@pytest.mark.usefixtures("often")
+def test_a_controller_that_hangs_up_when_asked(make_plc: MakePlc) -> None:
+    plc = make_plc(Traits(), Touchy)
+    client = plc.client()
+    for _ in range(2):
+        with pytest.raises(ConnectorError, match="closed the connection"):
+            client.connect()
+    client.connect()
+    for _ in range(5):
+        assert client.read() == plc.block
+
+
+@pytest.mark.usefixtures("often")
+def test_a_controller_that_is_silent_when_asked(plc: Plc) -> None:
+    plc.proxy.edit(lambda frame: None if frame[8] == 7 else frame)
+    client = plc.client(timeout=200)
+    for _ in range(2):
+        with pytest.raises(ConnectorError, match="no answer within 200 ms"):
+            client.connect()
+    client.connect()
+    for _ in range(5):
+        assert client.read() == plc.block
+
+
+def test_a_question_that_is_never_answered_ends_the_session(plc: Plc, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has answered before, so the connection is not what it was; the reads alone would not show it."""
+    client = plc.connected(timeout=200)
+    monkeypatch.setattr(mode, "INTERVAL_NS", 0)
+    plc.proxy.edit(lambda frame: None if frame[8] == 7 else frame)
+
+    def read_on() -> None:
+        while True:
+            client.read()
+
+    with pytest.raises(ConnectorError, match="no answer within 200 ms"):
+        read_on()
+    plc.proxy.pass_all()
+    client.connect()
+    assert client.read() == plc.block
+
+
+def test_wrong_answers_to_the_question(plc: Plc) -> None:
+    plc.proxy.edit(lambda frame: frame[:22] + b"\x44" + frame[23:] if frame[8] == 7 else frame)
+    with closing(plc.client()) as client, pytest.raises(ConnectorError, match="not an answer to 'read SZL'"):
+        client.connect()

@@ -1,0 +1,159 @@
+"""Writing through real sockets: what was written is there, what was not is said, and a doubt ends the connection."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+
+import pytest
+
+from shmio.connectors.s7.client import S7Client
+from shmio.emulators.s7_jobs import Fault, Traits
+from shmio.errors import ConnectorError
+from shmio.layout.write import Write
+from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc, assert_recovers
+
+
+def image(client: S7Client) -> bytes:
+    collected = client.collect(time.monotonic_ns() + 10**10)
+    assert collected is not None
+    return collected
+
+
+@pytest.mark.parametrize("pdu_size", [240, 480, 960])
+@pytest.mark.parametrize("jobs", [1, 3, 24])
+def test_what_is_written_is_read_back(make_plc: MakePlc, pdu_size: int, jobs: int) -> None:
+    plc = make_plc(Traits(max_pdu_size=pdu_size, max_jobs=jobs))
+    client = plc.connected()
+    whole = bytes(range(256)) * 8 + bytes(SIZE - 2048)
+    assert client.write([Write(0, 0, whole)]) == [""]
+    assert client.read() == whole == plc.block
+    writes = [Write(3, 0, b"abc"), Write(10, 1 << 7, b"\x80"), Write(10, 1, b"\xfe"), Write(SIZE - 1, 0, b"z")]
+    assert client.write(writes) == [""] * 4
+    assert client.read() == plc.block
+    assert plc.block[:12] + plc.block[-1:] == b"\0\1\2abc\6\7\x08\x09\x8a\x0bz"
+
+
+def test_nothing_to_write(plc: Plc) -> None:
+    assert plc.connected().write([]) == []
+
+
+def test_a_bit_leaves_its_neighbours_to_the_program(plc: Plc) -> None:
+    """The program counts in the other bits of the byte, all the time: not one count may be lost."""
+    client = plc.connected()
+    plc.block[7] = 0
+    stopping = threading.Event()
+    counted = 0
+
+    def count() -> None:
+        nonlocal counted
+        while not stopping.is_set():
+            with plc.server.lock:
+                plc.block[7] = plc.block[7] & 0x10 | (counted + 1 & 0x0F) | (counted + 1 & 0x70) << 1
+            counted += 1
+
+    thread = threading.Thread(target=count)
+    thread.start()
+    for turn in range(200):
+        assert client.write([Write(7, 0x10, b"\x10" if turn & 1 else b"\xef")]) == [""]
+        assert plc.block[7] & 0x10 == (0x10 if turn & 1 else 0)
+    stopping.set()
+    thread.join()
+    assert plc.block[7] & 0xEF == counted & 0x0F | (counted & 0x70) << 1
+
+
+def test_a_write_passes_between_reads_under_way(make_plc: MakePlc) -> None:
+    plc = make_plc(Traits(max_pdu_size=480, max_jobs=10))
+    client = plc.connected()
+    before = bytes(plc.block)
+    client.submit()
+    client.submit()
+    assert client.write([Write(0, 0, b"new"), Write(2000, 0, b"new")]) == ["", ""]
+    assert image(client)[3:2000] == before[3:2000]
+    assert image(client)[3:2000] == before[3:2000]
+    client.submit()
+    assert image(client) == b"new" + before[3:2000] + b"new" + before[2003:]
+
+
+def test_a_refused_item_among_good_ones(plc: Plc) -> None:
+    """The layout is longer than the block; whoever may write there is told so, and the others are served."""
+    client = plc.connected(size=SIZE)
+    outcomes = client.write([Write(0, 0, b"one"), Write(SIZE, 0, b"two"), Write(9, 2, b"\2")])
+    assert [outcomes[0], outcomes[2]] == ["", ""]
+    assert outcomes[1].startswith(f"DB201 has no byte {SIZE + 2} (item code 0x05): the layout is of another version")
+    assert plc.block[:3] == b"one"
+    assert client.read() == plc.block
+
+
+@pytest.mark.parametrize(
+    ("fault", "text"), [(Fault.WRITE_PROTECTED, r"'Full access'.*0x03"), (Fault.PUT_GET_OFF, r"PUT/GET.*0x8104")]
+)
+def test_a_controller_that_takes_no_writes(make_plc: MakePlc, fault: Fault, text: str) -> None:
+    plc = make_plc(Traits(fault=fault))
+    before = bytes(plc.block)
+    client = plc.connected()
+    for outcome in client.write([Write(0, 0, b"one"), Write(9, 2, b"\2")]):
+        assert re.search(text, outcome)
+    assert client.connected
+    assert plc.block == before
+
+
+def test_an_answer_to_another_request(plc: Plc) -> None:
+    client = plc.connected()
+    plc.proxy.rewrite_reference(lambda reference: reference + 100)
+    with pytest.raises(ConnectorError, match="not under way"):
+        client.write([Write(0, 0, b"x")])
+    assert_recovers(plc, client)
+
+
+def test_an_answer_for_fewer_items(plc: Plc) -> None:
+    client = plc.connected()
+
+    def shorten(frame: bytes) -> bytes:
+        return frame[:3] + bytes((len(frame) - 1,)) + frame[4:16] + b"\1" + frame[17:20] + b"\1" + frame[21:-1]
+
+    plc.proxy.edit(shorten, frames=1)
+    with pytest.raises(ConnectorError, match="1 return codes, 2 items were written"):
+        client.write([Write(0, 0, b"x"), Write(2, 0, b"y")])
+    assert_recovers(plc, client)
+
+
+def test_a_late_answer_is_never_taken_for_the_next(plc: Plc) -> None:
+    client = plc.connected(timeout=300)
+    plc.proxy.hold()
+    with pytest.raises(ConnectorError, match="no answer within 300 ms"):
+        client.write([Write(0, 0, b"x")])
+    assert plc.proxy.wait_held()
+    plc.proxy.edit(lambda frame: frame)  # let the session through, keep what is held
+    client.connect()
+    plc.proxy.release()  # the old confirmation, on the new connection
+    with pytest.raises(ConnectorError, match="not under way"):
+        client.write([Write(SIZE, 0, b"y")])  # which would be refused
+    assert_recovers(plc, client)
+
+
+@pytest.mark.parametrize("count", [0, 1, 21, 30])
+def test_the_connection_is_lost_in_mid_write(make_plc: MakePlc, count: int) -> None:
+    plc = make_plc(Traits(max_pdu_size=240, max_jobs=3))
+    client = plc.connected()
+    if count:
+        plc.proxy.cut_after(count)
+    else:
+        plc.proxy.cut(reset=True)
+    with pytest.raises(ConnectorError, match="closed the connection"):
+        client.write([Write(0, 0, bytes(SIZE))])
+    with pytest.raises(ConnectorError, match="not connected"):
+        client.write([Write(0, 0, b"x")])
+    assert_recovers(plc, client)
+
+
+def test_a_read_that_is_refused_does_not_spoil_a_write(make_plc: MakePlc) -> None:
+    """What became of the write is known, so it is told; the read then ends the connection."""
+    plc = make_plc(Traits(block_size=1000))
+    client = plc.connected()
+    client.submit()
+    assert client.write([Write(0, 0, b"x")]) == [""]
+    with pytest.raises(ConnectorError, match="DB201 has no 2180 bytes but 1000 bytes"):
+        client.collect(time.monotonic_ns() + 10**10)
+    assert not client.connected
