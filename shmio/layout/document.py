@@ -54,6 +54,9 @@ class _Layout(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     byte_order: ByteOrder = "big"
 
 
+_DECODER = msgspec.json.Decoder(_Layout)  # built here: msgspec crashes when two threads are the first to use a type
+
+
 def describe(layout: Layout) -> dict[str, object]:
     """Return the layout as the object of the public contract: JSON types, without ``byte_order``."""
     return {
@@ -93,7 +96,7 @@ def load(data: bytes) -> Layout:
     if len(data) > MAX_JSON_BYTES:
         raise LayoutError(f"layout: larger than {MAX_JSON_BYTES} bytes")
     try:
-        document = msgspec.json.decode(data, type=_Layout)
+        document = _DECODER.decode(data)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise LayoutError(f"layout: {error}") from None
     registers: list[Register] = []

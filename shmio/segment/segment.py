@@ -26,6 +26,8 @@ PREFIX = "shmio-"
 SPARE_SECTIONS = 40 * SECTIONS_PER_BLOCK
 SPARE_PROCESSES = 16 + GUESTS
 
+_ATTRIBUTES = msgspec.json.Decoder(Attributes)  # as in layout/document.py: built before there are threads
+
 
 class Segment:
     """One instance's shared memory, mapped.
@@ -133,7 +135,7 @@ class Segment:
         try:
             layout = Layout.from_json(bytes(memory[described.offset : described.offset + described.size]))
             at, size = part(SectionKind.SOURCE)
-            attributes = msgspec.json.decode(bytes(memory[at : at + size]), type=Attributes)
+            attributes = _ATTRIBUTES.decode(bytes(memory[at : at + size]))
             frames = _atomics.Ring(memory, *part(SectionKind.FRAMES))
             events = _atomics.Ring(memory, *part(SectionKind.EVENTS))
             queues = CommandQueues(memory, *part(SectionKind.COMMANDS))

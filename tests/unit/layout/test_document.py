@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -153,3 +155,22 @@ def test_initial_frame(layout: Layout) -> None:
          + "9001010000000002" * 2  # o
     )
     assert frame.hex() == expected.hex()
+
+
+def test_the_first_documents_may_be_read_by_several_threads() -> None:
+    """As a program does that attaches in each of its threads; a crash would take the process with it."""
+    program = """
+import sys, threading
+from shmio.layout.model import Layout
+data = b'{"name":"x","number":null,"size":1,"optimized":false,"registers":[],"byte_order":"big"}'
+sys.setswitchinterval(1e-6)
+barrier = threading.Barrier(8)
+def load():
+    barrier.wait()
+    Layout.from_json(data)
+threads = [threading.Thread(target=load) for _ in range(8)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+"""
+    for _ in range(5):
+        subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
