@@ -11,6 +11,7 @@ from shmio.config import Address, Grpc
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.server import Server
 from shmio.endpoints.grpc.simlog_v1 import SimlogV1
+from shmio.errors import SegmentError
 from shmio.logs import fields
 from shmio.worker import BEAT_S, Worker
 
@@ -26,6 +27,9 @@ async def _serve(worker: Worker) -> None:
     worker.on_stop(lambda: loop.call_soon_threadsafe(stopping.set))
     config = msgspec.convert(worker.config, Grpc)
     tasks: set[asyncio.Task[None]] = set()
+    writer = worker.slot.writer
+    if writer is None:
+        raise SegmentError("the segment has no command queue for this process")
 
     def on_quality(source: str, good: bool) -> None:
         worker.log.info("source %s", "good" if good else "bad", extra=fields(source=source))
@@ -35,7 +39,7 @@ async def _serve(worker: Worker) -> None:
 
     blocks = worker.segment.blocks
     default = config.default_source or (next(iter(blocks)) if len(blocks) == 1 else None)
-    feeds = {name: Feed(block, loop, on_quality) for name, block in blocks.items()}
+    feeds = {name: Feed(block, writer, loop, on_quality) for name, block in blocks.items()}
     service = SimlogV1(feeds, default)
     server = Server(service)
     for source in feeds:
@@ -50,8 +54,9 @@ async def _serve(worker: Worker) -> None:
     while not stopping.is_set():
         if not all(feed.alive for feed in feeds.values()):
             raise RuntimeError("a feed ended; the endpoint starts anew")
-        streams, dropped = service.counters
-        worker.report((streams, sum(feed.messages for feed in feeds.values()), dropped))
+        streams, dropped, published, refused = service.counters
+        messages = sum(feed.messages for feed in feeds.values())
+        worker.report((streams, messages, dropped, published, refused))
         try:
             await asyncio.wait_for(stopping.wait(), BEAT_S)
         except TimeoutError:

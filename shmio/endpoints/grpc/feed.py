@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import NamedTuple, Protocol
 
+from shmio.endpoints.grpc.inlet import Inlet
 from shmio.layout.model import Register
 from shmio.segment import Block, Frame, Quality
 from shmio.segment.scan import ChangeScan
@@ -56,8 +57,17 @@ class Feed:
     thread; the thread of the feed only reads the table that they replace.
     """
 
-    def __init__(self, block: Block, loop: asyncio.AbstractEventLoop, on_quality: Callable[[str, bool], None]) -> None:
+    def __init__(
+        self,
+        block: Block,
+        writer: int,
+        loop: asyncio.AbstractEventLoop,
+        on_quality: Callable[[str, bool], None],
+    ) -> None:
+        """``writer``: the command queue of this process."""
         self.block = block
+        self.inlet = Inlet(block, writer, loop)
+        """The other direction."""
         self.messages = 0
         self._loop = loop
         self._on_quality = on_quality
@@ -71,19 +81,22 @@ class Feed:
     @property
     def alive(self) -> bool:
         """Whether the block is being followed."""
-        return self._thread.is_alive()
+        return self._thread.is_alive() and self.inlet.alive
 
     def start(self) -> None:
         """Begin to follow the block."""
         self._thread.start()
+        self.inlet.start()
 
     def stop(self) -> None:
         """Tell the thread to end; it does within ``WAIT_S``."""
         self._stopping.set()
+        self.inlet.stop()
 
     def join(self) -> None:
         """Wait until the thread has ended."""
         self._thread.join()
+        self.inlet.join()
 
     def listen(self, register: Register, encode: Callable[[Frame], bytes | None], listener: Listener) -> None:
         """Join a register's listeners; the current value is delivered at once, or as soon as it is good."""

@@ -1,4 +1,4 @@
-"""SimlogAPI version 1, package ``simulation.server``: GetTopic and Subscribe. The rest is UNIMPLEMENTED for now."""
+"""SimlogAPI version 1, package ``simulation.server``: GetTopic, Subscribe and Publish; no more for now."""
 
 from __future__ import annotations
 
@@ -7,15 +7,18 @@ from functools import lru_cache
 from typing import Any
 
 import grpc
+from google.protobuf.empty_pb2 import Empty
 
+from shmio.endpoints.grpc.echo import Picture
 from shmio.endpoints.grpc.feed import CATCH_UP_FRAMES, Feed
+from shmio.endpoints.grpc.inlet import Inlet
+from shmio.endpoints.grpc.publish import Publisher
 from shmio.endpoints.grpc.queue import ConflatingQueue
 from shmio.errors import PathError
 from shmio.layout.codec import codec
 from shmio.layout.model import Layout, Register
 from shmio.layout.text import to_text, wire_type
 from shmio.layout.topic import Topic, find, parse_topic, shorten
-from shmio.segment import Frame
 from shmio.wire import simlog_v1_pb2 as wire
 
 SERVICE = wire.DESCRIPTOR.services_by_name["SimlogAPI"].full_name
@@ -32,11 +35,13 @@ class SimlogV1:
         self._default = default_source
         self._streams: set[_Stream] = set()
         self._dropped = 0
+        self._publisher = Publisher(self._locate_in)
 
     @property
-    def counters(self) -> tuple[int, int]:
-        """Streams open, messages dropped on slow ones."""
-        return len(self._streams), self._dropped + sum(stream.dropped for stream in self._streams)
+    def counters(self) -> tuple[int, int, int, int]:
+        """Streams of subscribers open, messages dropped on slow ones, messages published, and refused."""
+        dropped = self._dropped + sum(stream.dropped for stream in self._streams)
+        return len(self._streams), dropped, self._publisher.published, self._publisher.refused
 
     def handlers(self) -> grpc.GenericRpcHandler:
         """The service's calls, for a server."""
@@ -47,6 +52,8 @@ class SimlogV1:
             ),
             # No serializer: a change is encoded once, by the feed, and its bytes go to every stream.
             "Subscribe": grpc.unary_stream_rpc_method_handler(self.subscribe, decode),
+            # No deserializer either: bytes that are no message must not end the stream.
+            "Publish": grpc.stream_unary_rpc_method_handler(self.publish, None, Empty.SerializeToString),
         }
         return grpc.method_handlers_generic_handler(SERVICE, calls)
 
@@ -56,36 +63,34 @@ class SimlogV1:
         return wire.TopicDescriptor(path=request.path, msgType=wire_type(register))
 
     async def subscribe(self, request: wire.TopicDescriptor, context: Context) -> AsyncIterator[bytes]:
-        """Stream a topic's values: the current one if it is good, then every change.
+        """Stream a topic's values: the current one if it is good, then every change; of ``/in``, what is written to it.
 
         While quality is bad nothing is sent; on recovery the value is sent again. A slow client is
         given the newest value in place of those that wait.
         """
         topic, register = await self._resolve(request.path, context)
-        if topic.direction == "in":
-            await context.abort(
-                grpc.StatusCode.UNIMPLEMENTED,
-                f"{shorten(request.path)}: this version serves what comes out of sources; use /out",
-            )
         feed = self._feeds[topic.source]
+        joined = feed.inlet.echo if topic.direction == "in" else feed
         stream = _Stream()
+        joined.listen(register, encoder(register, feed.block.layout), stream)
+        self._streams.add(stream)
         try:
-            feed.listen(register, encoder(register, feed.block.layout), stream)
-            self._streams.add(stream)
+            await context.send_initial_metadata(())  # the client may wait for it, and then misses nothing
             while True:
                 yield await stream.pop()
         finally:
-            feed.leave(register, stream)
+            joined.leave(register, stream)
             self._streams.discard(stream)
             self._dropped += stream.dropped
 
+    async def publish(self, messages: AsyncIterator[bytes], context: Context) -> Empty:
+        """Write the values of a stream, in its order, and answer when it has ended and all of them have."""
+        return await self._publisher.publish(messages, context.peer())
+
     async def _resolve(self, path: str, context: Context) -> tuple[Topic, Register]:
         try:
-            topic = parse_topic(path, self._feeds, self._default)
-            feed = self._feeds.get(topic.source)
-            if feed is None:
-                raise PathError(f"{shorten(path)}: {topic.source} is reserved, and this version serves nothing there")
-            layout = feed.block.layout
+            topic = self._topic(path)
+            layout = self._feeds[topic.source].block.layout
             if layout.members(topic.path) or not topic.path:
                 await context.abort(
                     grpc.StatusCode.INVALID_ARGUMENT, f"{shorten(path)}: a structure; version 1 serves single registers"
@@ -94,6 +99,17 @@ class SimlogV1:
         except PathError as error:
             await context.abort(grpc.StatusCode.NOT_FOUND, str(error))
             raise  # abort never returns
+
+    def _locate_in(self, path: str) -> tuple[Topic, Inlet, Register]:
+        topic = self._topic(path)
+        feed = self._feeds[topic.source]
+        return topic, feed.inlet, find(feed.block.layout, topic.path)
+
+    def _topic(self, path: str) -> Topic:
+        topic = parse_topic(path, self._feeds, self._default)
+        if topic.source not in self._feeds:
+            raise PathError(f"{shorten(path)}: {topic.source} is reserved, and this version serves nothing there")
+        return topic
 
 
 class _Stream(ConflatingQueue):
@@ -110,7 +126,7 @@ class _Stream(ConflatingQueue):
         self.clear()
 
 
-def encoder(register: Register, layout: Layout) -> Callable[[Frame], bytes | None]:
+def encoder(register: Register, layout: Layout) -> Callable[[Picture], bytes | None]:
     """A function from a frame to the register's ROSMessage, serialised; None where the bytes hold no value.
 
     Fields of a protobuf message may be concatenated: what never changes is encoded once, the time once a frame.
@@ -118,7 +134,7 @@ def encoder(register: Register, layout: Layout) -> Callable[[Frame], bytes | Non
     kind = wire.ROSMessage(type=wire_type(register)).SerializeToString()
     decode = codec(register, layout.byte_order).decode
 
-    def encode(frame: Frame) -> bytes | None:
+    def encode(frame: Picture) -> bytes | None:
         value = decode(frame.image)
         if value is None:
             return None

@@ -3,136 +3,23 @@
 from __future__ import annotations
 
 import asyncio
-import struct
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import grpc
 import pytest
 import trustme
-from grpc_health.v1 import health_pb2, health_pb2_grpc
+from grpc_health.v1 import health_pb2
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from shmio.config import Address, Tls
-from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.queue import ConflatingQueue
 from shmio.endpoints.grpc.server import Server
-from shmio.endpoints.grpc.simlog_v1 import SimlogV1
 from shmio.errors import ConfigError, EndpointError
-from shmio.layout.model import Layout, Register
-from shmio.segment import BlockSpec, BlockWriter, ProcessSpec, Quality, Segment
+from shmio.segment import Quality, Segment
 from shmio.wire import simlog_v1_pb2 as wire
 from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
-
-LAYOUT = Layout(
-    "DB1",
-    1,
-    14,
-    False,
-    (
-        Register("axis/position", "REAL", (), 0, None, 4, 1),
-        Register("axis/speed", "REAL", (), 4, None, 4, 1),
-        Register("running", "BOOL", (), 8, 3, 1, 1),
-        Register("inputs", "BYTE", ((0, 1),), 10, None, 2, 2),
-        Register("step", "INT", (), 12, None, 2, 1),
-    ),
-)
-STALE_NS = 300_000_000
-TIMEOUT_S = 10
-
-
-def image(
-    position: float = 0.0, speed: float = 0.0, running: bool = False, inputs: bytes = b"\0\0", step: int = 0
-) -> bytes:
-    return struct.pack(">ffBx2sh", position, speed, running << 3, inputs, step)
-
-
-class Endpoint:
-    """A served segment, and a client of it."""
-
-    def __init__(self, writer: BlockWriter, feeds: dict[str, Feed], service: SimlogV1, port: int) -> None:
-        self.writer = writer
-        self.feeds = feeds
-        self.service = service
-        self.port = port
-        self.channel = grpc.aio.insecure_channel(f"127.0.0.1:{port}")
-        self.stub: Any = SimlogAPIStub(self.channel)  # type: ignore[no-untyped-call]
-        self.cycle = 0
-
-    def publish(self, raw: bytes, quality: Quality = Quality.GOOD) -> None:
-        self.cycle += 1
-        self.writer.publish(raw, cycle=self.cycle, quality=quality)
-
-    def subscribe(self, path: str) -> Any:
-        return self.stub.Subscribe(wire.TopicDescriptor(path=path), timeout=TIMEOUT_S)
-
-    async def health(self, service: str) -> int:
-        stub: Any = health_pb2_grpc.HealthStub(self.channel)
-        answer = await stub.Check(health_pb2.HealthCheckRequest(service=service), timeout=TIMEOUT_S)
-        return int(answer.status)
-
-    async def until(self, condition: Callable[[], Awaitable[bool]]) -> None:
-        """Wait for what another thread brings about."""
-        async with asyncio.timeout(TIMEOUT_S):
-            while not await condition():  # noqa: ASYNC110  it is another thread's doing
-                await asyncio.sleep(0)
-
-
-@asynccontextmanager
-async def endpoint(segment: Segment) -> AsyncIterator[Endpoint]:
-    tasks: set[asyncio.Task[None]] = set()
-
-    def on_quality(source: str, good: bool) -> None:
-        tasks.add(asyncio.get_running_loop().create_task(server.set_source(source, good)))
-
-    loop = asyncio.get_running_loop()
-    feeds = {name: Feed(block, loop, on_quality) for name, block in segment.blocks.items()}
-    service = SimlogV1(feeds, "cell")
-    server = Server(service)
-    await server.set_source("cell", False)
-    ports = await server.start([Address("127.0.0.1", 0)], None)
-    for feed in feeds.values():
-        feed.start()
-    served = Endpoint(segment.writer("cell"), feeds, service, ports[0])
-    try:
-        yield served
-    finally:
-        await served.channel.close()
-        for feed in feeds.values():
-            feed.stop()
-            feed.join()
-        await server.stop()
-        await asyncio.gather(*tasks)
-
-
-@pytest.fixture
-def segment(instance: str) -> Iterator[Segment]:
-    block = BlockSpec("cell", LAYOUT, 20_000_000, STALE_NS, 1 << 20)
-    with Segment.create(instance, [block], [ProcessSpec("cell", "source")]) as segment:
-        yield segment
-        segment.unlink()
-
-
-def serve(segment: Segment, test: Callable[[Endpoint], Awaitable[None]]) -> None:
-    async def run() -> None:
-        async with endpoint(segment) as served:
-            await test(served)
-
-    asyncio.run(run())
-
-
-async def value(stream: Any) -> str:
-    message = await asyncio.wait_for(stream.read(), TIMEOUT_S)
-    return str(message.value)
-
-
-async def code(call: Any) -> grpc.StatusCode:
-    with pytest.raises(grpc.aio.AioRpcError) as caught:
-        await call
-    found: grpc.StatusCode = caught.value.code()
-    return found
+from tests.unit.endpoints.harness import LAYOUT, STALE_NS, TIMEOUT_S, Endpoint, code, image, listening, serve, value
 
 
 @pytest.mark.parametrize(
@@ -244,11 +131,6 @@ def test_a_subscriber_of_a_bad_source_waits_for_it(segment: Segment) -> None:
     serve(segment, test)
 
 
-async def listening(served: Endpoint, streams: int) -> bool:
-    await asyncio.sleep(0)
-    return served.service.counters[0] == streams
-
-
 def test_health_follows_quality_and_age(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         serving, not_serving = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
@@ -294,8 +176,6 @@ def test_what_is_not_built_yet_says_so(segment: Segment) -> None:
         assert await code(stub.step(wire.StepRequest(), timeout=TIMEOUT_S)) is unimplemented
         assert await code(stub.setStepSize(wire.StepSizeRequest(step=5), timeout=TIMEOUT_S)) is unimplemented
         assert await code(stub.Inject(wire.InjectRequest(), timeout=TIMEOUT_S).read()) is unimplemented
-        assert await code(stub.Publish(iter([]), timeout=TIMEOUT_S)) is unimplemented
-        assert await code(served.subscribe("cell/step/in").read()) is unimplemented
 
     serve(segment, test)
 
@@ -459,11 +339,11 @@ def test_who_joins_around_a_change_of_quality_is_shown_no_past(segment: Segment)
         first = Recorder()
         served.publish(image(step=1))
         feed.listen(step, lambda f: f.image[12:14], first)
-        for value in (2, 3):
-            served.publish(image(step=value))
+        for step_now in (2, 3):
+            served.publish(image(step=step_now))
         served.publish(image(step=3), Quality.BAD)
-        for value in (4, 5, 6):
-            served.publish(image(step=value))
+        for step_now in (4, 5, 6):
+            served.publish(image(step=step_now))
         published = served.writer.block.ring.head()
         joiner = Recorder()
         feed.listen(step, lambda f: f.image[12:14], joiner)

@@ -1,0 +1,152 @@
+"""What is written to registers, for those who listen to their ``/in``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final, NamedTuple, Protocol
+
+from shmio.layout.model import Register
+from shmio.layout.write import bit_mask
+from shmio.segment import Block, Event, EventKind
+
+
+class Picture(Protocol):
+    """An image of a block and its time: a frame, or what is to become one."""
+
+    @property
+    def number(self) -> int:
+        """Number of the frame."""
+
+    @property
+    def clock_ns(self) -> int:
+        """The instance's clock."""
+
+    @property
+    def image(self) -> bytes:
+        """The block's bytes."""
+
+
+Encode = Callable[[Picture], bytes | None]
+
+
+class Listener(Protocol):
+    """One stream; called in the event loop's thread."""
+
+    def deliver(self, message: bytes) -> None:
+        """Take one message for this stream."""
+
+
+class InChannel:
+    """One register as somebody listens to its ``/in``."""
+
+    def __init__(self, register: Register, encode: Encode) -> None:
+        self.encode = encode
+        self.listeners: set[Listener] = set()
+        self.start, self.stop = register.offset, register.offset + register.size
+        self.bits = int.from_bytes(bit_mask(register, self.stop)[self.start :], "big")
+
+
+Message = tuple[InChannel, bytes]
+
+
+class _Written(NamedTuple):
+    """A :class:`Picture` of a block as it will be."""
+
+    number: int
+    clock_ns: int
+    image: bytes
+
+
+_NOBODY: Final = (0, 0, 0)
+
+
+class Echo:
+    """Turns accepted writes of all writers into messages, in the order in which the source accepted them.
+
+    A register is shown when a command has written all of it. One of which only a part is written, as an array's
+    element, is shown when that is known to be all, with the rest as of the newest frame. ``listen`` and ``leave``
+    belong to the event loop's thread, ``follow`` to that of the events.
+    """
+
+    def __init__(self, block: Block) -> None:
+        self._block = block
+        self._channels: dict[Register, InChannel] = {}
+        self._table: tuple[InChannel, ...] = ()
+        self._frame = -1  # the image is this frame, and what was accepted since
+        self._image = bytearray(block.layout.size)
+        self._command = _NOBODY
+        self._mask = bytearray(block.layout.size)  # what the command has written
+        self._partly: dict[InChannel, Event] = {}  # channels it has written a part of
+
+    def listen(self, register: Register, encode: Encode, listener: Listener) -> None:
+        """Join: what is accepted from now on is delivered."""
+        channel = self._channels.get(register)
+        if channel is None:
+            channel = self._channels[register] = InChannel(register, encode)
+            self._table = tuple(self._channels.values())
+        channel.listeners.add(listener)
+
+    def leave(self, register: Register, listener: Listener) -> None:
+        """Leave; the last listener takes the channel with it."""
+        channel = self._channels[register]
+        channel.listeners.discard(listener)
+        if not channel.listeners:
+            del self._channels[register]
+            self._table = tuple(self._channels.values())
+
+    def follow(self, event: Event) -> list[Message]:
+        """The messages that an event gives rise to."""
+        command = (event.incarnation, event.writer, event.command)
+        if event.kind != EventKind.ACCEPTED:
+            # Ends of commands before it may come between the parts of one.
+            return self._rest() if command == self._command or event.kind == EventKind.STARTED else []
+        messages = self._rest() if command != self._command else []
+        table = self._table
+        if not table:
+            self._frame, self._command = -1, _NOBODY
+            return messages
+        if command != self._command:
+            self._command, self._mask = command, bytearray(len(self._image))
+        self._apply(event)
+        for channel in table:
+            if channel.start < event.offset + len(event.data) and event.offset < channel.stop:
+                self._touch(channel, event, messages)
+        return messages
+
+    def _apply(self, event: Event) -> None:
+        if event.frame != self._frame:
+            frame = self._block.read(event.frame) or self._block.latest()
+            self._frame = event.frame
+            self._image = bytearray(len(self._image)) if frame is None else bytearray(frame.image)
+        start, stop = event.offset, event.offset + len(event.data)
+        if event.mask:
+            self._image[start] = self._image[start] & ~event.mask | event.data[0] & event.mask
+            self._mask[start] |= event.mask
+        else:
+            self._image[start:stop] = event.data
+            self._mask[start:stop] = b"\xff" * len(event.data)
+
+    def _touch(self, channel: InChannel, event: Event, messages: list[Message]) -> None:
+        """Show a channel when the last of its bits is written; what remains in part is shown by :meth:`_rest`."""
+        bits = int.from_bytes(event.mask.to_bytes(1, "big") if event.mask else b"\xff" * len(event.data), "big")
+        shift = 8 * (channel.stop - event.offset - len(event.data))
+        if not (bits << shift if shift >= 0 else bits >> -shift) & channel.bits:
+            return  # other bits of its bytes
+        if channel.bits & ~int.from_bytes(self._mask[channel.start : channel.stop], "big"):
+            self._partly[channel] = event
+            return
+        self._partly.pop(channel, None)
+        self._show(channel, event, messages)
+
+    def _rest(self) -> list[Message]:
+        """The channels of which the command has written a part: it is over when something else is told."""
+        messages: list[Message] = []
+        for channel, event in self._partly.items():
+            self._show(channel, event, messages)
+        self._partly.clear()
+        return messages
+
+    def _show(self, channel: InChannel, event: Event, messages: list[Message]) -> None:
+        message = channel.encode(_Written(event.frame, event.clock_ns, bytes(self._image)))
+        if message is not None:
+            messages.append((channel, message))

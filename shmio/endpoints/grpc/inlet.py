@@ -1,0 +1,232 @@
+"""The way into one block: sends values, follows the block's events in a thread, and tells what became of each."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from shmio.endpoints.grpc.echo import Echo, Message
+from shmio.errors import CommandError
+from shmio.layout.model import Register
+from shmio.segment import ENDS, Block, Event, EventKind
+from shmio.segment.commander import PATIENCE_S, TIMEOUT_S, Commander
+from shmio.segment.events import EVENT_DATA_SIZE
+
+log = logging.getLogger("shmio.grpc")
+
+MAX_OPEN: Final = 512
+"""Events that may be outstanding: a quarter of the ring, so that none is overwritten before it is read."""
+MIN_PERIODS: Final = 3
+"""A command waits for so many cycles at least: of a slow source it must not expire between two."""
+BATCH: Final = 256
+WAIT_S: Final = 0.2
+
+Done = Callable[[str], None]
+"""Called once with what became of a value: empty if the device has it, else the reason."""
+
+
+@dataclass(slots=True)
+class _Pending:
+    """A command whose end has not come."""
+
+    open_items: set[int]
+    incarnation: int
+    until_ns: int
+    record_bytes: int
+    events: int
+    done: Done
+    taken: bool = False
+    reason: str = ""
+
+
+class Inlet:
+    """Sends values to a block's source, in order, and keeps no more under way than it can hear the end of.
+
+    All but the thread belongs to the event loop.
+    """
+
+    def __init__(self, block: Block, writer: int, loop: asyncio.AbstractEventLoop) -> None:
+        """``writer``: the command queue of this process."""
+        self.block = block
+        self.echo = Echo(block)
+        self._writer = writer
+        self._loop = loop
+        self._commander = Commander(block, writer)
+        self._timeout_s = max(TIMEOUT_S, MIN_PERIODS * block.period_ns / 1e9)
+        self._pending: dict[int, _Pending] = {}
+        self._untaken_bytes = 0  # of records that may still lie in the queue
+        self._open_events = 0
+        self._silent = False
+        self._turn = asyncio.Lock()  # who waits for room is served in order
+        self._freed: asyncio.Future[None] | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._cursor = block.events.cursor()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"inlet-{block.source}", daemon=True)
+
+    @property
+    def alive(self) -> bool:
+        """Whether the block's events are being followed, as long as there are any."""
+        return self._thread.is_alive() or self.block.retired
+
+    def start(self) -> None:
+        """Begin to follow the events."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Tell the thread to end; it does within ``WAIT_S``."""
+        self._stopping.set()
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def join(self) -> None:
+        """Wait until the thread has ended."""
+        self._thread.join()
+
+    def ready(self, register: Register) -> bool:
+        """Whether :meth:`send` would not have to wait."""
+        return not self._turn.locked() and self._has_room(register)
+
+    async def send(self, register: Register, value: object, done: Done) -> None:
+        """Send a value as soon as there is room; ``done`` is called when its end is known, a bounded time later.
+
+        CommandError: it is not writable, or the source takes nothing at present; ValueRangeError. ``done`` is not
+        called then.
+        """
+        async with self._turn:
+            while not self._has_room(register):
+                self._freed = self._loop.create_future()
+                await self._freed
+            if self._silent and self._pending:  # one at a time asks whether it is back
+                raise CommandError(
+                    f"source {self.block.source} does not answer; shmio-supervisor status says how it fares"
+                )
+            ticket = self._commander.submit({register.path: value}, self._timeout_s)
+            record_bytes, events = _cost(register)
+            self._pending[ticket.number] = _Pending(
+                set(range(len(ticket.owners))), ticket.incarnation, ticket.until_ns, record_bytes, events, done
+            )
+            self._untaken_bytes += record_bytes
+            self._open_events += events
+            if self._timer is None:
+                self._set_timer()
+
+    def _has_room(self, register: Register) -> bool:
+        if self._silent or not self._pending:
+            return True
+        record_bytes, events = _cost(register)
+        fits = self._untaken_bytes + record_bytes <= self.block.commands.capacity
+        return fits and self._open_events + events <= MAX_OPEN
+
+    # ---- what the source says --------------------------------------------------------------------------------
+
+    def _on_events(self, events: list[Event], messages: list[Message]) -> None:
+        for channel, message in messages:
+            for listener in channel.listeners:
+                listener.deliver(message)
+        for event in events:
+            if event.kind == EventKind.STARTED:
+                self._restarted(event)
+            elif pending := self._pending.get(event.command):
+                self._silent = False
+                self._hear(event, pending)
+        self._free()
+
+    def _hear(self, event: Event, pending: _Pending) -> None:
+        if not pending.taken:
+            pending.taken = True
+            self._untaken_bytes -= pending.record_bytes
+        if event.kind not in ENDS:
+            return
+        if event.kind != EventKind.WRITTEN:
+            pending.reason = f"{EventKind(event.kind)}: {event.text}"
+        stop = event.item + event.items
+        pending.open_items -= {item for item in pending.open_items if event.item <= item < stop}
+        if event.kind == EventKind.REJECTED or not pending.open_items:
+            self._end(event.command, pending.reason)
+
+    def _restarted(self, event: Event) -> None:
+        """A successor rejects what its predecessor had not taken; of what it had taken nobody knows."""
+        self._silent = False
+        soon_ns = time.monotonic_ns() + round(PATIENCE_S * 1e9)
+        for number, pending in list(self._pending.items()):
+            if pending.incarnation == event.incarnation:
+                continue
+            if pending.taken:
+                self._end(number, "the source was restarted meanwhile; it is not known whether the value was written")
+            else:
+                pending.until_ns = min(pending.until_ns, soon_ns)
+        self._set_timer()
+
+    def _retired(self) -> None:
+        for number in list(self._pending):
+            self._end(number, "the source was changed or removed by a reload")
+        self._free()
+
+    def _end(self, number: int, reason: str) -> None:
+        pending = self._pending.pop(number)
+        self._open_events -= pending.events
+        if not pending.taken:
+            self._untaken_bytes -= pending.record_bytes
+        pending.done(reason)
+
+    def _free(self) -> None:
+        if self._freed is not None and not self._freed.done():
+            self._freed.set_result(None)
+
+    # ---- and what it does not say ----------------------------------------------------------------------------
+
+    def _set_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        if self._pending:
+            first_ns = min(pending.until_ns for pending in self._pending.values())
+            self._timer = self._loop.call_later(max(0.0, (first_ns - time.monotonic_ns()) / 1e9), self._expire)
+
+    def _expire(self) -> None:
+        self._timer = None
+        now_ns = time.monotonic_ns()
+        for number, pending in list(self._pending.items()):
+            if pending.until_ns <= now_ns:
+                self._silent |= not pending.taken
+                self._end(number, "the source gave no answer in time; it is not known whether the value was written")
+        self._free()
+        self._set_timer()
+
+    # ---- the thread ------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        try:
+            self._follow()
+        except Exception:
+            log.exception("the events of %s cannot be followed", self.block.source)
+
+    def _follow(self) -> None:
+        cursor = self._cursor
+        while not self._stopping.is_set():
+            retired = self.block.retired
+            event = cursor.next(WAIT_S)
+            if event is None:
+                if retired:
+                    self._loop.call_soon_threadsafe(self._retired)
+                    return
+                continue
+            batch = [event]
+            while len(batch) < BATCH and (event := cursor.poll()) is not None:
+                batch.append(event)
+            messages = [message for event in batch for message in self.echo.follow(event)]
+            ours = [event for event in batch if event.writer == self._writer or event.kind == EventKind.STARTED]
+            if ours or messages:
+                self._loop.call_soon_threadsafe(self._on_events, ours, messages)
+
+
+def _cost(register: Register) -> tuple[int, int]:
+    """At most so many bytes in the queue, and events until the end, has a write of the register."""
+    items = register.count if register.type == "BOOL" else 1
+    return 64 + 24 * items + register.size, 1 + items + register.size // EVENT_DATA_SIZE

@@ -1,0 +1,134 @@
+"""A gRPC endpoint over real sockets: a segment on one side, a client on the other."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from typing import Any
+
+import grpc
+import pytest
+from grpc_health.v1 import health_pb2, health_pb2_grpc
+
+from shmio.config import Address
+from shmio.endpoints.grpc.feed import Feed
+from shmio.endpoints.grpc.server import Server
+from shmio.endpoints.grpc.simlog_v1 import SimlogV1
+from shmio.layout.model import Layout, Register
+from shmio.segment import Quality, Segment
+from shmio.wire import simlog_v1_pb2 as wire
+from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
+
+WRITER = 4
+LAYOUT = Layout(
+    "DB1",
+    1,
+    628,
+    False,
+    (
+        Register("axis/position", "REAL", (), 0, None, 4, 1),
+        Register("axis/speed", "REAL", (), 4, None, 4, 1),
+        Register("running", "BOOL", (), 8, 3, 1, 1),
+        Register("inputs", "BYTE", ((0, 1),), 10, None, 2, 2),
+        Register("step", "INT", (), 12, None, 2, 1),
+        Register("bits", "BOOL", ((0, 9),), 14, 0, 2, 10),
+        Register("name", "STRING[8]", (), 16, None, 10, 1),
+        Register("long", "BYTE", ((1, 600),), 26, None, 600, 600),
+        Register("secret", "INT", (), 626, None, 2, 1),
+    ),
+)
+WRITABLE = ("axis", "running", "inputs", "step", "bits", "name", "long")
+STALE_NS = 300_000_000
+TIMEOUT_S = 10
+
+
+def image(
+    position: float = 0.0, speed: float = 0.0, running: bool = False, inputs: bytes = b"\0\0", step: int = 0
+) -> bytes:
+    return struct.pack(">ffBx2sh", position, speed, running << 3, inputs, step).ljust(LAYOUT.size, b"\0")
+
+
+class Endpoint:
+    """A served segment, and a client of it."""
+
+    def __init__(self, segment: Segment, feeds: dict[str, Feed], service: SimlogV1, port: int) -> None:
+        self.segment = segment
+        self.writer = segment.writer("cell")
+        self.feeds = feeds
+        self.service = service
+        self.port = port
+        self.channel = grpc.aio.insecure_channel(f"127.0.0.1:{port}")
+        self.stub: Any = SimlogAPIStub(self.channel)  # type: ignore[no-untyped-call]
+        self.cycle = 0
+
+    def publish(self, raw: bytes, quality: Quality = Quality.GOOD) -> None:
+        self.cycle += 1
+        self.writer.publish(raw, cycle=self.cycle, quality=quality)
+
+    def subscribe(self, path: str) -> Any:
+        return self.stub.Subscribe(wire.TopicDescriptor(path=path), timeout=TIMEOUT_S)
+
+    async def health(self, service: str) -> int:
+        stub: Any = health_pb2_grpc.HealthStub(self.channel)
+        answer = await stub.Check(health_pb2.HealthCheckRequest(service=service), timeout=TIMEOUT_S)
+        return int(answer.status)
+
+    async def until(self, condition: Callable[[], Awaitable[bool]]) -> None:
+        """Wait for what another thread brings about."""
+        async with asyncio.timeout(TIMEOUT_S):
+            while not await condition():  # noqa: ASYNC110  it is another thread's doing
+                await asyncio.sleep(0)
+
+
+@asynccontextmanager
+async def endpoint(segment: Segment) -> AsyncIterator[Endpoint]:
+    tasks: set[asyncio.Task[None]] = set()
+
+    def on_quality(source: str, good: bool) -> None:
+        tasks.add(asyncio.get_running_loop().create_task(server.set_source(source, good)))
+
+    loop = asyncio.get_running_loop()
+    feeds = {name: Feed(block, WRITER, loop, on_quality) for name, block in segment.blocks.items()}
+    service = SimlogV1(feeds, "cell")
+    server = Server(service)
+    await server.set_source("cell", False)
+    ports = await server.start([Address("127.0.0.1", 0)], None)
+    for feed in feeds.values():
+        feed.start()
+    served = Endpoint(segment, feeds, service, ports[0])
+    try:
+        yield served
+    finally:
+        await served.channel.close()
+        for feed in feeds.values():
+            feed.stop()
+            feed.join()
+        await server.stop()
+        await asyncio.gather(*tasks)
+
+
+def serve(segment: Segment, test: Callable[[Endpoint], Awaitable[None]]) -> None:
+    async def run() -> None:
+        async with endpoint(segment) as served:
+            await test(served)
+
+    asyncio.run(run())
+
+
+async def value(stream: Any) -> str:
+    message = await asyncio.wait_for(stream.read(), TIMEOUT_S)
+    return str(message.value)
+
+
+async def code(call: Any) -> grpc.StatusCode:
+    with pytest.raises(grpc.aio.AioRpcError) as caught:
+        await call
+    found: grpc.StatusCode = caught.value.code()
+    return found
+
+
+async def listening(served: Endpoint, streams: int) -> bool:
+    await asyncio.sleep(0)
+    return served.service.counters[0] == streams

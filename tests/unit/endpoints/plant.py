@@ -1,0 +1,70 @@
+"""A source that takes commands, with its device, cycle by cycle as the test wants."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+
+from shmio.connectors.desk import CommandDesk
+from shmio.errors import ConnectorError
+from shmio.segment import BlockWriter, Write
+from tests.unit.endpoints.harness import LAYOUT, WRITABLE
+
+
+class Plant:
+    """A desk in its thread, and a device that does what it is told unless ``refusal`` says why not."""
+
+    def __init__(self, writer: BlockWriter) -> None:
+        self.writer = writer
+        self.memory = bytearray(LAYOUT.size)
+        self.written: list[Write] = []
+        self.refusal = ""
+        self.lost = False
+        self.desk = CommandDesk(writer, WRITABLE, time.monotonic_ns)
+        self.desk.open()
+        self._cycles = 0
+        self._stop = threading.Event()
+        self._threads = [threading.Thread(target=self.desk.run)]
+        self._threads[0].start()
+
+    def cycle(self) -> None:
+        """Carry out what waits, then publish the memory as it is."""
+        try:
+            if self.desk.waiting:
+                self.desk.carry_out(self._write)
+        except ConnectorError as error:
+            self.desk.close(str(error))
+        self._cycles += 1
+        self.writer.publish(self.memory, cycle=self._cycles)
+
+    def run(self, period_s: float = 0.002) -> None:
+        """Go on cycle after cycle."""
+
+        def loop() -> None:
+            while not self._stop.wait(period_s):
+                self.cycle()
+
+        thread = threading.Thread(target=loop)
+        self._threads.append(thread)
+        thread.start()
+
+    def stop(self) -> None:
+        self._stop.set()
+        self.desk.stop()
+        for thread in self._threads:
+            thread.join(20)
+            assert not thread.is_alive()
+
+    def _write(self, writes: Sequence[Write]) -> list[str]:
+        if self.lost:
+            raise ConnectorError("cable out")
+        for offset, mask, data in writes:
+            if self.refusal:
+                continue
+            if mask:
+                self.memory[offset] = self.memory[offset] & ~mask | data[0] & mask
+            else:
+                self.memory[offset : offset + len(data)] = data
+        self.written += writes
+        return [self.refusal] * len(writes)
