@@ -10,7 +10,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import pytest
 
@@ -41,16 +41,18 @@ class Rig(Protocol):
 class Run:
     """A source's loop at work on a connector, watched through its block."""
 
-    def __init__(self, segment: Segment, rig: Rig) -> None:
-        block = segment.blocks["device"]
+    def __init__(self, segment: Segment, rig: Rig, writable: tuple[str, ...] = ()) -> None:
+        self.block = block = segment.blocks["device"]
         self.frames: list[Frame] = []
         self._rig = rig
         self._cursor = block.cursor()
         self._stopping = threading.Event()
         schedule = Schedule(segment.header.started_ns, block.period_ns)
-        self.loop = SourceLoop(rig.connector(), segment.writer("device"), schedule, WallClock(self._stopping))
-        self._thread = threading.Thread(target=self.loop.run, daemon=True)
-        self._thread.start()
+        clock = WallClock(self._stopping)
+        self.loop = SourceLoop(rig.connector(), segment.writer("device"), schedule, clock, writable)
+        self._threads = [threading.Thread(target=run, daemon=True) for run in (self.loop.run, self.loop.desk.run)]
+        for thread in self._threads:
+            thread.start()
 
     def until(self, condition: Callable[[Frame], bool]) -> Frame:
         """Follow the block until a frame fulfils the condition."""
@@ -74,8 +76,10 @@ class Run:
     def stop(self) -> None:
         """End the loop, then hold all frames to what holds always."""
         self._stopping.set()
-        self._thread.join(PATIENCE_S)
-        assert not self._thread.is_alive(), "the loop did not end"
+        self.loop.desk.stop()
+        for thread in self._threads:
+            thread.join(PATIENCE_S)
+            assert not thread.is_alive(), "the loop did not end"
         while (frame := self._cursor.poll()) is not None:
             self.frames.append(frame)
         assert self._cursor.missed == 0
@@ -93,14 +97,17 @@ class Run:
 
 
 class ConnectorConformance:
-    """Inherit, and give a fixture ``rig``."""
+    """Inherit, and give a fixture ``rig``. Who can write inherits :class:`shmio.testing.write_conformance`'s, too."""
+
+    writable: ClassVar[tuple[str, ...]] = ()
+    """Patterns of what the source may write."""
 
     @pytest.fixture
     def run(self, rig: Rig, instance: str) -> Iterator[Run]:
         """A running loop, stopped and checked at the end."""
         block = BlockSpec("device", rig.layout, PERIOD_NS, 10**9, 1 << 24)
         with Segment.create(instance, [block], [ProcessSpec("device", "source")]) as segment:
-            run = Run(segment, rig)
+            run = Run(segment, rig, self.writable)
             try:
                 yield run
             finally:

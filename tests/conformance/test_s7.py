@@ -1,30 +1,59 @@
-"""Classic S7 against the emulated PLC, held to the common suite: blocks of one PDU and of several."""
+"""Classic S7 against the emulated PLC, held to the common suites: reads of one PDU, of several, several at once."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
+import snap7
 
 from shmio.config import Address
 from shmio.connectors.base import Connector
 from shmio.connectors.s7.connector import S7Connector
 from shmio.connectors.s7.options import S7Options
-from shmio.emulators.counter import generations
+from shmio.emulators.counter import Counter, generations
 from shmio.emulators.emulator import Emulator
+from shmio.emulators.s7_jobs import Traits
 from shmio.layout.model import Layout, Register
-from shmio.segment import Quality
-from shmio.testing.conformance import ConnectorConformance, Run
+from shmio.segment import EventKind, Quality, Write
+from shmio.testing.conformance import Run
 from shmio.testing.proxy import FaultProxy
+from shmio.testing.write_conformance import SPARE, WriteConformance, Writer
+
+TAIL = SPARE + 2
+"""Bytes behind the counter: spare ones, flags, and what the count in the flags must be."""
+
+
+class Shared:
+    """The counter's program, which leaves a few bytes to clients and counts in the flags, from what it finds there."""
+
+    period_ms = 1
+
+    def __init__(self, layout: Layout) -> None:
+        self._counter = Counter(replace(layout, size=layout.size - TAIL))
+        self._part = bytearray(layout.size - TAIL)
+        self._count = 0
+
+    def step(self, time_s: float, frame: bytearray) -> None:
+        self._counter.step(time_s, self._part)
+        frame[:-TAIL] = self._part
+        self._count = self._count + 2 & 0xFE
+        frame[-2] = frame[-2] + 2 & 0xFE | frame[-2] & 1
+        frame[-1] = self._count
 
 
 class S7Rig:
-    """The emulated PLC with the counter program."""
+    """The emulated PLC with this program."""
 
-    def __init__(self, proxy: FaultProxy, size: int) -> None:
+    def __init__(self, proxy: FaultProxy, plc: Emulator, size: int) -> None:
         self.proxy = proxy
+        self.plc = plc
         self.layout = layout(size)
         self.one_pdu = size <= 900
+        self.spare = size - TAIL
+        self.flags = size - 2
+        self.refused = Write(size, 0, b"beyond")
 
     def connector(self) -> Connector:
         address = self.proxy.address
@@ -32,9 +61,10 @@ class S7Rig:
 
     def generation(self, raw: bytes) -> int:
         """A read of one PDU is one cycle of the PLC; one of several may span a few."""
-        found = generations(raw)
+        found = generations(raw[:-TAIL])
         assert len(found) == 1 or not self.one_pdu, f"mixed cycles {found}"
         assert found[-1] - found[0] < 10_000, f"not the PLC's bytes: {found}"
+        assert raw[-2] & 0xFE == raw[-1], "a write has changed the neighbours of its bit"
         return found[0]
 
 
@@ -42,14 +72,22 @@ def layout(size: int) -> Layout:
     return Layout("DB7", 7, size, False, (Register("data", "BYTE", ((0, size - 1),), 0, None, size, size),))
 
 
-class TestS7(ConnectorConformance):
-    @pytest.fixture(params=[400, 2180], ids=["one PDU", "several PDUs"])
-    def rig(self, request: pytest.FixtureRequest) -> Iterator[S7Rig]:
+class TestS7(WriteConformance):
+    @pytest.fixture(
+        params=[
+            pytest.param((400, Traits(), 0.0), id="one PDU"),
+            pytest.param((2180, Traits(), 0.0), id="several PDUs"),
+            pytest.param((2180, Traits(max_pdu_size=480, max_jobs=24), 0.004), id="several cycles"),
+        ]
+    )
+    def rig(self, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[S7Rig]:
+        size, traits, delay_s = request.param
+        monkeypatch.setattr("shmio.emulators.programs.PROGRAMS", {"shared": Shared})
         with (
-            Emulator(layout(request.param), "counter", Address("127.0.0.1", 0)) as plc,
-            FaultProxy(plc.address) as proxy,
+            Emulator(layout(size), "shared", Address("127.0.0.1", 0), traits=traits) as plc,
+            FaultProxy(plc.address, up_s=delay_s, down_s=delay_s) as proxy,
         ):
-            yield S7Rig(proxy, request.param)
+            yield S7Rig(proxy, plc, size)
 
     def test_a_wrong_reference_is_never_taken(self, run: Run, rig: S7Rig) -> None:
         """An answer that names another request than any under way drops the connection."""
@@ -58,3 +96,30 @@ class TestS7(ConnectorConformance):
         run.until(lambda frame: frame.quality is Quality.BAD)
         rig.proxy.pass_all()
         run.good()
+
+    def test_a_confirmation_with_a_wrong_reference(self, run: Run, writer: Writer, rig: S7Rig) -> None:
+        """It confirms nothing: nobody knows, and the connection is dropped."""
+
+        def rename(frame: bytes) -> bytes:
+            return frame[:11] + bytes((frame[11] ^ 0x40,)) + frame[12:] if frame[19:20] == b"\x05" else frame
+
+        rig.proxy.edit(rename)
+        end = writer.write(Write(rig.spare, 0, b"x"))
+        assert end.kind == EventKind.UNKNOWN
+        assert "not under way" in end.text
+        run.bad()
+        rig.proxy.pass_all()
+        run.good()
+
+    def test_stop_makes_values_uncertain(self, run: Run, rig: S7Rig) -> None:
+        """The image is right, but stands still: uncertain, with the remedy, until the PLC runs again."""
+        run.good()
+        peer = snap7.Client()
+        peer.connect(rig.plc.address.host, 0, 1, rig.plc.address.port)
+        peer.plc_stop()
+        frame = run.until(lambda frame: frame.quality is Quality.UNCERTAIN)
+        assert "in STOP" in frame.reason
+        peer.plc_hot_start()
+        run.good()
+        peer.disconnect()
+        peer.destroy()

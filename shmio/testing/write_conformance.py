@@ -1,0 +1,157 @@
+"""The suite that connectors inherit that can write, after that of reading. Needs pytest.
+
+What is said to be written is there; what is surely not, is not; a bit is written without its neighbours; and whatever
+breaks, no confirmation is ever taken for that of another write.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from typing import ClassVar, Protocol
+
+import pytest
+
+from shmio.errors import ConnectorError
+from shmio.segment import CommandSender, Event, EventKind, Frame, Quality, Write
+from shmio.testing.conformance import PATIENCE_S, ConnectorConformance, Rig, Run
+
+ENDS = {EventKind.WRITTEN, EventKind.REFUSED, EventKind.EXPIRED, EventKind.UNKNOWN}
+FAR_S = 60.0
+SPARE = 8
+
+
+class WriteRig(Rig, Protocol):
+    """A device that lets itself be written."""
+
+    spare: int
+    """Offset of ``SPARE`` bytes that the device leaves as they were written. Zero at first."""
+    flags: int
+    """Offset of a byte in whose other bits the device counts all the time, and whose lowest bit it leaves alone.
+
+    ``generation`` asserts that it has not lost a count.
+    """
+    refused: Write
+    """What the device refuses."""
+
+
+class Writer:
+    """Sends commands to a running source, and sees what becomes of them."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self._sender = CommandSender(run.block, 0)
+        self._events = run.block.events.cursor()
+
+    def write(self, *writes: Write) -> Event:
+        """Send one command; the event that ends its first item, when each item has exactly one end."""
+        number = self._sender.submit(writes, time.monotonic_ns() + round(FAR_S * 1e9))
+        ends: list[Event] = []
+        deadline_s = time.monotonic() + PATIENCE_S
+        while sum(event.items for event in ends) < len(writes):
+            event = self._events.next(max(0.0, deadline_s - time.monotonic()))
+            assert event is not None, f"command {number} has no end; so far: {ends}"
+            if event.command == number and event.kind == EventKind.REJECTED:
+                raise ConnectorError(event.text)
+            if event.command == number and event.kind in ENDS:
+                ends.append(event)
+        assert sorted(event.item for event in ends)[0] == 0
+        return min(ends, key=lambda event: event.item)
+
+    def written(self, *writes: Write) -> Frame:
+        """The same, confirmed; the first frame that was asked for afterwards."""
+        end = self.write(*writes)
+        assert end.kind == EventKind.WRITTEN, end
+        return self.after(end)
+
+    def after(self, end: Event) -> Frame:
+        """The first good frame that was asked for after a command's end."""
+        return self._run.until(lambda frame: frame.quality is Quality.GOOD and frame.source_ns > end.utc_ns)
+
+    def once_open(self, *writes: Write) -> Event:
+        """Send again for as long as the source is not connected and takes nothing."""
+        deadline_s = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                return self.write(*writes)
+            except ConnectorError:
+                assert time.monotonic() < deadline_s
+                self._run.good()
+
+
+class WriteConformance(ConnectorConformance):
+    """Inherit, and give a fixture ``rig`` that is a :class:`WriteRig`."""
+
+    writable: ClassVar[tuple[str, ...]] = ("**",)
+
+    @pytest.fixture
+    def writer(self, run: Run) -> Writer:
+        """A writer of commands to the running source, which is connected."""
+        run.good()
+        return Writer(run)
+
+    def test_a_value_written_is_in_the_next_frame(self, run: Run, writer: Writer, rig: WriteRig) -> None:
+        """Confirmed means that whoever asks from then on gets the new value."""
+        for turn in range(1, 20):
+            value = bytes([turn]) * SPARE
+            frame = writer.written(Write(rig.spare, 0, value))
+            assert frame.raw[rig.spare : rig.spare + SPARE] == value
+
+    def test_several_writes_in_one_command(self, run: Run, writer: Writer, rig: WriteRig) -> None:
+        """Bytes and bits together, each done."""
+        frame = writer.written(
+            Write(rig.spare, 0, b"ab"), Write(rig.spare + 4, 0x40, b"\xff"), Write(rig.spare + 4, 0x02, b"\xff")
+        )
+        assert frame.raw[rig.spare : rig.spare + SPARE] == b"ab\0\0\x42\0\0\0"
+
+    def test_a_bit_is_written_without_its_neighbours(self, run: Run, writer: Writer, rig: WriteRig) -> None:
+        """The device counts in the other bits meanwhile; that it loses no count is checked in every frame."""
+        for turn in range(50):
+            frame = writer.written(Write(rig.flags, 1, bytes([turn & 1])))
+            assert frame.raw[rig.flags] & 1 == turn & 1
+
+    def test_a_refused_item_among_good_ones(self, rig: WriteRig) -> None:
+        """One refusal, in words; the others are done, and the connection stands."""
+        connector = rig.connector()
+        try:
+            connector.connect()
+            writes = [Write(rig.spare, 0, b"one"), rig.refused, Write(rig.spare + 4, 0, b"two")]
+            outcomes = connector.write(writes)
+            assert [bool(outcome) for outcome in outcomes] == [False, True, False]
+            assert connector.read()[rig.spare : rig.spare + SPARE] == b"one\0two\0"
+        finally:
+            connector.close()
+
+    def test_a_late_confirmation_is_not_taken_for_the_next(self, rig: WriteRig) -> None:
+        """The confirmation of a write comes on the next connection: never as that of what is refused there."""
+        connector = rig.connector()
+        try:
+            connector.connect()
+            rig.proxy.hold()
+            with pytest.raises(ConnectorError):
+                connector.write([Write(rig.spare, 0, b"late")])
+            assert rig.proxy.wait_held()
+            connector.close()
+            rig.proxy.edit(lambda frame: frame)  # what is held stays held
+            connector.connect()
+            rig.proxy.release()
+            with contextlib.suppress(ConnectorError):
+                assert connector.write([rig.refused])[0]
+        finally:
+            connector.close()
+
+    @pytest.mark.parametrize("count", [1, 30])
+    def test_lost_in_mid_write(self, run: Run, writer: Writer, rig: WriteRig, count: int) -> None:
+        """The connection breaks somewhere around a write: what is said of the write is true."""
+        for turn in range(1, 5):
+            rig.proxy.cut_after(count * turn)
+            value = bytes([turn]) * SPARE
+            end = writer.once_open(Write(rig.spare, 0, value))
+            assert end.kind in {EventKind.WRITTEN, EventKind.EXPIRED, EventKind.UNKNOWN}
+            rig.proxy.pass_all()
+            frame = writer.after(end)
+            if end.kind != EventKind.UNKNOWN:
+                done = frame.raw[rig.spare : rig.spare + SPARE] == value
+                assert done == (end.kind == EventKind.WRITTEN), end
+        frame = writer.written(Write(rig.spare, 0, b"at last!"))
+        assert frame.raw[rig.spare : rig.spare + SPARE] == b"at last!"
