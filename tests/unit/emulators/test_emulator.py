@@ -14,8 +14,10 @@ from shmio.config.address import Address
 from shmio.connectors.s7 import S7Client, S7Options
 from shmio.emulators.counter import generations
 from shmio.emulators.emulator import Emulator
+from shmio.emulators.s7_jobs import Traits
 from shmio.errors import ConfigError, EndpointError
 from shmio.layout.model import Layout
+from shmio.layout.write import Write
 
 LOOPBACK = Address("127.0.0.1", 0)
 
@@ -142,3 +144,23 @@ def test_a_failing_program_is_reported(db201: Layout, monkeypatch: pytest.Monkey
     with Emulator(db201, "failing", LOOPBACK) as emulator:
         assert failed.wait(10)
     assert isinstance(emulator.failure, ZeroDivisionError)
+
+
+def test_traits_and_orders_reach_the_program_and_its_clients(db201: Layout) -> None:
+    """A client orders a hold: the cell stands, and says so."""
+    with (
+        Emulator(db201, "a50", LOOPBACK, traits=Traits(max_pdu_size=480, max_jobs=10)) as emulator,
+        closing(client_of(emulator)) as client,
+    ):
+        client.connect()
+        assert (client.pdu_size, client.jobs, client.depth) == (480, 10, 2)
+        assert client.write([Write(1013, 1, b"\1")]) == [""]
+        while not client.read()[1001] & 8:
+            pass
+        stands = client.read()[2100:]
+        cycles = emulator.cycles
+        while emulator.cycles < cycles + 20:
+            assert client.read()[2100:] == stands
+        assert client.write([Write(1013, 1, b"\0")]) == [""]
+        while client.read()[2100:] == stands:
+            pass

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import random
 import socket
 import threading
 from collections.abc import Iterator
@@ -92,6 +93,30 @@ def test_answers_while_stopped(client: snap7.Client, server: S7Server, block: by
     assert client.db_read(5, 0, 4) == block[:4]
     client.plc_hot_start()
     assert server.get_status()[1] == "Run"
+
+
+def test_tells_its_operating_mode(client: snap7.Client) -> None:
+    """SZL 0x0424: one record of 20 bytes, in its fourth byte the mode now and before."""
+
+    def mode() -> int:
+        data = bytes(client.read_szl(0x0424).Data)
+        assert data[:4] == bytes.fromhex("0014 0001")  # size and number of the records
+        assert data[24:] == bytes(len(data) - 24)
+        return data[7]
+
+    assert mode() == 0x48
+    client.plc_stop()
+    assert mode() == 0x84
+    client.plc_hot_start()
+    assert mode() == 0x48
+    client.plc_stop()
+    client.plc_cold_start()
+    assert mode() == 0x48
+
+
+def test_an_unknown_system_status_list(client: snap7.Client) -> None:
+    with pytest.raises(Exception, match=r"\(0x81\)"):
+        client.read_szl(0x0999)
 
 
 def test_the_address_is_exclusive(server: S7Server) -> None:
@@ -189,6 +214,40 @@ def test_garbage_ends_only_its_own_connection(server: S7Server, block: bytearray
                 received += data
         assert len(received) < 200
         assert client.read() == block
+
+
+JOBS = [
+    bytes.fromhex("32 07 0000 0001 0008 0008 00 01 12 04 11 44 01 00 ff 09 0004 0424 0000"),
+    bytes.fromhex("32 07 0000 0001 0008 0004 00 01 12 04 11 43 01 00 0a 00 0000"),
+    bytes.fromhex("32 01 0000 0001 0010 0000 29 0000000000 09") + b"P_PROGRAM",
+    bytes.fromhex("32 01 0000 0001 0014 0000 28 00000000000000fd 0000 09") + b"P_PROGRAM",
+]
+
+
+def test_noise_in_control_and_status_jobs_ends_at_most_its_own_connection(server: S7Server, block: bytearray) -> None:
+    setup = bytes.fromhex("03000019 02f080 32 01 0000 0001 0008 0000 f0 00 0008 0008 03c0")
+    noise = random.Random(4)
+    before = bytes(block)
+    with closing(ours(server)) as client:
+        client.connect()
+        for _ in range(100):
+            pdus = []
+            for _ in range(8):
+                pdu = bytearray(noise.choice(JOBS))
+                for _ in range(noise.randint(0, 3)):
+                    pdu[noise.randrange(2, len(pdu))] = noise.randrange(256)
+                del pdu[noise.randint(10, 60) :]
+                pdus.append(b"\x03\x00" + (len(pdu) + 7).to_bytes(2, "big") + b"\x02\xf0\x80" + pdu)
+            with socket.create_connection(tuple_of(server)) as peer:
+                peer.settimeout(10)
+                received = b""
+                with contextlib.suppress(ConnectionError):
+                    peer.sendall(SESSION + setup + b"".join(pdus))
+                    peer.shutdown(socket.SHUT_WR)
+                    while data := peer.recv(4096):
+                        received += data
+            assert len(received) < 8 * 400
+            assert client.read() == before
 
 
 def send_forever(peer: socket.socket, data: bytes) -> None:

@@ -187,7 +187,68 @@ def test_leaves_other_functions_to_others(jobs: Jobs) -> None:
     assert jobs.answer(memoryview(bytes.fromhex("32 07 0000 0001 0004 0000 04 01 12 00"))) is None
 
 
-VALID = [bytes(frame) for frame in (SETUP, read(item(BYTE, 9, 3)), write((item(BYTE, 3, 0), 4, b"abc")))]
+# -- traits ------------------------------------------------------------------------------------------------------------
+
+
+def jobs_of(block: bytearray, traits: Traits) -> Jobs:
+    jobs = Jobs(Memory({(S7Area.DB, 1): block, (S7Area.MK, 0): bytearray(b"flags")}), traits)
+    jobs.answer(SETUP)
+    return jobs
+
+
+def test_grants_what_it_is_told_to(block: bytearray) -> None:
+    jobs = Jobs(Memory({}), Traits(max_pdu_size=480, max_jobs=19))
+    answer = jobs.answer(SETUP)
+    assert answer is not None
+    assert answer[14:] == struct.pack(">HHH", 19, 19, 480)
+    assert len(payload(jobs_of(block, Traits(max_pdu_size=100)).answer(read(item(BYTE, 82, 0))))) == 86
+    assert error(jobs_of(block, Traits(max_pdu_size=100)).answer(read(item(BYTE, 83, 0)))) == 0x8500
+
+
+@pytest.mark.parametrize("wrong", [{"max_pdu_size": 99}, {"max_pdu_size": 961}, {"max_jobs": 0}, {"max_jobs": 33}])
+def test_refuses_traits_out_of_bounds(wrong: dict[str, int]) -> None:
+    with pytest.raises(ValueError, match="a PDU has 100 to 960 bytes"):
+        Traits(**wrong)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("fault", "reading", "writing"),
+    [
+        (Fault.PROTECTED, "03 00 0000", "03"),
+        (Fault.WRITE_PROTECTED, "ff 04 0008 05", "03"),
+        (Fault.OPTIMIZED, "05 00 0000", "05"),
+    ],
+)
+def test_faults_of_items(block: bytearray, fault: Fault, reading: str, writing: str) -> None:
+    jobs = jobs_of(block, Traits(fault=fault))
+    assert payload(jobs.answer(read(item(BYTE, 1, 5)))) == bytes.fromhex(reading)
+    assert payload(jobs.answer(write((item(BYTE, 1, 5), 4, b"x")))) == bytes.fromhex(writing)
+    assert payload(jobs.answer(write((item(BIT, 1, 5, bit=1), 3, b"\1")))) == bytes.fromhex(writing)
+    assert block == bytes(range(200))
+
+
+def test_put_get_off_refuses_every_job_but_the_set_up(block: bytearray) -> None:
+    jobs = jobs_of(block, Traits(fault=Fault.PUT_GET_OFF))
+    assert error(jobs.answer(read(item(BYTE, 1, 5)))) == 0x8104
+    assert error(jobs.answer(write((item(BYTE, 1, 5), 4, b"x")))) == 0x8104
+    assert block == bytes(range(200))
+
+
+def test_optimized_are_data_blocks_only(block: bytearray) -> None:
+    jobs = jobs_of(block, Traits(fault=Fault.OPTIMIZED))
+    assert payload(jobs.answer(read(item(BYTE, 5, 0, number=0, area=0x83)))) == bytes.fromhex("ff 04 0028") + b"flags"
+
+
+def test_a_shorter_block(block: bytearray) -> None:
+    jobs = jobs_of(block, Traits(block_size=100))
+    assert payload(jobs.answer(read(item(BYTE, 1, 99)))) == bytes.fromhex("ff 04 0008 63")
+    assert payload(jobs.answer(read(item(BYTE, 2, 99)))) == bytes.fromhex("05 00 0000")
+    assert payload(jobs.answer(write((item(BYTE, 1, 100), 4, b"x"), (item(BYTE, 1, 99), 4, b"x")))) == b"\x05\xff"
+    assert block[99:102] == bytes((ord("x"), 100, 101))
+
+
+MANY = write((item(BYTE, 3, 0), 4, b"abc"), (item(BIT, 1, 9, bit=3), 3, b"\1"), (item(BYTE, 2, 98), 4, b"xy"))
+VALID = [bytes(frame) for frame in (SETUP, read(item(BYTE, 9, 3)), write((item(BYTE, 3, 0), 4, b"abc")), MANY)]
 
 
 @given(
@@ -195,14 +256,15 @@ VALID = [bytes(frame) for frame in (SETUP, read(item(BYTE, 9, 3)), write((item(B
     | st.builds(
         lambda whole, at, byte, tail: whole[:at] + bytes((byte,)) + whole[at + 1 :] + tail,
         st.sampled_from(VALID),
-        st.integers(0, 40),
+        st.integers(0, 90),
         st.integers(0, 255),
         st.binary(max_size=4),
-    )
+    ),
+    st.builds(Traits, fault=st.none() | st.sampled_from(Fault), block_size=st.none() | st.integers(0, 200)),
 )
-def test_noise_gives_an_answer_or_none(noise: bytes) -> None:
+def test_noise_gives_an_answer_or_none(noise: bytes, traits: Traits) -> None:
     block = bytearray(100)
-    jobs = Jobs(Memory({(S7Area.DB, 1): block}), Traits())
+    jobs = Jobs(Memory({(S7Area.DB, 1): block}), traits)
     jobs.answer(SETUP)
     answer = jobs.answer(memoryview(noise))
     assert answer is None or 12 <= len(answer) <= 960
