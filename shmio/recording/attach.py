@@ -1,0 +1,52 @@
+"""The files that go with a recording: the instance's configuration and the sources of its layouts."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Final
+
+from shmio.config import load
+from shmio.errors import ConfigError
+from shmio.recording.recorder import Attachment
+from shmio.recording.writer import TEXT, TOML
+
+MAX_FILE_BYTES: Final = 16 << 20
+
+log = logging.getLogger("shmio.recorder")
+
+
+class ConfigFiles:
+    """Gives the files that a configuration names. One that cannot be read is left out, and that is logged."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+
+    def __call__(self, source: str | None) -> list[Attachment]:
+        """The configuration itself for None, the layout's sources for a source's name: as they are now."""
+        if source is None:
+            return self._read("config", [self._file], TOML)
+        try:
+            config = load(self._file)
+        except ConfigError as error:
+            log.warning("the layout's sources of %s are not attached: %s", source, error)
+            return []
+        layouts = [section.layout for section in config.source if section.name == source and section.layout]
+        names = [name for layout in layouts for name in ([layout] if isinstance(layout, str) else layout)]
+        return self._read(f"sources/{source}", [config.path(name) for name in names], TEXT)
+
+    def _read(self, folder: str, files: list[Path], media_type: str) -> list[Attachment]:
+        found = []
+        for file in files:
+            try:
+                with file.open("rb") as stream:
+                    data = stream.read(MAX_FILE_BYTES + 1)
+                changed_ns = file.stat().st_mtime_ns
+            except OSError as error:
+                log.warning("%s is not attached: %s", file, error.strerror)
+                continue
+            if len(data) > MAX_FILE_BYTES:
+                log.warning("%s is not attached: larger than %d bytes", file, MAX_FILE_BYTES)
+                continue
+            found.append(Attachment(f"{folder}/{file.name}", media_type, data, max(0, changed_ns)))
+        return found

@@ -1,0 +1,134 @@
+"""Frames, events and gaps as the messages of a recording (docs/reference/dump-format.md).
+
+Decoding trusts nothing: ValueError for bytes that are no such message.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import StrEnum
+from typing import Final
+
+import msgspec
+
+from shmio.segment.events import EVENT_DATA_SIZE, Event
+from shmio.segment.frame import Frame, Provenance, Quality
+
+FRAME: Final = "shmio.frame.v1"
+EVENT: Final = "shmio.event.v1"
+GAP: Final = "json"
+
+_FRAME: Final = struct.Struct("<QQqqqQIBBHHHI")
+_EVENT: Final = struct.Struct("<QQQqqqQIIIIIIHBBHH")
+_EFFECTIVE: Final = 1  # flag: an effective image follows the raw one
+
+FRAME_SCHEMA: Final = b"""Little-endian. u64 number, u64 cycle, i64 publish (ns, CLOCK_MONOTONIC), i64 clock (ns since \
+the instance's start), i64 source (ns UTC), u64 event (last one before), u32 incarnation, u8 quality (0 bad, \
+1 uncertain, 2 good), u8 provenance (0 live, 1 simulated, 2 replayed, 3 injected), u16 flags (1: effective), \
+u16 reason size, u16 0, u32 image size; then reason (UTF-8), raw, effective."""
+EVENT_SCHEMA: Final = b"""Little-endian. u64 number, u64 frame (last one before), u64 cycle, i64 publish (ns, \
+CLOCK_MONOTONIC), i64 clock (ns since the instance's start), i64 UTC (ns), u64 command, u32 incarnation, u32 writer, \
+u32 item, u32 items, u32 offset, u32 size, u16 kind, u8 quality, u8 mask, u16 data size, u16 text size; then data, \
+text (UTF-8)."""
+GAP_SCHEMA: Final = b"""{"type": "object", "properties": {"source": {"type": "string"}, "block": {"type": "integer"}, \
+"what": {"enum": ["frames", "events"]}, "first": {"type": "integer"}, "last": {"type": "integer"}, \
+"count": {"type": "integer"}, "reason": {"enum": ["overtaken", "not running", "no room"]}, \
+"after_ns": {"type": "integer"}, "before_ns": {"type": "integer"}}}"""
+
+
+class Reason(StrEnum):
+    """Why something is not in a recording."""
+
+    OVERTAKEN = "overtaken"
+    """The source had overwritten it before the recorder came to it."""
+    NOT_RUNNING = "not running"
+    """It was overwritten while no recorder ran."""
+    NO_ROOM = "no room"
+    """The disk was full or too slow, and so was the memory set aside for that."""
+
+
+class Gap(msgspec.Struct, frozen=True):
+    """Frames or events of one block that are not in the recording: numbers ``first`` to ``last``, ``count`` in all.
+
+    ``after_ns``, ``before_ns``: log times of what was recorded before and after it; 0 for nothing.
+    """
+
+    source: str
+    block: int
+    what: str
+    first: int
+    last: int
+    count: int
+    reason: Reason
+    after_ns: int = 0
+    before_ns: int = 0
+
+
+def encode_frame(frame: Frame) -> bytes:
+    """One frame as it is in its ring."""
+    reason = frame.reason.encode()
+    head = _FRAME.pack(
+        frame.number, frame.cycle, frame.publish_ns, frame.clock_ns, frame.source_ns, frame.event, frame.incarnation,
+        frame.quality, frame.provenance, 0 if frame.effective is None else _EFFECTIVE, len(reason), 0, len(frame.raw),
+    )  # fmt: skip
+    return b"".join((head, reason, frame.raw, frame.effective or b""))
+
+
+def decode_frame(data: bytes) -> Frame:
+    """The frame of a message; ValueError."""
+    if len(data) < _FRAME.size:
+        raise ValueError("a frame is shorter than its header")
+    number, cycle, publish_ns, clock_ns, source_ns, event, incarnation, *rest = _FRAME.unpack_from(data)
+    quality, provenance, flags, reason_size, _, size = rest
+    raw_at = _FRAME.size + reason_size
+    images = 2 if flags & _EFFECTIVE else 1
+    if len(data) != raw_at + images * size or provenance > Provenance.INJECTED:
+        raise ValueError("a frame contradicts its header")
+    return Frame(
+        number, cycle, publish_ns, clock_ns, source_ns, incarnation,
+        Quality(quality) if quality <= Quality.GOOD else Quality.BAD, Provenance(provenance), event,
+        data[_FRAME.size : raw_at].decode("utf-8", "replace"),
+        data[raw_at : raw_at + size],
+        data[raw_at + size :] if images == 2 else None,
+    )  # fmt: skip
+
+
+def encode_event(event: Event) -> bytes:
+    """One event as it is in its ring."""
+    text = event.text.encode()
+    head = _EVENT.pack(
+        event.number, event.frame, event.cycle, event.publish_ns, event.clock_ns, event.utc_ns, event.command,
+        event.incarnation, event.writer, event.item, event.items, event.offset, event.size,
+        event.kind, event.quality, event.mask, len(event.data), len(text),
+    )  # fmt: skip
+    return b"".join((head, event.data, text))
+
+
+def decode_event(data: bytes) -> Event:
+    """The event of a message; ValueError."""
+    if len(data) < _EVENT.size:
+        raise ValueError("an event is shorter than its header")
+    number, frame, cycle, publish_ns, clock_ns, utc_ns, command, incarnation, *rest = _EVENT.unpack_from(data)
+    writer, item, items, offset, size, kind, quality, mask, data_size, text_size = rest
+    text_at = _EVENT.size + data_size
+    if len(data) != text_at + text_size or data_size > EVENT_DATA_SIZE:
+        raise ValueError("an event contradicts its header")
+    known = Quality(quality) if quality <= Quality.GOOD else Quality.BAD
+    return Event(
+        number, kind, frame, cycle, publish_ns, clock_ns, utc_ns, incarnation, known,
+        writer, command, item, items, offset, mask, size,
+        data[_EVENT.size : text_at], data[text_at:].decode("utf-8", "replace"),
+    )  # fmt: skip
+
+
+def encode_gap(gap: Gap) -> bytes:
+    """A gap as JSON."""
+    return msgspec.json.encode(gap)
+
+
+def decode_gap(data: bytes) -> Gap:
+    """The gap of a message; ValueError."""
+    gap = msgspec.json.decode(data, type=Gap)
+    if gap.what not in ("frames", "events") or not 0 < gap.first <= gap.last or gap.count != gap.last - gap.first + 1:
+        raise ValueError("a gap contradicts itself")
+    return gap

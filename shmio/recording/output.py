@@ -1,0 +1,177 @@
+"""The file that a recording goes to. A thread of its own writes it, so that a slow or full disk holds up no reader."""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections import deque
+from contextlib import suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from shmio.errors import RecordingError
+
+RETRY_S: Final = 0.5
+"""How often a disk that refuses is tried again."""
+SLOW_S: Final = 2.0
+"""A write that takes longer is told."""
+SUFFIX: Final = ".mem"
+_NAMES: Final = 1000
+
+
+def create(directory: Path, instance: str, now: datetime | None = None) -> tuple[Path, int]:
+    """Make a new file, named after the instance and the time (UTC), and its folder; path and descriptor.
+
+    A file that is there is never touched. RecordingError.
+    """
+    stem = f"{instance}-{(now or datetime.now(UTC)).strftime('%Y%m%dT%H%M%SZ')}"
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        for turn in range(1, _NAMES):
+            path = directory / f"{stem}{f'_{turn}' if turn > 1 else ''}{SUFFIX}"
+            with suppress(FileExistsError):
+                return path, os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+    except OSError as error:
+        raise RecordingError(f"cannot make a recording in {directory}: {error.strerror}") from None
+    raise RecordingError(f"cannot make a recording in {directory}: all names for this second are taken")
+
+
+class Output:
+    """Takes bytes from one thread and writes them in another.
+
+    What was written between two calls of :meth:`flush` is a piece; the file holds whole pieces only, also while the
+    disk is full: a piece that does not fit is taken back and tried again.
+    """
+
+    def __init__(self, path: Path, fd: int, *, limit_bytes: int, fsync_s: float = 0.0) -> None:
+        """``limit_bytes``: from where on :attr:`full`. ``fsync_s``: how often to fsync; 0: at the end."""
+        self.path = path
+        self.error = ""
+        """Why the disk does not take what waits; empty while it does."""
+        self.written = 0
+        """Bytes in the file."""
+        self._fd = fd
+        self._limit = limit_bytes
+        self._fsync_s = fsync_s
+        self._piece = bytearray()
+        self._given = 0
+        self._full = False
+        self._pieces: deque[bytes] = deque()
+        self._news = threading.Condition()
+        self._closing = False
+        self._busy_since_s: float | None = None
+        self._synced_s = time.monotonic()
+        self._thread = threading.Thread(target=self._run, name="disk", daemon=True)
+        self._thread.start()
+
+    # ---- the recorder's thread ---------------------------------------------------------------------------------------
+
+    def write(self, data: bytes | memoryview) -> int:
+        """Add to the present piece; never waits."""
+        self._piece += data
+        return len(data)
+
+    def tell(self) -> int:
+        """Bytes given so far."""
+        return self._given + len(self._piece)
+
+    def flush(self) -> None:
+        """End the present piece and have it written."""
+        if self._piece:
+            self._given += len(self._piece)
+            with self._news:
+                self._pieces.append(bytes(self._piece))
+                self._news.notify()
+            self._piece.clear()
+
+    @property
+    def full(self) -> bool:
+        """Whether no more should be given: too much waits. It ends when half of it has been written."""
+        waiting = self.tell() - self.written
+        self._full = waiting > (self._limit // 2 if self._full else self._limit)
+        return self._full
+
+    @property
+    def problem(self) -> str:
+        """What is wrong with the file or its disk at present, by name; empty: nothing."""
+        since_s = self._busy_since_s
+        if self.error:
+            return f"{self.path}: {self.error}"
+        if since_s is not None and time.monotonic() - since_s > SLOW_S:
+            return f"{self.path}: the disk has not answered for {time.monotonic() - since_s:.0f} s"
+        return ""
+
+    def check(self) -> None:
+        """RecordingError when the file was removed: what is written now nobody will find."""
+        if os.fstat(self._fd).st_nlink == 0:
+            raise RecordingError(f"{self.path} was removed while it was being written")
+
+    def close(self, patience_s: float) -> bool:
+        """Write what waits, as far as the disk takes it in this time; whether all of it is in the file."""
+        self.flush()
+        with self._news:
+            self._closing = True
+            self._news.notify()
+        self._thread.join(patience_s)
+        if self._thread.is_alive():
+            self.error = self.error or "the disk does not answer"
+            return False
+        whole = self.written == self._given and not self.error
+        os.close(self._fd)
+        return whole
+
+    # ---- the disk's thread -------------------------------------------------------------------------------------------
+
+    def _run(self) -> None:
+        while True:
+            with self._news:
+                while not self._pieces and not self._closing:
+                    self._news.wait()
+                if not self._pieces:
+                    break
+                piece = self._pieces[0]
+            if self._put(piece):
+                with self._news:
+                    self._pieces.popleft()
+                    self.written += len(piece)
+                if self._fsync_s and time.monotonic() - self._synced_s >= self._fsync_s:
+                    self._sync()
+            elif not self._wait():
+                break
+        self._sync()
+
+    def _put(self, piece: bytes) -> bool:
+        """Write a piece as a whole, or leave nothing of it."""
+        self._busy_since_s = time.monotonic()
+        view, at = memoryview(piece), 0
+        try:
+            while at < len(piece):
+                at += os.pwrite(self._fd, view[at:], self.written + at)
+        except OSError as error:
+            self.error = error.strerror or str(error)
+            with suppress(OSError):
+                os.ftruncate(self._fd, self.written)
+            return False
+        finally:
+            self._busy_since_s = None
+        self.error = ""
+        return True
+
+    def _wait(self) -> bool:
+        """Wait for the disk to have room again; False when there is no time for it."""
+        with self._news:
+            if not self._closing:
+                self._news.wait_for(lambda: self._closing, RETRY_S)
+                return True
+        return False
+
+    def _sync(self) -> None:
+        self._busy_since_s = time.monotonic()
+        try:
+            os.fsync(self._fd)
+        except OSError as error:
+            self.error = error.strerror or str(error)
+        self._busy_since_s = None
+        self._synced_s = time.monotonic()

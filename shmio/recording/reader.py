@@ -1,0 +1,198 @@
+"""Reads recordings: whole ones, those of a killed recorder, and those being written."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Channel as ChannelRecord
+from mcap.records import Metadata
+
+from shmio.errors import LayoutError, RecordingError
+from shmio.layout.model import Layout
+from shmio.recording.encoding import EVENT, FRAME, GAP, Gap, decode_event, decode_frame, decode_gap
+from shmio.recording.records import MAX_RECORD_BYTES, Record, Records, stream
+from shmio.recording.writer import ABOUT, GAPS_TOPIC
+from shmio.segment import Event, Frame
+
+MAX_LAYOUT_BYTES: Final = 64 << 20
+"""All layouts of one file together."""
+MAX_ATTACHMENTS: Final = 10_000
+
+_MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_ATTACHMENT_HEAD: Final = 4096  # times, name, media type and size of any attachment fit in
+_LAYOUTS: Final = "layouts/"
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """Where the messages of one kind of one block are. ``layout``: the hash of its layout, in hexadecimal digits.
+
+    ``encoding`` is empty for messages that are not a recorder's.
+    """
+
+    number: int
+    encoding: str
+    topic: str
+    source: str = ""
+    block: int = 0
+    layout: str = ""
+
+
+class Message(NamedTuple):
+    """One message: a frame, an event or a gap."""
+
+    channel: Channel
+    log_ns: int
+    item: Frame | Event | Gap
+
+
+class AttachmentEntry(NamedTuple):
+    """An attachment: where its data are."""
+
+    at: int
+    size: int
+
+
+class Reader:
+    """One recording. A context manager; what is read of it is known from where :meth:`messages` has come to.
+
+    OSError, RecordingError: it cannot be opened, or is no recording.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+        self.records = Records(file)
+        self.about: dict[str, str] = {}
+        """What the recorder said of the instance."""
+        self.complete = False
+        """Whether all channels are known, from a walk through the whole file."""
+        self.channels: dict[int, Channel] = {}
+        self.attachments: dict[str, AttachmentEntry] = {}
+        self._layouts: dict[str, Layout] = {}
+        self._layout_bytes = 0
+
+    def messages(
+        self,
+        wanted: Callable[[Channel], bool] = lambda _: True,
+        from_ns: int = 0,
+        to_ns: int = (1 << 64) - 1,
+    ) -> Iterator[Message]:
+        """Messages of the wanted channels whose log times are in this range, as the file has them.
+
+        Ends where the file does; then :attr:`Records.closed` and :attr:`Records.damage` say how. RecordingError: a part
+        that is there is damaged.
+        """
+        for record in self.records.walk():
+            if record.opcode == Opcode.CHUNK:
+                first_ns, last_ns = self.records.chunk_times(record)
+                if (first_ns <= to_ns and last_ns >= from_ns) or not self.complete:
+                    for channel, log_ns, data in self.raw(record):
+                        if from_ns <= log_ns <= to_ns and wanted(channel):
+                            yield Message(channel, log_ns, self.decode(channel, data))
+            else:
+                self.note(record)
+
+    def raw(self, record: Record) -> Iterator[tuple[Channel, int, memoryview]]:
+        """(channel, log time, data) of a chunk's messages, those of others passed over; its channels are noted.
+
+        RecordingError.
+        """
+        for opcode, content in self.records.chunk(record):
+            if opcode == Opcode.CHANNEL:
+                self._channel(content)
+            elif opcode == Opcode.MESSAGE:
+                if len(content) < _MESSAGE.size:
+                    raise RecordingError(f"{self.file}: a message is shorter than its header")
+                number, _, log_ns, _ = _MESSAGE.unpack_from(content)
+                channel = self.channels.get(number)
+                if channel is None:
+                    raise RecordingError(f"{self.file}: a message of channel {number}, which is not described")
+                if channel.encoding:
+                    yield channel, log_ns, content[_MESSAGE.size :]
+
+    def decode(self, channel: Channel, data: memoryview) -> Frame | Event | Gap:
+        """What a message holds; RecordingError."""
+        try:
+            if channel.encoding == FRAME:
+                frame = decode_frame(bytes(data))
+                if len(frame.raw) != self.layout(channel).size:
+                    raise ValueError("a frame is not of its layout's size")
+                return frame
+            return decode_event(bytes(data)) if channel.encoding == EVENT else decode_gap(bytes(data))
+        except ValueError as error:
+            raise RecordingError(f"{self.file}: {channel.topic}: {error}") from None
+
+    def layout(self, channel: Channel) -> Layout:
+        """The layout of a channel's block, from its attachment; RecordingError."""
+        digest = channel.layout
+        if digest not in self._layouts:
+            entry = self.attachments.get(f"{_LAYOUTS}{digest}.json")
+            if entry is None:
+                raise RecordingError(f"{self.file}: the layout of {channel.topic} is not in the file")
+            self._layout_bytes += entry.size
+            data = self.records.read(entry.at, entry.size, MAX_LAYOUT_BYTES - self._layout_bytes + entry.size)
+            if hashlib.sha256(data).hexdigest() != digest:
+                raise RecordingError(f"{self.file}: the layout of {channel.topic} is damaged")
+            try:
+                self._layouts[digest] = Layout.from_json(data)
+            except LayoutError as error:
+                raise RecordingError(f"{self.file}: the layout of {channel.topic}: {error}") from None
+        return self._layouts[digest]
+
+    def note(self, record: Record) -> None:
+        """Take in a record that is not of a chunk: what it tells about the instance, or an attachment."""
+        try:
+            if record.opcode == Opcode.METADATA:
+                metadata = Metadata.read(stream(self.records.read(record.at, record.size)))
+                if metadata.name == ABOUT:
+                    self.about = metadata.metadata
+            elif record.opcode == Opcode.ATTACHMENT and len(self.attachments) < MAX_ATTACHMENTS:
+                self._attachment(record)
+        except (ValueError, struct.error, McapError):
+            raise RecordingError(f"{self.file}: the record at byte {record.at} is damaged") from None
+
+    def _attachment(self, record: Record) -> None:
+        data = stream(self.records.read(record.at, min(record.size, _ATTACHMENT_HEAD)))
+        data.read(16)
+        name = data.read_prefixed_string()
+        data.read_prefixed_string()
+        size = data.read8()
+        if data.count + size + 4 != record.size:
+            raise ValueError("its sizes contradict each other")
+        self.attachments[name] = AttachmentEntry(record.at + data.count, size)
+
+    def _channel(self, content: memoryview) -> None:
+        if len(content) > MAX_RECORD_BYTES:
+            raise RecordingError(f"{self.file}: a channel's description is larger than {MAX_RECORD_BYTES} bytes")
+        try:
+            found = ChannelRecord.read(stream(content))
+            about = found.metadata
+            if found.message_encoding in (FRAME, EVENT):
+                block = int(about["block"])
+                channel = Channel(
+                    found.id, found.message_encoding, found.topic, about["source"], block, about["layout"]
+                )
+            elif (found.topic, found.message_encoding) == (GAPS_TOPIC, GAP):
+                channel = Channel(found.id, found.message_encoding, found.topic)
+            else:
+                channel = Channel(found.id, "", found.topic)  # another program's
+        except (ValueError, KeyError, struct.error, McapError):
+            raise RecordingError(f"{self.file}: the description of a channel is damaged") from None
+        self.channels[found.id] = channel
+
+    def close(self) -> None:
+        """Close the file."""
+        self.records.close()
+
+    def __enter__(self) -> Reader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

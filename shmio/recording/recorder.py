@@ -1,0 +1,258 @@
+"""Copies what the sources of an instance publish into one recording."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+from itertools import chain
+from typing import Final, NamedTuple
+
+from shmio import __version__
+from shmio.recording.encoding import Gap, Reason
+from shmio.recording.follower import Entry, Follower, Place
+from shmio.recording.output import Output
+from shmio.recording.writer import JSON, Channels, Writer
+from shmio.segment import Block, Frame, Segment
+
+TURN_S: Final = 0.1
+CHUNK_S: Final = 0.8
+"""A chunk is no longer than this: with a turn, and the time to write it, less than the second that a kill may cost."""
+BATCH: Final = 4096
+"""Entries of one block in one turn; what is left comes in the next, at once."""
+CLOSE_S: Final = 3.0
+CHECK_S: Final = 1.0
+
+
+class Attachment(NamedTuple):
+    """A file that goes with a recording."""
+
+    name: str
+    media_type: str
+    data: bytes
+    changed_ns: int = 0
+
+
+class Start(NamedTuple):
+    """Where to begin: behind these places by source; blocks without one at their first frame, or at the present."""
+
+    places: Mapping[str, Place] = {}
+    first: bool = True
+
+
+@dataclass(slots=True)
+class Counters:
+    """What came of it so far. ``missed``: frames and events."""
+
+    frames: int = 0
+    events: int = 0
+    missed: int = 0
+
+
+@dataclass(slots=True)
+class _Lost:
+    """What could not be taken because there was no room: numbers from, to."""
+
+    first: int
+    last: int
+    after_ns: int
+
+
+@dataclass(slots=True)
+class _Followed:
+    follower: Follower
+    channels: Channels | None = None
+    lost: dict[str, _Lost] = field(default_factory=dict)
+    log_ns: int = 0
+
+
+class Recorder:
+    """One recording of the blocks of a segment. Use from one thread: :meth:`turn` again and again, then :meth:`close`.
+
+    Blocks that a reload adds or puts in the place of others are followed too.
+    """
+
+    def __init__(
+        self,
+        segment: Segment,
+        output: Output,
+        *,
+        by: str,
+        start: Start | None = None,
+        sources: Collection[str] | None = None,
+        attachments: Callable[[str | None], list[Attachment]] = lambda _: [],
+    ) -> None:
+        """``by``: who records. ``start``: default from the first frame. ``sources``: only these.
+
+        ``attachments`` gives the files to attach: those of the instance for None, those of a source for its name.
+        """
+        self.output = output
+        self.counters = Counters()
+        self._segment = segment
+        self._sources = sources
+        self._attachments = attachments
+        self._writer = Writer(output, self._about(by))
+        self._followed: list[_Followed] = []
+        self._blocks = 0
+        self._attached: set[str] = set()
+        self._attach(None)
+        self._follow(start or Start())
+        self._flushed_s = self._checked_s = time.monotonic()
+
+    def _about(self, by: str) -> dict[str, str]:
+        head = self._segment.header
+        return {
+            "instance": self._segment.instance,
+            "epoch": f"{head.epoch:016x}",
+            "mode": head.mode,
+            "started_utc_ns": str(head.started_utc_ns),
+            "started_ns": str(head.started_ns),
+            "instance_version": head.version,
+            "version": __version__,
+            "host": socket.gethostname(),
+            "recorder": by,
+            "recorder_pid": str(os.getpid()),
+            "recording_utc_ns": str(time.time_ns()),
+        }
+
+    def log_time(self, monotonic_ns: int) -> int:
+        """Time in the recording, UTC by the instance's start: it goes on evenly whatever is done to the wall clock."""
+        head = self._segment.header
+        return max(0, head.started_utc_ns + monotonic_ns - head.started_ns)
+
+    def turn(self) -> bool:
+        """Take what has been published; whether there is more at once. RecordingError: the file was removed."""
+        if self._segment.refresh():
+            self._follow(Start())
+        entries = list(chain.from_iterable(followed.follower.take(BATCH) for followed in self._followed))
+        entries.sort(key=lambda entry: entry.log_ns)  # stable: a block's own order stays
+        full = self.output.full
+        by_follower = {id(followed.follower): followed for followed in self._followed}
+        for entry in entries:
+            followed = by_follower[id(entry.follower)]
+            if full:
+                self._lose(followed, entry)
+            else:
+                self._write(followed, entry)
+        self._followed = [followed for followed in self._followed if not self._ended(followed)]
+        now_s = time.monotonic()
+        if now_s - self._flushed_s >= CHUNK_S - TURN_S / 2:
+            self._flushed_s = now_s
+            self._writer.flush()
+        if now_s - self._checked_s >= CHECK_S:
+            self._checked_s = now_s
+            self.output.check()
+        return len(entries) >= BATCH
+
+    @property
+    def pause_s(self) -> float:
+        """How long to wait between two turns: far less than any ring holds."""
+        rings = [followed.follower.block.ring for followed in self._followed]
+        return min([TURN_S, *(ring.slot_count * ring.period_ns / 8e9 for ring in rings)])
+
+    @property
+    def problem(self) -> str:
+        """What is wrong at present, in words; empty: nothing."""
+        problem = self.output.problem
+        lost = sum(lost.last - lost.first + 1 for followed in self._followed for lost in followed.lost.values())
+        return f"{problem}; {lost} frames and events lost so far" if problem and lost else problem
+
+    def close(self, patience_s: float = CLOSE_S) -> bool:
+        """Take what is there, write it, close the file; False if the disk did not take all of it in this time."""
+        while self.turn():
+            pass
+        for followed in self._followed:
+            self._write_rest(followed)
+        self._writer.finish()
+        return self.output.close(patience_s)
+
+    # ---- blocks ------------------------------------------------------------------------------------------------------
+
+    def _follow(self, start: Start) -> None:
+        followed = {id(known.follower.block) for known in self._followed}
+        for source, block in self._segment.blocks.items():
+            if id(block) in followed or (self._sources is not None and source not in self._sources):
+                continue
+            self._blocks += 1
+            place = start.places.get(source)
+            reason = Reason.NOT_RUNNING if place or start.first else Reason.OVERTAKEN
+            if place is None:
+                place = Place() if start.first else Place(block.ring.head(), block.events.head())
+            follower = Follower(block, self._blocks, place, reason, self.log_time)
+            self._followed.append(_Followed(follower, log_ns=place.log_ns))
+            self._attach_layout(block)
+            self._attach(source)
+
+    def _attach_layout(self, block: Block) -> None:
+        digest = block.layout.hash.hex()
+        self._put(Attachment(f"layouts/{digest}.json", JSON, block.layout.to_json()), digest)
+
+    def _attach(self, source: str | None) -> None:
+        for attachment in self._attachments(source):
+            self._put(attachment, attachment.name)
+
+    def _put(self, attachment: Attachment, key: str) -> None:
+        if key not in self._attached:
+            self._attached.add(key)
+            now_ns = self.log_time(time.monotonic_ns())
+            name, media_type, data, changed_ns = attachment
+            self._writer.attach(name, media_type, data, now_ns, changed_ns)
+
+    def _ended(self, followed: _Followed) -> bool:
+        if not followed.follower.done:
+            return False
+        if not self.output.full:
+            self._write_rest(followed)
+        return not followed.lost
+
+    # ---- entries -----------------------------------------------------------------------------------------------------
+
+    def _write(self, followed: _Followed, entry: Entry) -> None:
+        log_ns, follower, item = entry
+        self._tell_lost(followed, log_ns)
+        followed.log_ns = log_ns
+        if isinstance(item, Gap):
+            self.counters.missed += item.count
+            self._writer.gap(item, log_ns)
+            return
+        if followed.channels is None:
+            block = follower.block
+            followed.channels = self._writer.open_block(
+                block.source, follower.number, block.layout, block.period_ns, block.stale_ns
+            )
+        if isinstance(item, Frame):
+            self.counters.frames += 1
+            self._writer.frame(followed.channels, item, log_ns)
+        else:
+            self.counters.events += 1
+            self._writer.event(followed.channels, item, log_ns)
+
+    def _lose(self, followed: _Followed, entry: Entry) -> None:
+        item = entry.item
+        if isinstance(item, Gap):
+            what, first, last = item.what, item.first, item.last
+        else:
+            what, first, last = "frames" if isinstance(item, Frame) else "events", item.number, item.number
+        self.counters.missed += last - first + 1
+        lost = followed.lost.setdefault(what, _Lost(first, last, followed.log_ns))
+        lost.last = last
+
+    def _tell_lost(self, followed: _Followed, before_ns: int) -> None:
+        """Put down what there was no room for, before what follows it."""
+        follower = followed.follower
+        for what, lost in followed.lost.items():
+            count = lost.last - lost.first + 1
+            gap = Gap(
+                follower.block.source, follower.number, what, lost.first, lost.last, count, Reason.NO_ROOM,
+                lost.after_ns, before_ns,
+            )  # fmt: skip
+            self._writer.gap(gap, before_ns or self.log_time(time.monotonic_ns()))
+        followed.lost.clear()
+
+    def _write_rest(self, followed: _Followed) -> None:
+        """What was missed at the very end."""
+        self._tell_lost(followed, 0)
+        for entry in followed.follower.rest():
+            self._write(followed, entry)

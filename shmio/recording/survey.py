@@ -1,0 +1,152 @@
+"""What is in a recording, found out without reading all of it: chunks are passed over where their indexes suffice."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+from mcap.opcode import Opcode
+
+from shmio.errors import RecordingError
+from shmio.recording.encoding import GAP, Gap
+from shmio.recording.reader import Channel, Reader
+from shmio.recording.records import MAX_RECORD_BYTES, Record
+
+MAX_GAPS: Final = 1000
+"""Gaps that are kept one by one; all are counted."""
+
+_INDEX: Final = struct.Struct("<HI")  # channel, bytes of the entries
+_ENTRY: Final = struct.Struct("<QQ")  # log time, offset
+_NUMBER: Final = struct.Struct("<Q")  # how frames and events begin
+
+
+class _Count(NamedTuple):
+    """Messages of one channel in one chunk."""
+
+    channel: int
+    messages: int
+    first_ns: int
+    last_ns: int
+
+
+@dataclass(slots=True)
+class Track:
+    """The messages of one channel: how many, from when to when, in which chunks the first and the last are."""
+
+    channel: Channel
+    count: int
+    first_ns: int
+    last_ns: int
+    first_in: Record
+    last_in: Record
+
+    def numbers(self, reader: Reader) -> tuple[int, int]:
+        """Numbers of its first and its last frame or event; RecordingError."""
+        return next(self._in(reader, self.first_in)), list(self._in(reader, self.last_in))[-1]
+
+    def _in(self, reader: Reader, chunk: Record) -> Iterator[int]:
+        for channel, _, data in reader.raw(chunk):
+            if channel.number == self.channel.number and len(data) >= _NUMBER.size:
+                yield _NUMBER.unpack_from(data)[0]
+
+
+@dataclass(slots=True)
+class Survey:
+    """A recording as a whole."""
+
+    tracks: dict[int, Track] = field(default_factory=dict)
+    """By the channel's number."""
+    gaps: list[Gap] = field(default_factory=list)
+    """The first ones."""
+    missed: dict[tuple[str, int, str], int] = field(default_factory=dict)
+    """How many by source, block, and what it is."""
+    missed_to: dict[tuple[str, int, str], int] = field(default_factory=dict)
+    """Highest number missed."""
+    gap_count: int = 0
+    damage: list[str] = field(default_factory=list)
+    """What could not be read."""
+
+
+def survey(reader: Reader) -> Survey:
+    """Walk through the file. RecordingError: it is no recording of ours; damage within it is noted only."""
+    found = Survey()
+    chunk: Record | None = None
+    counts: list[_Count] | None = []
+    for record in reader.records.walk():
+        if record.opcode == Opcode.MESSAGE_INDEX:
+            count = _read_index(reader, record) if counts is not None else None
+            counts = None if counts is None or count is None else [*counts, count]
+            continue
+        if chunk is not None:
+            _settle(reader, found, chunk, counts)
+            chunk = None
+        if record.opcode == Opcode.CHUNK:
+            chunk, counts = record, []
+        elif record.opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
+            try:
+                reader.note(record)
+            except RecordingError as error:
+                found.damage.append(str(error))
+    if chunk is not None:  # the last of a file that ends here: its indexes may be missing
+        _settle(reader, found, chunk, None)
+    if not reader.about:
+        raise RecordingError(f"{reader.file} is an MCAP file, but no recording of shmio")
+    reader.complete = True
+    return found
+
+
+def _read_index(reader: Reader, record: Record) -> _Count | None:
+    """What a message index says; None if it is of no use."""
+    if not _INDEX.size < record.size <= MAX_RECORD_BYTES or (record.size - _INDEX.size) % _ENTRY.size:
+        return None
+    data = reader.records.read(record.at, record.size)
+    channel, _ = _INDEX.unpack_from(data)
+    first_ns, _ = _ENTRY.unpack_from(data, _INDEX.size)
+    last_ns, _ = _ENTRY.unpack_from(data, record.size - _ENTRY.size)
+    return _Count(channel, (record.size - _INDEX.size) // _ENTRY.size, first_ns, last_ns)
+
+
+def _settle(reader: Reader, found: Survey, chunk: Record, counts: list[_Count] | None) -> None:
+    """Count a chunk's messages: by its indexes, unless something in it must be read."""
+    try:
+        if not counts or any(_must_read(reader, count.channel) for count in counts):
+            counts = _read(reader, found, chunk)
+    except RecordingError as error:
+        found.damage.append(str(error))
+        return
+    for count in counts:
+        channel = reader.channels[count.channel]
+        track = found.tracks.get(count.channel)
+        if track is None:
+            found.tracks[count.channel] = Track(channel, count.messages, count.first_ns, count.last_ns, chunk, chunk)
+        else:
+            track.count += count.messages
+            track.last_ns, track.last_in = count.last_ns, chunk
+
+
+def _must_read(reader: Reader, number: int) -> bool:
+    channel = reader.channels.get(number)
+    return channel is None or channel.encoding == GAP
+
+
+def _read(reader: Reader, found: Survey, chunk: Record) -> list[_Count]:
+    counts: dict[int, _Count] = {}
+    for channel, log_ns, data in reader.raw(chunk):
+        old = counts.get(channel.number, _Count(channel.number, 0, log_ns, log_ns))
+        counts[channel.number] = old._replace(messages=old.messages + 1, last_ns=log_ns)
+        if channel.encoding == GAP:
+            item = reader.decode(channel, data)
+            if isinstance(item, Gap):
+                _add_gap(found, item)
+    return list(counts.values())
+
+
+def _add_gap(found: Survey, gap: Gap) -> None:
+    key = (gap.source, gap.block, gap.what)
+    found.gap_count += 1
+    found.missed[key] = found.missed.get(key, 0) + gap.count
+    found.missed_to[key] = max(found.missed_to.get(key, 0), gap.last)
+    if len(found.gaps) < MAX_GAPS:
+        found.gaps.append(gap)

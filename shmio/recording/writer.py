@@ -1,0 +1,109 @@
+"""A recording as MCAP: one channel for the frames and one for the events of each block, one for what was missed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import IO, Final, cast
+
+import mcap.writer
+
+from shmio import __version__
+from shmio.layout.model import Layout
+from shmio.recording.encoding import (
+    EVENT,
+    EVENT_SCHEMA,
+    FRAME,
+    FRAME_SCHEMA,
+    GAP,
+    GAP_SCHEMA,
+    Gap,
+    encode_event,
+    encode_frame,
+    encode_gap,
+)
+from shmio.recording.output import Output
+from shmio.segment import Event, Frame
+
+PROFILE: Final = "shmio"
+ABOUT: Final = "shmio"
+"""Name of the metadata that tell about the instance."""
+CHUNK_BYTES: Final = 1 << 20
+GAPS_TOPIC: Final = "gaps"
+
+JSON: Final = "application/json"
+TOML: Final = "application/toml"
+TEXT: Final = "text/plain"
+
+
+@dataclass(frozen=True, slots=True)
+class Channels:
+    """Where the messages of one block go."""
+
+    frames: int
+    events: int
+
+
+class Writer:
+    """Writes one recording to an :class:`Output`; one thread. Nothing here waits for the disk."""
+
+    def __init__(self, output: Output, about: Mapping[str, str]) -> None:
+        """``about``: what the reader is told of the instance."""
+        self._output = output
+        self._mcap = mcap.writer.Writer(cast("IO[bytes]", output), chunk_size=CHUNK_BYTES)
+        self._mcap.start(PROFILE, f"shmio {__version__}")
+        self._mcap.add_metadata(ABOUT, dict(about))
+        self._schemas: dict[str, int] = {}
+        self._gaps: int | None = None
+        self.flush()
+
+    def attach(self, name: str, media_type: str, data: bytes, now_ns: int, changed_ns: int = 0) -> None:
+        """Attach a file."""
+        self._mcap.add_attachment(changed_ns, now_ns, name, media_type, data)
+
+    def open_block(self, source: str, number: int, layout: Layout, period_ns: int, stale_ns: int) -> Channels:
+        """Begin a block: the ``number``-th in this recording. Its layout was attached before."""
+        self.flush()  # a channel's record is in the chunk of its block's first message, for readers without an index
+        about = {
+            "source": source,
+            "block": str(number),
+            "layout": layout.hash.hex(),
+            "period_ns": str(period_ns),
+            "stale_ns": str(stale_ns),
+        }
+        return Channels(
+            self._mcap.register_channel(f"{source}/frames", FRAME, self._schema(FRAME, FRAME_SCHEMA), about),
+            self._mcap.register_channel(f"{source}/events", EVENT, self._schema(EVENT, EVENT_SCHEMA), about),
+        )
+
+    def _schema(self, name: str, text: bytes) -> int:
+        if name not in self._schemas:
+            self._schemas[name] = self._mcap.register_schema(name, "text/plain", text)
+        return self._schemas[name]
+
+    def frame(self, channels: Channels, frame: Frame, log_ns: int) -> None:
+        """Add a frame."""
+        told_ns = frame.source_ns if frame.source_ns > 0 else log_ns
+        self._mcap.add_message(channels.frames, log_ns, encode_frame(frame), told_ns, frame.number & 0xFFFFFFFF)
+
+    def event(self, channels: Channels, event: Event, log_ns: int) -> None:
+        """Add an event."""
+        told_ns = event.utc_ns if event.utc_ns > 0 else log_ns
+        self._mcap.add_message(channels.events, log_ns, encode_event(event), told_ns, event.number & 0xFFFFFFFF)
+
+    def gap(self, gap: Gap, log_ns: int) -> None:
+        """Tell what was missed; it comes before what follows it."""
+        if self._gaps is None:
+            self.flush()
+            schema = self._mcap.register_schema("shmio.gap.v1", "jsonschema", GAP_SCHEMA)
+            self._gaps = self._mcap.register_channel(GAPS_TOPIC, GAP, schema)
+        self._mcap.add_message(self._gaps, log_ns, encode_gap(gap), log_ns)
+
+    def flush(self) -> None:
+        """End the chunk; what was added is on its way to the file."""
+        self._mcap.flush()
+
+    def finish(self) -> None:
+        """Write index and footer: the recording is closed."""
+        self._mcap.finish()
+        self._output.flush()
