@@ -79,7 +79,8 @@ class Placer:
             own = len(segment) + 1 + len(member.comment) + (len(initial or "") if isinstance(placed, Leaf) else 0)
             cost = cost.plus(extent.cost, 1, own)
             height = max(height, extent.height + 1)
-            fields[member.name.lower()] = Field(segment, replace(member, initial=initial), placed, offset, bit)
+            known = member if initial == member.initial else replace(member, initial=initial)
+            fields[member.name.lower()] = Field(segment, known, placed, offset, bit)
             good = good and self._fits(member.position, round_up(bits, 8) // 8, cost, height)
         return Group(fields, round_up(round_up(bits, 8) // 8, 2), cost, height) if good else None
 

@@ -1,0 +1,114 @@
+"""Fuzzes the layout compiler, the layout document and the codec.
+
+A finding is an exception that should not be, more than ``--cpu-s`` seconds of processor time, or more memory
+than ``--memory-mb``. Its input is kept; naming it on the command line repeats it.
+
+Inputs are made from the golden files by mutation. ``--guided`` leaves that to atheris, which watches what code
+each input reaches.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import resource
+import signal
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import FrameType
+
+from tests.fuzz import layout_checks
+from tests.fuzz.layout_inputs import FRAGMENTS, MAX_INPUT, Mutator, seeds
+
+
+class TooSlow(BaseException):
+    """An input took more than its time."""
+
+
+def guarded(check: Callable[[bytes], None], cpu_s: float) -> Callable[[bytes], None]:
+    """Return the check with a limit of processor time; its findings are kept and told."""
+
+    def expire(_signal: int, _frame: FrameType | None) -> None:
+        raise TooSlow
+
+    signal.signal(signal.SIGVTALRM, expire)
+
+    def run(data: bytes) -> None:
+        signal.setitimer(signal.ITIMER_VIRTUAL, cpu_s)
+        try:
+            check(data)
+        except BaseException as error:
+            signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+            if isinstance(error, KeyboardInterrupt):
+                raise
+            with tempfile.NamedTemporaryFile(prefix="fuzz-layout-", suffix=".bin", delete=False) as file:
+                file.write(data)
+            traceback.print_exc()
+            sys.stderr.write(f"finding: {type(error).__name__}; its input is {file.name}\n")
+            raise SystemExit(1) from None
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+
+    return run
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the script; return 0 when nothing was found."""
+    parser = argparse.ArgumentParser(prog="fuzz-layout", description="Fuzz the layout compiler and codec.")
+    parser.add_argument("inputs", nargs="*", type=Path, metavar="INPUT", help="repeat these findings and nothing else")
+    parser.add_argument("--seconds", type=float, default=20.0, help="how long (20)")
+    parser.add_argument("--count", type=int, default=sys.maxsize, help="at most so many inputs")
+    parser.add_argument("--seed", type=int, default=int(time.time()), help="of the inputs (the time)")
+    parser.add_argument("--cpu-s", type=float, default=20.0, help="processor time that one input may take (20)")
+    parser.add_argument("--memory-mb", type=int, default=2048, help="address space of the process (2048; 0: no limit)")
+    parser.add_argument("--guided", action="store_true", help="by atheris (the extra 'fuzz'), which watches coverage")
+    options = parser.parse_args(arguments)
+    if options.guided:
+        return guide(options)
+    if options.memory_mb:
+        resource.setrlimit(resource.RLIMIT_AS, (options.memory_mb << 20, resource.getrlimit(resource.RLIMIT_AS)[1]))
+    run = guarded(layout_checks.check, options.cpu_s)
+    for path in options.inputs:
+        run(path.read_bytes())
+    if options.inputs:
+        return 0
+    started, count, slowest_s = time.monotonic(), 0, 0.0
+    for data in Mutator(options.seed):
+        before = time.process_time()
+        run(data)
+        slowest_s = max(slowest_s, time.process_time() - before)
+        count += 1
+        if count >= options.count or time.monotonic() - started >= options.seconds:
+            break
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
+    seed = options.seed
+    sys.stdout.write(f"{count} inputs of seed {seed}, nothing found; slowest {slowest_s:.2f} s, peak {peak_mb} MB\n")
+    return 0
+
+
+def guide(options: argparse.Namespace) -> int:
+    """Let atheris make the inputs; it ends the process itself."""
+    atheris = importlib.import_module("atheris")
+    for name in [name for name in sys.modules if name.startswith("shmio.layout") or name == layout_checks.__name__]:
+        del sys.modules[name]
+    with atheris.instrument_imports(include=["shmio.layout"]):
+        check = importlib.import_module(layout_checks.__name__).check
+    with tempfile.TemporaryDirectory(prefix="fuzz-layout-") as corpus:
+        for index, seed in enumerate(seeds()):
+            (Path(corpus) / f"seed{index}").write_bytes(seed)
+        dictionary = Path(corpus) / "dictionary.txt"
+        words = ("".join(f"\\x{byte:02x}" for byte in fragment.encode()) for fragment in FRAGMENTS)
+        dictionary.write_text("".join(f'"{word}"\n' for word in words))
+        limits = [f"-max_total_time={int(options.seconds)}", f"-rss_limit_mb={options.memory_mb}"]
+        limits += [f"-runs={options.count}"] if options.count < sys.maxsize else []
+        limits += [f"-max_len={MAX_INPUT}", f"-dict={dictionary}", f"-seed={options.seed}", corpus]
+        atheris.Setup(["fuzz-layout", *limits], guarded(check, options.cpu_s))
+        atheris.Fuzz()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
