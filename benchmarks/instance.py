@@ -57,8 +57,13 @@ class Instance:
 
 
 @contextmanager
-def instance(period_ms: float, *, plc: Address | None = None, layout: Path = DB201) -> Iterator[Instance]:
-    """Run an instance that polls ``plc``, or an emulated controller of its own with the program of the A50 cell."""
+def instance(
+    period_ms: float, *, plc: Address | None = None, layout: Path = DB201, more: str = ""
+) -> Iterator[Instance]:
+    """Run an instance that polls ``plc``, or an emulated controller of its own with the program of the A50 cell.
+
+    ``more``: further sections of the configuration.
+    """
     name = f"bench-{os.getpid()}"
     with ExitStack() as stack:
         grpc = stack.enter_context(reserved_port())
@@ -66,7 +71,8 @@ def instance(period_ms: float, *, plc: Address | None = None, layout: Path = DB2
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         text = _SOURCE if plc else _SOURCE + _EMULATOR
         config = folder / "supervisor.toml"
-        config.write_text(text.format(name=name, layout=layout, plc=controller, period_ms=period_ms, grpc=grpc))
+        values = {"name": name, "layout": layout, "plc": controller, "period_ms": period_ms, "grpc": grpc}
+        config.write_text(text.format(**values) + more)
         output = stack.enter_context((folder / "output").open("w+"))
         supervisor = subprocess.Popen(
             [sys.executable, "-m", "shmio.cli.supervisor", "up", "-c", str(config)],

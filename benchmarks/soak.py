@@ -1,0 +1,176 @@
+"""A cell left alone: DB201 at 50 Hz for half an hour, five gRPC subscribers, a recorder. Does it grow, does it lose?
+
+A reader of its own follows every frame: cycles must follow each other, quality must stay good. What the subscribers got
+is held against how often their registers changed; the recording against the frames. Memory and descriptors of each
+process are taken every few seconds; what the second half holds more than the second quarter is growth.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from common import Child, machine, table
+from instance import Instance, instance
+
+from shmio.layout.codec import codec
+from shmio.layout.topic import find
+from shmio.segment import Block, Quality
+
+PERIOD_MS = 20
+REGISTERS = [f"Robot_800/Axs{axis}_Pos" for axis in range(1, 6)]
+FIRST_S = 1.0
+"""Overruns in the first second do not count: everybody is starting."""
+SAMPLE_S = 5.0
+
+
+@dataclass
+class Follower:
+    """Reads every frame, in a thread."""
+
+    block: Block
+    frames: int = 0
+    bad: int = 0
+    skipped: int = 0
+    changes: dict[str, int] = field(default_factory=lambda: dict.fromkeys(REGISTERS, 0))
+    stopping: threading.Event = field(default_factory=threading.Event)
+
+    def run(self) -> None:
+        """Follow until told to stop."""
+        decoders = {path: codec(find(self.block.layout, path)) for path in REGISTERS}
+        cursor, cycle = self.block.cursor(), None
+        values: dict[str, object] = {}
+        while not self.stopping.is_set():
+            frame = cursor.next(0.5)
+            if frame is None:
+                continue
+            self.frames += 1
+            self.bad += frame.quality is not Quality.GOOD
+            self.skipped += 0 if cycle is None else frame.cycle - cycle - 1
+            cycle = frame.cycle
+            for path, decoder in decoders.items():
+                value = decoder.decode(frame.image)
+                self.changes[path] += path in values and values[path] != value
+                values[path] = value
+        self.missed = cursor.missed
+
+
+@dataclass(frozen=True)
+class Size:
+    """What a process holds."""
+
+    memory_kb: int
+    """Private and shared pages that are its own share (PSS), without the segment."""
+    descriptors: int
+
+    @classmethod
+    def of(cls, pid: int) -> Size:
+        """Read /proc/PID/smaps."""
+        memory_kb, ours = 0, False
+        for line in Path(f"/proc/{pid}/smaps").read_text().splitlines():
+            if line.startswith("Pss:"):
+                memory_kb += 0 if ours else int(line.split()[1])
+            elif line[0] in "0123456789abcdef":
+                ours = "/dev/shm/" in line
+        return cls(memory_kb, sum(1 for _ in Path(f"/proc/{pid}/fd").iterdir()))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--for", dest="duration_s", type=float, default=1800.0, help="seconds (default: half an hour)")
+    parser.add_argument("--quick", action="store_true", help="10 s: does it work")
+    arguments = parser.parse_args()
+    duration_s = 10.0 if arguments.quick else arguments.duration_s
+    print(f"# Soak: DB201 at 50 Hz, 5 subscribers, a recorder, {duration_s:g} s\n{machine()}")
+    with tempfile.TemporaryDirectory() as folder:
+        with instance(PERIOD_MS, more=f'[recorder]\ndirectory = "{folder}"\n') as running:
+            problems = soak(running, duration_s)
+        problems += recorded(Path(folder))
+    for problem in problems:
+        print(f"BROKEN: {problem}")
+    raise SystemExit(1 if problems else 0)
+
+
+def soak(running: Instance, duration_s: float) -> list[str]:
+    """Watch for so long; what is not as it should be."""
+    slots = {slot.name: slot for slot in running.segment.processes}
+    time.sleep(FIRST_S)
+    before = slots["cell"].counters
+    follower = Follower(running.segment.blocks["cell"])
+    thread = threading.Thread(target=follower.run)
+    sizes: dict[str, list[Size]] = {name: [] for name in running.pids}
+    with Child("subscriber.py", running.grpc, *(f"cell/{path}" for path in REGISTERS)) as subscribers:
+        thread.start()
+        end_s = time.monotonic() + duration_s
+        while (rest_s := end_s - time.monotonic()) > 0:
+            time.sleep(min(SAMPLE_S, rest_s))
+            for name, pid in running.pids.items():
+                sizes[name].append(Size.of(pid))
+        follower.stopping.set()
+        thread.join()
+        messages = int(subscribers.finish()["messages"])
+    after = slots["cell"].counters
+    rows, problems = [], []
+    for name, taken in sizes.items():
+        early, late = taken[len(taken) // 4 : len(taken) // 2] or taken, taken[len(taken) // 2 :]
+        memory_kb = [statistics.median(size.memory_kb for size in part) for part in (early, late)]
+        descriptors = [statistics.median(size.descriptors for size in part) for part in (early, late)]
+        rows.append([name, *(f"{value / 1024:.2f}" for value in memory_kb), *(f"{value:.0f}" for value in descriptors)])
+        if memory_kb[1] > memory_kb[0] * 1.02 + 256:
+            problems.append(f"{name} grew from {memory_kb[0]:.0f} to {memory_kb[1]:.0f} kB")
+        if descriptors[1] > descriptors[0]:
+            problems.append(f"{name} holds {descriptors[1]:.0f} descriptors, {descriptors[0]:.0f} before")
+    table(["process", "MB, 2nd quarter", "MB, 2nd half", "descriptors, 2nd quarter", "2nd half"], rows)
+    overruns, failures = (after[name] - before[name] for name in ("overruns", "failures"))
+    changes = sum(follower.changes.values())
+    print(
+        f"{follower.frames} frames, {overruns} overruns, {failures} failures, {follower.bad} not good, "
+        f"{follower.skipped} cycles skipped, {follower.missed} missed by the reader; {changes} changes, "
+        f"{messages} messages received, {slots['grpc'].counters['dropped']} dropped"
+    )
+    for name, value in (
+        ("overruns after the first second", overruns),
+        ("failed polls", failures),
+        ("frames that are not good", follower.bad),
+        ("cycles without a frame", follower.skipped),
+        ("frames missed by the reader", follower.missed),
+        ("messages dropped", slots["grpc"].counters["dropped"]),
+        ("restarts", sum(slot.supervised.restarts for slot in slots.values())),
+    ):
+        if value:
+            problems.append(f"{value} {name}")
+    # The subscribers joined before the follower and left after it: a few frames at each end.
+    if not 0 <= messages - changes <= len(REGISTERS) * 5 / (PERIOD_MS / 1000):
+        problems.append(f"{messages} messages for {changes} changes")
+    return problems
+
+
+def recorded(folder: Path) -> list[str]:
+    """What the recording says of itself; what is not as it should be."""
+    problems, frames = [], 0
+    files = sorted(folder.glob("*.mem"))
+    for file in files:
+        command = [sys.executable, "-m", "shmio.cli.dump", "info", "--json", str(file)]
+        info = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+        print(json.dumps(info))
+        for one in info if isinstance(info, list) else [info]:
+            for block in one["blocks"]:
+                frames += block["frames"]
+                if block["missed"]:
+                    problems.append(f"{file.name}: {block['missed']} frames of {block['source']} missed")
+    if len(files) != 1:
+        problems.append(f"{len(files)} recordings instead of one")
+    print(f"{frames} frames recorded")
+    return problems
+
+
+if __name__ == "__main__":
+    main()
