@@ -8,6 +8,7 @@ from pathlib import Path
 
 from shmio import __version__
 from shmio.cli import get, registers, watch
+from shmio.cli import set as set_verb
 from shmio.cli.run import run
 from shmio.cli.target import instance_name
 from shmio.segment.attach import Attachment, attach
@@ -22,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(argv)
 
     def command() -> int:
-        with attach(instance_name(arguments)) as cell:
+        with attach(instance_name(arguments), writable=arguments.writable) as cell:
             verb: Verb = arguments.verb
             return verb(cell, arguments)
 
@@ -30,15 +31,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog=PROGRAM, description="Look at the registers of a running instance.")
+    parser = argparse.ArgumentParser(prog=PROGRAM, description="Read and write the registers of a running instance.")
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("-c", dest="config", type=Path, metavar="FILE", help="the instance of this supervisor.toml")
     common.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
     common.add_argument("--json", action="store_true", help="print JSON")
     verbs = parser.add_subparsers(required=True, metavar="VERB")
-    for name, module in (("list", registers), ("get", get), ("watch", watch)):
+    for name, module in (("list", registers), ("get", get), ("watch", watch), ("set", set_verb)):
         sub = verbs.add_parser(name, parents=[common], help=module.HELP, description=module.HELP)
         module.arguments(sub)
-        sub.set_defaults(verb=module.execute)
+        sub.set_defaults(verb=module.execute, writable=module is set_verb)
     return parser

@@ -1,0 +1,165 @@
+"""``shmio set``: values toward a source, and what became of them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import shlex
+
+from shmio.cli.readings import topic_path
+from shmio.cli.run import dumps
+from shmio.errors import CommandError, PathError, ValueRangeError
+from shmio.layout.codec import Value
+from shmio.layout.lists import split_array
+from shmio.layout.literal import parse_literal
+from shmio.layout.model import Register
+from shmio.layout.text import from_text, wire_type
+from shmio.layout.topic import find, parse_topic
+from shmio.logs import printable
+from shmio.segment import Block, EventKind
+from shmio.segment.attach import Attachment
+from shmio.segment.commander import TIMEOUT_S, Outcome
+
+HELP = "Write values of registers, and print what became of each."
+MAX_TIMEOUT_S = 86_400
+
+_QUOTED = frozenset({"CHAR", "WCHAR", "STRING", "WSTRING"})
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's own arguments."""
+    parser.epilog = (
+        "VALUE is JSON or an S7 literal: 5, -1.5, true, 16#FF, T#1s, '\"text\"'. Before one that begins with a minus "
+        "and is no plain number, put -- in front of the first PATH."
+    )
+    parser.add_argument(
+        "--timeout",
+        type=_seconds,
+        default=TIMEOUT_S,
+        metavar="S",
+        help=f"give up when no cycle came to write them in so many seconds (default {TIMEOUT_S:g})",
+    )
+    parser.add_argument("pairs", nargs="+", action=_Pairs, metavar="PATH VALUE", help="register or array element")
+
+
+class _Pairs(argparse.Action):
+    """PATH VALUE, as often as wanted."""
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: object, _: str | None = None
+    ) -> None:
+        """Keep them as pairs; wrong usage when one is single."""
+        words = list(values) if isinstance(values, list) else []
+        if len(words) % 2:
+            parser.error(f"{words[-1]!r} has no value: give PATH VALUE [PATH VALUE ...]")
+        namespace.pairs = list(zip(words[::2], words[1::2], strict=True))
+
+
+def execute(cell: Attachment, options: argparse.Namespace) -> int:
+    """Write all values of each source as one command. CommandError, when not all were written, names the first."""
+    wanted: dict[str, dict[str, Value]] = {}
+    for path, text in options.pairs:
+        block, register = _target(cell, path)
+        values = wanted.setdefault(block.source, {})
+        name = topic_path(block, register)
+        if name in values:
+            raise PathError(f"{name}: given twice")
+        try:
+            values[name] = read_value(text, register)
+        except ValueRangeError as error:
+            raise ValueRangeError(f"{name}: {str(error).removeprefix(f'{register.path}: ')}") from None
+    outcomes: dict[str, Outcome] = {}
+    try:
+        for values in wanted.values():
+            outcomes |= zip(values, cell.write(values, options.timeout), strict=True)
+    finally:  # also of what was written before a later source took nothing
+        _print(outcomes, options.json)
+    failed = [(path, outcome) for path, outcome in outcomes.items() if not outcome.done]
+    if failed:
+        more = f" (and {len(failed) - 1} more)" if failed[1:] else ""
+        raise CommandError(_complaint(*failed[0]) + more)
+    return 0
+
+
+def read_value(text: str, register: Register) -> Value:
+    """The value of a text for this register: JSON if it is that, else an S7 literal. ValueRangeError.
+
+    An array's literal must have all elements: what it leaves out would be written as zero.
+    """
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        return _literal(text, register)
+    if register.dims:
+        try:
+            return from_text(text, register)
+        except ValueRangeError:
+            return _literal(text, register)
+    if isinstance(value, str) and wire_type(register) != "double":
+        return value
+    if isinstance(value, (str, int, float)) and wire_type(register) != "string":
+        return from_text(value if isinstance(value, str) else text, register)
+    if isinstance(value, (dict, list)) or value is None:
+        raise ValueRangeError(f"expected one {register.type}, found {text[:60]!r}")
+    return _literal(text, register)
+
+
+def _literal(text: str, register: Register) -> Value:
+    if register.dims:
+        # Once more with room for what is too much.
+        given = [
+            sum(count for _, count, _ in split_array(text, shape))
+            for shape in (register.shape, tuple(length + 1 for length in register.shape))
+        ]
+        if given != [register.count] * 2:
+            raise ValueRangeError(f"expected all of the array's {register.count} elements, found {max(given)}")
+    try:
+        return parse_literal(text, register)
+    except ValueRangeError as error:
+        if register.element.base in _QUOTED:
+            raise ValueRangeError(
+                f"{error}; put text in quotes, and these in quotes for the shell: '\"text\"'"
+            ) from None
+        raise
+
+
+def _target(cell: Attachment, path: str) -> tuple[Block, Register]:
+    sources = cell.sources
+    topic = parse_topic(path, sources, sources[0] if len(sources) == 1 else None)
+    if topic.direction == "out":
+        raise PathError(f"{path}: what comes out of a source is not written; leave out /out")
+    if topic.source not in sources:
+        raise PathError(f"{path}: nothing is served under {topic.source} in this version")
+    block = cell.block(topic.source)
+    return block, find(block.layout, topic.path)
+
+
+def _print(outcomes: dict[str, Outcome], as_json: bool) -> None:
+    if as_json:
+        print(dumps({path: {"outcome": str(end.kind), "reason": end.text} for path, end in outcomes.items()}))
+        return
+    width = max((len(printable(path)) for path in outcomes), default=0)
+    for path, end in outcomes.items():
+        print(f"{printable(path):<{width}}  {end.kind}{f': {printable(end.text)}' if end.text else ''}")
+
+
+def _complaint(path: str, outcome: Outcome) -> str:
+    """What to tell, and what to do about it."""
+    if outcome.kind == EventKind.REJECTED:
+        return f"{path}: not written, the source took nothing: {outcome.text}; see shmio-supervisor status"
+    if outcome.kind == EventKind.REFUSED:
+        return f"{path}: refused by the device: {outcome.text}"
+    if outcome.kind == EventKind.EXPIRED:
+        return f"{path}: not written: {outcome.text}; try again, or with a longer --timeout"
+    return f"{path}: {outcome.text}; look with shmio get {shlex.quote(path)} before writing it again"
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0 < seconds <= MAX_TIMEOUT_S:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds above 0, at most {MAX_TIMEOUT_S}")
+    return seconds

@@ -1,0 +1,299 @@
+"""``shmio set``: what values it takes, and what it says of their end."""
+
+from __future__ import annotations
+
+import json
+import math
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+import shmio
+from shmio.cli.set import read_value
+from shmio.cli.user import main
+from shmio.connectors.desk import CommandDesk
+from shmio.errors import ConnectorError, ValueRangeError
+from shmio.layout.model import Layout, Register
+from shmio.segment import Attributes, BlockSpec, BlockWriter, Segment, Write
+
+LAYOUT = Layout(
+    "DB1",
+    1,
+    32,
+    False,
+    (
+        Register("count", "INT", (), 0, None, 2, 1),
+        Register("run", "BOOL", (), 2, 0, 1, 1),
+        Register("speed", "REAL", (), 4, None, 4, 1),
+        Register("name", "STRING[6]", (), 8, None, 8, 1),
+        Register("wait", "TIME", (), 16, None, 4, 1),
+        Register("row", "BYTE", ((1, 3),), 20, None, 3, 3),
+        Register("secret", "INT", (), 24, None, 2, 1),
+        Register("its place", "INT", (), 26, None, 2, 1),
+    ),
+)
+WRITABLE = ("count", "run", "speed", "name", "wait", "row", "its place")
+
+
+class Device:
+    """A source whose cycles come as soon as there is something to do."""
+
+    def __init__(self, writer: BlockWriter) -> None:
+        self.memory = bytearray(LAYOUT.size)
+        self.refusal = ""
+        self.lost = False
+        self.idle = False
+        self.taken = threading.Event()
+        self._writer = writer
+        self._desk = CommandDesk(writer, WRITABLE, time.monotonic_ns)
+        self._stop = threading.Event()
+        self._threads = [threading.Thread(target=self._desk.run), threading.Thread(target=self._cycles)]
+        self.desk.open()
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def desk(self) -> CommandDesk:
+        return self._desk
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._desk.stop()
+        for thread in self._threads:
+            thread.join(20)
+
+    def _cycles(self) -> None:
+        while not self._stop.wait(0.001):
+            if not self._desk.waiting:
+                continue
+            self.taken.set()
+            if not self.idle:
+                try:
+                    self._desk.carry_out(self._write)
+                except ConnectorError as error:
+                    self._desk.close(str(error))
+
+    def _write(self, writes: Any) -> list[str]:
+        if self.lost:
+            raise ConnectorError("cable out")
+        for offset, mask, data in writes:
+            assert mask in (0, 1)
+            self.memory[offset : offset + len(data)] = data
+        return [self.refusal if write == Write(0, 0, b"\0\1") else "" for write in writes]
+
+
+@pytest.fixture
+def device(instance: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> Iterator[Device]:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "supervisor.toml").write_text(f'[instance]\nname = "{instance}"\n')
+    blocks = [
+        BlockSpec(name, LAYOUT, 20_000_000, 3600 * 10**9, 1 << 16, Attributes("test", WRITABLE))
+        for name in ("cell", "other")
+    ]
+    with Segment.create(instance, blocks, []) as segment:
+        device = Device(segment.writer("cell"))
+        segment.writer("other")
+        yield device
+        device.stop()
+        segment.unlink()
+
+
+def register(path: str) -> Register:
+    return LAYOUT.registers[LAYOUT.by_path[path]]
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "value"),
+    [
+        ("count", "5", 5),
+        ("count", "-5", -5),
+        ("count", "5.0", 5),
+        ("count", "16#FF", 255),
+        ("count", "INT#-7", -7),
+        ("count", "2#1010", 10),
+        ("run", "true", True),
+        ("run", "TRUE", True),
+        ("run", "1", True),
+        ("run", "FALSE", False),
+        ("speed", "1.0E-4", 1e-4),
+        ("speed", "2", 2.0),
+        ("speed", "1_000.5", 1000.5),
+        ("speed", "Infinity", math.inf),
+        ("speed", '"-Infinity"', -math.inf),
+        ("name", "'it$'s'", "it's"),
+        ("name", '"a\\"b"', 'a"b'),
+        ("wait", "T#1s", 1000),
+        ("wait", "T#1m_500ms", 60_500),
+        ("wait", "250", 250),
+        ("row", "[1,2,3]", [1, 2, 3]),
+        ("row", "[16#FF, 2(0)]", [255, 0, 0]),
+        ("row", "1, 2, 3", [1, 2, 3]),
+    ],
+)
+def test_a_value_is_json_or_a_literal(path: str, text: str, value: object) -> None:
+    assert read_value(text, register(path)) == value
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "message"),
+    [
+        ("count", "x", "expected a literal such as 0"),
+        ("count", "40000", "out of range"),
+        ("count", "1.5", "expected a whole number"),
+        ("count", "[1]", "expected one INT"),
+        ("count", "null", "expected one INT"),
+        ("count", "true", "expected a number"),
+        ("run", "2", "expected true or false"),
+        ("speed", '"fast"', "expected a number"),
+        ("speed", "1e400", "out of range"),
+        ("name", "hello", "put text in quotes, and these in quotes for the shell"),
+        ("name", "5", "put text in quotes"),
+        ("wait", "T#1x", "expected a literal"),
+        ("row", "[1,2]", "expected all of the array's 3 elements, found 2"),
+        ("row", "[1,2,3,4]", "expected all of the array's 3 elements, found 4"),
+        ("row", "[1, 16#2]", "found 2"),
+        ("row", "[1, 2, 3, 16#4]", "found 4"),
+        ("row", "5(0)", "found 4"),
+        ("row", "7", "found 1"),
+        ("row", "[1,2,300]", "out of range"),
+        ("row", "[[1,2,3]]", "found"),
+        ("count", "9" * 6000, "expected a literal"),
+        ("row", "[" * 20_000, "found"),
+    ],
+)
+def test_what_is_no_value_is_refused(path: str, text: str, message: str) -> None:
+    with pytest.raises(ValueRangeError, match=message) as caught:
+        read_value(text, register(path))
+    assert len(str(caught.value)) < 300
+
+
+def test_values_are_written_and_each_end_is_printed(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
+    assert (
+        main(["set", "cell/count", "16#0203", "cell/run/in", "TRUE", "CELL://row/2", "-0", "cell/its place", "1"]) == 0
+    )
+    assert device.memory[:3] == b"\2\3\1"
+    assert capsys.readouterr().out.splitlines() == [
+        "cell/count      written",
+        "cell/run        written",
+        "cell/row/2      written",
+        "cell/its place  written",
+    ]
+
+
+def test_json_is_an_object_by_path(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
+    device.refusal = "locked"
+    assert main(["set", "--json", "cell/count", "1", "cell/run", "true"]) == 1
+    out, err = capsys.readouterr()
+    assert json.loads(out) == {
+        "cell/count": {"outcome": "refused", "reason": "locked"},
+        "cell/run": {"outcome": "written", "reason": ""},
+    }
+    assert err == "cell/count: refused by the device: locked\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["cell/nothing", "1"], "no such register in DB1"),
+        (["nothing/count", "1"], "name the source first"),
+        (["cell/count/out", "1"], "leave out /out"),
+        (["model/clock", "1"], "nothing is served under model"),
+        (["cell/count", "70000"], "cell/count: INT: "),
+        (["cell/row", "[1]"], "cell/row: expected all"),
+        (
+            ["cell/secret", "1"],
+            "cell/secret is not writable; the configuration has to name it in the source",
+        ),
+        (["cell/count", "1", "CELL://count", "2"], "cell/count: given twice"),
+        (["cell", "1"], "names a source, not a register"),
+    ],
+)
+def test_what_cannot_be_sent_is_one_line_and_nothing_is_written(
+    device: Device, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
+) -> None:
+    assert main(["set", "cell/run", "true", *arguments]) == 1
+    out, err = capsys.readouterr()
+    assert out.strip() in ("", "{}")
+    assert message in err
+    assert err.count("\n") == 1
+    assert device.memory == bytes(LAYOUT.size)
+
+
+def test_a_source_without_its_device_says_so(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
+    device.desk.close("no answer from 10.0.0.1")
+    assert main(["set", "cell/count", "1", "cell/run", "true"]) == 1
+    out, err = capsys.readouterr()
+    assert out.splitlines()[0] == "cell/count  rejected: the source is not connected: no answer from 10.0.0.1"
+    assert err == (
+        "cell/count: not written, the source took nothing: the source is not connected: no answer from 10.0.0.1; "
+        "see shmio-supervisor status (and 1 more)\n"
+    )
+
+
+def test_what_nobody_knows_is_said_with_what_to_do(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
+    device.lost = True
+    assert main(["set", "cell/its place", "1"]) == 1
+    _, err = capsys.readouterr()
+    assert "cable out" in err
+    assert "look with shmio get 'cell/its place' before writing it again" in err
+
+
+def test_it_waits_no_longer_than_told(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
+    device.idle = True
+    assert main(["set", "--timeout", "0.01", "cell/count", "1"]) == 1
+    assert "the source gave no answer in time" in capsys.readouterr().err
+
+
+def test_sources_have_a_command_each_and_what_was_written_is_told(
+    device: Device, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["set", "--timeout", "0.01", "cell/count", "5", "other/count", "6"]) == 1
+    out, err = capsys.readouterr()
+    assert out.splitlines()[0] == "cell/count   written"
+    assert err.startswith("other/count: the source gave no answer in time")
+    assert device.memory[1] == 5
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["cell/count"],
+        ["cell/count", "1", "cell/run"],
+        ["--timeout", "0", "cell/count", "1"],
+        ["--timeout", "nan", "cell/count", "1"],
+        ["--timeout", "x", "cell/count", "1"],
+        ["--host", "127.0.0.1:8089", "cell/count", "1"],
+    ],
+)
+def test_wrong_usage_is_2(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["set", *arguments])
+    assert stop.value.code == 2
+    assert "usage: shmio" in capsys.readouterr().err
+
+
+def test_what_begins_with_a_minus_goes_behind_two(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["set", "cell/count", "-3"]) == 0
+    assert main(["set", "--", "cell/speed", "-1.5e-3"]) == 0
+    assert device.memory[:2] == b"\xff\xfd"
+
+
+def test_ctrl_c_while_waiting_is_clean(device: Device, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    device.idle = True
+
+    def interrupt() -> None:
+        device.taken.wait(20)
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    assert main(["set", "--timeout", "600", "cell/count", "1"]) == 130
+    thread.join()
+    device.idle = False
+    with shmio.attach(instance, writable=True) as cell:  # the place is free again
+        assert cell.write({"cell/count": 2})[0].done
