@@ -19,7 +19,7 @@ from shmio.layout.model import Layout
 from shmio.logs import printable
 
 EXAMPLE = ("supervisor.toml", "db201.db")
-SOURCES = (".db", ".udt", ".scl")
+SOURCES = (".db", ".udt", ".scl", ".awl")
 _NAME = re.compile(r"[^A-Za-z0-9_-]+")
 
 
