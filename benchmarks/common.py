@@ -117,6 +117,17 @@ def report(title: str, samples: Samples, ours: str, better: Literal["less", "mor
     table([title, "best", "median", "shmio is"], rows)
 
 
+def report_spread(title: str, samples: Samples, ours: str, digits: int = 1) -> None:
+    """Print median, p90 and p99 of times, and how ours compares, by the medians."""
+    own = statistics.median(samples[ours])
+    rows = []
+    for name, values in samples.items():
+        cuts = quantiles(values)
+        ratio = "" if name == ours else f"{cuts[0] / own:.2f} times as fast"
+        rows.append([name, *(f"{cut:.{digits}f}" for cut in cuts), ratio])
+    table([title, "median", "p90", "p99", "shmio is"], rows)
+
+
 def table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
     """Print rows under titles; the first column flush left."""
     widths = [max(len(row[place]) for row in [titles, *rows]) for place in range(len(titles))]
