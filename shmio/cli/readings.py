@@ -7,7 +7,7 @@ from typing import Any
 
 from shmio.errors import PathError
 from shmio.layout.glob import select
-from shmio.layout.model import Register
+from shmio.layout.model import Layout, Register
 from shmio.layout.text import json_value, to_text
 from shmio.layout.topic import find, parse_topic
 from shmio.logs import printable
@@ -35,17 +35,20 @@ def choose(cell: Attachment, patterns: list[str]) -> list[Selected]:
         if topic.source not in sources:
             raise PathError(f"{pattern}: nothing is served under {topic.source} in this version")
         block = cell.block(topic.source)
-        layout = block.layout
-        if not topic.path:
-            registers = list(layout.registers)
-        elif "*" in topic.path or layout.members(topic.path):
-            registers = [layout.registers[i] for i in select(layout, [topic.path])]
-            if not registers:
-                raise PathError(f"{pattern}: no register of {topic.source} has such a path")
-        else:
-            registers = [find(layout, topic.path)]
+        registers = registers_at(block.layout, topic.path)
+        if not registers:
+            raise PathError(f"{pattern}: no register of {topic.source} has such a path")
         chosen |= {(topic.source, register.path): (block, register) for register in registers}
     return list(chosen.values())
+
+
+def registers_at(layout: Layout, path: str) -> list[Register]:
+    """Registers of a path within a block, or of a glob, which may match none; all for an empty path. PathError."""
+    if not path:
+        return list(layout.registers)
+    if "*" in path or layout.members(path):
+        return [layout.registers[i] for i in select(layout, [path])]
+    return [find(layout, path)]
 
 
 def topic_path(block: Block, register: Register) -> str:

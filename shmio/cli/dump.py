@@ -1,0 +1,73 @@
+"""``shmio-dump``: record a running instance, look into recordings. Each verb is a module of ``shmio.cli.dumping``."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from shmio import __version__
+from shmio.cli.run import run
+
+PROGRAM = "shmio-dump"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point of the console script; the exit status."""
+    arguments = _parser().parse_args(argv)
+
+    def command() -> int:
+        verb = importlib.import_module(f"shmio.cli.dumping.{arguments.verb}")
+        status: int = verb.execute(arguments)
+        return status
+
+    return run(PROGRAM, command)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog=PROGRAM, description="Record a running instance, and look into recordings.")
+    parser.add_argument("--version", action="version", version=f"shmio {__version__}")
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB")
+
+    def verb(name: str, text: str) -> argparse.ArgumentParser:
+        return verbs.add_parser(name, help=text, description=text)
+
+    record = verb("record", "record what an instance's sources publish from now on; Ctrl-C ends it")
+    record.add_argument("-c", dest="config", type=Path, metavar="FILE", help="the instance of this supervisor.toml")
+    record.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
+    record.add_argument(
+        "-o", dest="directory", type=Path, default=Path("dumps"), metavar="DIR", help="where to (default: dumps)"
+    )
+    record.add_argument("--for", dest="duration_s", type=_seconds, metavar="SECONDS", help="end by itself")
+    record.add_argument("--source", dest="sources", nargs="+", action="extend", metavar="NAME", help="only these")
+
+    info = verb("info", "tell what is in recordings")
+    info.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    info.add_argument("--json", action="store_true", help="print JSON: one object, or a list for several files")
+
+    cat = verb("cat", "print values as they changed, events, and what was missed")
+    cat.add_argument("file", type=Path, metavar="FILE")
+    cat.add_argument("patterns", nargs="*", metavar="PATH", help="register, element, structure or glob (default: all)")
+    for option, what in (("--from", "begin"), ("--to", "end")):
+        cat.add_argument(
+            option, dest=what, metavar="TIME", help=f"{what} there: 2026-11-21T08:30:00, or seconds of the recording"
+        )
+    cat.add_argument("--json", action="store_true", help="print a JSON object a line")
+    return parser
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0 < seconds <= 1e9:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds above 0")
+    return seconds
+
+
+if __name__ == "__main__":
+    sys.exit(main())

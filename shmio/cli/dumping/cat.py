@@ -1,0 +1,210 @@
+"""``shmio-dump cat``: what happened, line by line."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any, Protocol
+
+from shmio.cli.dumping.moments import MAX_NS, iso, local, parse_time
+from shmio.cli.readings import SHOWN_CHARACTERS, registers_at
+from shmio.cli.run import dumps
+from shmio.errors import PathError
+from shmio.layout.codec import codec
+from shmio.layout.model import Layout, Register
+from shmio.layout.text import json_value, to_text
+from shmio.layout.topic import parse_topic
+from shmio.logs import printable
+from shmio.recording.encoding import EVENT, FRAME, Gap
+from shmio.recording.reader import Channel, Message, Reader
+from shmio.recording.survey import survey
+from shmio.segment import Event, EventKind, Frame, Quality
+from shmio.segment.scan import ChangeScan
+
+
+def execute(arguments: argparse.Namespace) -> int:
+    """Print a line for each frame in which a chosen value or the quality changed, and for events and gaps."""
+    with Reader(arguments.file) as reader:
+        found = survey(reader)
+        start_ns = min((track.first_ns for track in found.tracks.values() if track.channel.source), default=0)
+        from_ns = parse_time("--from", arguments.begin, start_ns, 0)
+        to_ns = parse_time("--to", arguments.end, start_ns, MAX_NS)
+        views = _views(reader, [track.channel for track in found.tracks.values()], arguments.patterns)
+        printer: Printer = JsonLines() if arguments.json else Table()
+        sources = {view.source for view in views.values()}
+        wanted = {number for number, channel in reader.channels.items() if not channel.source or number in views}
+        wanted |= {c.number for c in reader.channels.values() if c.encoding == EVENT and c.source in sources}
+        for message in reader.messages(lambda channel: channel.number in wanted, from_ns, to_ns):
+            for line in _lines(message, views, sources, printer):
+                print(line)
+        sys.stdout.flush()
+        if not reader.records.closed:
+            end = printable(f"{reader.file} was not closed: {reader.records.damage}")
+            print(end, file=sys.stderr)
+    return 0
+
+
+class View:
+    """The chosen registers of one block, and what was shown of them last."""
+
+    def __init__(self, channel: Channel, layout: Layout, registers: Sequence[Register]) -> None:
+        self.source = channel.source
+        self.registers = registers
+        self.codecs = [codec(register, layout.byte_order) for register in registers]
+        self._scan = ChangeScan(registers)
+        self._shown: Frame | None = None
+
+    def news(self, frame: Frame) -> bool:
+        """Whether a value or the quality differs from the frame shown before; if so, this one is shown."""
+        shown = self._shown
+        same = shown is not None and (shown.quality, shown.reason) == (frame.quality, frame.reason)
+        if shown is not None and same and not self._scan.changed(shown.image, frame.image):
+            return False
+        self._shown = frame
+        return True
+
+
+class Printer(Protocol):
+    """How things are put into lines."""
+
+    def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
+        """A frame's chosen values."""
+
+    def event(self, time_ns: int, source: str, event: Event) -> str:
+        """An event."""
+
+    def gap(self, time_ns: int, gap: Gap) -> str:
+        """What was missed."""
+
+
+def _views(reader: Reader, channels: Sequence[Channel], patterns: Sequence[str]) -> dict[int, View]:
+    """By their frames' channels the blocks of which something is to be shown. PathError: a pattern names nothing."""
+    blocks = {channel.number: (channel, reader.layout(channel)) for channel in channels if channel.encoding == FRAME}
+    sources = list(dict.fromkeys(channel.source for channel, _ in blocks.values()))
+    default = sources[0] if len(sources) == 1 else None
+    topics = [parse_topic(pattern, sources, default) for pattern in patterns or sources]
+    chosen: dict[int, dict[str, Register]] = {}
+    for pattern, topic in zip(patterns or sources, topics, strict=True):
+        problem = PathError(f"{pattern}: no register of this recording has such a path")
+        for number, (channel, layout) in blocks.items():
+            if channel.source == topic.source:
+                try:
+                    registers = registers_at(layout, topic.path)
+                except PathError as error:  # it may be in the layout after a change
+                    problem = error
+                else:
+                    chosen.setdefault(number, {}).update((register.path, register) for register in registers)
+        if not any(chosen.get(number) for number, (channel, _) in blocks.items() if channel.source == topic.source):
+            raise problem
+    return {number: View(*blocks[number], list(found.values())) for number, found in chosen.items() if found}
+
+
+def _lines(message: Message, views: dict[int, View], sources: set[str], printer: Printer) -> Iterator[str]:
+    channel, time_ns, item = message
+    if isinstance(item, Frame):
+        if views[channel.number].news(item):
+            yield from printer.frame(time_ns, views[channel.number], item)
+    elif isinstance(item, Event):
+        yield printer.event(time_ns, channel.source, item)
+    elif item.source in sources:
+        yield printer.gap(time_ns, item)
+
+
+def _kind(event: Event) -> str:
+    try:
+        return str(EventKind(event.kind))
+    except ValueError:  # of a later version
+        return f"kind {event.kind}"
+
+
+class JsonLines:
+    """An object a line, times in UTC."""
+
+    def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
+        """``values`` by path, null for all of them where the source never had any."""
+        known = frame.source_ns != 0
+        values = {
+            register.path: json_value(decode.decode(frame.image), register.element) if known else None
+            for register, decode in zip(view.registers, view.codecs, strict=True)
+        }
+        yield self._line(
+            time_ns,
+            view.source,
+            frame=frame.number,
+            cycle=frame.cycle,
+            quality=str(frame.quality),
+            reason=frame.reason,
+            provenance=str(frame.provenance),
+            values=values,
+        )
+
+    def event(self, time_ns: int, source: str, event: Event) -> str:
+        """``event`` is its number; ``data`` in hexadecimal digits."""
+        fields = {name: getattr(event, name) for name in ("cycle", "incarnation", "writer", "command", "item", "items")}
+        fields |= {name: getattr(event, name) for name in ("offset", "mask", "size", "text")}
+        return self._line(
+            time_ns,
+            source,
+            event=event.number,
+            kind=_kind(event),
+            after_frame=event.frame,
+            quality=str(event.quality),
+            **fields,
+            data=event.data.hex(),
+        )
+
+    def gap(self, time_ns: int, gap: Gap) -> str:
+        """``missed`` is how many."""
+        return self._line(
+            time_ns, gap.source, missed=gap.count, what=gap.what, first=gap.first, last=gap.last, why=str(gap.reason)
+        )
+
+    def _line(self, time_ns: int, source: str, **fields: Any) -> str:
+        return dumps({"time": iso(time_ns), "source": source, **fields})
+
+
+class Table:
+    """A line with columns, under headings when the block is another than before."""
+
+    def __init__(self) -> None:
+        self._view: View | None = None
+        self._widths: list[int] = []
+
+    def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
+        """The values; quality is said unless it is good."""
+        known = frame.source_ns != 0
+        cells = [
+            _short(to_text(decode.decode(frame.image), register)) if known else "-"
+            for register, decode in zip(view.registers, view.codecs, strict=True)
+        ]
+        if view is not self._view:
+            self._view = view
+            names = [printable(register.path) for register in view.registers]
+            self._widths = [max(map(len, pair)) for pair in zip(names, cells, strict=True)]
+            yield f"{'time':<23}  {view.source}  frame  {self._row(names)}".rstrip()
+        quality = "" if frame.quality is Quality.GOOD else f"  {frame.quality}: {printable(frame.reason)}"
+        yield f"{local(time_ns)}  {view.source}  {frame.number:<5}  {self._row(cells)}".rstrip() + quality
+
+    def event(self, time_ns: int, source: str, event: Event) -> str:
+        """Kind and reason, and of a command which bytes."""
+        what = f"{_kind(event)} {event.quality}" if event.kind == EventKind.QUALITY else _kind(event)
+        if event.command:
+            what += (
+                f" command {event.command}.{event.item} of writer {event.writer}: {event.size} bytes at {event.offset}"
+            )
+        text = f": {printable(event.text)}" if event.text else ""
+        return f"{local(time_ns)}  {source}  event {event.number} after frame {event.frame}: {what}{text}"
+
+    def gap(self, time_ns: int, gap: Gap) -> str:
+        """How many, which, why."""
+        source = printable(gap.source)
+        return f"{local(time_ns)}  {source}  {gap.count} {gap.what} missed, {gap.first} to {gap.last}: {gap.reason}"
+
+    def _row(self, cells: Sequence[str]) -> str:
+        return "  ".join(cell.ljust(width) for cell, width in zip(cells, self._widths, strict=True))
+
+
+def _short(text: str) -> str:
+    text = printable(text)
+    return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 1]}…"

@@ -1,0 +1,143 @@
+"""``shmio-dump info``: what is in recordings."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+import msgspec
+
+from shmio.cli.dumping.moments import iso, local
+from shmio.cli.run import dumps
+from shmio.errors import RecordingError
+from shmio.logs import printable
+from shmio.recording.encoding import EVENT, FRAME
+from shmio.recording.reader import Reader
+from shmio.recording.survey import Survey, Track, survey
+
+
+def execute(arguments: argparse.Namespace) -> int:
+    """Describe each file; 1 if one of them is none, or damaged."""
+    found, failed = [], False
+    for file in arguments.files:
+        try:
+            with Reader(file) as reader:
+                described = _describe(reader, survey(reader))
+        except (RecordingError, OSError) as error:
+            text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
+            print(printable(text), file=sys.stderr)
+            failed = True
+            continue
+        failed = failed or bool(described["damage"])
+        found.append(described)
+        if not arguments.json:
+            print("\n".join(map(printable, _lines(described))))
+    if arguments.json and found:
+        print(dumps(found[0] if len(arguments.files) == 1 else found, indent=2))
+    return int(failed)
+
+
+def _describe(reader: Reader, found: Survey) -> dict[str, Any]:
+    tracks = [track for track in found.tracks.values() if track.channel.source]
+    first_ns = min((track.first_ns for track in tracks), default=0)
+    last_ns = max((track.last_ns for track in tracks), default=0)
+    duration_s = (last_ns - first_ns) / 1e9
+    size = reader.records.size
+    about = reader.about
+    started_ns = about.get("started_utc_ns", "")
+    return {
+        "file": str(reader.file),
+        "size": size,
+        "closed": reader.records.closed,
+        "end": reader.records.damage,
+        "damage": found.damage,
+        "instance": about.get("instance", ""),
+        "epoch": about.get("epoch", ""),
+        "mode": about.get("mode", ""),
+        "host": about.get("host", ""),
+        "version": about.get("version", ""),
+        "recorder": about.get("recorder", ""),
+        "started": iso(int(started_ns)) if started_ns.isdecimal() and len(started_ns) < 20 else None,
+        "from": iso(first_ns) if tracks else None,
+        "to": iso(last_ns) if tracks else None,
+        "duration_s": round(duration_s, 3),
+        "bytes_per_minute": round(size / duration_s * 60) if duration_s > 0 else None,
+        "blocks": _blocks(reader, found),
+        "missed_frames": _missed(found, "frames"),
+        "missed_events": _missed(found, "events"),
+        "gap_count": found.gap_count,
+        "gaps": [msgspec.to_builtins(gap) for gap in found.gaps],
+        "attachments": {name: entry.size for name, entry in reader.attachments.items()},
+    }
+
+
+def _missed(found: Survey, what: str) -> int:
+    return sum(count for (_, _, kind), count in found.missed.items() if kind == what)
+
+
+def _blocks(reader: Reader, found: Survey) -> list[dict[str, Any]]:
+    blocks: dict[int, dict[str, Track]] = {}
+    for track in found.tracks.values():
+        if track.channel.encoding in (FRAME, EVENT):
+            blocks.setdefault(track.channel.block, {})[track.channel.encoding] = track
+    return [_block(reader, found, tracks) for _, tracks in sorted(blocks.items())]
+
+
+def _block(reader: Reader, found: Survey, tracks: dict[str, Track]) -> dict[str, Any]:
+    frames, events = tracks.get(FRAME), tracks.get(EVENT)
+    channel = next(iter(tracks.values())).channel
+    described: dict[str, Any] = {
+        "source": channel.source,
+        "block": channel.block,
+        "layout": None,
+        "layout_hash": channel.layout,
+        "size": None,
+        "registers": None,
+        "frames": frames.count if frames else 0,
+        "first_frame": None,
+        "last_frame": None,
+        "from": iso(frames.first_ns) if frames else None,
+        "to": iso(frames.last_ns) if frames else None,
+        "rate_hz": None,
+        "events": events.count if events else 0,
+        "missed_frames": found.missed.get((channel.source, channel.block, "frames"), 0),
+        "missed_events": found.missed.get((channel.source, channel.block, "events"), 0),
+    }
+    if frames and frames.last_ns > frames.first_ns:
+        described["rate_hz"] = round((frames.count - 1) / (frames.last_ns - frames.first_ns) * 1e9, 3)
+    try:
+        layout = reader.layout(channel)
+        described |= {"layout": layout.name, "size": layout.size, "registers": len(layout.registers)}
+        if frames:
+            described["first_frame"], described["last_frame"] = frames.numbers(reader)
+    except RecordingError as error:
+        found.damage.append(str(error))
+    return described
+
+
+def _lines(found: dict[str, Any]) -> list[str]:
+    size = f"{found['size'] / 1e6:.2f} MB"
+    rate = f", {found['bytes_per_minute'] / 1e6:.2f} MB/min" if found["bytes_per_minute"] else ""
+    ended = "closed" if found["closed"] else f"not closed ({found['end']}): still being written, or cut off"
+    by = f"recorded by {found['recorder']}, shmio {found['version']}, on {found['host']}"
+    lines = [
+        f"{found['file']}: {size}, {ended}",
+        f"  instance {found['instance']}, mode {found['mode']}, started {found['started']}; {by}",
+        f"  {found['from']} to {found['to']}, {found['duration_s']:.1f} s{rate}",
+    ]
+    for block in found["blocks"]:
+        hertz = f" at {block['rate_hz']:.1f} Hz" if block["rate_hz"] else ""
+        lines.append(
+            f"  {block['source']}: {block['layout']}, {block['registers']} registers, {block['size']} bytes, "
+            f"layout {block['layout_hash'][:12]}: {block['frames']} frames{hertz}, {block['events']} events"
+        )
+    missed = f"{found['missed_frames']} frames and {found['missed_events']} events missed"
+    lines.append(f"  {missed} in {found['gap_count']} gaps" if found["gap_count"] else "  nothing missed")
+    lines += [f"    {_gap(gap)}" for gap in found["gaps"][:10]]
+    return lines + [f"  damage: {text}" for text in found["damage"]]
+
+
+def _gap(gap: dict[str, Any]) -> str:
+    when = local(gap["before_ns"] or gap["after_ns"]) if gap["before_ns"] or gap["after_ns"] else "-"
+    return f"{when}  {gap['source']}: {gap['count']} {gap['what']}, {gap['first']} to {gap['last']}: {gap['reason']}"

@@ -1,0 +1,43 @@
+"""Times of recordings, as options say them and as they are printed."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+from shmio.errors import RecordingError
+
+MAX_NS = (1 << 63) - 1
+
+
+def parse_time(option: str, text: str | None, start_ns: int, default_ns: int) -> int:
+    """Log time in ns of ``--from`` or ``--to``: seconds since the recording's start, or ISO 8601, local unless it says.
+
+    RecordingError for what is neither.
+    """
+    if text is None:
+        return default_ns
+    try:
+        try:
+            moment_ns = start_ns + round(float(text) * 1e9)
+        except ValueError:
+            moment_ns = round(datetime.fromisoformat(text).astimezone().timestamp() * 1e6) * 1000
+    except (ValueError, OverflowError):
+        raise RecordingError(
+            f"{option}: {text!r} is neither a time such as 2026-11-21T08:30:00 nor seconds of the recording"
+        ) from None
+    return min(max(0, moment_ns), MAX_NS)
+
+
+def iso(time_ns: int) -> str:
+    """UTC with µs, for JSON."""
+    return _datetime(time_ns).isoformat(timespec="microseconds").replace("+00:00", "Z")
+
+
+def local(time_ns: int) -> str:
+    """Local date and time with ms, for people."""
+    return _datetime(time_ns).astimezone().isoformat(" ", timespec="milliseconds")[:23]
+
+
+def _datetime(time_ns: int) -> datetime:
+    """A file may say any time; what no calendar has is its nearest."""
+    return datetime.fromtimestamp(min(time_ns, 253_000_000_000 * 10**9) // 1000 / 1e6, UTC)
