@@ -205,6 +205,8 @@ class S7Client:
     def _ask_mode(self) -> None:
         """Ask for the operating mode, if it is time to, after the requests that wait already. TimeoutError."""
         now_ns = time.monotonic_ns()
+        if not self._mode.complete:  # after a long period, the answer may wait in the socket
+            self._advance(self._mode, now_ns)
         if self._mode.due(now_ns):
             self._mode.begin(now_ns, now_ns + self._timeout_ns)
             self._window.add(self._mode)

@@ -16,21 +16,21 @@ ITEM_OK = 0xFF
 ACCESS_DENIED, OUT_OF_RANGE, NO_SUCH_TYPE, OTHER_SIZE, NO_SUCH_OBJECT = 0x03, 0x05, 0x06, 0x07, 0x0A
 
 _NO_OPTIMIZED = "clear 'Optimized block access' in the block's attributes, compile and load"
-_ACCESS_REMEDY = (
-    "access denied: PUT/GET is disabled, or the protection level or an optimized block forbids it; enable "
-    "'Permit access with PUT/GET communication from remote partner' and 'Full access' in the CPU's protection "
-    f"settings, and {_NO_OPTIMIZED}"
+_ACCESS_DENIED = (
+    "access denied {where}: enable 'Permit access with PUT/GET communication' and 'Full access' in the CPU's "
+    f"protection settings; if they are, {_NO_OPTIMIZED}"
 )
-_PROTECTION_REMEDY = (
-    "the CPU's protection level forbids it: choose 'Full access' in its protection settings, for it asks for a password"
+_PROTECTED = (
+    "the CPU's protection level forbids it {where}: choose 'Full access' in its protection settings, for it asks for a "
+    "password"
 )
 
 # Errors of a whole job for which the table of python-snap7 has less to say.
 _ERRORS = {
-    0x8104: _ACCESS_REMEDY,  # S7-1200 and S7-1500 to all jobs with PUT/GET off, and for optimized blocks
-    0x8304: _ACCESS_REMEDY,  # S7-1200 and S7-1500 to writes with PUT/GET off
-    0xD241: _PROTECTION_REMEDY,
-    0xD602: _PROTECTION_REMEDY,
+    0x8104: _ACCESS_DENIED,  # S7-1200 and S7-1500 to all jobs with PUT/GET off, and for optimized blocks
+    0x8304: _ACCESS_DENIED,  # S7-1200 and S7-1500 to writes with PUT/GET off
+    0xD241: _PROTECTED,
+    0xD602: _PROTECTED,
 }
 
 
@@ -48,7 +48,7 @@ class RefusedError(ConnectorError):
 def explain_error(error: int) -> str:
     """Say what the error class and code in an answer's header mean."""
     if error in _ERRORS:
-        return f"{_ERRORS[error]} (error 0x{error:04X})"
+        return _ERRORS[error].format(where=f"(error 0x{error:04X})")
     known = S7_PROTOCOL_ERROR_CODES.get(error)
     return f"the controller refused the request: {known or 'no text known'} (error 0x{error:04X})"
 
@@ -89,7 +89,7 @@ def explain_write(code: int, db_number: int, last: int) -> str:
 def _explain_item(code: int) -> str:
     where = f"(item code 0x{code:02X})"
     if code == ACCESS_DENIED:
-        return f"{_ACCESS_REMEDY} {where}"
+        return _ACCESS_DENIED.format(where=where)
     if code == NO_SUCH_OBJECT:
         return (
             f"the block does not exist {where}: check dbNumber, and that it is loaded; on an S7-1200 or S7-1500 it may "

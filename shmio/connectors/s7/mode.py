@@ -1,8 +1,8 @@
 """The controller's operating mode: one more job about once a second, which says when a PLC is in STOP. No I/O.
 
-The mode is in SZL W#16#0424: the low half of the record's fourth byte; the high half is the mode before. The numbers are
-those of Siemens, System Software for S7-300/400, A5E00739858, 33.21. Not every controller knows the list; one that does
-not is asked no more, and goes unwatched.
+The mode is in SZL W#16#0424: the low half of the record's fourth byte; the high half is the mode before. The numbers
+are those of Siemens, System Software for S7-300/400, A5E00739858, 33.21. Not every controller knows the list; one that
+does not is asked no more, and goes unwatched.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from snap7.datatypes import S7Area
 
@@ -55,6 +55,7 @@ WRITES = st.lists(
 )
 
 
+@settings(deadline=None, max_examples=60)
 @given(writes=WRITES, pdu_size=st.sampled_from([100, 101, 240, 480, 960]), data=st.data())
 def test_as_if_written_one_by_one(writes: list[Write], pdu_size: int, data: st.DataObject) -> None:
     block = bytearray(range(200)) * 2

@@ -52,7 +52,7 @@ def scripted() -> Iterator[Scripted]:
 @pytest.mark.parametrize("packet", [None, 1, 96, 461, 941, 942, 65535])
 @pytest.mark.parametrize("jobs", [None, 1, 3])
 def test_reads_the_whole_block(plc: Plc, packet: int | None, jobs: int | None) -> None:
-    client = plc.client(packetSize=packet, maxJobs=jobs)
+    client = plc.client(packetSize=packet, maxJobs=jobs, timeout=60_000)
     client.connect()
     assert (client.pdu_size, client.jobs) == (960, jobs or 8)
     for generation in range(3):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from contextlib import closing
 
 import pytest
@@ -17,8 +19,8 @@ from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc
 @pytest.mark.parametrize(
     ("traits", "text"),
     [
-        (Traits(fault=Fault.PUT_GET_OFF), r"enable 'Permit access with PUT/GET.*\(error 0x8104\)"),
-        (Traits(fault=Fault.PROTECTED), r"DB201: access denied.*'Full access'.*\(item code 0x03\)"),
+        (Traits(fault=Fault.PUT_GET_OFF), r"\(error 0x8104\): enable 'Permit access with PUT/GET"),
+        (Traits(fault=Fault.PROTECTED), r"DB201: access denied \(item code 0x03\): .*'Full access'"),
         (Traits(fault=Fault.OPTIMIZED), r"DB201 has no byte that can be addressed.*clear 'Optimized block access'"),
         (Traits(block_size=1), r"DB201 has no 2180 bytes but 1 bytes .*export it again"),
         (Traits(block_size=SIZE - 1), r"DB201 has no 2180 bytes but 2179 bytes"),
@@ -173,6 +175,25 @@ def test_a_question_that_is_never_answered_ends_the_session(plc: Plc, monkeypatc
         read_on()
     plc.proxy.pass_all()
     client.connect()
+    assert client.read() == plc.block
+
+
+def test_an_answer_that_waited_through_a_long_period_is_in_time(plc: Plc, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody looked into the socket between two reads; the clock is set on, beyond the time-out."""
+    monkeypatch.setattr(mode, "INTERVAL_NS", 0)
+    client = plc.connected()
+    answered = threading.Event()
+
+    def see(frame: bytes) -> bytes:
+        if frame[8] == 7:
+            answered.set()
+        return frame
+
+    plc.proxy.edit(see)
+    client.read()
+    assert answered.wait(10)
+    now_ns = time.monotonic_ns
+    monkeypatch.setattr(time, "monotonic_ns", lambda: now_ns() + 10**10)
     assert client.read() == plc.block
 
 

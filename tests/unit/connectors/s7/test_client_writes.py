@@ -87,7 +87,7 @@ def test_a_refused_item_among_good_ones(plc: Plc) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fault", "text"), [(Fault.WRITE_PROTECTED, r"'Full access'.*0x03"), (Fault.PUT_GET_OFF, r"PUT/GET.*0x8104")]
+    ("fault", "text"), [(Fault.WRITE_PROTECTED, r"0x03.*'Full access'"), (Fault.PUT_GET_OFF, r"0x8104.*PUT/GET")]
 )
 def test_a_controller_that_takes_no_writes(make_plc: MakePlc, fault: Fault, text: str) -> None:
     plc = make_plc(Traits(fault=fault))

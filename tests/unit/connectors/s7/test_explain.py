@@ -7,6 +7,7 @@ import re
 import pytest
 
 from shmio.connectors.s7 import explain
+from shmio.segment._atomics import REASON_SIZE
 
 
 @pytest.mark.parametrize(
@@ -14,7 +15,7 @@ from shmio.connectors.s7 import explain
     [
         (0x0A, r"^DB201: the block does not exist \(item code 0x0A\).*dbNumber.*optimized"),
         (0x05, r"^DB201 has no 2180 bytes \(item code 0x05\).*export it again.*Optimized"),
-        (0x03, r"access denied: PUT/GET is disabled.*Full access.*0x03"),
+        (0x03, r"access denied \(item code 0x03\): enable.*PUT/GET.*Full access"),
         (0x06, "type or length"),
         (0x07, "type or length"),
         (0x01, "Hardware error"),
@@ -27,7 +28,7 @@ def test_items_that_are_read(code: int, text: str) -> None:
 
 def test_items_that_are_written() -> None:
     assert re.search(r"^DB201 has no byte 99 .*export it again", explain.explain_write(0x05, 201, 99))
-    assert re.search("access denied: PUT/GET", explain.explain_write(0x03, 201, 99))
+    assert re.search("access denied .*PUT/GET", explain.explain_write(0x03, 201, 99))
 
 
 def test_the_size_of_a_block() -> None:
@@ -38,7 +39,7 @@ def test_the_size_of_a_block() -> None:
 @pytest.mark.parametrize(
     ("error", "text"),
     [
-        (0x8104, r"PUT/GET.*\(error 0x8104\)$"),
+        (0x8104, r"\(error 0x8104\): enable .*PUT/GET"),
         (0x8304, "PUT/GET"),
         (0xD241, "protection level.*Full access"),
         (0x8500, "0x8500"),
@@ -47,3 +48,12 @@ def test_the_size_of_a_block() -> None:
 )
 def test_jobs(error: int, text: str) -> None:
     assert re.search(text, explain.explain_error(error))
+
+
+def test_all_fit_the_reason_of_a_frame() -> None:
+    """What is cut off there is the remedy."""
+    texts = [explain.explain_error(error) for error in (0x8104, 0x8304, 0xD241, *range(0x8000, 0x8800))]
+    for code in range(256):
+        texts += [explain.explain_read(code, 65535, 65536), explain.explain_write(code, 65535, 65535)]
+    texts += [explain.explain_size(65535, 65536, found) for found in (0, 65535)]
+    assert max(len(text.encode()) for text in texts) <= REASON_SIZE

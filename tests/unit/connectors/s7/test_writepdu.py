@@ -70,7 +70,7 @@ def test_codes_for_other_items_than_written() -> None:
 @pytest.mark.parametrize("head", ["32 02 0000 0007 0000 0000", "32 03 0000 0007 0000 0000"])
 def test_a_job_that_is_refused_as_a_whole(head: str) -> None:
     frame = bytes.fromhex("03000013 02f080" + head + "83 04")
-    with pytest.raises(RefusedError, match=r"PUT/GET.*0x8304"):
+    with pytest.raises(RefusedError, match=r"0x8304.*PUT/GET"):
         writepdu.parse_write_answer(memoryview(frame), 3)
 
 
