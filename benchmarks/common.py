@@ -147,10 +147,14 @@ class Child:
     outlive its parent.
     """
 
-    def __init__(self, script: str, *arguments: object) -> None:
+    def __init__(self, script: str, *arguments: object, packages: Path | None = None) -> None:
+        """``packages``: a folder whose packages come before the installed ones."""
         self._script = script
         command = [sys.executable, str(HERE / script), *map(str, arguments)]
-        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        environment = None if packages is None else os.environ | {"PYTHONPATH": str(packages)}
+        self._process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment
+        )
         self.pid = self._process.pid
         self.hello: Any = self._line()
 
@@ -161,6 +165,12 @@ class Child:
             self.stop()
             raise SystemExit(f"{self._script} ended with status {self._process.returncode}")
         return json.loads(line)
+
+    def ask(self, line: object) -> Any:
+        """Send a line; what it prints then."""
+        assert self._process.stdin is not None
+        print(line, file=self._process.stdin, flush=True)
+        return self._line()
 
     def finish(self) -> Any:
         """Tell it to end; what it prints last."""

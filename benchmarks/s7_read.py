@@ -1,6 +1,7 @@
-"""Whole reads of DB201 a second: shmio's S7 client beside python-snap7's ``Client.db_read``, over ever longer links.
+"""Whole reads of DB201 a second: shmio's S7 client beside two others' ``db_read``, over ever longer links.
 
-Controller, link and clients are processes of their own. Each client keeps its session over all rounds.
+The others are python-snap7 and the C library snap7. Controller, link and clients are processes of their own. Each
+client keeps its session over all rounds.
 """
 
 from __future__ import annotations
@@ -9,8 +10,10 @@ import statistics
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from pathlib import Path
 
 import snap7
+from c_snap7 import fetched
 from common import Child, begin, interleave, per_second, report, table
 from plc import NUMBER, SIZE, still_block
 from snap7.type import Parameter
@@ -53,7 +56,26 @@ def reader_in_parts(client: snap7.Client, packet_size: int) -> Callable[[], byte
     return read
 
 
-def compare(address: Address, pdu_size: int, packet_size: int | None, title: str, rounds: int, round_s: float) -> None:
+def c_client(
+    stack: ExitStack, address: Address, pdu_size: int, packet_size: int | None, packages: Path, round_s: float
+) -> Callable[[], float]:
+    """Start the C library's client; a sampler, as ``per_second`` makes them."""
+    arguments = (address.host, address.port, pdu_size, packet_size or 0)
+    child = stack.enter_context(Child("c_snap7.py", *arguments, packages=packages))
+    if child.hello != {"pdu_size": pdu_size, "block": still_block().hex()}:
+        raise SystemExit(f"C snap7: {child.hello['pdu_size']} bytes of PDU, or the block came back changed")
+    return lambda: float(child.ask(round_s))
+
+
+def compare(
+    address: Address,
+    pdu_size: int,
+    packet_size: int | None,
+    title: str,
+    rounds: int,
+    round_s: float,
+    packages: Path | None,
+) -> None:
     """Time all clients against one controller over one link."""
     with ExitStack() as stack:
         ours = shmio_client(stack, address, SIZE, packet_size=packet_size)
@@ -72,6 +94,8 @@ def compare(address: Address, pdu_size: int, packet_size: int | None, title: str
             if read() != still_block():
                 raise SystemExit(f"{name}: the block came back changed")
         samplers = {name: per_second(read, round_s) for name, read in reads.items()}
+        if packages is not None:
+            samplers["C snap7 db_read"] = c_client(stack, address, pdu_size, packet_size, packages, round_s)
         report(title, interleave(samplers, rounds), OURS, "more")
 
 
@@ -99,6 +123,7 @@ def _times_ms(client: S7Client, calls: int) -> list[float]:
 def main() -> None:
     quick = begin("S7: whole reads of DB201 (2,180 bytes) a second")
     rounds, round_s, calls = (2, 0.05, 10) if quick else (5, 0.4, 300)
+    packages = fetched(download=not quick)
     for pdu_size in (480, 960):
         with ExitStack() as stack:
             address = Address.parse(stack.enter_context(Child("plc.py", "--pdu", pdu_size)).hello)
@@ -109,10 +134,10 @@ def main() -> None:
             if pdu_size == 480:
                 measure_link(links, calls)
             for name, place in links.items():
-                compare(place, pdu_size, None, f"PDU {pdu_size}, {name}, reads/s", rounds, round_s)
+                compare(place, pdu_size, None, f"PDU {pdu_size}, {name}, reads/s", rounds, round_s, packages)
             if pdu_size == 480:
                 for name, place in links.items():
-                    compare(place, pdu_size, SMALL, f"packetSize {SMALL}, {name}, reads/s", rounds, round_s)
+                    compare(place, pdu_size, SMALL, f"packetSize {SMALL}, {name}, reads/s", rounds, round_s, packages)
 
 
 if __name__ == "__main__":

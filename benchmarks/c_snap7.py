@@ -1,0 +1,68 @@
+"""The C client snap7, by way of python-snap7 2.1 (later ones are Python), as a process of its own.
+
+:func:`fetched` installs it once into ``build/``, apart from the python-snap7 that shmio needs. Run as a script with
+host, port, PDU and packet size, it reads DB201 for as many seconds as each line of its standard input says, and answers
+with the reads a second.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+REQUIREMENT = "python-snap7==2.1.*"
+PLACE = Path(__file__).parents[1] / "build" / "c-snap7"
+NUMBER, SIZE = 201, 2180  # as in plc.py, which is not imported: shmio's python-snap7 would come along
+
+
+def fetched(*, download: bool) -> Path | None:
+    """Folder to put first on PYTHONPATH; None, and a line that says why, when it cannot be had."""
+    if PLACE.exists():
+        return PLACE
+    if not download:
+        print("the C client snap7 is left out: a quick run downloads nothing")
+        return None
+    part = PLACE.with_suffix(".part")
+    command = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
+    command += ["--only-binary", ":all:", "--upgrade", "--target", str(part), REQUIREMENT]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        reason = (done.stderr.strip().splitlines() or ["pip gave no reason"])[-1]
+        print(f"the C client snap7 is left out: {REQUIREMENT} cannot be installed: {reason}")
+        return None
+    part.rename(PLACE)
+    return PLACE
+
+
+def main() -> None:
+    import snap7.client  # noqa: PLC0415  the old one, where PYTHONPATH says
+    from snap7.type import Parameter  # noqa: PLC0415
+
+    host, port, pdu_size, packet_size = sys.argv[1], *map(int, sys.argv[2:])
+    client: Any = snap7.client.Client()
+    client.set_param(Parameter.PDURequest, pdu_size)
+    client.connect(host, 0, 1, port)
+
+    def read() -> bytes:
+        if packet_size == 0:
+            return bytes(client.db_read(NUMBER, 0, SIZE))
+        parts = [client.db_read(NUMBER, at, min(packet_size, SIZE - at)) for at in range(0, SIZE, packet_size)]
+        return b"".join(map(bytes, parts))
+
+    print(json.dumps({"pdu_size": client.get_pdu_length(), "block": read().hex()}), flush=True)
+    for line in sys.stdin:
+        duration_s, count = float(line), 0
+        begun_s = time.perf_counter()
+        while (taken_s := time.perf_counter() - begun_s) < duration_s:
+            read()
+            count += 1
+        print(count / taken_s, flush=True)
+    client.disconnect()
+
+
+if __name__ == "__main__":
+    main()
