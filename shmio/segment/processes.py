@@ -1,7 +1,7 @@
 """The process table: who runs, since when, how it fares. Written by supervisor and workers, read by anybody.
 
-A slot has three parts, each with one writer: name and kind (fixed), the supervisor's cell, and the worker's heartbeat
-and cell. The worker holds an OS lock on its slot for life, so a dead owner is known for certain.
+A slot has three parts, each with one writer: name, kind and digest with the supervisor's cell, and the worker's
+heartbeat and cell. The worker holds an OS lock on its slot for life, so a dead owner is known for certain.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final
 
+from shmio.errors import SegmentError
 from shmio.segment import _atomics
 from shmio.segment.header import HEARTBEAT_OFFSET, SLOT_SIZE, Header, cut, text
 from shmio.segment.shm import SharedObject
@@ -20,6 +21,7 @@ from shmio.segment.shm import SharedObject
 SUPERVISOR_LOCK: Final = 0  # lock byte of the instance; slot i has byte i + 1
 
 _FIXED: Final = struct.Struct("<64s16sI")
+_NAME_SIZE: Final = 64
 _DIGEST_AT: Final = 96
 _DIGEST_SIZE: Final = 32
 _SUPERVISED_AT: Final = 128
@@ -177,13 +179,13 @@ class ProcessTable(Sequence[ProcessSlot]):
     """The instance's own processes, in the order of the table; ``guests``: the places for others."""
 
     def __init__(self, shared: SharedObject, memory: memoryview, header: Header) -> None:
-        slots = (
-            ProcessSlot(shared, memory, i, header.processes_offset + i * SLOT_SIZE)
-            for i in range(header.process_capacity)
-        )
-        named = [slot for slot in slots if slot.name]
+        self._shared, self._memory, self._header = shared, memory, header
+        named = [slot for slot in map(self._slot, range(header.process_capacity)) if slot.name]
         self._slots = [slot for slot in named if slot.kind != "guest"]
         self.guests = [slot for slot in named if slot.kind == "guest"]
+
+    def _slot(self, index: int) -> ProcessSlot:
+        return ProcessSlot(self._shared, self._memory, index, self._header.processes_offset + index * SLOT_SIZE)
 
     @staticmethod
     def write(memory: memoryview, header: Header, specs: Sequence[ProcessSpec]) -> None:
@@ -194,6 +196,36 @@ class ProcessTable(Sequence[ProcessSlot]):
         for index, name, kind, writer in slots:
             at = header.processes_offset + index * SLOT_SIZE
             _FIXED.pack_into(memory, at, name.encode(), kind.encode(), 0 if writer is None else writer + 1)
+
+    @property
+    def vacant(self) -> int:
+        """Slots that are left for further processes."""
+        return self._header.process_capacity - len(self.guests) - len(self._slots)
+
+    def add(self, spec: ProcessSpec) -> ProcessSlot:
+        """Give a vacant slot to a process; the supervisor's alone. SegmentError: there is none."""
+        taken = {slot.index for slot in (*self._slots, *self.guests)}
+        index = next((i for i in range(self._header.process_capacity) if i not in taken), None)
+        if index is None:
+            raise SegmentError(
+                f"segment {self._shared.name} has no room for process {spec.name}: stop the instance and start it anew"
+            )
+        at = self._header.processes_offset + index * SLOT_SIZE
+        writer = WRITERS.get(spec.kind)
+        fields = _FIXED.pack(spec.name.encode(), spec.kind.encode(), 0 if writer is None else writer + 1)
+        self._memory[at + _NAME_SIZE : at + len(fields)] = fields[_NAME_SIZE:]
+        self._memory[at : at + _NAME_SIZE] = fields[:_NAME_SIZE]  # last: a slot with a name is whole
+        slot = self._slot(index)
+        self._slots = sorted([*self._slots, slot], key=lambda slot: slot.index)
+        return slot
+
+    def remove(self, slot: ProcessSlot) -> None:
+        """Empty the slot of a process that has ended; the supervisor's alone. Its place may be given to another."""
+        at = self._header.processes_offset + slot.index * SLOT_SIZE
+        self._memory[at : at + _NAME_SIZE] = bytes(_NAME_SIZE)  # first: nobody is to find what follows
+        slot.supervised, slot.report, slot.digest = Supervised(), Report(), bytes(_DIGEST_SIZE)
+        _atomics.store64(self._memory, at + _HEARTBEAT_AT, 0)
+        self._slots = [other for other in self._slots if other.index != slot.index]
 
     def __getitem__(self, index: int) -> ProcessSlot:  # type: ignore[override]  # no slices
         return self._slots[index]

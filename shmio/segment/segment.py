@@ -165,21 +165,34 @@ class Segment:
         self.processes = ProcessTable(self.shared, self.memory, self.header)
         return True
 
+    def reserve(self, add: Sequence[BlockSpec]) -> int:
+        """Make room for what :meth:`change` is to add, so that it cannot fail; the offset at which it is.
+
+        SegmentError: no room in shared memory or in the section table.
+        """
+        entries = self._sections()
+        if len(entries) + len(add) * SECTIONS_PER_BLOCK > self.header.section_capacity:
+            raise SegmentError(
+                f"segment {self.shared.name} has no room for more changes: stop the instance and start it anew"
+            )
+        head = self.header
+        tables = head.processes_offset + head.process_capacity * SLOT_SIZE
+        at = align(max([tables, *(entry.offset + entry.size for entry in entries)]), 64)
+        size = at + sum(block.size for block in add)
+        before = self.shared.size
+        self.shared.allocate(size)
+        with memoryview(self.shared.map()) as memory:  # reserved before, and perhaps begun by a supervisor that died
+            memory[at : min(before, size)] = bytes(max(0, min(before, size) - at))
+        return at
+
     def change(self, add: Sequence[BlockSpec] = (), retire: Sequence[str] = ()) -> None:
         """Add blocks and end others, which readers see in this order; the supervisor's alone.
 
         A name in both gets a new block in place of the old. Nothing has changed after SegmentError: no room in shared
         memory or in the section table.
         """
-        at = align(self.shared.size, 64)
-        size = at + sum(block.size for block in add)
+        at = self.reserve(add)
         entries = self._sections()
-        if len(entries) + len(add) * SECTIONS_PER_BLOCK > self.header.section_capacity:
-            raise SegmentError(
-                f"segment {self.shared.name} has no room for more changes: stop the instance and start it anew"
-            )
-        if add:
-            self.shared.allocate(size)
         memory = memoryview(self.shared.map())
         ending = [self.blocks[name] for name in retire]
         indices = [i for i, entry in enumerate(entries) if not entry.retired and entry.name in retire]
