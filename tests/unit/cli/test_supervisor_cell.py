@@ -91,6 +91,7 @@ def test_a_day_in_the_life_of_the_cell(cell: Cell) -> None:
         ("plc", "emulator", "running"),
         ("cell", "source", "running"),
         ("grpc", "grpc", "running"),
+        ("recorder", "recorder", "running"),
     ]
     assert cell.of("cell")["quality"] == "good"
 
@@ -108,7 +109,7 @@ def test_a_day_in_the_life_of_the_cell(cell: Cell) -> None:
 
     assert cell.run("restart", "cell", status=0).stdout == "cell runs again\n"
     assert cell.of("cell")["pid"] != pids["cell"]
-    assert "there are: plc, cell, grpc" in cell.run("restart", "nobody", status=1).stderr
+    assert "there are: plc, cell, grpc, recorder" in cell.run("restart", "nobody", status=1).stderr
     file = cell.folder / "supervisor.toml"
     moved = file.rename(cell.folder / "elsewhere.toml")
     assert cell.run("logs", "--instance", cell.instance, "cell", status=0).stdout

@@ -102,7 +102,7 @@ def test_logs_of_an_unknown_process_names_those_there_are(
     instance_logs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["logs", "cel"]) == 1
-    assert capsys.readouterr().err == "no process 'cel'; there are: supervisor, plc, cell, grpc\n"
+    assert capsys.readouterr().err == "no process 'cel'; there are: supervisor, plc, cell, grpc, recorder\n"
 
 
 def test_logs_before_the_first_start(instance_logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
