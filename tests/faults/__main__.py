@@ -1,0 +1,45 @@
+"""``scripts/fault-suite``: runs the fault suite and writes its report."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import secrets
+import shutil
+import signal
+import sys
+import tempfile
+from pathlib import Path
+
+from tests.faults import report
+from tests.faults.suite import Suite
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="fault-suite", description="Break a whole instance under load, and watch.")
+    parser.add_argument("--for", dest="for_s", type=float, default=60.0, metavar="SECONDS", help="default: 60")
+    parser.add_argument("--seed", type=int, help="which faults come when; default: a new one")
+    parser.add_argument("--report", type=Path, metavar="FILE", help="default: printed at the end")
+    arguments = parser.parse_args()
+    seed = secrets.randbits(32) if arguments.seed is None else arguments.seed
+    folder = Path(tempfile.mkdtemp(prefix="shmio-faults-"))
+    print(f"fault suite: seed {seed}, {arguments.for_s:g} s, in {folder}", flush=True)
+    suite = Suite(folder, f"faults-{os.getpid()}", seed, lambda line: print(line, flush=True))
+    for sign in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(sign, lambda *_: suite.stop())
+    record = suite.run(arguments.for_s)
+    text = report.write(record)
+    if arguments.report:
+        arguments.report.write_text(text)
+        print(text.splitlines()[2])
+    else:
+        print(text)
+    if record.violated:
+        print(f"logs and configuration: {folder}", file=sys.stderr)
+        return 1
+    shutil.rmtree(folder)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,227 @@
+"""The invariants. They know nothing of how shmio works, only what it promises; each can be fed by hand.
+
+A check tells what it finds to ``complain``, a function that takes one line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from shmio.segment import Frame, Quality
+from tests.faults.truth import Truth, Words, generations, places
+
+Complain = Callable[[str], None]
+
+HELD_UP_NS = 4_000_000_000
+"""How long a process may be held up between its cycle's due time and its frame: the schedule pauses them so long."""
+
+FOREIGN = 60_000
+"""Generations within an image that differ by more are not of one PLC's cycles, where no truth is kept."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What a check must know of a source. ``truth``: None for a PLC that keeps none.
+
+    A good value may be as old as a frame may be, ``stale_ns``, and as its answer has taken, at most ``answer_ns``.
+    """
+
+    name: str
+    size: int
+    period_ns: int
+    stale_ns: int
+    tolerance_ns: int
+    one_pdu: bool
+    truth: Truth | None = None
+    answer_ns: int = 0
+
+    @property
+    def oldest_ns(self) -> int:
+        """Greatest age of a good value."""
+        return self.stale_ns + self.answer_ns + self.tolerance_ns
+
+
+@dataclass
+class Counts:
+    """What a check has seen."""
+
+    frames: int = 0
+    good: int = 0
+    missed: int = 0
+    values: int = 0
+    since_ns: int = 0
+    """When the PLC got the newest good value seen, or was last heard of."""
+
+
+@dataclass
+class FrameCheck:
+    """Holds one reader's frames of one source to all that is promised of them."""
+
+    source: Source
+    complain: Complain
+    counts: Counts = field(default_factory=Counts)
+    _last: Frame | None = None
+    _words: Words | None = None
+    _started_ns: int = 0
+
+    def __post_init__(self) -> None:
+        self._places = places(self.source.size)
+
+    def begin(self, started_ns: int) -> None:
+        """A stream begins: of an instance that was started at ``started_ns``. Values still may not go back."""
+        self._last = None
+        self._started_ns = started_ns
+
+    def frame(self, frame: Frame, missed: int, now_ns: int) -> None:
+        """The next frame of the stream, ``missed`` after the one before, in the reader's hands at ``now_ns``."""
+        self.counts.frames += 1
+        self.counts.missed += missed
+        if self._last is not None:
+            self._follows(self._last, frame, missed)
+        self._times(frame, now_ns)
+        self._quality(frame)
+        self._image(frame, repeats=self._last is not None and missed == 0)
+        self.age(frame, now_ns)
+        self._last = frame
+
+    def _say(self, frame: Frame, problem: str) -> None:
+        self.complain(
+            f"{self.source.name}: frame {frame.number} (cycle {frame.cycle}, incarnation {frame.incarnation}, "
+            f"{frame.quality} {frame.reason!r}, published {frame.publish_ns}): {problem}"
+        )
+
+    def _follows(self, last: Frame, frame: Frame, missed: int) -> None:
+        if frame.number != last.number + 1 + missed:
+            self._say(frame, f"comes after frame {last.number} with {missed} missed")
+        if frame.incarnation < last.incarnation:
+            self._say(frame, f"incarnation {last.incarnation} was here before")
+        again = frame.cycle == last.cycle and frame.quality is last.quality is Quality.GOOD
+        if frame.cycle < last.cycle or again:
+            self._say(frame, f"cycle {last.cycle} was here before, in frame {last.number}")
+        if frame.publish_ns < last.publish_ns:
+            self._say(frame, f"published before frame {last.number}, {last.publish_ns}")
+
+    def _times(self, frame: Frame, now_ns: int) -> None:
+        if frame.publish_ns > now_ns:
+            self._say(frame, f"published in the future, now is {now_ns}")
+        if frame.clock_ns != frame.publish_ns - self._started_ns:
+            self._say(frame, f"the clock says {frame.clock_ns}, the instance started at {self._started_ns}")
+        late_ns = frame.publish_ns - self._started_ns - frame.cycle * self.source.period_ns
+        if frame.quality is Quality.GOOD and not 0 <= late_ns <= HELD_UP_NS:
+            self._say(frame, f"published {late_ns / 1e6:.1f} ms after its cycle was due")
+
+    def _quality(self, frame: Frame) -> None:
+        if (frame.quality is Quality.GOOD) == bool(frame.reason):
+            self._say(frame, "good frames have no reason, others have one")
+
+    def _image(self, frame: Frame, *, repeats: bool) -> None:
+        if len(frame.image) != self.source.size:
+            self._say(frame, f"has {len(frame.image)} bytes")
+            return
+        if frame.quality is not Quality.GOOD and not any(frame.image):
+            return  # never had one
+        if frame.quality is not Quality.GOOD and repeats and self._last is not None and frame.raw != self._last.raw:
+            self._say(frame, "is bad, but its bytes are not those of the frame before")
+        words = generations(frame.image, self._places)
+        self.counts.values += len(words)
+        found = [int(word) for word in np.unique(words)]
+        if self.source.one_pdu and len(found) > 1:
+            self._say(frame, f"mixes generations {found[:8]}")
+        if self.source.truth is None:
+            if found[-1] - found[0] > FOREIGN:
+                self._say(frame, f"holds bytes that the PLC never had: {found[:8]}")
+            return
+        for generation in found:
+            if self.source.truth.since_ns(generation) is None:
+                self._say(frame, f"holds {generation:#x}, which the PLC never had or long ago")
+                return
+        if self._words is not None and (back := np.flatnonzero(words < self._words)).size:
+            place = int(back[0])
+            self._say(frame, f"word {place} went back from {self._words[place]} to {words[place]}")
+        self._words = words
+        if frame.quality is Quality.GOOD and (since_ns := self.source.truth.since_ns(found[-1])) is not None:
+            if since_ns > frame.publish_ns:
+                self._say(frame, f"holds generation {found[-1]} of later, {since_ns}")
+            self.counts.since_ns = max(self.counts.since_ns, since_ns)
+
+    def age(self, frame: Frame, now_ns: int) -> None:
+        """What is good now was in the PLC not long ago."""
+        if frame.assess(self.source.stale_ns, now_ns)[0] is not Quality.GOOD or len(frame.image) != self.source.size:
+            return
+        self.counts.good += 1
+        if self.source.truth is None:
+            self.counts.since_ns = max(self.counts.since_ns, frame.publish_ns)
+            return
+        oldest = int(generations(frame.image, self._places).min())
+        age_ns = self.source.truth.age_ns(oldest, now_ns)
+        if age_ns is not None and age_ns > self.source.oldest_ns:
+            published_ns = self.source.truth.age_ns(oldest, frame.publish_ns)
+            self._say(
+                frame,
+                f"is good at {now_ns}, but the PLC has not had generation {oldest} for {age_ns / 1e6:.1f} ms "
+                f"(when it was published, for {(published_ns or 0) / 1e6:.1f} ms; stale_ms is "
+                f"{self.source.stale_ns / 1e6:.0f})",
+            )
+
+
+@dataclass
+class ValueCheck:
+    """Holds one stream of single values (the block's first word) to the truth. For readers of other kinds."""
+
+    source: Source
+    complain: Complain
+    counts: Counts = field(default_factory=Counts)
+    _last: int = 0
+
+    def value(self, generation: int, now_ns: int, *, slack_ns: int = 0) -> None:
+        """A good value, in the reader's hands at ``now_ns``, at most ``slack_ns`` after it was sent."""
+        self.counts.values += 1
+        if self.source.truth is None:
+            self.counts.since_ns = now_ns
+            return
+        since_ns = self.source.truth.since_ns(generation)
+        age_ns = self.source.truth.age_ns(generation, now_ns)
+        if since_ns is None or age_ns is None:
+            self.complain(f"{self.source.name}: value {generation:#x} is none the PLC had")
+            return
+        if generation < self._last:
+            self.complain(f"{self.source.name}: value {generation} comes after {self._last}")
+        if age_ns > self.source.oldest_ns + slack_ns:
+            self.complain(f"{self.source.name}: value {generation} is good, but {age_ns / 1e6:.1f} ms old")
+        self._last = generation
+        self.counts.since_ns = max(self.counts.since_ns, since_ns)
+
+
+@dataclass(frozen=True)
+class Process:
+    """A process as the instance's status shows it."""
+
+    pid: int | None
+    restarts: int
+
+
+Processes = Mapping[str, Process]
+
+
+def check_restarts(before: Processes, after: Processes, hit: set[str], *, replaced: bool, complain: Complain) -> None:
+    """Who was hit has a successor; nobody else was touched.
+
+    ``replaced``: all of the instance was, since it has another segment: then no process is of before.
+    """
+    if set(before) != set(after):
+        complain(f"processes were {sorted(before)}, now they are {sorted(after)}")
+        return
+    for name, now in after.items():
+        then = before[name]
+        if now.pid is None:
+            complain(f"{name} is not there")
+        elif replaced or name in hit:
+            if now.pid == then.pid:
+                complain(f"{name} was to be replaced, but is pid {now.pid} as before")
+            if not replaced and now.restarts <= then.restarts:
+                complain(f"{name} was restarted, but counts {now.restarts} restarts as before")
+        elif now != then:
+            complain(f"{name} was not hit, but went from {then} to {now}")

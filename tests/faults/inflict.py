@@ -1,0 +1,134 @@
+"""Carries faults out. Each returns when it is over: what was broken is whole again, or dead and to be replaced."""
+
+from __future__ import annotations
+
+import random
+import signal
+import time
+from collections.abc import Callable
+from typing import Final
+
+from shmio.segment import Segment
+from shmio.testing.cell import kill, until
+from tests.faults.deface import deface
+from tests.faults.midwrite import MidWrite
+from tests.faults.rig import Device, Rig
+from tests.faults.schedule import SUPERVISOR, Fault
+
+GONE_S: Final = 20.0
+"""A frozen process is found out and replaced within this time."""
+DAY_NS: Final = 86_400 * 10**9
+GARBAGE: Final = (
+    b"\0" * 64,
+    b"\xff" * 64,
+    b"\x03",
+    b"HTTP/1.1 400 Bad Request\r\n\r\n",
+    bytes.fromhex("0300001602f080320300000001000200000000"),  # a header that promises more than comes
+)
+
+
+class Inflictor:
+    """Knows the rig, and how to break each part of it."""
+
+    def __init__(self, rig: Rig, mid_write: MidWrite) -> None:
+        self._rig = rig
+        self._mid_write = mid_write
+
+    def inflict(self, fault: Fault) -> None:
+        """Do it, at once."""
+        kinds: dict[str, Callable[[Fault], None]] = {
+            "kill": lambda f: kill(self._pid(f.target)),
+            "pause": self._pause,
+            "hang": self._hang,
+            "restart": self._restart,
+            "torn": self._torn,
+            "supervisor_kill": self._supervisor_kill,
+            "supervisor_pause": self._pause,
+            "clock": lambda f: self._rig.set_clock(f.number % 3 and round((f.number / 2**31 - 1) * 30 * DAY_NS)),
+            "midwrite": lambda f: self._mid_write.strike(f.number),
+        }
+        if fault.kind in kinds:
+            kinds[fault.kind](fault)
+        else:
+            self._device(fault, self._rig.devices[fault.target.rpartition(" ")[2]])
+
+    def _pid(self, name: str) -> int:
+        status = self._rig.status()
+        if name == SUPERVISOR:
+            assert status.supervisor is not None
+            return status.supervisor.pid
+        pid = next(process.pid for process in status.processes if process.name == name)
+        assert pid is not None, f"{name} is not there"
+        return pid
+
+    def _pause(self, fault: Fault) -> None:
+        pid = self._pid(fault.target)
+        kill(pid, signal.SIGSTOP)
+        time.sleep(fault.for_s)
+        kill(pid, signal.SIGCONT)
+
+    def _hang(self, fault: Fault) -> None:
+        pid = self._pid(fault.target)
+        kill(pid, signal.SIGSTOP)
+        until(lambda: self._rig.processes()[fault.target].pid != pid, f"{fault.target} replaced", GONE_S)
+
+    def _restart(self, fault: Fault) -> None:
+        done = self._rig.supervisor("restart", fault.target)
+        if done.returncode:
+            raise RuntimeError(f"restart {fault.target} failed: {done.stderr}")
+
+    def _torn(self, fault: Fault) -> None:
+        """The writer dies in the middle of a slot, for certain."""
+        pid = self._pid(fault.target)
+        kill(pid, signal.SIGSTOP)
+        until(lambda: _stopped(pid), f"{fault.target} stopped")
+        with Segment.open(self._rig.instance, writable=True) as segment:
+            deface(segment.memory, fault.target, fault.number)
+        kill(pid)
+
+    def _supervisor_kill(self, fault: Fault) -> None:
+        kill(self._pid(SUPERVISOR))
+        until(lambda: self._rig.status().supervisor is None, "the supervisor is gone")
+        time.sleep(fault.for_s)
+        self._rig.up()
+
+    def _device(self, fault: Fault, device: Device) -> None:
+        chance = random.Random(fault.number)
+        proxy = device.proxy
+        if fault.kind == "plc_kill":
+            device.kill()
+            time.sleep(fault.for_s)
+            device.start()
+        elif fault.kind == "plc_pause":
+            kill(device.pid, signal.SIGSTOP)
+            time.sleep(fault.for_s)
+            kill(device.pid, signal.SIGCONT)
+        elif fault.kind == "cut":
+            proxy.cut(reset=chance.random() < 0.5)
+        elif fault.kind == "late":
+            proxy.hold(frames=chance.randrange(1, 4))
+            proxy.wait_held(2.0)
+            time.sleep(fault.for_s)
+            proxy.release()
+        else:
+            frames = chance.randrange(1, 6)
+            offset = chance.randrange(1000, 60_000)
+            begin: dict[str, Callable[[], None]] = {
+                "delay": lambda: proxy.delay(chance.uniform(0, 0.2), chance.uniform(0, 0.2)),
+                "cut_after": lambda: proxy.cut_after(chance.randrange(1, 5000)),
+                "freeze": proxy.freeze,
+                "refuse": proxy.refuse,
+                "garble": lambda: proxy.garble(chance.choice(GARBAGE)),
+                "reference": lambda: proxy.rewrite_reference(lambda number: number + offset, frames=frames),
+                "drop": lambda: proxy.edit(lambda _: None, frames=frames),
+            }
+            begin[fault.kind]()
+            time.sleep(fault.for_s)
+            proxy.delay(0.0, 0.0)
+        proxy.pass_all()
+
+
+def _stopped(pid: int) -> bool:
+    """Whether a process is in state T, proc_pid_stat(5)."""
+    with open(f"/proc/{pid}/stat", encoding="utf-8") as stat:  # noqa: PTH123
+        return stat.read().rpartition(")")[2].split()[0] == "T"

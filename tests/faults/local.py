@@ -1,0 +1,100 @@
+"""Local readers of all sources: one that follows each frame, one slower than its ring, one that looks at the newest."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+
+import shmio
+from shmio.errors import NotRunningError, QualityError, SegmentError
+from shmio.segment import Quality
+from shmio.segment.attach import Attachment
+from tests.faults.checker import Checker
+from tests.faults.checks import FrameCheck, Source
+
+PAUSE_S = 0.05
+LOOK_S = 0.007
+TURN_S = 0.2
+FRAMES, SLEEP_S = 20, 3.0
+"""The slow reader sleeps so long after so many frames: longer than its ring."""
+
+
+def attached(checker: Checker, work: Callable[[Attachment], None]) -> None:
+    """Work on the instance as long as it is there, and on the next one when there is one."""
+    while not checker.stopping.is_set():
+        try:
+            with shmio.attach(checker.description.instance) as attachment:
+                work(attachment)
+        except (NotRunningError, SegmentError):  # not there, half-made, stopped: try again
+            checker.stopping.wait(PAUSE_S)
+
+
+def started_ns(attachment: Attachment) -> int:
+    """CLOCK_MONOTONIC of the instance's start."""
+    return attachment._segment.header.started_ns
+
+
+def follow(checker: Checker, source: Source, *, slow: bool) -> None:
+    """Every frame, once; or, slow, what is left of them."""
+    check = FrameCheck(source, checker.complain, checker.counts(f"{'slow' if slow else 'stream'} {source.name}"))
+
+    def work(attachment: Attachment) -> None:
+        check.begin(started_ns(attachment))
+        cursor = attachment.block(source.name).cursor(after=(after := attachment.block(source.name).ring.head()))
+        delivered = missed = 0
+        while attachment.current and not checker.stopping.is_set():
+            frame = cursor.next(timeout_s=TURN_S)
+            if frame is not None:
+                delivered += 1
+                check.frame(frame, cursor.missed - missed, time.monotonic_ns())
+                missed = cursor.missed
+            if slow and delivered % FRAMES == 0 and checker.stopping.wait(SLEEP_S):
+                break
+        if delivered + missed != cursor.last - after:
+            checker.complain(
+                f"{source.name}: {delivered} frames and {missed} missed are not {after + 1}..{cursor.last}"
+            )
+
+    attached(checker, work)
+
+
+def look(checker: Checker, source: Source) -> None:
+    """The newest frame and value, again and again, also while nothing new comes."""
+    check = FrameCheck(source, checker.complain, checker.counts(f"newest {source.name}"))
+
+    def work(attachment: Attachment) -> None:
+        check.begin(started_ns(attachment))
+        number = 0
+        while attachment.current and not checker.stopping.wait(LOOK_S):
+            try:
+                frame = attachment.frame(source.name).frame
+            except QualityError:
+                continue  # no frame yet
+            now_ns = time.monotonic_ns()
+            if frame.number < number:
+                checker.complain(f"{source.name}: frame {frame.number} is the newest after {number}")
+            if frame.number > number:
+                check.frame(frame, max(0, frame.number - number - 1), now_ns)
+            else:
+                check.age(frame, now_ns)
+            number = frame.number
+            reading = attachment.read(f"{source.name}/stamp")
+            if reading.quality is Quality.BAD and not reading.reason:
+                checker.complain(f"{source.name}: a bad value without a reason")
+
+    attached(checker, work)
+
+
+def main() -> None:
+    checker = Checker()
+    for source in checker.sources:
+        checker.work(partial(follow, checker, source, slow=False))
+        checker.work(partial(look, checker, source))
+    fastest = min(checker.sources, key=lambda source: source.period_ns)
+    checker.work(partial(follow, checker, fastest, slow=True))
+    checker.run()
+
+
+if __name__ == "__main__":
+    main()

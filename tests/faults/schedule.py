@@ -1,0 +1,77 @@
+"""What goes wrong, and when: a stream of rounds that a seed determines, whatever happens on the way."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final
+
+SOURCES: Final = ("fast", "block")
+"""Sources whose PLC is behind a proxy and keeps the truth."""
+WORKERS: Final = ("fast", "block", "demo", "plc", "grpc")
+"""Processes that the supervisor starts: sources, an emulator that feeds ``demo``, the endpoint."""
+SUPERVISOR: Final = "supervisor"
+
+PROCESS_FAULTS: Final = {"kill": 6, "pause": 3, "hang": 1, "restart": 3, "torn": 2}
+DEVICE_FAULTS: Final = {
+    "delay": 2, "cut": 2, "cut_after": 2, "freeze": 2, "refuse": 2, "garble": 2, "late": 2, "reference": 2, "drop": 2,
+    "plc_kill": 2, "plc_pause": 2,
+}  # fmt: skip
+OTHER_FAULTS: Final = {"supervisor_kill": 3, "supervisor_pause": 2, "clock": 3, "midwrite": 3}
+WEIGHTS: Final = PROCESS_FAULTS | DEVICE_FAULTS | OTHER_FAULTS
+"""How often each kind comes, relative to the others."""
+
+RESTARTING: Final = {"kill", "hang", "restart", "torn"}
+"""Kinds after which the target is another process."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One thing that goes wrong. ``after_s`` from its round's begin; what lasts does so for ``for_s``."""
+
+    kind: str
+    target: str
+    after_s: float
+    for_s: float
+    number: int
+    """A random number of its own, for whatever else is left open."""
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.target} at +{self.after_s:.2f} s for {self.for_s:.2f} s ({self.number})"
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """Faults that come together. After them all must be well again before the next round."""
+
+    faults: tuple[Fault, ...]
+    rest_s: float
+    """Time of peace after it."""
+
+
+def rounds(seed: int) -> Iterator[Round]:
+    """The rounds of a seed, for ever. Never two faults on one target, nor one beside the death of the supervisor."""
+    chance = random.Random(seed)
+    kinds, weights = list(WEIGHTS), list(WEIGHTS.values())
+    while True:
+        count = chance.choices((1, 2, 3), (70, 20, 10))[0]
+        faults: dict[str, Fault] = {}
+        for kind in chance.choices(kinds, weights, k=count):
+            fault = _fault(kind, chance)
+            faults.setdefault(fault.target, fault)
+        alone = next((fault for fault in faults.values() if fault.target == SUPERVISOR), None)
+        yield Round((alone,) if alone else tuple(faults.values()), chance.choice((0.0, chance.uniform(0, 1), 6.0)))
+
+
+def _fault(kind: str, chance: random.Random) -> Fault:
+    target = kind
+    if kind in PROCESS_FAULTS:
+        target = chance.choice(("fast", "block", "demo") if kind == "torn" else WORKERS)
+    elif kind in DEVICE_FAULTS:
+        target = f"device of {chance.choice(SOURCES)}"
+    elif kind.startswith(SUPERVISOR):
+        target = SUPERVISOR
+    # Short of the 5 s after which a process counts as hanging, or long enough for it to be replaced.
+    for_s = chance.uniform(0.05, 3.0)
+    return Fault(kind, target, chance.uniform(0, 1), for_s, chance.getrandbits(32))

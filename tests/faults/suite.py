@@ -1,0 +1,202 @@
+"""The run: round after round of faults, recovery awaited after each, everything recorded for the report."""
+
+from __future__ import annotations
+
+import threading
+import time
+import traceback
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from shmio.segment import instances
+from tests.faults.checks import Counts, Processes, check_restarts
+from tests.faults.inflict import Inflictor
+from tests.faults.midwrite import MidWrite
+from tests.faults.panel import Panel
+from tests.faults.resources import Resources
+from tests.faults.rig import Rig, marked
+from tests.faults.schedule import RESTARTING, Fault, Round, rounds
+
+RECOVERY_S: Final = 30.0
+"""All is well again within this time after a fault, at the latest."""
+LOOK_S: Final = 0.02
+HISTORY: Final = 20
+MOST_VIOLATIONS: Final = 10
+"""So many are kept; the others are counted."""
+END_S: Final = 5.0
+
+Say = Callable[[str], None]
+
+
+@dataclass
+class Record:
+    """What a run has seen, for its report."""
+
+    seed: int
+    begun_utc: str = field(default_factory=lambda: time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime()))
+    duration_s: float = 0.0
+    rounds: int = 0
+    faults: Counter[str] = field(default_factory=Counter)
+    recoveries: defaultdict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    replaced: int = 0
+    adopted: int = 0
+    counts: dict[str, Counts] = field(default_factory=dict)
+    mid_kills: int = 0
+    mid_torn: int = 0
+    mid_frames: int = 0
+    peaks: dict[str, tuple[float, int]] = field(default_factory=dict)
+    """Most MB of memory and most descriptors of each process."""
+    violations: list[str] = field(default_factory=list)
+    violated: int = 0
+
+
+class Suite:
+    """One run on one instance. ``say`` gets a line for each round, and each violation with its evidence."""
+
+    def __init__(self, folder: Path, instance: str, seed: int, say: Say) -> None:
+        self.record = Record(seed)
+        self._folder = folder
+        self._instance = instance
+        self._say = say
+        self._turn = threading.Lock()
+        self._history: deque[str] = deque(maxlen=HISTORY)
+        self._stopping = threading.Event()
+
+    def complain(self, problem: str) -> None:
+        """Record a violation with all that is needed to find its cause, and end the run."""
+        with self._turn:
+            self.record.violated += 1
+            if len(self.record.violations) < MOST_VIOLATIONS:
+                now = f"{time.monotonic_ns()} ({time.strftime('%H:%M:%S', time.gmtime())} UTC)"
+                past = "".join(f"\n    {line}" for line in self._history)
+                evidence = f"{problem}\n  seed {self.record.seed}, now {now}; the last faults, oldest first:{past}"
+                self.record.violations.append(evidence)
+                self._say(f"VIOLATION: {evidence}")
+        self._stopping.set()
+
+    def stop(self) -> None:
+        """End the run after the present round."""
+        self._stopping.set()
+
+    def run(self, for_s: float, faults: list[Round] | None = None) -> Record:
+        """Run for so long, or through the rounds given; the record. What is left behind is a violation too."""
+        begun_s = well_s = time.monotonic()
+        with ExitStack() as stack:
+            rig = stack.enter_context(Rig(self._folder, self._instance))
+            mid_write = MidWrite(f"{self._instance}-torn", rig.environment, self.complain)
+            stack.enter_context(mid_write)
+            panel = Panel(rig.description(self.record.seed), rig.environment, self.complain)
+            stack.enter_context(panel)
+            self._inflictor = Inflictor(rig, mid_write)
+            resources = Resources(self.complain)
+            self._await_recovery(rig, panel, time.monotonic_ns(), {})
+            well_s = time.monotonic()
+            for turn in faults if faults is not None else rounds(self.record.seed):
+                if self._stopping.is_set() or (faults is None and time.monotonic() - well_s > for_s):
+                    break
+                self._round(rig, panel, turn)
+                resources.look({name: process.pid for name, process in rig.processes().items()})
+            self.record.mid_kills, self.record.mid_torn = mid_write.kills, mid_write.torn
+            self.record.mid_frames = mid_write.frames
+            self.record.peaks = resources.peaks
+            rig.down()
+        self.record.counts = panel.counts
+        self._check_leftovers()
+        self.record.duration_s = time.monotonic() - begun_s
+        return self.record
+
+    def _round(self, rig: Rig, panel: Panel, turn: Round) -> None:
+        before, epoch = rig.processes(), self._epoch(rig)
+        begun_s = time.monotonic()
+        ended: list[tuple[int, str]] = []
+        threads = [threading.Thread(target=self._inflict, args=(fault, begun_s, ended)) for fault in turn.faults]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        hit = {fault.target for fault in turn.faults if fault.kind in RESTARTING}
+        ended_ns, last = max(ended)
+        took_s = self._await_recovery(rig, panel, ended_ns, {name: before[name] for name in hit})
+        self.record.rounds += 1
+        self.record.faults.update(fault.kind for fault in turn.faults)
+        if took_s is not None:
+            self.record.recoveries[last].append(took_s)
+        well = f"well again after {took_s:.2f} s" if took_s is not None else "NOT well again"
+        self._say(f"{self.record.rounds:5d}  {'; '.join(map(str, turn.faults))}: {well}")
+        if took_s is None:
+            return
+        replaced = self._epoch(rig) != epoch
+        if any(fault.kind == "supervisor_kill" for fault in turn.faults):
+            self.record.replaced += replaced
+            self.record.adopted += not replaced
+        elif replaced:
+            self.complain("the instance has another segment, but its supervisor was not hit")
+        check_restarts(before, rig.processes(), hit, replaced=replaced, complain=self.complain)
+        self._check_processes(rig)
+        panel.check()
+        self._stopping.wait(turn.rest_s)
+
+    def _inflict(self, fault: Fault, begun_s: float, ended: list[tuple[int, str]]) -> None:
+        time.sleep(max(0.0, begun_s + fault.after_s - time.monotonic()))
+        self._history.append(f"{time.monotonic_ns()}: {fault}")
+        try:
+            self._inflictor.inflict(fault)
+        except Exception:  # noqa: BLE001 - an error of a command, or of the suite: a finding in any case
+            self.complain(f"{fault} failed: {traceback.format_exc()}")
+        ended.append((time.monotonic_ns(), fault.kind))
+
+    def _await_recovery(self, rig: Rig, panel: Panel, ended_ns: int, hit: Processes) -> float | None:
+        """Wait until everybody has values newer than ``ended_ns``; how long that took in s, None: too long.
+
+        ``hit``: processes of before that are to have successors.
+        """
+        while (took_ns := time.monotonic_ns() - ended_ns) < RECOVERY_S * 1e9:
+            behind = panel.behind(ended_ns)
+            if panel.counts and not behind and rig.status().state == "running":
+                now = rig.processes()
+                if not any(name in now and now[name].pid == process.pid for name, process in hit.items()):
+                    return took_ns / 1e9
+            time.sleep(LOOK_S)
+        status = rig.status()
+        ill = [f"{p.name}: {p.state} {p.note}" for p in status.processes if p.state != "running"]
+        self.complain(f"not well {RECOVERY_S:g} s after a fault: {status.state} {status.note}, {ill}, behind: {behind}")
+        return None
+
+    def _epoch(self, rig: Rig) -> str:
+        """What tells one segment of an instance from the next."""
+        return str((Path("/dev/shm") / f"shmio-{rig.instance}").stat().st_ino)
+
+    def _check_processes(self, rig: Rig) -> None:
+        """No process of the instance but those it shows."""
+        status = rig.status()
+        known = {p.pid for p in status.processes} | {status.supervisor.pid if status.supervisor else None}
+        ours = ("shmio.connectors", "shmio.emulators", "shmio.endpoints", "shmio.cli.supervisor up")
+        deadline_s = time.monotonic() + END_S
+        while True:
+            strays = {
+                pid: line
+                for pid, line in marked(rig.instance).items()
+                if pid not in known and any(module in line for module in ours)
+            }
+            if not strays:
+                return
+            if time.monotonic() > deadline_s:
+                self.complain(f"processes that belong to nobody: {strays}")
+                return
+            time.sleep(LOOK_S)
+
+    def _check_leftovers(self) -> None:
+        """Nothing is left: no segment, no process, no socket in the file system, no file but configuration and logs."""
+        if left := [name for name in instances() if name.startswith(self._instance)]:
+            self.complain(f"segments left behind: {left}")
+        if processes := marked(self._instance):
+            self.complain(f"processes left behind: {processes}")
+        known = {".toml", ".db", ".truth", ".so", ".log", ".1", ".2", ".3"}
+        files = [file for file in self._folder.rglob("*") if not file.is_dir() and file.suffix not in known]
+        names = {str(file.relative_to(self._folder)) for file in files} - {"clock", "reader"}
+        if names:
+            self.complain(f"files left behind: {sorted(names)}")
