@@ -70,12 +70,11 @@ class Cursor:
         self.token = self._tokens[index]
 
     def skip_to(self, word: str) -> bool:
-        """Go to this keyword, without a word about faults on the way; return whether there is one."""
+        """Go to this keyword, without a word about faults on the way; stay, and return False, if there is none."""
         for index in range(self.index, len(self._tokens)):
             if self._tokens[index].is_word(word):
                 self.rewind(index)
                 return True
-        self.rewind(len(self._tokens) - 1)
         return False
 
     def _pass_faults(self) -> None:

@@ -91,7 +91,8 @@ def extent_of(placed: Leaf | Group | Repeat) -> Extent:
         return Extent(placed.size, 2, placed.cost, placed.height)
     group, count = placed.group, math.prod(high - low + 1 for low, high in placed.dims)
     index_text = sum(1 + max(len(str(low)), len(str(high))) for low, high in placed.dims)
-    return Extent(count * group.size, 2, Cost().plus(group.cost, count, index_text), group.height)
+    cost = Cost(elements=count).plus(group.cost, count, index_text)  # a group may be empty, and its array endless
+    return Extent(count * group.size, 2, cost, group.height)
 
 
 def round_up(value: int, step: int) -> int:

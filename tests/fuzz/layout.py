@@ -18,6 +18,7 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 
@@ -76,13 +77,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.inputs:
         return 0
     started, count, slowest_s = time.monotonic(), 0, 0.0
-    for data in Mutator(options.seed):
-        before = time.process_time()
-        run(data)
-        slowest_s = max(slowest_s, time.process_time() - before)
-        count += 1
-        if count >= options.count or time.monotonic() - started >= options.seconds:
-            break
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with suppress(KeyboardInterrupt):  # Ctrl-C ends it early
+        for data in Mutator(options.seed):
+            before = time.process_time()
+            run(data)
+            slowest_s = max(slowest_s, time.process_time() - before)
+            count += 1
+            if count >= options.count or time.monotonic() - started >= options.seconds:
+                break
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
     seed = options.seed
     sys.stdout.write(f"{count} inputs of seed {seed}, nothing found; slowest {slowest_s:.2f} s, peak {peak_mb} MB\n")

@@ -60,7 +60,15 @@ NUMBERS = (0, 1, -1, 7, 255, 65_535, 1 << 31, 10**20)
 TYPES = (
     *("Bool", "Byte", "Int", "DWord", "Real", "LReal", "Char", "WChar", "String", "String[3]", "WString[#N]", "Time"),
     *("S5Time", "LTime", "Date", "TOD", "LTOD", "DT", "LDT", "DTL", "Any", "Pointer", '"t"', "UDT 1", '"g"', "SFB 4"),
-    *("ErrorStruct", "HW_ANY", "Timer", "Array[0..1] of Bool", "Array[-1..1, 0..N] of Int", 'Array[1..2] of "t"'),
+    *(
+        "ErrorStruct",
+        "HW_ANY",
+        "Timer",
+        "Array[0..1] of Bool",
+        "Array[-1..1, 0..N] of Int",
+        'Array[1..2] of "t"',
+        'Array[1..9] of "e"',
+    ),
     *(
         "Array[1..3] of String[5]",
         "Struct x : Bool; y : Int := 5; END_STRUCT",
@@ -83,6 +91,7 @@ TYPE "t" STRUCT p : Int; q : Struct r : Bool; s : String[4] := 'ab'; END_STRUCT;
 TYPE UDT 1 STRUCT x : Array[0..N] of Byte; y : "t" := (7); END_STRUCT; END_TYPE
 FUNCTION_BLOCK "g" VAR_INPUT i : Bool; END_VAR VAR_IN_OUT a : Array[*] of Int; END_VAR VAR u : UDT 1; END_VAR
 END_FUNCTION_BLOCK
+FUNCTION_BLOCK "e" VAR_TEMP i : Bool; END_VAR BEGIN END_FUNCTION_BLOCK
 """
 SHAPES = (
     "{}",
@@ -116,7 +125,7 @@ class Mutator:
         self._seeds = seeds()
 
     def __iter__(self) -> Iterator[bytes]:
-        ways = (self._values, self._declarations, self._declarations, self._fragments, self._golden, self._golden)
+        ways = (self._values, self._values, self._declarations, self._declarations, self._fragments, self._golden)
         while True:
             data = self._random.choice(ways)()
             if self._random.random() < 0.4:

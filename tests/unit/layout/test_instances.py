@@ -144,11 +144,18 @@ def test_an_instance_without_members_is_empty() -> None:
     assert layout_of(f'FUNCTION_BLOCK "f" x := 1; END_FUNCTION_BLOCK DATA_BLOCK "d" "f" BEGIN {END}').size == 0
 
 
+def test_endless_arrays_of_nothing_end_in_an_error() -> None:
+    nothing = 'FUNCTION_BLOCK "f" VAR_INPUT v : Variant; END_VAR BEGIN END_FUNCTION_BLOCK '
+    assert layout_of(nothing + block('a : Array[0..99] of "f"; b : Int;')).size == 2
+    message = error(nothing + block('a : Array[0..2147483647] of "f" := [(1)];'))
+    assert "expected at most 1048576 elements of arrays" in message
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ('FUNCTION_BLOCK "f" VAR a : Int; END_VAR BEGIN', "the function block 'f' has no END_FUNCTION_BLOCK"),
-        ('FUNCTION_BLOCK "f" VAR_TEMP a : Int; END_FUNCTION_BLOCK', "'f' has no END_FUNCTION_BLOCK"),
+        ('FUNCTION_BLOCK "f" VAR_TEMP a : Int; END_FUNCTION_BLOCK', "expected END_VAR, found 'a'"),
         ("FUNCTION_BLOCK FB 1 : VOID VAR a : Int; END_VAR END_FUNCTION_BLOCK", "section of variables or BEGIN"),
         ('FUNCTION_BLOCK "f" VAR a : "f"; END_VAR BEGIN END_FUNCTION_BLOCK', "contains itself"),
     ],
