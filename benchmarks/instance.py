@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,19 +23,22 @@ from shmio.testing.ports import reserved_port
 
 START_S = 20.0
 
-_SOURCE = """
+_HEAD = """
 [instance]
 name = "{name}"
+[grpc]
+listen = ["{grpc}"]
+"""
+_SOURCE = """
 [[source]]
-name = "cell"
+name = "{name}"
 connector = "s7"
 layout = "{layout}"
 host = "{plc.host}"
 port = {plc.port}
 dbNumber = 201
 period_ms = {period_ms}
-[grpc]
-listen = ["{grpc}"]
+writable = {writable}
 """
 _EMULATOR = """
 [[emulator]]
@@ -47,8 +51,29 @@ listen = "{plc}"
 
 
 @dataclass(frozen=True)
+class Polled:
+    """A source: what it polls, and how often."""
+
+    name: str
+    plc: Address
+    period_ms: float
+    layout: Path = DB201
+    writable: Sequence[str] = ()
+
+    def text(self) -> str:
+        """Its part of the configuration."""
+        return _SOURCE.format(
+            name=self.name,
+            layout=self.layout,
+            plc=self.plc,
+            period_ms=self.period_ms,
+            writable=json.dumps(list(self.writable)),
+        )
+
+
+@dataclass(frozen=True)
 class Instance:
-    """A running instance: a source ``cell``, the gRPC endpoint, and maybe an emulated controller ``plc``."""
+    """A running instance: its sources, the gRPC endpoint, and maybe an emulated controller ``plc``."""
 
     segment: Segment
     grpc: Address
@@ -57,22 +82,27 @@ class Instance:
 
 
 @contextmanager
-def instance(
-    period_ms: float, *, plc: Address | None = None, layout: Path = DB201, more: str = ""
-) -> Iterator[Instance]:
-    """Run an instance that polls ``plc``, or an emulated controller of its own with the program of the A50 cell.
+def instance(period_ms: float, *, more: str = "") -> Iterator[Instance]:
+    """Run a source ``cell`` that polls an emulated controller of the instance's own, with the program of the A50 cell.
 
     ``more``: further sections of the configuration.
     """
+    with reserved_port() as plc:
+        emulator = _EMULATOR.format(layout=DB201, plc=plc)
+        with started([Polled("cell", plc, period_ms)], more=emulator + more) as running:
+            yield running
+
+
+@contextmanager
+def started(sources: Sequence[Polled], *, more: str = "") -> Iterator[Instance]:
+    """Run an instance with these sources; ``more``: further sections of the configuration."""
     name = f"bench-{os.getpid()}"
     with ExitStack() as stack:
         grpc = stack.enter_context(reserved_port())
-        controller = plc or stack.enter_context(reserved_port())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        text = _SOURCE if plc else _SOURCE + _EMULATOR
         config = folder / "supervisor.toml"
-        values = {"name": name, "layout": layout, "plc": controller, "period_ms": period_ms, "grpc": grpc}
-        config.write_text(text.format(**values) + more)
+        parts = [_HEAD.format(name=name, grpc=grpc), *(source.text() for source in sources), more]
+        config.write_text("".join(parts))
         output = stack.enter_context((folder / "output").open("w+"))
         supervisor = subprocess.Popen(
             [sys.executable, "-m", "shmio.cli.supervisor", "up", "-c", str(config)],

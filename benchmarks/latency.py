@@ -9,7 +9,7 @@ from __future__ import annotations
 import time
 
 from common import HERE, Child, begin, quantiles, table
-from instance import instance
+from instance import Polled, started
 
 from shmio.config.address import Address
 
@@ -21,7 +21,7 @@ def measure(period_ms: float, mean_change_ms: float, duration_s: float) -> None:
     round_trips_us = []
     with (
         Child("plc.py", "--stamp-ms", mean_change_ms) as plc,
-        instance(period_ms, plc=Address.parse(plc.hello), layout=HERE / "stamped.db") as running,
+        started([Polled("cell", Address.parse(plc.hello), period_ms, HERE / "stamped.db")]) as running,
         Child("subscriber.py", running.grpc, "cell/Stamp", "--stamps") as client,
     ):
         source = running.segment.processes.find("cell")

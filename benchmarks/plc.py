@@ -24,9 +24,9 @@ SIZE = 2180
 SEED = 201
 
 
-def still_block() -> bytes:
+def still_block(size: int = SIZE) -> bytes:
     """Fill a block with bytes that differ from place to place."""
-    return random.Random(SEED).randbytes(SIZE)
+    return random.Random(SEED).randbytes(size)
 
 
 def stamp(server: S7Server, block: bytearray, mean_s: float, wait: Callable[[float], bool]) -> None:
@@ -41,10 +41,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--pdu", type=int, default=MAX_PDU_SIZE, help="largest PDU to grant, in bytes")
     parser.add_argument("--jobs", type=int, default=8, help="most jobs to grant at once")
+    parser.add_argument("--size", type=int, default=SIZE, help="of the block, in bytes")
     parser.add_argument("--stamp-ms", type=float)
     arguments = parser.parse_args()
     server = S7Server(Address("127.0.0.1", 0), traits=Traits(arguments.pdu, arguments.jobs))
-    block = bytearray(still_block())
+    block = bytearray(still_block(arguments.size))
     server.add_block(NUMBER, block)
     server.start()
     stopping = threading.Event()
