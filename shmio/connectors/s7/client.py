@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from types import TracebackType
 
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.blockread import BlockRead
@@ -18,7 +18,7 @@ from shmio.connectors.s7.blockwrite import waves
 from shmio.connectors.s7.explain import OUT_OF_RANGE, RefusedError, explain_size
 from shmio.connectors.s7.mode import ModeQuestion
 from shmio.connectors.s7.options import S7Options
-from shmio.connectors.s7.transport import Transport, naming_errors
+from shmio.connectors.s7.transport import Transport, named
 from shmio.connectors.s7.window import Operation, Window
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.write import Write
@@ -50,6 +50,7 @@ class S7Client:
         self._under_way: deque[BlockRead] = deque()
         self._idle: list[BlockRead] = []
         self._mode = ModeQuestion()
+        self._dropping_on_error = _DroppingOnError(self)
 
     @property
     def connected(self) -> bool:
@@ -82,7 +83,7 @@ class S7Client:
         ConnectorError: nobody there, not an S7 controller, session refused.
         """
         self.close()
-        with self._dropping_on_error(opening=True):
+        with _DroppingOnError(self, opening=True):
             self._transport = transport = Transport(self.options.host, self.options.port, self._timeout_ns)
             deadline_ns = transport.deadline_ns
             transport.send(pdu.connect_request(self.options.rack, self.options.cpu_slot), deadline_ns)
@@ -95,7 +96,7 @@ class S7Client:
             if transport.left:
                 raise ConnectorError("unexpected bytes after the session was set up")
             self._use(granted, transport)
-        with self._dropping_on_error():
+        with self._dropping_on_error:
             self._ask_mode()
             self._flush()
             self._finish(self._mode, deadline_ns)
@@ -120,7 +121,7 @@ class S7Client:
             raise ConnectorError("not connected")
         if not self._idle:
             raise RuntimeError(f"no more than {self.depth} reads may be under way")
-        with self._dropping_on_error():
+        with self._dropping_on_error:
             read = self._idle.pop()
             read.begin(time.monotonic_ns() + self._timeout_ns)
             self._under_way.append(read)
@@ -139,7 +140,7 @@ class S7Client:
         if not self._under_way:
             raise RuntimeError("no read is under way")
         read = self._under_way[0]
-        with self._dropping_on_error():
+        with self._dropping_on_error:
             if not self._advance(read, min(until_ns, read.deadline_ns)):
                 if time.monotonic_ns() >= read.deadline_ns:
                     raise TimeoutError
@@ -159,7 +160,7 @@ class S7Client:
         if self._transport is None:
             raise ConnectorError("not connected")
         outcomes = [""] * len(writes)
-        with self._dropping_on_error():
+        with self._dropping_on_error:
             deadline_ns = time.monotonic_ns() + self._timeout_ns
             for wave in waves(self.db_number, self.pdu_size, writes, outcomes):
                 self._window.add(wave, urgent=True)
@@ -190,16 +191,6 @@ class S7Client:
         depth = min(max(1, jobs // first.count), MAX_DEPTH)
         self._idle = [first, *(BlockRead(self.db_number, self.size, chunk) for _ in range(depth - 1))]
 
-    @contextmanager
-    def _dropping_on_error(self, *, opening: bool = False) -> Iterator[None]:
-        """Close the socket on any way out but the good one, and name the error for people."""
-        try:
-            with naming_errors(self.options, opening=opening):
-                yield
-        except BaseException:
-            self.close()
-            raise
-
     # -- requests and answers ------------------------------------------------------------------------------------------
 
     def _ask_mode(self) -> None:
@@ -216,7 +207,7 @@ class S7Client:
     def _flush(self) -> None:
         """Send what may be sent."""
         assert self._transport is not None  # noqa: S101 - for the type checker
-        if requests := self._window.due():
+        if self._window.waiting and (requests := self._window.due()):
             self._transport.send(requests, time.monotonic_ns() + self._timeout_ns)
 
     def _advance(self, operation: Operation, until_ns: int) -> bool:
@@ -253,3 +244,22 @@ class S7Client:
         except (ConnectorError, OSError, EOFError):
             return refusal
         return RefusedError(explain_size(self.db_number, self.size, probe.found), OUT_OF_RANGE)
+
+
+class _DroppingOnError:
+    """Closes the client on any way out of a ``with`` block but the good one, and names the error for people."""
+
+    def __init__(self, client: S7Client, *, opening: bool = False) -> None:
+        self._client = client
+        self._opening = opening
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if error is not None:
+            self._client.close()
+            if (clear := named(error, self._client.options, opening=self._opening)) is not None:
+                raise clear from None

@@ -69,11 +69,12 @@ class ReadAnswer(NamedTuple):
 # -- frames ------------------------------------------------------------------------------------------------------------
 
 
-def frame_length(head: memoryview, longest: int) -> int:
-    """Length in bytes of the frame that begins with these four or more bytes; at most ``longest``."""
-    version, length = _TPKT.unpack_from(head)
+def frame_length(inbox: memoryview, start: int, longest: int) -> int:
+    """Length in bytes of the frame that begins at ``start``, of which four bytes are there; at most ``longest``."""
+    version, length = _TPKT.unpack_from(inbox, start)
     if version != 3:
-        raise ConnectorError(f"the peer is not an S7 controller: it sent {bytes(head[:8])!r}, which is not ISO-on-TCP")
+        sent = bytes(inbox[start : start + 8])
+        raise ConnectorError(f"the peer is not an S7 controller: it sent {sent!r}, which is not ISO-on-TCP")
     if not FRAME_OVERHEAD <= length <= longest:
         raise ConnectorError(f"frame of {length} bytes, expected {FRAME_OVERHEAD} to {longest}")
     return int(length)

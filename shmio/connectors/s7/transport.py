@@ -5,8 +5,6 @@ from __future__ import annotations
 import select
 import socket
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.options import S7Options
@@ -85,7 +83,7 @@ class Transport:
         """Take the next frame out of what has come; None if it is not whole yet. Good until the next ``receive``."""
         if self._end - self._start < 4:
             return None
-        length = pdu.frame_length(self._inbox[self._start : self._end], self._longest)
+        length = pdu.frame_length(self._inbox, self._start, self._longest)
         if self._end - self._start < length:
             return None
         frame = self._inbox[self._start : self._start + length]
@@ -108,25 +106,23 @@ def _left_s(until_ns: int) -> float:
     return max(0, until_ns - time.monotonic_ns()) / 1e9
 
 
-@contextmanager
-def naming_errors(options: S7Options, *, opening: bool = False) -> Iterator[None]:
-    """Name for people what a connection can suffer: OSError, EOFError and TimeoutError become ConnectorError."""
+def named(error: BaseException, options: S7Options, *, opening: bool = False) -> ConnectorError | None:
+    """Say for people what happened to a connection; None if the error is not of a connection."""
     peer = options.peer
-    try:
-        yield
-    except TimeoutError:
-        raise ConnectorError(f"no answer within {options.timeout} ms from {peer}") from None
-    except ConnectionRefusedError:
-        raise ConnectorError(f"connection refused by {peer}") from None
-    except (EOFError, ConnectionError):
+    if isinstance(error, TimeoutError):
+        return ConnectorError(f"no answer within {options.timeout} ms from {peer}")
+    if isinstance(error, ConnectionRefusedError):
+        return ConnectorError(f"connection refused by {peer}")
+    if isinstance(error, (EOFError, ConnectionError)):
         text = f"{peer} closed the connection"
         if opening:
             text += (
                 f" during set-up: rack {options.rack}, slot {options.cpu_slot} may be wrong, all its connections in "
                 "use, or it is not an S7 controller"
             )
-        raise ConnectorError(text) from None
-    except socket.gaierror as error:
-        raise ConnectorError(f"host name {options.host!r} cannot be resolved: {error.strerror}") from None
-    except OSError as error:
-        raise ConnectorError(f"{peer} cannot be reached: {error.strerror or error}") from None
+        return ConnectorError(text)
+    if isinstance(error, socket.gaierror):
+        return ConnectorError(f"host name {options.host!r} cannot be resolved: {error.strerror}")
+    if isinstance(error, OSError):
+        return ConnectorError(f"{peer} cannot be reached: {error.strerror or error}")
+    return None

@@ -49,6 +49,11 @@ class Window:
         """Whether no answer is due."""
         return not self._under_way
 
+    @property
+    def waiting(self) -> bool:
+        """Whether there are requests that are not sent yet."""
+        return bool(self._queue)
+
     def add(self, operation: Operation, *, urgent: bool = False) -> None:
         """Have an operation's requests sent, after those of others; ``urgent``: before them."""
         if urgent:

@@ -36,7 +36,7 @@ def test_finds_the_size(sizes: tuple[int, int], pdu_size: int) -> None:
         assert probe.complete
         rounds += 1
     assert probe.found == real
-    assert rounds <= (4 if pdu_size >= 240 else 6)
+    assert rounds <= (4 if pdu_size >= 240 else 7)
 
 
 def test_reads_which_bytes_are_there() -> None:

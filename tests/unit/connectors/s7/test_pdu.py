@@ -125,13 +125,13 @@ def test_refuses_a_wrong_grant(frame: memoryview, text: str) -> None:
 
 
 def test_frame_length_is_bounded() -> None:
-    assert pdu.frame_length(memoryview(GOOD_ANSWER), 29) == 29
+    assert pdu.frame_length(memoryview(GOOD_ANSWER), 0, 29) == 29
     with pytest.raises(ConnectorError, match="29 bytes, expected 7 to 28"):
-        pdu.frame_length(memoryview(GOOD_ANSWER), 28)
+        pdu.frame_length(memoryview(GOOD_ANSWER), 0, 28)
     with pytest.raises(ConnectorError, match=r"not an S7 controller.*HTTP"):
-        pdu.frame_length(memoryview(b"HTTP/1.1 400"), 967)
+        pdu.frame_length(memoryview(b"..HTTP/1.1 400"), 2, 967)
     with pytest.raises(ConnectorError, match="frame of 6 bytes"):
-        pdu.frame_length(memoryview(b"\x03\x00\x00\x06"), 967)
+        pdu.frame_length(memoryview(b"\x03\x00\x00\x06"), 0, 967)
 
 
 NOISE = st.binary(min_size=7, max_size=80) | st.builds(
@@ -156,4 +156,4 @@ def test_noise_gives_an_answer_or_a_connector_error(noise: bytes) -> None:
         assert 64 <= session.pdu_size <= 960
         assert 1 <= session.jobs <= 8
     with contextlib.suppress(ConnectorError):
-        assert 7 <= pdu.frame_length(frame, 967) <= 967
+        assert 7 <= pdu.frame_length(frame, 0, 967) <= 967
