@@ -124,7 +124,8 @@ class Recorder:
 
     def turn(self) -> bool:
         """Take what has been published; whether there is more at once. RecordingError: the file was removed."""
-        if self._segment.refresh():
+        self._segment.refresh()
+        if self._segment.blocks is not self._known:
             self._follow(Start())
         entries = list(chain.from_iterable(followed.follower.take(BATCH) for followed in self._followed))
         entries.sort(key=lambda entry: entry.log_ns)  # stable: a block's own order stays
@@ -172,7 +173,8 @@ class Recorder:
 
     def _follow(self, start: Start) -> None:
         followed = {id(known.follower.block) for known in self._followed}
-        for source, block in self._segment.blocks.items():
+        self._known = self._segment.blocks
+        for source, block in self._known.items():
             if id(block) in followed or (self._sources is not None and source not in self._sources):
                 continue
             self._blocks += 1

@@ -1,0 +1,177 @@
+"""The recorder's process: killed, restarted, without room. The file is what counts."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from shmio.recording.encoding import Reason
+from shmio.recording.reader import Reader
+from shmio.segment import Activity, Event, Segment
+from shmio.testing.cell import kill, until
+from tests.unit.recording.harness import RING, Process, gaps, numbers, publish
+
+
+def written(process: Process) -> list[int]:
+    """Numbers of the frames in its file as of now."""
+    return numbers(process.file) if process.file.is_file() and process.file.stat().st_size else []
+
+
+def ready(process: Process) -> bool:
+    return process.slot.report.pid == process.popen.pid and process.slot.report.note.startswith("to ")
+
+
+def test_it_records_tells_its_counters_and_closes_its_file(segment: Segment, tmp_path: Path) -> None:
+    (tmp_path / "supervisor.toml").write_text(
+        f'[instance]\nname = "{segment.instance}"\n[[source]]\nname = "cell"\nconnector = "x"\nlayout = "a.db"\n'
+    )
+    (tmp_path / "a.db").write_text("the source")
+    with Process(segment, tmp_path) as process:
+        publish(segment.writer("cell"), 5)
+        until(lambda: process.counts("frames") == 5 and process.counts("events") == 1, "the counters")
+        until(lambda: process.counts("bytes") > 0, "bytes")
+        file = process.file
+        assert file.name.startswith(f"{segment.instance}-")
+        assert process.stop() == 0
+    assert process.slot.report.activity is Activity.STOPPING
+    assert numbers(file) == [1, 2, 3, 4, 5]
+    with Reader(file) as reader:
+        list(reader.messages())
+        assert reader.records.closed
+        assert {"config/supervisor.toml", "sources/cell/a.db"} < set(reader.attachments)
+        assert reader.about["recorder"] == "supervised"
+    assert "5 frames, 1 events, 0 missed" in process.log.read_text()
+
+
+def test_a_killed_recorder_leaves_a_file_that_is_read_and_its_successor_goes_on(
+    segment: Segment, tmp_path: Path
+) -> None:
+    writer = segment.writer("cell")
+    with Process(segment, tmp_path) as first:
+        publish(writer, 20)
+        until(lambda: ready(first) and len(written(first)) == 20, "what was published, within the file")
+        publish(writer, 30)
+        kill(first.popen.pid)
+        first.popen.wait()
+    old = first.file
+    kept = numbers(old)
+    assert kept == list(range(1, len(kept) + 1))
+    assert len(kept) >= 20
+    with Reader(old) as reader:
+        list(reader.messages())
+        assert not reader.records.closed
+    with Process(segment, tmp_path) as second:
+        until(lambda: second.counts("frames") == 50 - len(kept), "what the first had not written")
+        assert second.file != old
+        assert second.stop() == 0
+    assert kept + numbers(second.file) == list(range(1, 51))
+    assert gaps(second.file) == []
+    assert numbers(old, kind=Event) == [1]
+    assert numbers(second.file, kind=Event) == []
+
+
+def test_what_the_ring_no_longer_has_is_a_gap_to_the_predecessor(segment: Segment, tmp_path: Path) -> None:
+    writer = segment.writer("cell")
+    with Process(segment, tmp_path) as first:
+        publish(writer, 10)
+        until(lambda: first.counts("frames") == 10, "frames")
+        old = first.file
+        first.stop()
+    publish(writer, 2 * RING)
+    with Process(segment, tmp_path) as second:
+        until(lambda: second.counts("frames") + second.counts("missed") == 2 * RING, "all, or missed")
+        second.stop()
+    [gap] = gaps(second.file)
+    assert (gap.first, gap.reason) == (11, Reason.NOT_RUNNING)
+    with Reader(old) as reader:
+        before = [message.log_ns for message in reader.messages()]
+    assert gap.after_ns == before[-1]
+    assert numbers(second.file) == list(range(gap.last + 1, 2 * RING + 11))
+    assert second.counts("missed") == gap.count
+
+
+def test_a_recording_of_another_run_or_by_another_is_no_predecessor(segment: Segment, tmp_path: Path) -> None:
+    (tmp_path / "dumps").mkdir()
+    (tmp_path / "dumps" / f"{segment.instance}-20990101T000000Z.mem").write_bytes(b"nonsense")
+    publish(segment.writer("cell"), 3)
+    with Process(segment, tmp_path) as process:
+        until(lambda: process.counts("frames") == 3, "all frames")
+        process.stop()
+    assert "is no recording" in process.log.read_text()
+
+
+def test_without_room_it_says_so_and_goes_on_by_itself(segment: Segment, tmp_path: Path) -> None:
+    """The limit is that of a file's size, which anybody can set on a process of theirs."""
+    writer = segment.writer("cell")
+    with Process(segment, tmp_path, buffer_mb=0.02) as process:
+        publish(writer, 10)
+        until(lambda: ready(process) and len(written(process)) == 10, "frames in the file")
+        file, size = process.file, process.file.stat().st_size
+        _, hard = resource.prlimit(process.popen.pid, resource.RLIMIT_FSIZE)
+        resource.prlimit(process.popen.pid, resource.RLIMIT_FSIZE, (size + 100, hard))
+
+        def costs() -> bool:
+            publish(writer, 20, first=writer.block.ring.head())
+            return process.counts("missed") > 0
+
+        until(costs, "something lost")
+        until(lambda: f"{file}: File too large; " in process.slot.report.note, "the reason in the status")
+        assert "File too large" in process.log.read_text()
+        assert file.stat().st_size == size, "whole pieces only"
+        resource.prlimit(process.popen.pid, resource.RLIMIT_FSIZE, (hard, hard))
+        until(lambda: ready(process), "well again")
+        publish(writer, 1, first=writer.block.ring.head())
+        until(lambda: file.stat().st_size > size, "written again")
+        process.stop()
+    assert "is being written again" in process.log.read_text()
+    found, missed = numbers(file), gaps(file)
+    assert {gap.reason for gap in missed} == {Reason.NO_ROOM}
+    lost = [number for gap in missed for number in range(gap.first, gap.last + 1)]
+    assert sorted(found + lost) == list(range(1, writer.block.ring.head() + 1))
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    folder = tmp_path / "small"
+    folder.mkdir()
+    mounted = os.geteuid() == 0 and (
+        subprocess.run(
+            ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", folder], capture_output=True, check=False
+        ).returncode == 0
+    )  # fmt: skip
+    if not mounted:
+        pytest.skip("only root can mount a small disk")
+    yield folder
+    subprocess.run(["umount", "-l", folder], check=True)
+
+
+def test_a_full_disk_is_named_and_its_end_is_seen(segment: Segment, tmp_path: Path, small_disk: Path) -> None:
+    ballast = small_disk / "ballast"
+    writer = segment.writer("cell")
+    with Process(segment, tmp_path, directory=str(small_disk / "dumps"), buffer_mb=0.02) as process:
+        process.folder = small_disk / "dumps"
+        publish(writer, 10)
+        until(lambda: ready(process) and len(written(process)) == 10, "frames in the file")
+        file = process.file
+        with ballast.open("wb", buffering=0) as stream, suppress(OSError):
+            while stream.write(b"\xa5" * 4096):
+                pass
+
+        def costs() -> bool:
+            publish(writer, 20, first=writer.block.ring.head())
+            return process.counts("missed") > 0
+
+        until(costs, "something lost")
+        until(lambda: "No space left on device" in process.slot.report.note, "the reason in the status")
+        ballast.unlink()
+        until(lambda: ready(process), "well again")
+        process.stop()
+    found = numbers(file)
+    lost = [number for gap in gaps(file) for number in range(gap.first, gap.last + 1)]
+    assert sorted(found + lost) == list(range(1, writer.block.ring.head() + 1))
