@@ -1,7 +1,9 @@
-"""The S7 connector: reads a data block of a Siemens controller over ISO-on-TCP.
+"""The S7 connector: reads and writes a data block of a Siemens controller over ISO-on-TCP.
 
-``options`` is what the config can say, ``pdu`` the bytes, ``blockread`` the order of requests and answers,
-``client`` the socket.
+``options`` is what the config can say. ``pdu`` and ``writepdu`` are the bytes; ``blockread``, ``blockwrite``, ``mode``
+and ``blocksize`` are what is asked, each with the answers it expects; ``window`` has them share the jobs that the
+controller granted; ``transport`` is the socket; ``client`` puts them together. ``explain`` has the words for what goes
+wrong.
 """
 
 from shmio.connectors.s7.client import S7Client

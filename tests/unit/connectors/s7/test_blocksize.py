@@ -57,6 +57,7 @@ def test_answers_of_a_wrong_length(data: str) -> None:
         parse_readable(memoryview(head + items), 3)
 
 
+@settings(deadline=None)
 @given(st.binary(min_size=7, max_size=60) | st.builds(lambda cut, tail: (ANSWER[:cut] + tail).ljust(7, b"\0"),
        st.integers(0, 35), st.binary(max_size=20)))  # fmt: skip
 def test_noise_gives_an_answer_or_a_connector_error(noise: bytes) -> None:
