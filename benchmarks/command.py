@@ -122,7 +122,7 @@ def measure(period_ms: float, round_trip_ms: float, count: int) -> None:
 def main() -> None:
     quick = begin("Commands: a value written until it is confirmed and seen")
     count = 10 if quick else 300
-    for period_ms, round_trip_ms in ((20, 0), (1, 1)) if quick else ((20, 0), (20, 1), (1, 0), (1, 1)):
+    for period_ms, round_trip_ms in ((1, 1),) if quick else ((20, 0), (20, 1), (1, 0), (1, 1)):
         measure(period_ms, round_trip_ms, count)
 
 
