@@ -52,7 +52,8 @@ def _parser() -> argparse.ArgumentParser:
     verb("down", "stop the instance", target)
     status = verb("status", "tell how the instance and its processes are", target)
     status.add_argument("--json", action="store_true", help="print one JSON object")
-    verb("restart", "restart one process, as it was configured at the start", target).add_argument(
+    verb("reload", "take what has changed in the configuration; leave alone what has not", target)
+    verb("restart", "restart one process, as it was configured at the start or the last reload", target).add_argument(
         "name", metavar="NAME"
     )
     verb("check", "validate the configuration and its layouts; start nothing", file)

@@ -46,7 +46,7 @@ def open_supervised(name: str) -> Segment:
     if not segment.supervised:
         segment.close()
         raise NotRunningError(
-            f"the supervisor of instance {name!r} is dead: shmio-supervisor up starts anew, down clears what it left"
+            f"the supervisor of instance {name!r} is dead: shmio-supervisor up takes over what it left, down clears it"
         )
     return segment
 

@@ -22,6 +22,8 @@ MAX_PROCESSES: Final = 256
 
 # Offsets of what changes while the segment lives.
 GENERATION_OFFSET: Final = 48  # u32 generation, u32 section count: one word, so that they move together
+CONTROL_OFFSET: Final = 208
+CONTROL_SIZE: Final = 256
 HEARTBEAT_OFFSET: Final = 504
 SUPERVISOR_CELL: Final = 512
 
@@ -180,6 +182,11 @@ def read_sections(memory: memoryview, header: Header, count: int, name: str) -> 
 def finish(memory: memoryview) -> None:
     """Write the magic: from now on the segment can be opened."""
     _atomics.store64(memory, 0, MAGIC)
+
+
+def write_control(memory: memoryview, path: str) -> None:
+    """Tell where the control socket is by now."""
+    memory[CONTROL_OFFSET : CONTROL_OFFSET + CONTROL_SIZE] = path.encode().ljust(CONTROL_SIZE, b"\0")
 
 
 def write_supervisor(memory: memoryview, pid: int, state: State) -> None:

@@ -197,19 +197,20 @@ class ProcessTable(Sequence[ProcessSlot]):
             at = header.processes_offset + index * SLOT_SIZE
             _FIXED.pack_into(memory, at, name.encode(), kind.encode(), 0 if writer is None else writer + 1)
 
-    @property
-    def vacant(self) -> int:
-        """Slots that are left for further processes."""
-        return self._header.process_capacity - len(self.guests) - len(self._slots)
+    def require(self, count: int) -> None:
+        """Make sure that so many processes can be added; SegmentError."""
+        vacant = self._header.process_capacity - len(self.guests) - len(self._slots)
+        if count > vacant:
+            raise SegmentError(
+                f"segment {self._shared.name} has room for {vacant} more processes, not for {count}: "
+                "stop the instance and start it anew"
+            )
 
     def add(self, spec: ProcessSpec) -> ProcessSlot:
         """Give a vacant slot to a process; the supervisor's alone. SegmentError: there is none."""
+        self.require(1)
         taken = {slot.index for slot in (*self._slots, *self.guests)}
-        index = next((i for i in range(self._header.process_capacity) if i not in taken), None)
-        if index is None:
-            raise SegmentError(
-                f"segment {self._shared.name} has no room for process {spec.name}: stop the instance and start it anew"
-            )
+        index = next(i for i in range(self._header.process_capacity) if i not in taken)
         at = self._header.processes_offset + index * SLOT_SIZE
         writer = WRITERS.get(spec.kind)
         fields = _FIXED.pack(spec.name.encode(), spec.kind.encode(), 0 if writer is None else writer + 1)

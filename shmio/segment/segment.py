@@ -231,6 +231,11 @@ class Segment:
         header.write_supervisor(self.memory, pid, state)
         supervisor_beat(self.memory)
 
+    def lead_to(self, control: str) -> None:
+        """Tell another path of the control socket; the supervisor's alone. Who has opened the segment keeps the old."""
+        header.write_control(self.memory, control)
+        self.header = Header.read(self.memory, self.shared.name)
+
     def unlink(self) -> None:
         """Remove the name, if it is still this segment's. Only a clean stop does this."""
         if self.shared.current():

@@ -5,6 +5,7 @@ request                                   answer                                
 ========================================  =================================================  =======================
 ``{"do": "stop"}``                        ``{"ok": true}``                                   all is stopped
 ``{"do": "restart", "name": "cell"}``     ``{"ok": true}``                                   the process runs again
+``{"do": "reload"}``                      ``{"ok": true, "done": [lines], …}``               the change is over
 ``{"do": "where"}``                       ``{"ok": true, "config": …, "log_dir": …}``        at once
 anything else                             ``{"error": "…"}``                                 at once
 ========================================  =================================================  =======================
@@ -40,21 +41,30 @@ MAX_PATH_BYTES: Final = 107  # sun_path holds 108 with the final zero, unix(7)
 _CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
 
-class Stop(msgspec.Struct, tag_field="do", tag="stop", forbid_unknown_fields=True):
+class _Request(msgspec.Struct, tag_field="do", forbid_unknown_fields=True, kw_only=True):
+    until_ns: int | None = None
+    """CLOCK_MONOTONIC at which the client gives up: from then on it is not carried out."""
+
+
+class Stop(_Request, tag="stop"):
     """Stop the instance."""
 
 
-class Restart(msgspec.Struct, tag_field="do", tag="restart", forbid_unknown_fields=True):
+class Restart(_Request, tag="restart"):
     """Restart one process."""
 
     name: str
 
 
-class Where(msgspec.Struct, tag_field="do", tag="where", forbid_unknown_fields=True):
+class Reload(_Request, tag="reload"):
+    """Read the configuration again, and take over what has changed."""
+
+
+class Where(_Request, tag="where"):
     """Tell which configuration the instance was started from, and where it logs."""
 
 
-Request = Stop | Restart | Where
+Request = Stop | Restart | Reload | Where
 
 
 class Answer:
@@ -140,6 +150,9 @@ class ControlServer:
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             self.answer(client, {"error": f"not a request: {error}"})
         else:
+            if request.until_ns is not None and time.monotonic_ns() >= request.until_ns:
+                self.answer(client, {"error": "the request came too late and is not carried out"})
+                return
             self._handle(request, Answer(self, client))
 
     def answer(self, client: socket.socket, message: dict[str, object]) -> None:
@@ -191,7 +204,8 @@ def request(
         try:
             client.settimeout(timeout_s)
             client.connect(path)
-            client.sendall(msgspec.json.encode(message) + b"\n")
+            timed = msgspec.structs.replace(message, until_ns=round(deadline * 1e9))
+            client.sendall(msgspec.json.encode(timed) + b"\n")
             while not received.endswith(b"\n"):
                 data = _wait(client, deadline, lost)
                 if not data or len(received) > MAX_ANSWER_BYTES:

@@ -1,4 +1,4 @@
-"""A job together with its life and its process, and what the log says about them."""
+"""A process's slot together with its job, its life and its process, and what the log says about them."""
 
 from __future__ import annotations
 
@@ -8,25 +8,57 @@ from shmio.logs import fields
 from shmio.segment import Activity, ProcessSlot
 from shmio.supervisor import policy
 from shmio.supervisor.control import Answer
-from shmio.supervisor.plan import Job
+from shmio.supervisor.plan import RANKS, Job
 from shmio.supervisor.policy import Life, Limits
-from shmio.supervisor.process import Child, describe_end
+from shmio.supervisor.process import Adopted, Child, describe_end
 from shmio.supervisor.states import Action, State
 
 log = logging.getLogger("shmio.supervisor")
 
 
 class Managed:
-    """A job, its life, and its process while it has one."""
+    """A slot, the job that is to run there, its life, and its process while it has one."""
 
-    def __init__(self, job: Job, slot: ProcessSlot) -> None:
-        self.job = job
+    def __init__(self, slot: ProcessSlot) -> None:
         self.slot = slot
         self.life = Life()
-        self.child: Child | None = None
+        self.child: Child | Adopted | None = None
         self.waiting: list[Answer] = []
+        self._job: Job | None = None
         self._beat_ns = 0
         self._quiet_ns = 0
+
+    @property
+    def name(self) -> str:
+        """Name of the process."""
+        return self.slot.name
+
+    @property
+    def rank(self) -> int:
+        """Place in the order of start; what this version does not know is stopped last."""
+        return RANKS.get(self.slot.kind, 0)
+
+    @property
+    def job(self) -> Job:
+        """What it runs; there is none for a process that is found and only to be stopped."""
+        if self._job is None:
+            raise LookupError(f"{self.name} has no job")
+        return self._job
+
+    def renew(self, job: Job) -> None:
+        """Begin a new life with another job."""
+        self._job = job
+        self.life = Life()
+
+    def keep(self, job: Job) -> None:
+        """Go on with the same job, as a new plan has it."""
+        self._job = job
+
+    def adopt(self, child: Adopted) -> None:
+        """Take a process that another supervisor has started and that runs."""
+        told = self.slot.supervised
+        self.child = child
+        self.life = policy.adopted(told.spawned_ns, told.restarts)
 
     @property
     def ready(self) -> bool:
@@ -43,20 +75,32 @@ class Managed:
         self._quiet_ns = 0 if fresh else self._quiet_ns + elapsed_ns
         return self._quiet_ns
 
-    def end_note(self, pid: int, code: int) -> str:
+    def end_note(self, pid: int, code: int | None) -> str:
         """Why the process ended, with its own words if it left any."""
         end = describe_end(code)
-        if code <= 0:
+        if code is not None and code <= 0:
             return end
         report = self.slot.report
         words = report.note if report.pid == pid and report.note else ""
         words = words or (self.child.last_words() if self.child else "")
         return f"{words} ({end})" if words else end
 
+    def answer(self) -> None:
+        """Tell those who asked for a restart how it went, if it is over."""
+        state = self.life.state
+        if state not in (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED):
+            return
+        for answer in self.waiting:
+            if state is State.RUNNING:
+                answer.ok()
+            else:
+                answer.error(f"{self.name} did not come back: {self.life.note or state.value}")
+        self.waiting.clear()
+
 
 def log_step(managed: Managed, before: Life, action: Action | None, limits: Limits) -> None:
     """Tell about one edge of the graph, unless it says nothing."""
-    name, life = managed.job.name, managed.life
+    name, life = managed.name, managed.life
     if life.state is State.RUNNING:
         log.info("%s running", name, extra=fields(pid=managed.child.pid) if managed.child else None)
     elif life.state is State.HUNG:

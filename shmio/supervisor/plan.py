@@ -57,7 +57,8 @@ class Job:
                 "kind": self.kind,
                 "log_file": str(self.log_file),
                 "config": self.config,
-            }
+            },
+            order="deterministic",  # it is compared with what an earlier supervisor gave
         )
 
 

@@ -123,8 +123,13 @@ def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits) 
     return None
 
 
-def ended(returncode: int) -> Event:
-    """What the end of a process means."""
+def adopted(spawned_ns: int, restarts: int) -> Life:
+    """The life of a process that runs, as far as its former supervisor has told of it."""
+    return Life(State.RUNNING, spawned_ns=spawned_ns, ready_ns=spawned_ns, starts=restarts + 1, ran=True)
+
+
+def ended(returncode: int | None) -> Event:
+    """What the end of a process means; None: its exit status is not known."""
     return Event.REFUSAL if returncode == REFUSED_STATUS else Event.EXIT
 
 

@@ -1,9 +1,10 @@
-"""One child process: started by exec, watched through its pidfd, its end put into words."""
+"""One process: started by exec or taken over, watched through its pidfd, its end put into words."""
 
 from __future__ import annotations
 
 import os
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -12,6 +13,8 @@ from pathlib import Path
 
 import shmio
 
+NOTIFY_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
+"""What a service manager tells its service by, sd_notify(3), sd_watchdog_enabled(3)."""
 _PACKAGED = ("site-packages", "dist-packages")
 _TAIL_BYTES = 4096
 _STAMP = re.compile(r"^\S+Z [A-Z]+ +\S+\[\d+\] ")  # what begins a line of shmio.logs
@@ -79,6 +82,36 @@ class Child:
         return ""
 
 
+class Adopted:
+    """A running process that another supervisor has started: not a child of this one, so it has no exit status."""
+
+    def __init__(self, pid: int, pidfd: int) -> None:
+        """``pidfd`` is closed by :meth:`reap`."""
+        self.pid = pid
+        self.pidfd = pidfd
+
+    def terminate(self) -> None:
+        """Ask it to end."""
+        self._send(signal.SIGTERM)
+
+    def kill(self) -> None:
+        """End it."""
+        self._send(signal.SIGKILL)
+
+    def _send(self, sign: signal.Signals) -> None:
+        with suppress(ProcessLookupError):
+            signal.pidfd_send_signal(self.pidfd, sign)
+
+    def reap(self) -> None:
+        """Wait for its end."""
+        select.select([self.pidfd], [], [])
+        os.close(self.pidfd)
+
+    def last_words(self) -> str:
+        """It is not known where in its log file they would begin."""
+        return ""
+
+
 def _open_log(file: Path) -> int:
     """Open a log file for appending. A controller is read with or without one."""
     try:
@@ -88,8 +121,10 @@ def _open_log(file: Path) -> int:
         return os.open(os.devnull, os.O_WRONLY | os.O_CLOEXEC)
 
 
-def describe_end(code: int) -> str:
-    """A return code in words."""
+def describe_end(code: int | None) -> str:
+    """A return code in words; None: it is not known."""
+    if code is None:
+        return "ended; its exit status is not known, for an earlier supervisor had started it"
     if code >= 0:
         return f"exit status {code}" if code else "ended by itself"
     try:
@@ -105,6 +140,8 @@ def child_environment() -> dict[str, str]:
     the standard library).
     """
     environment = dict(os.environ, PYTHONFAULTHANDLER="1")
+    for name in NOTIFY_VARIABLES:  # a child must not speak to the service manager in the supervisor's name
+        environment.pop(name, None)
     root = Path(shmio.__file__).parents[1]
     if root.name not in _PACKAGED:
         path = environment.get("PYTHONPATH")

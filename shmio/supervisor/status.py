@@ -88,9 +88,7 @@ def _read(segment: Segment) -> InstanceStatus:
         if not any(process.pid for process in processes):
             status.note = "its supervisor died and left the segment; the next up or down clears it"
             return status
-        status.note = (
-            "its supervisor is dead, nothing watches the processes; up stops them and starts anew, down stops them"
-        )
+        status.note = "its supervisor is dead, nothing watches the processes; up takes them over, down stops them"
         status.state = str(InstanceState.DEGRADED)
     else:
         status.supervisor = SupervisorStatus(pid, _seconds(now_ns - segment.header.started_ns))

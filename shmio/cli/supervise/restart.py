@@ -21,7 +21,7 @@ def execute(arguments: argparse.Namespace) -> int:
         print(f"{arguments.name} runs again")
         file = Path(ask(segment, control.Where(), WHERE_S)["config"])
         if _changed(file, segment):
-            print(f"{file} has changed since the start; restart keeps the old configuration, down and up take the new")
+            print(f"{file} has changed since the start; restart keeps the old configuration, reload takes the new")
     return 0
 
 

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import TextIO
@@ -19,10 +20,10 @@ from shmio.cli.supervise.prepare import Prepared, peer, prepare
 from shmio.cli.target import config_file
 from shmio.errors import ConfigError, ControlError, ShmioError
 from shmio.logs import printable
-from shmio.segment import PREFIX, State, leftover
+from shmio.segment import PREFIX, State
 from shmio.segment.segment import refuse_second
 from shmio.supervisor.main import Supervisor
-from shmio.supervisor.plan import MODES, Job
+from shmio.supervisor.plan import MODES, Job, Plan
 from shmio.supervisor.process import child_environment
 from shmio.supervisor.status import SourceStatus, read_status
 
@@ -51,8 +52,13 @@ def _foreground(prepared: Prepared) -> int:
     console.setFormatter(_Console())
     logs.setup(prepared.plan.log_dir / "supervisor.log", "supervisor")
     logging.getLogger("shmio.supervisor").addHandler(console)
-    Supervisor(prepared.plan).run()
+    Supervisor(prepared.plan, replan=_replan(prepared.plan)).run()
     return 0
+
+
+def _replan(plan: Plan) -> Callable[[], Plan]:
+    """What a reload makes of the same file by then."""
+    return lambda: prepare(plan.config_file, plan.mode).plan
 
 
 def _announce(prepared: Prepared) -> None:
@@ -94,7 +100,13 @@ def _detached(file: Path, mode: str, report: int) -> int:
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
         prepared = prepare(file, mode)
         logs.setup(prepared.plan.log_dir / "supervisor.log", "supervisor")
-        Supervisor(prepared.plan, on_state=lambda state: tell("ok") if state is not State.STOPPING else None).run()
+
+        def on_state(state: State) -> None:
+            if state is not State.STOPPING:
+                tell("\n".join(["ok", *supervisor.history]))
+
+        supervisor = Supervisor(prepared.plan, replan=_replan(prepared.plan), on_state=on_state)
+        supervisor.run()
     except (ShmioError, OSError) as error:
         tell(str(error))
         return 1
@@ -107,9 +119,6 @@ def _detach(prepared: Prepared) -> int:
     refuse_second(plan.instance)
     log_file = plan.log_dir / "supervisor.log"
     logs.setup(log_file, "supervisor")
-    for line in leftover.clear(plan.instance):  # here, where it can be said
-        logging.getLogger("shmio.supervisor").warning("%s", line)
-        _say(line)
     command = (sys.executable, "-P", "-m", "shmio.cli.supervisor", "up")
     reader, writer = os.pipe()
     with os.fdopen(reader, "rb") as answers, log_file.open("ab") as log:
@@ -129,10 +138,13 @@ def _detach(prepared: Prepared) -> int:
             child.terminate()
             child.wait()
             raise
+    answer, *history = answer.split("\n")
     if answer != "ok":
         child.wait()
         raise ControlError(answer or f"the supervisor died while it started; see {log_file}")
     child.returncode = 0  # it lives on, which Popen would complain about
+    for line in history:
+        _say(line)
     _announce(prepared)
     _tell_how(plan.instance)
     return 0

@@ -95,6 +95,14 @@ class Launched:
             path = segment.header.control
         return control.request(path, message, DEADLINE_S)
 
+    def plan(self, jobs: list[Any], **others: Any) -> None:
+        """Write what the instance is to be from the next reload on."""
+        (self.folder / "plan.json").write_text(json.dumps({"jobs": jobs, **others}))
+
+    def reload(self, jobs: list[Any], **others: Any) -> dict[str, Any]:
+        self.plan(jobs, **others)
+        return self.request(control.Reload())
+
     def log(self, name: str = "supervisor") -> str:
         return (self.folder / f"{name}.log").read_text()
 

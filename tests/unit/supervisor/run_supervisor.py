@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 from shmio import logs
-from shmio.errors import ShmioError
+from shmio.errors import ConfigError, ShmioError
 from shmio.layout.model import Layout, Register
 from shmio.segment import BlockSpec, State
 from shmio.supervisor.main import Supervisor
@@ -15,21 +16,46 @@ from shmio.supervisor.plan import Job, Plan
 from shmio.supervisor.policy import Limits
 
 instance, folder, jobs, limits = sys.argv[1], Path(sys.argv[2]), json.loads(sys.argv[3]), json.loads(sys.argv[4])
-layout = Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
-plan = Plan(
-    instance=instance,
-    mode="live",
-    group=None,
-    config_file=folder / "supervisor.toml",
-    log_dir=folder,
-    blocks=tuple(
-        BlockSpec(name, layout, 20_000_000, 500_000_000, 1 << 20) for name, kind, _ in jobs if kind == "source"
+LAYOUTS = {
+    "old": Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),)),
+    "new": Layout(
+        "DB1", 1, 4, False, (Register("b", "INT", (), 0, None, 2, 1), Register("a", "INT", (), 2, None, 2, 1))
     ),
-    jobs=tuple(
-        Job(name, kind, folder / f"{name}.log", {"behaviour": behaviour, "ends": str(folder / "ends")})
-        for name, kind, behaviour in jobs
-    ),
-)
+}
+
+
+def block(name: str, layout: Layout, ring_bytes: int) -> BlockSpec:
+    return BlockSpec(name, layout, 20_000_000, 500_000_000, ring_bytes)
+
+
+def make(settings: dict[str, Any]) -> Plan:
+    """``settings``: jobs as (name, kind, behaviour[, layout]), and what else of the plan is not as usual."""
+    return Plan(
+        instance=settings.get("instance", instance),
+        mode=settings.get("mode", "live"),
+        group=None,
+        config_file=folder / "supervisor.toml",
+        log_dir=Path(settings.get("log_dir", folder)),
+        blocks=tuple(
+            block(name, LAYOUTS[layout[0] if layout else "old"], settings.get("ring", 1 << 20))
+            for name, kind, _, *layout in settings["jobs"]
+            if kind == "source"
+        ),
+        jobs=tuple(
+            Job(name, kind, folder / f"{name}.log", {"behaviour": behaviour, "ends": str(folder / "ends")})
+            for name, kind, behaviour, *_ in settings["jobs"]
+        ),
+    )
+
+
+def replan() -> Plan:
+    """As the file has it by now."""
+    try:
+        return make(json.loads((folder / "plan.json").read_text()))
+    except ValueError:
+        raise ConfigError("plan.json: no JSON") from None
+
+
 logs.setup(folder / "supervisor.log", "supervisor")
 modules = dict.fromkeys(("source", "emulator", "grpc"), "fake_worker")
 
@@ -40,6 +66,6 @@ def tell(state: State) -> None:
 
 
 try:
-    Supervisor(plan, limits=Limits(**limits), modules=modules, on_state=tell).run()
+    Supervisor(make({"jobs": jobs}), replan=replan, limits=Limits(**limits), modules=modules, on_state=tell).run()
 except ShmioError as error:
     sys.exit(str(error))
