@@ -1,0 +1,82 @@
+"""A change of a running instance under way: what must go is stopped, the blocks are changed, what is new is started."""
+
+from __future__ import annotations
+
+from shmio.segment import Segment
+from shmio.supervisor.fleet import Fleet
+from shmio.supervisor.plan import Job, Plan
+from shmio.supervisor.reconcile import reconcile
+from shmio.supervisor.states import Event, State
+
+SETTLED = (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED)
+
+
+class Change:
+    """Brings an instance to a plan, a step at each call of :meth:`step`; what is as planned already is not touched."""
+
+    def __init__(self, fleet: Fleet, segment: Segment, plan: Plan) -> None:
+        """Begin. SegmentError: no room for what is new; then nothing has changed."""
+        self.plan = plan
+        self.changes = reconcile(plan, segment.header.epoch, fleet.present(), segment.blocks.values())
+        self._fleet = fleet
+        self._segment = segment
+        self._jobs = {job.name: job for job in plan.jobs}
+        self._stopped = False
+        segment.reserve(self.changes.add)
+        segment.processes.require(len(self.changes.started) - len(self.changes.stopped))
+        for name in self.changes.kept:
+            self._fleet.named(name).keep(self._jobs[name])
+
+    @property
+    def _leaving(self) -> tuple[str, ...]:
+        return (*self.changes.stopped, *self.changes.replaced)
+
+    @property
+    def _coming(self) -> list[Job]:
+        names = {*self.changes.started, *self.changes.replaced}
+        return [job for job in self.plan.jobs if job.name in names]
+
+    def step(self) -> bool:
+        """Do what can be done now; whether the change is over: each new process runs, or has failed once."""
+        if not self._stopped:
+            self._stopped = self._stop()
+            if self._stopped:
+                self._turn()
+        if self._stopped:
+            self._fleet.start_due()
+        return self._stopped and all(self._has_come(job.name) for job in self._coming)
+
+    def _has_come(self, name: str) -> bool:
+        life = self._fleet.named(name).life
+        return life.starts > 0 and life.state in SETTLED
+
+    def _stop(self) -> bool:
+        """Have all end that must; whether they have."""
+        leaving = [self._fleet.named(name) for name in self._leaving]
+        for managed in leaving:
+            if managed.life.state not in (State.STOPPED, State.STOPPING):
+                self._fleet.apply(managed, Event.STOP)
+        return all(managed.life.state is State.STOPPED for managed in leaving)
+
+    def _turn(self) -> None:
+        """Between the old and the new."""
+        if self.changes.add or self.changes.retire:
+            self._segment.change(self.changes.add, self.changes.retire)
+        for name in self.changes.stopped:
+            self._fleet.drop(name)
+        for job in self._coming:
+            self._fleet.assign(job)
+
+    def outcome(self) -> tuple[list[str], list[str]]:
+        """What was done, and what came out badly, a line each."""
+        done = [f"{name}: stopped" for name in self.changes.stopped]
+        problems = []
+        for job in self._coming:
+            managed = self._fleet.named(job.name)
+            how = "restarted, as its configuration has changed" if job.name in self.changes.replaced else "started"
+            if managed.life.state is State.RUNNING:
+                done.append(f"{job.name}: {how}")
+            else:
+                why = managed.life.note or managed.life.state.value
+                problems.append(f"{job.name}: {how}, but it does not run: {why}")
+        return done, problems

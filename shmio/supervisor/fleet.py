@@ -1,0 +1,156 @@
+"""The processes of an instance: what ``policy`` decides about them is done here."""
+
+from __future__ import annotations
+
+import selectors
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Final
+
+from shmio.segment import Phase, ProcessSpec, Segment, Supervised
+from shmio.supervisor import policy
+from shmio.supervisor.managed import Managed, log_step
+from shmio.supervisor.plan import Job
+from shmio.supervisor.policy import Limits
+from shmio.supervisor.process import Adopted, Child
+from shmio.supervisor.reconcile import Present, digest
+from shmio.supervisor.states import PHASES, Action, Event, State
+
+TICK_S: Final = 0.1
+"""How often heartbeats are looked at."""
+
+
+class Fleet:
+    """All processes of a segment, by name. Selector keys of its own have a function without arguments as their data."""
+
+    def __init__(
+        self, segment: Segment, selector: selectors.BaseSelector, limits: Limits, modules: Mapping[str, str]
+    ) -> None:
+        self._segment = segment
+        self._selector = selector
+        self._limits = limits
+        self._modules = modules
+        self._managed: dict[str, Managed] = {}
+        self._ticked_ns = time.monotonic_ns()
+        for slot in segment.processes:
+            self._managed[slot.name] = Managed(slot)
+
+    def __iter__(self) -> Iterator[Managed]:
+        return iter(self._managed.values())
+
+    @property
+    def names(self) -> list[str]:
+        """Names of all."""
+        return list(self._managed)
+
+    def named(self, name: str) -> Managed:
+        """The process of this name; KeyError."""
+        return self._managed[name]
+
+    @property
+    def ranked(self) -> list[tuple[int, policy.Life]]:
+        """Rank and life of each, in the order of iteration."""
+        return [(managed.rank, managed.life) for managed in self]
+
+    def present(self) -> dict[str, Present]:
+        """What there is, for comparing with a plan. One that can never work as configured is not well."""
+        return {
+            m.name: Present(m.slot.kind, m.slot.digest, m.life.state not in (State.STOPPED, State.FATAL)) for m in self
+        }
+
+    def assign(self, job: Job) -> None:
+        """Have a process, of which none lives, run this job from its next start on; a new one gets a slot."""
+        managed = self._managed.get(job.name)
+        if managed is None:
+            slot = self._segment.processes.add(ProcessSpec(job.name, job.kind))
+            managed = self._managed[job.name] = Managed(slot)
+        managed.renew(job)
+
+    def drop(self, name: str) -> None:
+        """Forget a process that has ended, and free its slot."""
+        managed = self._managed.pop(name)
+        self._segment.processes.remove(managed.slot)
+
+    def adopt(self, managed: Managed, child: Adopted) -> None:
+        """Watch a living process that another supervisor has started."""
+        managed.adopt(child)
+        self._watch(managed, child)
+
+    def start_due(self) -> None:
+        """Start the processes whose turn has come."""
+        self._apply_all(policy.to_start(self.ranked), Event.START)
+
+    def stop_due(self) -> None:
+        """Stop the processes whose turn has come, when all are to be stopped."""
+        self._apply_all(policy.to_stop(self.ranked), Event.STOP)
+
+    def _apply_all(self, indices: list[int], event: Event) -> None:
+        managed = list(self)
+        for index in indices:
+            self.apply(managed[index], event)
+
+    def look(self, now_ns: int) -> None:
+        """Look at each heartbeat and at each time that is over."""
+        # If the supervisor itself was held up (host suspended, container paused), so were the others: what it did not
+        # live through does not count against them.
+        elapsed_ns = min(now_ns - self._ticked_ns, round(2 * TICK_S * 1e9))
+        self._ticked_ns = now_ns
+        for managed in self:
+            quiet_ns = managed.quiet_ns(elapsed_ns)
+            event = policy.due(managed.life, now_ns, ready=managed.ready, quiet_ns=quiet_ns, limits=self._limits)
+            if event is not None:
+                self.apply(managed, event)
+
+    def apply(self, managed: Managed, event: Event, note: str = "") -> None:
+        """Let something happen to a process, and do what follows from it."""
+        before = managed.life
+        managed.life, action = policy.step(before, event, time.monotonic_ns(), self._limits, note)
+        if managed.life == before:
+            return
+        if action is Action.SPAWN:
+            self._publish(managed)  # before the process can report
+            self._spawn(managed)
+            return
+        if managed.child is not None and action is Action.TERMINATE:
+            managed.child.terminate()
+        elif managed.child is not None and action is Action.KILL:
+            managed.child.kill()
+        self._publish(managed)
+        log_step(managed, before, action, self._limits)
+        managed.answer()
+
+    def _spawn(self, managed: Managed) -> None:
+        job = managed.job
+        description = job.describe(self._segment.instance, self._segment.header.epoch)
+        managed.slot.digest = digest(description)
+        try:
+            child = Child.spawn(self._modules[job.kind], description, job.log_file)
+        except OSError as error:
+            self.apply(managed, Event.EXIT, f"cannot be started: {error.strerror}")
+            return
+        managed.child = child
+        self._watch(managed, child)
+
+    def _watch(self, managed: Managed, child: Child | Adopted) -> None:
+        self._selector.register(child.pidfd, selectors.EVENT_READ, lambda: self._on_exit(managed, child))
+
+    def _on_exit(self, managed: Managed, child: Child | Adopted) -> None:
+        self._selector.unregister(child.pidfd)
+        code = child.reap()
+        note = managed.end_note(child.pid, code)
+        managed.child = None
+        self.apply(managed, policy.ended(code), note)
+
+    def _publish(self, managed: Managed) -> None:
+        life = managed.life
+        managed.slot.supervised = Supervised(PHASES[life.state], life.restarts, life.spawned_ns, life.note)
+
+    def kill_all(self) -> None:
+        """Leave no process behind, should the loop itself have failed; after a stop there is none."""
+        for managed in self:
+            if managed.child is not None:
+                managed.child.kill()
+                managed.child.reap()
+                managed.life = replace(managed.life, state=State.STOPPED)
+                managed.slot.supervised = Supervised(Phase.STOPPED)

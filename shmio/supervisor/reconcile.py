@@ -1,0 +1,102 @@
+"""What must be done so that an instance becomes as planned, found by comparing it with what is there. No I/O.
+
+One rule for a reload and for taking over what a dead supervisor left: what is as planned already is not touched.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from shmio.segment import Block, BlockSpec
+from shmio.supervisor.plan import Plan
+
+
+class Present(NamedTuple):
+    """A process that the instance has. ``well``: it is there and works, or is being brought back."""
+
+    kind: str
+    digest: bytes
+    well: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """What to do, by name: stop, then change the blocks, then start. ``replaced`` ones are stopped and started."""
+
+    kept: tuple[str, ...]
+    started: tuple[str, ...]
+    stopped: tuple[str, ...]
+    replaced: tuple[str, ...]
+    add: tuple[BlockSpec, ...]
+    retire: tuple[str, ...]
+
+    def __bool__(self) -> bool:
+        return bool(self.started or self.stopped or self.replaced or self.add or self.retire)
+
+
+def digest(description: bytes) -> bytes:
+    """What a process was started from, for comparing: SHA-256 of its description."""
+    return hashlib.sha256(description).digest()
+
+
+def reconcile(plan: Plan, epoch: int, processes: Mapping[str, Present], blocks: Iterable[Block]) -> Changes:
+    """Compare a plan with the processes, by name, and the blocks that there are.
+
+    A source whose block is replaced is replaced with it: it writes to one block for life.
+    """
+    present = {block.source: block for block in blocks}
+    add = tuple(spec for spec in plan.blocks if spec.source not in present or not same(spec, present[spec.source]))
+    planned = {spec.source for spec in plan.blocks}
+    retire = (*(spec.source for spec in add if spec.source in present), *(n for n in present if n not in planned))
+    changed = {spec.source for spec in add}
+    kept, started, replaced = [], [], []
+    stopped = [name for name in processes if name not in {job.name for job in plan.jobs}]
+    for job in plan.jobs:
+        there = processes.get(job.name)
+        if there is None:
+            started.append(job.name)
+        elif there.kind != job.kind:  # another process of the same name
+            stopped.append(job.name)
+            started.append(job.name)
+        elif (
+            there.well
+            and there.digest == digest(job.describe(plan.instance, epoch))
+            and not (job.kind == "source" and job.name in changed)
+        ):
+            kept.append(job.name)
+        else:
+            replaced.append(job.name)
+    return Changes(tuple(kept), tuple(started), tuple(stopped), tuple(replaced), add, retire)
+
+
+def same(spec: BlockSpec, block: Block) -> bool:
+    """Whether a block is as this one would be."""
+    return (
+        block.layout.hash == spec.layout.hash
+        and block.ring.slot_count == spec.slots
+        and (block.period_ns, block.stale_ns) == (spec.period_ns, spec.stale_ns)
+        and block.attributes == spec.attributes
+    )
+
+
+def refusal(plan: Plan, running: Plan) -> str | None:
+    """Why a running instance cannot become as planned; None if it can."""
+    fixed = {
+        "instance.name": (running.instance, plan.instance),
+        "instance.group": (running.group, plan.group),
+        "instance.log_dir": (running.log_dir, plan.log_dir),
+    }
+    for key, (old, new) in fixed.items():
+        if old != new:
+            return (
+                f"{key}: {_shown(new)} instead of {_shown(old)} cannot be taken while the instance runs; "
+                "nothing has changed: shmio-supervisor down and up take it"
+            )
+    return None
+
+
+def _shown(value: object) -> str:
+    return "none" if value is None else repr(str(value))

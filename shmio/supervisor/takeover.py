@@ -1,0 +1,111 @@
+"""What an earlier supervisor left is taken over: its segment as it is, and its processes as they run."""
+
+from __future__ import annotations
+
+import grp
+import os
+import stat
+import time
+from dataclasses import dataclass, field
+
+from shmio.errors import FormatError, SegmentError, UnfinishedError
+from shmio.segment import Activity, ProcessSlot, Segment, leftover, shm
+from shmio.segment.shm import SharedObject
+from shmio.supervisor.control import remove_socket
+from shmio.supervisor.plan import Plan
+from shmio.supervisor.policy import Limits
+from shmio.supervisor.process import Adopted
+
+
+@dataclass
+class Found:
+    """A segment whose supervisor's lock is ours now, and the processes in it that go on."""
+
+    segment: Segment
+    children: list[tuple[ProcessSlot, Adopted]] = field(default_factory=list)
+
+
+def take_over(plan: Plan, control: str, limits: Limits) -> tuple[Found | None, list[str]]:
+    """What can be taken over for this plan, if anything; all else is stopped and removed. What was done, a line each.
+
+    ``control``: path of the new control socket, to which the segment leads from now on.
+    AlreadyRunningError: a supervisor is alive. SegmentError: no permission, or a process cannot be identified.
+    """
+    shared = leftover.claim(plan.instance)
+    if shared is None:
+        return None, []
+    try:
+        segment, done = _fitting(shared, plan)
+        if segment is not None:
+            children, lines = _sort(segment, shared, limits)
+            if segment.header.control != control:
+                remove_socket(segment.header.control)
+                segment.lead_to(control)
+            return Found(segment, children), [*done, *lines]
+        done += leftover.clear_claimed(shared, plan.instance)
+    except BaseException:
+        shared.close()
+        raise
+    shared.close()
+    return None, done
+
+
+def _fitting(shared: SharedObject, plan: Plan) -> tuple[Segment | None, list[str]]:
+    """The segment, if this plan's instance can go on in it; else why not, if that needs saying."""
+    try:
+        segment = leftover.read(shared, plan.instance)
+    except (FormatError, UnfinishedError):  # told by who clears it
+        return None, []
+    if not any(slot.alive() for slot in segment.processes):
+        return None, []
+    if segment.header.mode != plan.mode:
+        return None, [f"{plan.instance} ran in mode {segment.header.mode}, not {plan.mode}: it starts anew"]
+    status = (shm.DIRECTORY / shared.name).stat()
+    if status.st_uid != os.geteuid():
+        return None, [f"segment {shared.name} belongs to another user: it starts anew"]
+    if stat.S_IMODE(status.st_mode) & 0o040 != (0o040 if plan.group else 0) or (
+        plan.group and status.st_gid != grp.getgrnam(plan.group).gr_gid
+    ):
+        return None, [f"instance.group has changed, {plan.instance} starts anew"]
+    return segment, []
+
+
+def _sort(
+    segment: Segment, shared: SharedObject, limits: Limits
+) -> tuple[list[tuple[ProcessSlot, Adopted]], list[str]]:
+    """The processes that run well; the others are ended. SegmentError: one cannot be told from a stranger's."""
+    living = {slot.name: slot for slot in segment.processes if slot.alive()}
+    fit: list[tuple[ProcessSlot, Adopted]] = []
+    done, unfit = [], []
+    deadline = time.monotonic() + leftover.GRACE_S
+    while living:
+        for name, slot in list(living.items()):
+            worker = leftover.holder(slot, shared)
+            if worker is not None and (reason := _ails(slot, limits)):
+                unfit.append(worker)
+                done.append(f"{name}, pid {worker.pid}, {reason}: it is replaced")
+            elif worker is not None:
+                fit.append((slot, Adopted(worker.pid, worker.pidfd)))
+                done.append(f"took over {name}, pid {worker.pid}, which had lost its supervisor")
+            if worker is not None or not slot.alive():
+                del living[name]
+        if living and time.monotonic() > deadline:
+            for pidfd in (*(worker.pidfd for worker in unfit), *(child.pidfd for _, child in fit)):
+                os.close(pidfd)
+            raise SegmentError(
+                f"instance {segment.instance!r} has processes that cannot be told from others: "
+                f"{', '.join(living)}; end them first"
+            )
+        time.sleep(0.01 if living else 0)
+    leftover.end(unfit)
+    for worker in unfit:
+        os.close(worker.pidfd)
+    return fit, done
+
+
+def _ails(slot: ProcessSlot, limits: Limits) -> str | None:
+    """Why a living process cannot be taken over as it is; None if it can."""
+    if slot.report.activity is not Activity.RUNNING:
+        return f"was {slot.report.activity.name.lower()}"
+    quiet_s = (time.monotonic_ns() - slot.heartbeat_ns) / 1e9
+    return f"has given no heartbeat for {quiet_s:.0f} s" if quiet_s >= limits.hang_s else None

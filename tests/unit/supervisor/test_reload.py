@@ -1,0 +1,177 @@
+"""A running instance that becomes as its configuration is by now, with real processes."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import shmio
+from shmio.errors import ControlError
+from shmio.segment import Quality, Segment
+from shmio.supervisor.control import Reload, Restart
+from tests.unit.supervisor.harness import CELL, Job, Launch, until
+
+PRESS: Job = ("press", "source", ["good"])
+
+
+def test_nothing_new_touches_nothing(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    before = cell.pids()
+    assert cell.reload(CELL) == {"ok": True, "done": [], "problems": [], "kept": ["plc", "cell", "grpc"]}
+    assert cell.pids() == before
+
+
+def test_a_source_is_added_and_nothing_else_is_touched(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    before = cell.pids()
+    with shmio.attach(cell.instance) as reader:
+        assert cell.reload([*CELL, PRESS])["done"] == ["press: started"]
+        after = cell.pids()
+        assert after.pop("press") is not None
+        assert after == before
+        until(lambda: reader.read("press/a").quality is Quality.GOOD)
+        assert cell.of("press").state == "running"
+        assert cell.request(Restart("press")) == {"ok": True}
+
+
+def test_a_source_is_removed_and_its_place_is_used_again(launch: Launch) -> None:
+    cell = launch([*CELL, PRESS])
+    cell.wait_state("running")
+    before = cell.pids()
+    gone = before.pop("press")
+    with shmio.attach(cell.instance) as reader:
+        held = reader.block("press")
+        assert cell.reload(CELL)["done"] == ["press: stopped"]
+        assert cell.pids() == before
+        assert held.retired
+        assert reader.sources == ["cell"]
+    assert gone is not None
+    assert not Path(f"/proc/{gone}").exists()
+    with Segment.open(cell.instance) as segment:
+        places = {slot.name: slot.index for slot in segment.processes}
+    assert cell.reload([*CELL, ("robot", "source", ["good"])])["done"] == ["robot: started"]
+    with Segment.open(cell.instance) as segment:
+        assert segment.processes.find("robot").index not in places.values()
+        assert segment.processes.find("robot").index == max(places.values()) + 1
+        assert segment.processes.find("robot").supervised.restarts == 0
+    assert [slot.name for slot in segment.processes.guests] == ["guest-1", "guest-2", "guest-3", "guest-4"]
+
+
+def test_what_is_configured_otherwise_is_replaced(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    before = cell.pids()
+    changed = [CELL[0], CELL[1], ("grpc", "grpc", ["good", "good"])]
+    answer = cell.reload(changed)
+    assert answer["done"] == ["grpc: restarted, as its configuration has changed"]
+    after = cell.pids()
+    assert after.pop("grpc") != before.pop("grpc")
+    assert after == before
+    assert cell.reload(changed)["done"] == []
+
+
+def test_another_layout_replaces_block_and_source_and_streams_go_on(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    before = cell.pids()
+    with shmio.attach(cell.instance) as reader:
+        stream = reader.stream("cell", timeout_s=20)
+        assert next(stream).layout.size == 2
+        answer = cell.reload([CELL[0], (*CELL[1], "new"), CELL[2]])
+        assert answer["done"] == ["cell: restarted, as its configuration has changed"]
+        assert next(view for view in stream if view.layout.size == 4)["a"] == 0
+    after = cell.pids()
+    assert after.pop("cell") != before.pop("cell")
+    assert after == before
+
+
+def test_a_name_can_become_another_kind_of_process(launch: Launch) -> None:
+    cell = launch([*CELL, PRESS])
+    cell.wait_state("running")
+    answer = cell.reload([*CELL, ("press", "emulator", ["good"])])
+    assert answer["done"] == ["press: stopped", "press: started"]
+    assert (cell.of("press").kind, cell.of("press").state) == ("emulator", "running")
+
+
+def test_a_wrong_configuration_changes_nothing(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    before = cell.pids()
+    (cell.folder / "plan.json").write_text("{")
+    with Segment.open(cell.instance) as segment:
+        generation = segment.generation
+        with pytest.raises(ControlError, match=r"^plan.json: no JSON$"):
+            cell.request(Reload())
+        assert segment.generation == generation
+    assert cell.pids() == before
+
+
+@pytest.mark.parametrize(
+    ("others", "refused"),
+    [({"instance": "other"}, "instance.name"), ({"log_dir": "/elsewhere"}, "instance.log_dir")],
+)
+def test_what_cannot_change_is_refused_by_its_key(launch: Launch, others: dict[str, Any], refused: str) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    before = cell.pids()
+    with pytest.raises(ControlError, match=rf"{refused}: .* cannot be taken while the instance runs.*down and up"):
+        cell.reload([*CELL, PRESS], **others)
+    assert cell.pids() == before
+
+
+def test_no_room_changes_nothing(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    before = cell.pids()
+    many = [(f"more-{i}", "source", ["good"]) for i in range(41)]
+    with pytest.raises(ControlError, match="no room for more changes"):
+        cell.reload([*CELL[1:], *many])
+    emulators = [(f"more-{i}", "emulator", ["good"]) for i in range(17)]
+    with pytest.raises(ControlError, match="room for 16 more processes, not for 17"):
+        cell.reload([*CELL, *emulators])
+    assert cell.pids() == before
+    with Segment.open(cell.instance) as segment:
+        assert list(segment.blocks) == ["cell"]
+
+
+def test_what_does_not_run_is_told_and_the_rest_goes_on(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    before = cell.pids()
+    answer = cell.reload([*CELL, ("press", "source", ["unfit"])])
+    assert answer["problems"] == ["press: started, but it does not run: no such thing here (exit status 2)"]
+    assert cell.of("press").state == "fatal"
+    assert cell.status().state == "degraded"
+    assert {name: pid for name, pid in cell.pids().items() if name != "press"} == before
+    answer = cell.reload([*CELL, PRESS])
+    assert answer["done"] == ["press: restarted, as its configuration has changed"]
+    assert cell.of("press").state == "running"
+
+
+def test_a_stop_ends_a_change_under_way(launch: Launch) -> None:
+    cell = launch([*CELL, ("press", "source", ["stubborn"])], grace_s=3600)
+    cell.wait_state("running")
+    outcomes: list[str] = []
+
+    def reload() -> None:
+        try:
+            cell.reload(CELL)
+        except ControlError as error:
+            outcomes.append(str(error))
+
+    asking = threading.Thread(target=reload)
+    asking.start()
+    until(lambda: cell.of("press").note == "stopping")
+    with pytest.raises(ControlError, match="just being changed"):
+        cell.request(Restart("plc"))
+    cell.process.send_signal(signal.SIGTERM)
+    asking.join()
+    assert outcomes == ["the instance is stopping"]
+    cell.process.send_signal(signal.SIGTERM)
+    assert cell.wait_end() == 0
