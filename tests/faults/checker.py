@@ -34,7 +34,7 @@ class Description:
     reader: str
     """The program of examples/reader.c, compiled."""
     sources: tuple[Mapping[str, Any], ...]
-    """The fields of :class:`Source`, with the path of a file for ``truth``."""
+    """The fields of :class:`Source`, with paths of files for ``truth`` and ``landed``."""
 
     def to_json(self) -> str:
         """As an argument of a command line."""
@@ -43,8 +43,8 @@ class Description:
 
 def open_source(fields: Mapping[str, Any]) -> Source:
     """A source whose truth is mapped."""
-    truth = fields["truth"]
-    return Source(**{**fields, "truth": Truth(Path(truth)) if truth else None})
+    files = {name: Truth(Path(fields[name])) if fields[name] else None for name in ("truth", "landed")}
+    return Source(**{**fields, **files})
 
 
 class Checker:

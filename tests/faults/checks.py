@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from shmio.segment import Frame, Quality
+from shmio.segment import EventKind, Frame, Quality
 from tests.faults.truth import Truth, Words, generations, places
 
 Complain = Callable[[str], None]
@@ -36,6 +36,8 @@ class Source:
     tolerance_ns: int
     one_pdu: bool
     truth: Truth | None = None
+    landed: Truth | None = None
+    """What was written into the last word, where there is a truth; that word is none of the program's then."""
     answer_ns: int = 0
 
     @property
@@ -68,7 +70,8 @@ class FrameCheck:
     _started_ns: int = 0
 
     def __post_init__(self) -> None:
-        self._places = places(self.source.size)
+        self._own = self.source.size if self.source.truth is None else self.source.size - 8
+        self._places = places(self._own)
 
     def begin(self, started_ns: int) -> None:
         """A stream begins: of an instance that was started at ``started_ns``. Values still may not go back."""
@@ -125,7 +128,7 @@ class FrameCheck:
             return  # never had one
         if frame.quality is not Quality.GOOD and repeats and self._last is not None and frame.raw != self._last.raw:
             self._say(frame, "is bad, but its bytes are not those of the frame before")
-        words = generations(frame.image, self._places)
+        words = generations(frame.image[: self._own], self._places)
         self.counts.values += len(words)
         found = [int(word) for word in np.unique(words)]
         if self.source.one_pdu and len(found) > 1:
@@ -155,7 +158,7 @@ class FrameCheck:
         if self.source.truth is None:
             self.counts.since_ns = max(self.counts.since_ns, frame.publish_ns)
             return
-        oldest = int(generations(frame.image, self._places).min())
+        oldest = int(generations(frame.image[: self._own], self._places).min())
         age_ns = self.source.truth.age_ns(oldest, now_ns)
         if age_ns is not None and age_ns > self.source.oldest_ns:
             published_ns = self.source.truth.age_ns(oldest, frame.publish_ns)
@@ -193,6 +196,48 @@ class ValueCheck:
             self.complain(f"{self.source.name}: value {generation} is good, but {age_ns / 1e6:.1f} ms old")
         self._last = generation
         self.counts.since_ns = max(self.counts.since_ns, since_ns)
+
+
+SURELY_NOT = {EventKind.REJECTED, EventKind.REFUSED, EventKind.EXPIRED}
+"""Outcomes after which the device has never had the value."""
+
+
+@dataclass
+class WriteCheck:
+    """Holds what a writer is told of its values to what the PLC got; each value is written once."""
+
+    source: Source
+    complain: Complain
+    counts: Counts = field(default_factory=Counts)
+    _known: dict[int, tuple[EventKind, int | None]] = field(default_factory=dict)
+
+    def _since_ns(self, value: int) -> int | None:
+        return None if self.source.landed is None else self.source.landed.since_ns(value)
+
+    def outcome(self, value: int, kind: EventKind, text: str) -> None:
+        """What the writer was told of ``value``."""
+        since_ns = self._since_ns(value)
+        self._known[value] = kind, since_ns
+        self.counts.values += 1
+        if kind is EventKind.WRITTEN:
+            self.counts.good += 1
+            if since_ns is None:
+                self.complain(f"{self.source.name}: {value} was reported as written, but the PLC never got it")
+            else:
+                self.counts.since_ns = max(self.counts.since_ns, since_ns)
+        elif kind in SURELY_NOT and since_ns is not None:
+            self.complain(f"{self.source.name}: {value} was reported as {kind.name} ({text}), but the PLC got it")
+        elif kind is not EventKind.UNKNOWN and kind not in SURELY_NOT:
+            self.complain(f"{self.source.name}: {value} ended as {kind.name}")
+
+    def again(self, value: int) -> None:
+        """Look later: what was surely not sent does not come late, what was written does not come twice."""
+        kind, before_ns = self._known[value]
+        since_ns = self._since_ns(value)
+        if kind is not EventKind.UNKNOWN and since_ns != before_ns:
+            self.complain(f"{self.source.name}: {value} was {kind.name}, and came to the PLC later, at {since_ns}")
+        for old in [key for key in self._known if key < value]:
+            del self._known[old]
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,11 @@ FRAMES, SLEEP_S = 20, 3.0
 """The slow reader sleeps so long after so many frames: longer than its ring."""
 
 
-def attached(checker: Checker, work: Callable[[Attachment], None]) -> None:
+def attached(checker: Checker, work: Callable[[Attachment], None], *, writable: bool = False) -> None:
     """Work on the instance as long as it is there, and on the next one when there is one."""
     while not checker.stopping.is_set():
         try:
-            with shmio.attach(checker.description.instance) as attachment:
+            with shmio.attach(checker.description.instance, writable=writable) as attachment:
                 work(attachment)
         except (NotRunningError, SegmentError):  # not there, half-made, stopped: try again
             checker.stopping.wait(PAUSE_S)

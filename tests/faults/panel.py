@@ -12,7 +12,7 @@ from typing import Final, Self
 from tests.faults.checker import Description
 from tests.faults.checks import Counts
 
-MODULES: Final = ("local", "remote", "churn")
+MODULES: Final = ("local", "remote", "churn", "writing")
 END_S: Final = 20.0
 
 

@@ -36,8 +36,9 @@ counted for the kind that ended last.
 |---|---|---|---|""".splitlines()
     for kind in WEIGHTS:
         if record.faults[kind]:
-            took = record.recoveries[kind] or [float("nan")]
-            lines.append(f"| {kind} | {record.faults[kind]} | {statistics.median(took):.2f} | {max(took):.2f} |")
+            took = record.recoveries[kind]
+            figures = f"{statistics.median(took):.2f} | {max(took):.2f}" if took else "- | -"
+            lines.append(f"| {kind} | {record.faults[kind]} | {figures} |")
     lines += ["", "## Readers", "", "| reader | frames | missed | good looks | values |", "|---|---|---|---|---|"]
     for name, counts in sorted(record.counts.items()):
         lines.append(f"| {name} | {counts.frames:,} | {counts.missed:,} | {counts.good:,} | {counts.values:,} |")

@@ -30,7 +30,7 @@ MARK: Final = "SHMIO_FAULTS"
 TOLERANCE_MS: Final = 100
 """What a loaded machine and the way through the network may add to an age."""
 
-SIZES: Final = {"fast": 400, "block": 2184, "demo": 400}
+SIZES: Final = {"fast": 408, "block": 2192, "demo": 408}
 PERIODS_MS: Final = {"fast": 5, "block": 20, "demo": 20}
 STALE_MS: Final = {"fast": 300, "block": 500, "demo": 500}
 
@@ -39,6 +39,7 @@ _DB = """DATA_BLOCK DB{number}
    STRUCT
       stamp : LWord;
       rest : Array[1..{rest}] of LWord;
+      command : LWord;
    END_STRUCT;
 BEGIN
 END_DATA_BLOCK
@@ -54,6 +55,7 @@ dbNumber = {number}
 timeout = 400
 period_ms = {period_ms}
 stale_ms = {stale_ms}
+writable = ["command"]
 """
 _OTHERS = """
 [[emulator]]
@@ -74,7 +76,9 @@ class Device:
         self._file = folder / f"{name}.truth"
         self.truth = Truth(self._file, create=True)
         self.proxy = FaultProxy(address)
-        self._command = [str(self._file), str(address.port), str(SIZES[name]), "2"]
+        self._landed = folder / f"{name}.landed.truth"
+        Truth(self._landed, create=True).close()
+        self._command = [str(self._file), str(self._landed), str(address.port), str(SIZES[name]), "2"]
         self._environment = environment
         self.start()
 
@@ -137,7 +141,7 @@ class Rig:
         ports = {name: stack.enter_context(reserved_port()) for name in ("fast", "block", "plc", "grpc")}
         text = f'[instance]\nname = "{self.instance}"\nring_mb = 1\n'
         for name, size in SIZES.items():
-            (self.folder / f"{name}.db").write_text(_DB.format(number=NUMBER, rest=size // 8 - 1))
+            (self.folder / f"{name}.db").write_text(_DB.format(number=NUMBER, rest=size // 8 - 2))
             port = ports["plc"].port
             if name in ports:
                 device = self.devices[name] = Device(name, self.folder, ports[name], self.environment)
@@ -156,8 +160,10 @@ class Rig:
             period_ns, stale_ns, tolerance_ns = (ms * 10**6 for ms in (PERIODS_MS[name], STALE_MS[name], TOLERANCE_MS))
             # The source loop takes answers that took up to stale_ms, and a frame's age does not count that time.
             source = Source(name, size, period_ns, stale_ns, tolerance_ns, one_pdu=size < 900, answer_ns=stale_ns)
-            truth = str(self.folder / f"{name}.truth") if name in self.devices else None
-            sources.append(asdict(source) | {"truth": truth})
+            files = {"truth": f"{name}.truth", "landed": f"{name}.landed.truth"}
+            known = name in self.devices
+            paths = {field: str(self.folder / file) if known else None for field, file in files.items()}
+            sources.append(asdict(source) | paths)
         return Description(self.instance, str(self.grpc), seed, str(self.folder / "reader"), tuple(sources))
 
     def supervisor(self, verb: str, *arguments: str) -> subprocess.CompletedProcess[str]:

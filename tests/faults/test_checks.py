@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from shmio.segment import Frame, Provenance, Quality
+from shmio.segment import EventKind, Frame, Provenance, Quality
 from tests.faults import report
-from tests.faults.checks import Complain, FrameCheck, Process, Source, ValueCheck, check_restarts
+from tests.faults.checks import Complain, FrameCheck, Process, Source, ValueCheck, WriteCheck, check_restarts
 from tests.faults.resources import Resources
 from tests.faults.suite import Record
 from tests.faults.truth import ENTRIES, Truth, generations, image, places
@@ -50,7 +50,7 @@ def check(source: Source, found: list[str]) -> FrameCheck:
 
 
 def block(generation: int) -> bytes:
-    return image(generation, places(SIZE))
+    return image(generation, places(SIZE - 8)) + b"\xff" * 8  # the last word is not the program's
 
 
 def frame(number: int, generation: int = FIRST, **changes: Any) -> Frame:
@@ -167,7 +167,7 @@ def test_several_pdus_may_be_of_several_cycles(source: Source, truth: Truth, fou
 def test_without_truth_foreign_bytes_are_found(found: list[str]) -> None:
     check = FrameCheck(Source("demo", SIZE, PERIOD_NS, STALE_NS, TOLERANCE_NS, False), found.append)
     check.begin(STARTED_NS)
-    feed(check, (good(1), 0), (frame(2, 3), 0))
+    feed(check, *((good(number, raw=image(generation, places(SIZE))), 0) for number, generation in ((1, 9), (2, 3))))
     assert found == []
     feed(check, (good(3, raw=bytes(range(SIZE))), 0))
     assert "bytes that the PLC never had" in found[0]
@@ -186,6 +186,35 @@ def test_values_are_held_to_the_truth(source: Source, found: list[str]) -> None:
     check.value(FIRST + 11, now_ns + 1000 * MS, slack_ns=1000 * MS)
     assert ["comes after" in found[0], "none the PLC had" in found[1], "is good, but" in found[2]] == [True] * 3
     assert len(found) == 3
+
+
+def test_writes_are_held_to_what_the_plc_got(tmp_path: Path, found: list[str]) -> None:
+    landed = Truth(tmp_path / "landed", create=True)
+    source = Source("cell", SIZE, PERIOD_NS, STALE_NS, TOLERANCE_NS, True, landed=landed)
+    check = WriteCheck(source, found.append)
+    for value in (1, 2, 3, 9):
+        landed.land(value, value)
+    check.outcome(1, EventKind.WRITTEN, "")
+    check.outcome(2, EventKind.UNKNOWN, "no answer")
+    check.outcome(4, EventKind.UNKNOWN, "no answer")
+    check.outcome(5, EventKind.EXPIRED, "too late")
+    landed.land(4, 10)  # nobody promised anything about it
+    for value in (1, 2, 4, 5):
+        check.again(value)
+    assert found == []
+    assert (check.counts.values, check.counts.good, check.counts.since_ns) == (4, 1, 1)
+    check.outcome(6, EventKind.WRITTEN, "")
+    check.outcome(3, EventKind.REFUSED, "protected")
+    check.outcome(7, EventKind.ACCEPTED, "")
+    check.outcome(8, EventKind.REJECTED, "not now")
+    check.outcome(9, EventKind.WRITTEN, "")
+    landed.land(8, 11)
+    landed.land(9, 12)
+    check.again(8)
+    check.again(9)
+    landed.close()
+    parts = ("6 was reported as written", "3 was reported as REFUSED", "7 ended as", "8 was REJECTED", "9 was WRITTEN")
+    assert [part in line for part, line in zip(parts, found, strict=True)] == [True] * 5
 
 
 def test_restarts_are_of_those_who_were_hit(found: list[str]) -> None:
@@ -240,7 +269,7 @@ def test_the_truth_forgets_in_order(truth: Truth) -> None:
     assert truth.since_ns(FIRST) == STARTED_NS + FIRST * 10 * MS
     truth.record(FIRST + ENTRIES, 7)
     assert truth.since_ns(FIRST) is None
-    assert list(generations(block(FIRST), places(SIZE))) == [FIRST] * (SIZE // 8)
+    assert list(generations(block(FIRST)[:-8], places(SIZE - 8))) == [FIRST] * (SIZE // 8 - 1)
 
 
 def test_a_violation_is_in_the_report() -> None:

@@ -57,6 +57,10 @@ class Truth:
         _ENTRY.pack_into(self._map, 64 + generation % ENTRIES * _ENTRY.size, generation, now_ns)
         _HEADER.pack_into(self._map, 0, generation, 0)
 
+    def land(self, value: int, now_ns: int) -> None:
+        """Tell that somebody wrote this value. In a file of its own: of the word that the program leaves alone."""
+        _ENTRY.pack_into(self._map, 64 + value % ENTRIES * _ENTRY.size, value, now_ns)
+
     def bury(self, now_ns: int) -> None:
         """Tell that the PLC is dead: it has nothing any more."""
         _HEADER.pack_into(self._map, 0, self.newest, now_ns)
