@@ -10,6 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+settings.register_profile("unhurried", deadline=None)  # the machine may be busy with other things
+settings.load_profile("unhurried")
 
 SHM = Path("/dev/shm")
 PREFIX = f"test-{os.getpid()}-"

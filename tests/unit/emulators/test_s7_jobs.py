@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from snap7.datatypes import S7Area
 
@@ -251,7 +251,6 @@ MANY = write((item(BYTE, 3, 0), 4, b"abc"), (item(BIT, 1, 9, bit=3), 3, b"\1"), 
 VALID = [bytes(frame) for frame in (SETUP, read(item(BYTE, 9, 3)), write((item(BYTE, 3, 0), 4, b"abc")), MANY)]
 
 
-@settings(deadline=None)
 @given(
     st.binary(min_size=10, max_size=120)
     | st.builds(

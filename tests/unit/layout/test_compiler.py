@@ -417,7 +417,7 @@ def outcome(*sources: Source) -> Compiled | LayoutError:
         return error
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.lists(st.sampled_from(FRAGMENTS), max_size=40))
 def test_anything_compiles_or_ends_in_a_layout_error(fragments: list[str]) -> None:
     for text in (" ".join(fragments), block(" ".join(fragments)), block("a : Int;", " ".join(fragments))):
@@ -429,7 +429,7 @@ def test_anything_compiles_or_ends_in_a_layout_error(fragments: list[str]) -> No
             assert all(Layout.from_json(layout.to_json()) == layout for layout in result.layouts)
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 @given(st.binary(max_size=200))
 def test_any_bytes_compile_or_end_in_a_layout_error(data: bytes) -> None:
     result = outcome(Source("x.db", data), Source("y.db", block("a : Int;").encode() + data))

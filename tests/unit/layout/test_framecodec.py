@@ -67,7 +67,7 @@ def same(found: Any, wanted: Any) -> bool:
 likely = st.one_of(st.integers(0, 255), st.sampled_from([0, 1, 2, 5, 0x07, 0xB2, 0x12, 0x31, 0x59, 0x99, 0xD8, 0xDC]))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.data())
 def test_agrees_with_the_scalar_codec(data: st.DataObject) -> None:
     seed = data.draw(st.lists(likely, min_size=40, max_size=120))

@@ -23,7 +23,7 @@ from tests.unit.recording.harness import publish, recorder
 
 CHUNK = 6  # opcode
 
-any_input = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+any_input = settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 @pytest.fixture

@@ -118,7 +118,7 @@ def test_something_else_by_that_name_is_refused(instance: str) -> None:
         Segment.open(instance)
 
 
-@settings(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=300)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=300)
 @given(edits=st.lists(st.tuples(st.integers(8, 12_000), st.binary(min_size=1, max_size=8)), min_size=1, max_size=6))
 def test_a_damaged_segment_is_refused_or_read_but_never_crashes(instance: str, edits: list[tuple[int, bytes]]) -> None:
     with Segment.create(instance, [block()], PROCESSES) as segment:

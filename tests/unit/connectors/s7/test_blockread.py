@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from shmio.connectors.s7 import pdu
@@ -28,7 +28,6 @@ def split(requests: memoryview) -> list[bytes]:
     return [bytes(requests[at : at + size]) for at in range(0, len(requests), size)]
 
 
-@settings(deadline=None)
 @given(
     block=st.binary(min_size=1, max_size=600),
     chunk=st.integers(1, 222),

@@ -6,7 +6,7 @@ import contextlib
 import struct
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from snap7.datatypes import S7Area
 
@@ -17,7 +17,6 @@ from shmio.errors import ConnectorError
 ANSWER = bytes.fromhex("03000025 02f080 32 03 0000 0007 0002 0010 0000 04 03 ff04000855 00 ff040008aa 00 05000000")
 
 
-@settings(deadline=None)
 @given(sizes=st.integers(2, 65536).flatmap(lambda size: st.tuples(st.just(size), st.integers(0, size - 1))),
        pdu_size=st.sampled_from([100, 240, 480, 960]))  # fmt: skip
 def test_finds_the_size(sizes: tuple[int, int], pdu_size: int) -> None:
@@ -57,7 +56,6 @@ def test_answers_of_a_wrong_length(data: str) -> None:
         parse_readable(memoryview(head + items), 3)
 
 
-@settings(deadline=None)
 @given(st.binary(min_size=7, max_size=60) | st.builds(lambda cut, tail: (ANSWER[:cut] + tail).ljust(7, b"\0"),
        st.integers(0, 35), st.binary(max_size=20)))  # fmt: skip
 def test_noise_gives_an_answer_or_a_connector_error(noise: bytes) -> None:

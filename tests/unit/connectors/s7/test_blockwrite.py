@@ -55,7 +55,7 @@ WRITES = st.lists(
 )
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(writes=WRITES, pdu_size=st.sampled_from([100, 101, 240, 480, 960]), data=st.data())
 def test_as_if_written_one_by_one(writes: list[Write], pdu_size: int, data: st.DataObject) -> None:
     block = bytearray(range(200)) * 2

@@ -8,7 +8,7 @@ import re
 import struct
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from shmio.connectors.s7.mode import INTERVAL_NS, ModeQuestion, parse_mode_answer
@@ -140,7 +140,6 @@ def test_refuses_a_wrong_answer(frame: memoryview) -> None:
         parse_mode_answer(frame)
 
 
-@settings(deadline=None)
 @given(st.binary(min_size=7, max_size=80) | st.builds(lambda cut, tail: (GOOD[:cut] + tail).ljust(7, b"\0"),
        st.integers(0, 61), st.binary(max_size=30)))  # fmt: skip
 def test_noise_gives_a_mode_or_none_or_a_connector_error(noise: bytes) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from shmio.connectors.s7 import pdu
@@ -142,7 +142,6 @@ NOISE = st.binary(min_size=7, max_size=80) | st.builds(
 )
 
 
-@settings(deadline=None)
 @given(NOISE)
 def test_noise_gives_an_answer_or_a_connector_error(noise: bytes) -> None:
     frame = memoryview(noise)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from shmio.connectors.s7 import writepdu
@@ -74,7 +74,6 @@ def test_a_job_that_is_refused_as_a_whole(head: str) -> None:
         writepdu.parse_write_answer(memoryview(frame), 3)
 
 
-@settings(deadline=None)
 @given(st.binary(min_size=7, max_size=60) | st.builds(lambda cut, tail: (ANSWER[:cut] + tail).ljust(7, b"\0"),
        st.integers(0, 24), st.binary(max_size=20)), st.integers(1, 20))  # fmt: skip
 def test_noise_gives_codes_or_a_connector_error(noise: bytes, count: int) -> None:
