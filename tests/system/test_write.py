@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -119,21 +117,19 @@ def test_what_cannot_be_written_is_one_clear_line(cell: Cell) -> None:
         assert done.stderr.count("\n") == 1
 
 
-def test_without_its_controller_nothing_is_written_and_the_reason_is_told(cell: Cell) -> None:
-    plc = cell.processes()["plc"]["pid"]
-    os.kill(plc, signal.SIGSTOP)
-    try:
-        with shmio.attach(cell.instance) as local:
-            until(lambda: "no answer" in local.read(PLACE).reason, "no answer")
-        done = cell.run("shmio", "set", PLACE, "5")
-        assert done.returncode == 1
-        assert done.stderr.startswith(f"{PLACE}: not written, the source took nothing: the source is not connected")
-        assert done.stderr.count("\n") == 1
-    finally:
-        os.kill(plc, signal.SIGCONT)
-    until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")
-    assert json.loads(cell.run("shmio", "get", "--json", PLACE).stdout)[PLACE]["value"] == 0
-    assert cell.run("shmio", "set", PLACE, "6").returncode == 0
+def test_without_its_controller_nothing_is_written_and_the_reason_is_told(make_cell: Callable[..., Cell]) -> None:
+    before, _, rest = WRITABLE.partition("[[emulator]]")
+    cell = make_cell(config=f"{before}[grpc]{rest.partition('[grpc]')[2]}")
+    cell.up()
+    until(lambda: "refused" in (cell.processes()["cell"]["note"] or ""), "no controller")
+    done = cell.run("shmio", "set", PLACE, "5")
+    assert (done.returncode, done.stdout.partition(":")[0]) == (1, f"{PLACE}  rejected")
+    assert done.stderr.startswith(f"{PLACE}: not written, the source took nothing: the source is not connected")
+    assert "shmio-supervisor status" in done.stderr
+    assert done.stderr.count("\n") == 1
+    with client(cell) as stub:
+        stub.Publish(iter([message(PLACE, "5")] * 3), timeout=PATIENCE_S)
+    until(lambda: counters(cell)["refused"] == 3, "all counted")
 
 
 def test_a_stream_outlives_its_source(cell: Cell) -> None:
