@@ -17,7 +17,12 @@ PROGRAM = "shmio-dump"
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of the console script; the exit status."""
-    arguments = _parser().parse_args(argv)
+    parser = _parser()
+    arguments, rest = parser.parse_known_args(argv)
+    if rest and (arguments.verb != "cat" or any(word.startswith("-") for word in rest)):
+        parser.error(f"unrecognized arguments: {' '.join(rest)}")
+    if rest:  # argparse leaves patterns that come after an option
+        arguments.patterns = [*arguments.patterns, *rest]
 
     def command() -> int:
         verb = importlib.import_module(f"shmio.cli.dumping.{arguments.verb}")

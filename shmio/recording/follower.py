@@ -67,6 +67,7 @@ class Follower:
             side = self._next()
             if side is None:
                 self.done = retired
+                self._frames.reason = self._events.reason = Reason.OVERTAKEN  # what comes now was not there before
                 return
             yield from self._entries(side)
 

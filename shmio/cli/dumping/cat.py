@@ -16,7 +16,7 @@ from shmio.layout.model import Layout, Register
 from shmio.layout.text import json_value, to_text
 from shmio.layout.topic import parse_topic
 from shmio.logs import printable
-from shmio.recording.encoding import EVENT, FRAME, Gap
+from shmio.recording.encoding import EVENT, FRAME, GAP, Gap
 from shmio.recording.reader import Channel, Message, Reader
 from shmio.recording.survey import survey
 from shmio.segment import Event, EventKind, Frame, Quality
@@ -30,11 +30,12 @@ def execute(arguments: argparse.Namespace) -> int:
         start_ns = min((track.first_ns for track in found.tracks.values() if track.channel.source), default=0)
         from_ns = parse_time("--from", arguments.begin, start_ns, 0)
         to_ns = parse_time("--to", arguments.end, start_ns, MAX_NS)
-        views = _views(reader, [track.channel for track in found.tracks.values()], arguments.patterns)
+        channels = [track.channel for track in found.tracks.values()]
+        views = _views(reader, channels, arguments.patterns)
+        sources = {view.source for view in views.values()} if arguments.patterns else {c.source for c in channels}
         printer: Printer = JsonLines() if arguments.json else Table()
-        sources = {view.source for view in views.values()}
-        wanted = {number for number, channel in reader.channels.items() if not channel.source or number in views}
-        wanted |= {c.number for c in reader.channels.values() if c.encoding == EVENT and c.source in sources}
+        wanted = {c.number for c in channels if c.number in views or (c.encoding == EVENT and c.source in sources)}
+        wanted |= {c.number for c in channels if c.encoding == GAP}
         for message in reader.messages(lambda channel: channel.number in wanted, from_ns, to_ns):
             for line in _lines(message, views, sources, printer):
                 print(line)
@@ -81,23 +82,27 @@ class Printer(Protocol):
 def _views(reader: Reader, channels: Sequence[Channel], patterns: Sequence[str]) -> dict[int, View]:
     """By their frames' channels the blocks of which something is to be shown. PathError: a pattern names nothing."""
     blocks = {channel.number: (channel, reader.layout(channel)) for channel in channels if channel.encoding == FRAME}
+    if not patterns:
+        return {number: View(*block, block[1].registers) for number, block in blocks.items()}
     sources = list(dict.fromkeys(channel.source for channel, _ in blocks.values()))
     default = sources[0] if len(sources) == 1 else None
-    topics = [parse_topic(pattern, sources, default) for pattern in patterns or sources]
     chosen: dict[int, dict[str, Register]] = {}
-    for pattern, topic in zip(patterns or sources, topics, strict=True):
-        problem = PathError(f"{pattern}: no register of this recording has such a path")
+    for pattern in patterns:
+        topic = parse_topic(pattern, sources, default)
+        problem, some = PathError(f"{pattern}: no register of this recording has such a path"), False
         for number, (channel, layout) in blocks.items():
-            if channel.source == topic.source:
-                try:
-                    registers = registers_at(layout, topic.path)
-                except PathError as error:  # it may be in the layout after a change
-                    problem = error
-                else:
-                    chosen.setdefault(number, {}).update((register.path, register) for register in registers)
-        if not any(chosen.get(number) for number, (channel, _) in blocks.items() if channel.source == topic.source):
+            if channel.source != topic.source:
+                continue
+            try:
+                registers = {register.path: register for register in registers_at(layout, topic.path)}
+            except PathError as error:  # it may be in the layout that came after a change
+                problem = error
+            else:
+                some = some or bool(registers)
+                chosen[number] = chosen.get(number, {}) | registers
+        if not some:
             raise problem
-    return {number: View(*blocks[number], list(found.values())) for number, found in chosen.items() if found}
+    return {number: View(*blocks[number], list(registers.values())) for number, registers in chosen.items()}
 
 
 def _lines(message: Message, views: dict[int, View], sources: set[str], printer: Printer) -> Iterator[str]:
@@ -184,7 +189,7 @@ class Table:
             self._widths = [max(map(len, pair)) for pair in zip(names, cells, strict=True)]
             yield f"{'time':<23}  {view.source}  frame  {self._row(names)}".rstrip()
         quality = "" if frame.quality is Quality.GOOD else f"  {frame.quality}: {printable(frame.reason)}"
-        yield f"{local(time_ns)}  {view.source}  {frame.number:<5}  {self._row(cells)}".rstrip() + quality
+        yield f"{local(time_ns)}  {view.source}  {frame.number:<5}  {self._row(cells)}{quality}".rstrip()
 
     def event(self, time_ns: int, source: str, event: Event) -> str:
         """Kind and reason, and of a command which bytes."""

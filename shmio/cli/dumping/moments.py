@@ -21,7 +21,7 @@ def parse_time(option: str, text: str | None, start_ns: int, default_ns: int) ->
             moment_ns = start_ns + round(float(text) * 1e9)
         except ValueError:
             moment_ns = round(datetime.fromisoformat(text).astimezone().timestamp() * 1e6) * 1000
-    except (ValueError, OverflowError):
+    except (ValueError, OverflowError, TypeError):  # argparse makes a list of --from=--
         raise RecordingError(
             f"{option}: {text!r} is neither a time such as 2026-11-21T08:30:00 nor seconds of the recording"
         ) from None

@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 
-from shmio.cli.target import ask, instance_name
+from shmio.cli.target import instance_name
 from shmio.errors import ControlError, PathError, RecordingError
 from shmio.logs import printable
 from shmio.recording.attach import ConfigFiles
@@ -80,7 +80,7 @@ def _record(segment: Segment, recorder: Recorder, stopping: threading.Event, dur
 def _attachments(segment: Segment) -> Callable[[str | None], list[Attachment]]:
     """The files of the configuration, if the supervisor says where that is."""
     try:
-        return ConfigFiles(Path(ask(segment, control.Where(), WHERE_S)["config"]))
+        return ConfigFiles(Path(control.request(segment.header.control, control.Where(), WHERE_S)["config"]))
     except (ControlError, KeyError) as error:
         _say(f"the configuration is not attached: {error}")
         return lambda _: []

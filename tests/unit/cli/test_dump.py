@@ -1,0 +1,294 @@
+"""``shmio-dump``: what it records, prints and refuses."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shmio.cli.dump import main
+from shmio.recording.reader import Reader
+from shmio.segment import EventKind, Quality, Record, Segment
+from shmio.testing.cell import until
+from tests.unit.recording.harness import OTHER, RING, numbers, publish, recorder, spec
+
+Output = Callable[[], tuple[list[str], list[str]]]
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def segment(instance: str) -> Iterator[Segment]:
+    with Segment.create(instance, [spec("cell"), spec("press")], []) as segment:
+        yield segment
+        segment.unlink()
+
+
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Output:
+    """Lines on standard output and standard error since the last call."""
+
+    def lines() -> tuple[list[str], list[str]]:
+        captured = capsys.readouterr()
+        return captured.out.splitlines(), captured.err.splitlines()
+
+    return lines
+
+
+@pytest.fixture
+def file(segment: Segment, tmp_path: Path) -> str:
+    """A recording: good, bad, a command, a change of layout, a gap."""
+    work = recorder(segment, tmp_path / "dumps")
+    cell = segment.writer("cell")
+    for value in (7, 7, 8):
+        cell.publish(value.to_bytes(2, "big"), cycle=value)
+    cell.event(Record(EventKind.WRITTEN, "", 4, 99, 0, 1, 0, 0, 2))
+    cell.event(Record(EventKind.QUALITY, "cable out"), quality=Quality.BAD)
+    cell.publish(b"\0\x08", cycle=9, quality=Quality.BAD, reason="cable out")
+    work.turn()
+    press = segment.writer("press")
+    publish(press, 3 * RING)
+    work.turn()
+    segment.change(add=[spec("cell", OTHER)], retire=["cell"])
+    segment.writer("cell").publish(b"\x40\x20\0\0\0\x05", cycle=10)
+    assert work.close()
+    return str(work.output.path)
+
+
+def objects(lines: list[str]) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in lines]
+
+
+def test_info_tells_what_is_in_a_file(file: str, segment: Segment, said: Output) -> None:
+    assert main(["info", "--json", file]) == 0
+    out, err = said()
+    found = json.loads("\n".join(out))
+    assert err == []
+    assert (found["instance"], found["closed"], found["damage"]) == (segment.instance, True, [])
+    assert found["size"] == Path(file).stat().st_size
+    blocks = {(block["source"], block["block"]): block for block in found["blocks"]}
+    old, press, new = (blocks[key] for key in (("cell", 1), ("press", 2), ("cell", 3)))
+    assert (old["frames"], old["first_frame"], old["last_frame"], old["events"]) == (4, 1, 4, 3)
+    assert (new["frames"], new["size"], new["layout_hash"]) == (1, 6, OTHER.hash.hex())
+    assert press["frames"] + press["missed_frames"] == 3 * RING
+    assert found["missed_frames"] == press["missed_frames"] > 0
+    [gap] = found["gaps"]
+    assert (gap["source"], gap["what"], gap["first"], gap["reason"]) == ("press", "frames", 1, "overtaken")
+    assert found["bytes_per_minute"] > 0
+
+    assert main(["info", file]) == 0
+    out, _ = said()
+    assert out[0] == f"{file}: {found['size'] / 1e6:.2f} MB, closed"
+    assert any("press: DB1, 1 registers, 2 bytes" in line for line in out)
+    assert any(f"{gap['count']} frames, 1 to {gap['last']}: overtaken" in line for line in out)
+
+
+def test_cat_prints_a_line_for_each_change(file: str, said: Output) -> None:
+    assert main(["cat", file, "cell/count"]) == 0
+    out, err = said()
+    stamp = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d\.\d{3}"
+    expected = [
+        rf"{stamp}  cell  event 1 after frame 0: started: pid \d+",
+        r"time +cell  frame  count",
+        rf"{stamp}  cell  1      7",
+        rf"{stamp}  cell  3      8",
+        rf"{stamp}  cell  event 2 after frame 3: written command 99\.0 of writer 4: 2 bytes at 0",
+        rf"{stamp}  cell  event 3 after frame 3: quality bad: cable out",
+        rf"{stamp}  cell  4      8      bad: cable out",
+        rf"{stamp}  cell  event 1 after frame 0: started: pid \d+",
+        r"time +cell  frame  count",
+        rf"{stamp}  cell  1      5",
+    ]
+    assert len(out) == len(expected), out
+    for line, pattern in zip(out, expected, strict=True):
+        assert re.fullmatch(pattern, line), (line, pattern)
+    assert err == []
+
+
+def test_cat_prints_json_lines(file: str, said: Output) -> None:
+    assert main(["cat", "--json", file, "cell/*"]) == 0
+    found = objects(said()[0])
+    frames = [line for line in found if "frame" in line]
+    assert [(line["frame"], line["quality"], line["values"]) for line in frames] == [
+        (1, "good", {"count": 7}),
+        (3, "good", {"count": 8}),
+        (4, "bad", {"count": 8}),
+        (1, "good", {"speed": 2.5, "count": 5}),
+    ]
+    assert {"time", "source", "cycle", "reason", "provenance"} < set(frames[0])
+    assert frames[0]["time"].endswith("Z")
+    events = [line for line in found if "event" in line]
+    assert [line["kind"] for line in events] == ["started", "written", "quality", "started"]
+    assert (events[1]["after_frame"], events[1]["command"], events[1]["size"]) == (3, 99, 2)
+
+
+def test_cat_tells_gaps_where_they_are(file: str, said: Output) -> None:
+    assert main(["cat", "--json", file, "press/count"]) == 0
+    found = objects(said()[0])
+    where = next(index for index, line in enumerate(found) if "missed" in line)
+    assert found[where]["missed"] == found[where]["last"]
+    assert found[where + 1]["frame"] == found[where]["last"] + 1
+    assert main(["cat", file]) == 0
+    assert any("frames missed, 1 to" in line for line in said()[0]), "and without a pattern, all of it"
+
+
+def test_cat_keeps_to_the_time_asked_for(file: str, said: Output) -> None:
+    with Reader(Path(file)) as reader:
+        times = [message.log_ns for message in reader.messages() if message.channel.source]
+    assert main(["cat", "--json", file, "--from", "1e6"]) == 0
+    assert said()[0] == []
+    assert main(["cat", "--json", file, "--to", "0", "cell"]) == 0
+    assert [line["event"] for line in objects(said()[0])] == [1]
+    assert main(["cat", "--json", file, "--from", "2020-01-01", "--to", "2020-01-01T10:00:00Z"]) == 0
+    assert said()[0] == []
+    assert main(["cat", "--json", file, "--from", "2020-01-01T10:00:00+02:00", "cell"]) == 0
+    assert len(said()[0]) == 8
+    assert min(times) == times[0]
+
+
+@pytest.mark.parametrize("time", ["yesterday", "nan", "1e400", "2026-13-01"])
+def test_what_is_no_time_is_refused(file: str, time: str, said: Output) -> None:
+    assert main(["cat", file, f"--from={time}"]) == 1
+    out, [line] = said()
+    assert line.startswith(f"--from: {time!r} is neither a time such as")
+    assert out == []
+
+
+def test_a_path_that_names_nothing_is_refused(file: str, said: Output) -> None:
+    assert main(["cat", file, "cell/cout"]) == 1
+    assert said() == ([], ["cout: no such register in DB1; near: count"])
+    assert main(["cat", file, "cell/x*"]) == 1
+    assert said()[1] == ["cell/x*: no register of this recording has such a path"]
+    assert main(["cat", file, "cell/speed"]) == 0, "it is in the second layout only"
+    assert main(["cat", file, "count"]) == 1
+    assert "name the source first" in said()[1][0]
+
+
+def test_a_recording_that_was_not_closed_is_read_and_that_is_told(file: str, said: Output) -> None:
+    data = Path(file).read_bytes()
+    Path("cut.mem").write_bytes(data[:-600])
+    assert main(["info", "--json", "cut.mem"]) == 0
+    found = json.loads("\n".join(said()[0]))
+    assert (found["closed"], found["damage"]) == (False, [])
+    assert main(["info", "cut.mem"]) == 0
+    assert "still being written, or cut off" in said()[0][0]
+    assert main(["cat", "cut.mem", "cell"]) == 0
+    out, [line] = said()
+    assert len(out) == 10
+    assert line.startswith("cut.mem was not closed: ")
+
+
+def test_a_damaged_recording_is_read_up_to_there(file: str, said: Output) -> None:
+    data = bytearray(Path(file).read_bytes())
+    at = data.rindex(b"zstd", 0, data.index(b"layouts/", data.index(b"zstd"))) + 100
+    data[at] ^= 0xFF
+    Path("bad.mem").write_bytes(data)
+    assert main(["info", "bad.mem", file]) == 1
+    out, err = said()
+    assert any(line.startswith("  damage: bad.mem: the chunk at byte") for line in out)
+    assert out[-1] != out[0], "the other is told too"
+    assert err == []
+    assert main(["cat", "bad.mem"]) == 1
+    out, err = said()
+    assert len(err) == 1
+
+
+@pytest.mark.parametrize("verb", ["info", "cat"])
+def test_what_is_no_recording_is_told_in_one_line(verb: str, said: Output) -> None:
+    Path("empty.mem").touch()
+    Path("text.mem").write_text("hello\n")
+    for name, message in (("empty.mem", "is empty"), ("text.mem", "is no recording"), ("none.mem", "No such file")):
+        assert main([verb, name]) == 1
+        out, [line] = said()
+        assert out == []
+        assert line.startswith(name)
+        assert message in line
+
+
+def test_record_ends_when_the_time_is_over(segment: Segment, said: Output) -> None:
+    assert main(["record", "--instance", segment.instance, "-o", "mine", "--for", "0.01", "--source", "press"]) == 0
+    out, err = said()
+    [file] = Path("mine").iterdir()
+    assert out == []
+    assert any(line.startswith(f"recording press of {segment.instance} to {file}") for line in err)
+    assert err[-1].startswith(f"{file}: 0 frames, 0 events, 0 missed")
+    with Reader(file) as reader:
+        assert list(reader.messages()) == []
+        assert reader.records.closed
+        assert reader.about["recorder"] == "shmio-dump"
+
+
+@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
+def test_several_record_at_once_and_ctrl_c_closes_the_file(segment: Segment, sign: signal.Signals) -> None:
+    command = [sys.executable, "-m", "shmio.cli.dump", "record", "--instance", segment.instance]
+    recorders = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    try:
+        writer = segment.writer("cell")
+
+        def all_have_some() -> bool:
+            publish(writer, 1, first=writer.block.ring.head())
+            files = list(Path("dumps").glob("*.mem"))
+            return len(files) == 2 and all(file.stat().st_size and numbers(file) for file in files)
+
+        until(all_have_some, "frames in both files")
+        for process in recorders:
+            process.send_signal(sign)
+        errors = [process.communicate(timeout=30)[1] for process in recorders]
+    finally:
+        for process in recorders:
+            process.kill()
+            process.wait()
+    assert [process.returncode for process in recorders] == [0, 0], errors
+    for file in Path("dumps").glob("*.mem"):
+        found = numbers(file)
+        assert found == list(range(found[0], writer.block.ring.head() + 1))
+        with Reader(file) as reader:
+            list(reader.messages())
+            assert reader.records.closed
+
+
+def test_the_end_of_the_instance_ends_a_recording(segment: Segment) -> None:
+    command = [sys.executable, "-m", "shmio.cli.dump", "record", "--instance", segment.instance]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        until(lambda: any(Path("dumps").glob("*.mem")), "a file")
+        segment.unlink()
+        errors = process.communicate(timeout=30)[1]
+    assert process.returncode == 0
+    assert f"instance {segment.instance!r} has stopped" in errors
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--source", "pres"], "no source 'pres'; there are: cell, press"),
+        (["-o", "text"], "cannot make a recording in text: File exists"),
+    ],
+)
+def test_what_cannot_be_recorded_is_told(segment: Segment, arguments: list[str], message: str, said: Output) -> None:
+    Path("text").touch()
+    assert main(["record", "--instance", segment.instance, *arguments]) == 1
+    assert said()[1][-1] == message
+
+
+def test_nothing_runs(said: Output) -> None:
+    assert main(["record", "--instance", "test-none"]) == 1
+    assert "no instance 'test-none' is running" in said()[1][0]
+
+
+@pytest.mark.parametrize("seconds", ["0", "-1", "nan", "x", "inf"])
+def test_a_duration_is_a_positive_number(seconds: str, said: Output) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["record", f"--for={seconds}"])
+    assert stop.value.code == 2
+    assert "is not a number of seconds above 0" in said()[1][-1]
