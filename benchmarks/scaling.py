@@ -24,7 +24,7 @@ from shmio.config.address import Address
 PERIOD_MS = 20.0
 WARM_UP_S = 1.0
 MOST_FRAMES = 8 * 50  # what a ring holds of the time that was measured
-SIZES = (2_180, 4_096, 8_192, 16_384, 32_768, 65_536)
+SIZE = 2_180
 TITLES = (
     "of each source",
     "supervisor, gRPC",
@@ -44,7 +44,7 @@ class Load:
     """How much of everything."""
 
     sources: int = 1
-    size: int = SIZES[0]
+    size: int = SIZE
     processes: int = 0
     """That read the first source."""
     threads: int = 0
@@ -53,7 +53,7 @@ class Load:
 
 def block_source(folder: Path, size: int) -> Path:
     """Write the source of a data block that is as long, and like stamped.db else."""
-    if size == SIZES[0]:
+    if size == SIZE:
         return HERE / "stamped.db"
     path = folder / f"block{size}.db"
     text = (HERE / "stamped.db").read_text()
@@ -155,13 +155,14 @@ def main() -> None:
         measure_all("everything at once", {"2 of each": Load(2, 4096, 2, 2)}, 1.0)
         return
     duration_s = 10.0
-    measure_all("2,180 bytes each", {f"{count} sources": Load(count) for count in (1, 2, 4, 8, 16)}, duration_s)
-    measure_all("1 source", {f"{size} bytes": Load(size=size) for size in SIZES}, duration_s)
+    measure_all("sources of 2,180 bytes", {f"{count}": Load(count) for count in (1, 2, 4, 8, 16)}, duration_s)
+    of_sizes = {f"{size}": Load(size=size) for size in (SIZE, 8_192, 32_768, 65_536)}
+    measure_all("1 source, bytes", of_sizes, duration_s)
     of_readers = {"none": Load()}
-    for count in (1, 5, 10, 25, 50):
+    for count in (1, 5, 50):
         of_readers[f"{count} processes"] = Load(processes=count)
         of_readers[f"{count} threads of one"] = Load(threads=count)
-    measure_all("1 source, 2,180 bytes", of_readers, duration_s)
+    measure_all("1 source of 2,180 bytes, readers", of_readers, duration_s)
 
 
 if __name__ == "__main__":

@@ -364,7 +364,7 @@ def iceoryx(count: int) -> Iterator[list[Way]]:
 
 def compare(what: str, readers: Readers, ways: Sequence[Way], count: int, rounds: int) -> None:
     """Print what both sides take, the ways in turn."""
-    rest_s = 0.002 if count < 10 else 0.01
+    rest_s, rounds = (0.002, rounds) if count < 10 else (0.01, rounds // 2)
     calls: dict[str, list[float]] = {way.name: [] for way in ways}
     lasts: dict[str, list[float]] = {way.name: [] for way in ways}
     for turn in range(5):
