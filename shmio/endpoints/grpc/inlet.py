@@ -26,6 +26,8 @@ MIN_PERIODS: Final = 3
 BATCH: Final = 256
 WAIT_S: Final = 0.2
 
+_RETIRED: Final = "the source was changed or removed by a reload"
+
 Done = Callable[[str], None]
 """Called once with what became of a value: empty if the device has it, else the reason."""
 
@@ -102,6 +104,8 @@ class Inlet:
             while not self._has_room(register):
                 self._freed = self._loop.create_future()
                 await self._freed
+            if self.block.retired:
+                raise CommandError(_RETIRED)
             if self._silent and self._pending:  # one at a time asks whether it is back
                 raise CommandError(
                     f"source {self.block.source} does not answer; shmio-supervisor status says how it fares"
@@ -165,7 +169,7 @@ class Inlet:
 
     def _retired(self) -> None:
         for number in list(self._pending):
-            self._end(number, "the source was changed or removed by a reload")
+            self._end(number, _RETIRED)
         self._free()
 
     def _end(self, number: int, reason: str) -> None:

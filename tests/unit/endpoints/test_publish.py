@@ -30,7 +30,7 @@ def message(path: str, value: str = "", kind: str = "double", **content: Any) ->
 
 async def publish(served: Endpoint, messages: Iterable[wire.PubRequest]) -> None:
     """Send all at once, half-close, and wait for the answer."""
-    await served.stub.Publish(iter(messages), timeout=TIMEOUT_S)
+    await served.stub.Publish(iter(messages), timeout=9 * TIMEOUT_S)  # a busy host takes its time for 10 000
 
 
 def counted(served: Endpoint) -> tuple[int, int]:
@@ -342,6 +342,19 @@ def test_a_source_that_says_nothing_holds_nobody_for_long(
 
     asyncio.run(run())
     assert "the source gave no answer in time" in caplog.text
+
+
+def test_a_source_that_a_reload_ends_refuses_at_once(segment: Segment, caplog: pytest.LogCaptureFixture) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        answer = asyncio.ensure_future(publish(served, [message("cell/step", "1")]))
+        await waiting(served, device, 1)
+        segment.change(retire=["cell"])
+        await answer
+        await publish(served, [message("cell/step", "2")])
+        assert counted(served) == (0, 2)
+
+    with_plant(segment, test, running=False)
+    assert caplog.text.count("the source was changed or removed by a reload") == 2
 
 
 def test_two_writers_meet_in_the_order_the_source_decides(segment: Segment, instance: str) -> None:
