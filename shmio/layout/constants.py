@@ -32,11 +32,17 @@ class Constants:
     def __init__(self, declared: Iterable[ConstantDeclaration] = (), outer: Constants | None = None) -> None:
         self._declared = {declaration.name.lower(): declaration for declaration in declared}
         self._outer = outer
+        self._numbers: dict[str, int] = {}  # each is computed once: a few may refer to each other many times
 
     def find(self, name: str) -> ConstantDeclaration | None:
         """Return a constant; its name may be in any case."""
-        found = self._declared.get(name.lower())
-        return found if found or self._outer is None else self._outer.find(name)
+        scope = self._scope(name.lower())
+        return scope._declared[name.lower()] if scope else None
+
+    def _scope(self, key: str) -> Constants | None:
+        if key in self._declared:
+            return self
+        return self._outer._scope(key) if self._outer else None
 
     def number(self, bound: Bound) -> int:
         """Return what a bound comes to, within 32 bits. Raises BoundFault."""
@@ -60,16 +66,20 @@ class Constants:
 
     def _constant(self, constant: Constant, depth: int) -> int:
         name, at = constant.name, constant.position
-        declaration = self.find(name)
-        if declaration is None:
+        scope = self._scope(name.lower())
+        if scope is None:
             what = f"the constant {name!r} is not in the sources; write its value here, or give one more source with: "
             raise BoundFault(at.error(f'{what}VAR CONSTANT "{name}" : Int := …; END_VAR'))
-        if declaration.number is None:
+        if (known := scope._numbers.get(name.lower())) is not None:
+            return known
+        number = scope._declared[name.lower()].number
+        if number is None:
             raise BoundFault(at.error(f"expected a whole number, found the constant {name!r} of another kind"))
         if depth >= MAX_DEFINITIONS:
             raise BoundFault(at.error(f"the constant {name!r} is defined by itself"))
-        number = declaration.number
-        return number if isinstance(number, int) else self._sum(number, depth + 1)
+        value = number if isinstance(number, int) else scope._sum(number, depth + 1)
+        scope._numbers[name.lower()] = value
+        return value
 
     def substitute(self, text: str | None) -> str | None:
         """Return an initial value with the names of known constants replaced by their values."""

@@ -31,6 +31,7 @@ class Cursor:
         self.report = report
         self._text = text
         self._tokens = tokens
+        self._absent: set[str] = set()  # keywords that do not come any more: they are not looked for twice
         self.index = 0
         self.token = tokens[0]
         self._pass_faults()
@@ -71,10 +72,12 @@ class Cursor:
 
     def skip_to(self, word: str) -> bool:
         """Go to this keyword, without a word about faults on the way; stay, and return False, if there is none."""
-        for index in range(self.index, len(self._tokens)):
-            if self._tokens[index].is_word(word):
-                self.rewind(index)
-                return True
+        if word not in self._absent:
+            for index in range(self.index, len(self._tokens)):
+                if self._tokens[index].is_word(word):
+                    self.rewind(index)
+                    return True
+            self._absent.add(word)
         return False
 
     def _pass_faults(self) -> None:

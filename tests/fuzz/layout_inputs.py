@@ -86,7 +86,7 @@ VALUES = (
     "#N",
     "N",
 )
-KNOWN = """VAR CONSTANT N : Int := 2; END_VAR
+KNOWN = """VAR CONSTANT N : Int := M + 1 - M * 2; M : Int := -1; END_VAR
 TYPE "t" STRUCT p : Int; q : Struct r : Bool; s : String[4] := 'ab'; END_STRUCT; END_STRUCT; END_TYPE
 TYPE UDT 1 STRUCT x : Array[0..N] of Byte; y : "t" := (7); END_STRUCT; END_TYPE
 FUNCTION_BLOCK "g" VAR_INPUT i : Bool; END_VAR VAR_IN_OUT a : Array[*] of Int; END_VAR VAR u : UDT 1; END_VAR

@@ -129,6 +129,19 @@ def test_instances_within_instances_and_system_function_blocks() -> None:
     }
 
 
+def test_many_unfinished_function_blocks_end_in_an_error() -> None:
+    unfinished = 'FUNCTION_BLOCK "f" VAR_TEMP a : Int; END_FUNCTION_BLOCK ' * 20_000
+    assert "declared already" in error(unfinished + block("a : Int;"))
+    assert "has no END_FUNCTION_BLOCK" in error('FUNCTION_BLOCK "f" VAR a : Int; END_VAR ' * 20_000)
+
+
+def test_a_constant_is_computed_where_it_is_declared() -> None:
+    fb = 'FUNCTION_BLOCK "f" VAR CONSTANT N : Int := 9; END_VAR VAR a : Array[1..LAST] of Byte; END_VAR '
+    fb += "END_FUNCTION_BLOCK "
+    given = "VAR CONSTANT N : Int := 2; LAST : Int := N + 1; END_VAR "
+    assert layout_of(given + fb + f'DATA_BLOCK "d" "f" BEGIN {END}').registers[0].count == 3
+
+
 def test_a_function_block_matters_only_if_it_has_an_instance() -> None:
     faulty = 'FUNCTION_BLOCK "odd" VAR_INPUT a : ; b : Nope; END_VAR x := 1; END_FUNCTION_BLOCK '
     assert layout_of(faulty + block("a : Int;")).size == 2
@@ -254,6 +267,9 @@ def test_constants_that_cannot_be(constants: str, member: str, message: str) -> 
 
 def test_long_sums_and_chains_of_constants_have_an_end() -> None:
     assert layout_of(block(f"a : Array[0..{'1+' * 50_000}1] of Bool;")).registers[0].count == 50_002
+    doubled = "".join(f"C{i} : Int := C{i + 1} * C{i + 1} + C{i + 1};\n" for i in range(31))
+    zero = f"VAR CONSTANT {doubled} C31 : Int := 0; END_VAR"
+    assert layout_of(zero, block("a : Array[0..C0] of Int;")).registers[0].count == 1
     chain = "".join(f"C{i} : Int := C{i + 1};\n" for i in range(1000))
     assert "is defined by itself" in error(f"VAR CONSTANT {chain} END_VAR", block("a : Array[0..C0] of Int;"))
 
