@@ -14,6 +14,8 @@ import msgspec
 from shmio.segment.events import EVENT_DATA_SIZE, Event
 from shmio.segment.frame import Frame, Provenance, Quality
 
+MAX_GAP_BYTES: Final = 4096
+
 FRAME: Final = "shmio.frame.v1"
 EVENT: Final = "shmio.event.v1"
 GAP: Final = "json"
@@ -128,6 +130,8 @@ def encode_gap(gap: Gap) -> bytes:
 
 def decode_gap(data: bytes) -> Gap:
     """The gap of a message; ValueError."""
+    if len(data) > MAX_GAP_BYTES:
+        raise ValueError(f"a gap of {len(data)} bytes")
     gap = msgspec.json.decode(data, type=Gap)
     if gap.what not in ("frames", "events") or not 0 < gap.first <= gap.last or gap.count != gap.last - gap.first + 1:
         raise ValueError("a gap contradicts itself")

@@ -17,13 +17,15 @@ from mcap.records import Metadata
 from shmio.errors import LayoutError, RecordingError
 from shmio.layout.model import Layout
 from shmio.recording.encoding import EVENT, FRAME, GAP, Gap, decode_event, decode_frame, decode_gap
-from shmio.recording.records import MAX_RECORD_BYTES, Record, Records, stream
+from shmio.recording.records import Record, Records, stream
 from shmio.recording.writer import ABOUT, GAPS_TOPIC
 from shmio.segment import Event, Frame
 
 MAX_LAYOUT_BYTES: Final = 64 << 20
 """All layouts of one file together."""
 MAX_ATTACHMENTS: Final = 10_000
+MAX_CHANNELS: Final = 10_000
+MAX_CHANNEL_BYTES: Final = 4096
 
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _ATTACHMENT_HEAD: Final = 4096  # times, name, media type and size of any attachment fit in
@@ -169,8 +171,10 @@ class Reader:
         self.attachments[name] = AttachmentEntry(record.at + data.count, size)
 
     def _channel(self, content: memoryview) -> None:
-        if len(content) > MAX_RECORD_BYTES:
-            raise RecordingError(f"{self.file}: a channel's description is larger than {MAX_RECORD_BYTES} bytes")
+        if len(content) > MAX_CHANNEL_BYTES or len(self.channels) >= MAX_CHANNELS:
+            raise RecordingError(
+                f"{self.file}: it describes more channels, or one at more length, than a recorder does"
+            )
         try:
             found = ChannelRecord.read(stream(content))
             about = found.metadata

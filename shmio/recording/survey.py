@@ -16,6 +16,9 @@ from shmio.recording.records import MAX_RECORD_BYTES, Record
 
 MAX_GAPS: Final = 1000
 """Gaps that are kept one by one; all are counted."""
+MAX_DAMAGE: Final = 20
+"""Damaged places that are told."""
+MAX_BLOCKS: Final = 10_000
 
 _INDEX: Final = struct.Struct("<HI")  # channel, bytes of the entries
 _ENTRY: Final = struct.Struct("<QQ")  # log time, offset
@@ -88,7 +91,7 @@ def survey(reader: Reader) -> Survey:
             try:
                 reader.note(record)
             except RecordingError as error:
-                found.damage.append(str(error))
+                _damaged(found, error)
     if chunk is not None:  # the last of a file that ends here: its indexes may be missing
         _settle(reader, found, chunk, None)
     if not reader.about:
@@ -114,7 +117,7 @@ def _settle(reader: Reader, found: Survey, chunk: Record, counts: list[_Count] |
         if not counts or any(_must_read(reader, count.channel) for count in counts):
             counts = _read(reader, found, chunk)
     except RecordingError as error:
-        found.damage.append(str(error))
+        _damaged(found, error)
         return
     for count in counts:
         channel = reader.channels[count.channel]
@@ -124,6 +127,11 @@ def _settle(reader: Reader, found: Survey, chunk: Record, counts: list[_Count] |
         else:
             track.count += count.messages
             track.last_ns, track.last_in = count.last_ns, chunk
+
+
+def _damaged(found: Survey, error: RecordingError) -> None:
+    if len(found.damage) < MAX_DAMAGE:
+        found.damage.append(str(error))
 
 
 def _must_read(reader: Reader, number: int) -> bool:
@@ -145,6 +153,8 @@ def _read(reader: Reader, found: Survey, chunk: Record) -> list[_Count]:
 
 def _add_gap(found: Survey, gap: Gap) -> None:
     key = (gap.source, gap.block, gap.what)
+    if key not in found.missed and len(found.missed) >= MAX_BLOCKS:
+        raise RecordingError(f"gaps of more than {MAX_BLOCKS} blocks")
     found.gap_count += 1
     found.missed[key] = found.missed.get(key, 0) + gap.count
     found.missed_to[key] = max(found.missed_to.get(key, 0), gap.last)
