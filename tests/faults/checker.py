@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 import traceback
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -20,6 +21,11 @@ from tests.faults.checks import Counts, Source
 from tests.faults.truth import Truth
 
 TELL_S: Final = 0.1
+PULSE_S: Final = 0.05
+SLACK_NS: Final = 1_000_000_000
+"""How much later than it was sent something may come to a checker's notice on a machine that is not overloaded."""
+REMEMBERED: Final = 200
+"""Pulses, 10 s of them and more."""
 TRACED: Final = 4096
 """Characters of a traceback that are told."""
 
@@ -57,6 +63,7 @@ class Checker:
         self._counts: dict[str, Counts] = {}
         self._turn = threading.Lock()
         self._threads: list[threading.Thread] = []
+        self._held_up: deque[int] = deque([0], maxlen=REMEMBERED)
 
     def complain(self, problem: str) -> None:
         """Tell a violation."""
@@ -80,9 +87,22 @@ class Checker:
         self._threads.append(thread)
         thread.start()
 
+    @property
+    def slack_ns(self) -> int:
+        """How late something may come to our notice: more, when the machine has lately kept us waiting."""
+        return SLACK_NS + 3 * max(self._held_up)
+
+    def _pulse(self) -> None:
+        """Measure how long the machine keeps a thread waiting that wants to run."""
+        while not self.stopping.is_set():
+            due_ns = time.monotonic_ns() + round(PULSE_S * 1e9)
+            time.sleep(PULSE_S)
+            self._held_up.append(max(0, time.monotonic_ns() - due_ns))
+
     def run(self) -> None:
         """Tell until standard input ends."""
         threading.Thread(target=self._await_end, daemon=True).start()
+        threading.Thread(target=self._pulse, daemon=True).start()
         while not self.stopping.wait(TELL_S):
             self._tell({"counts": {name: asdict(counts) for name, counts in self._counts.items()}})
         for thread in self._threads:

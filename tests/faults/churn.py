@@ -16,8 +16,6 @@ READERS = 50
 ON_FASTEST = 4
 """So many of them follow the fastest source, since each of its frames is a line to be looked at here."""
 TURN_S = 0.1
-SLACK_NS = 1_000_000_000
-"""A line waits in a pipe until it is looked at."""
 LINE = re.compile(rb"(\d+) cycle (\d+) missed (\d+) (good|uncertain|bad) (\d+) (.*)")
 GONE = re.compile(r"no instance|.* is just starting|.* has stopped|source \S+ was changed")
 """What a reader may say when its instance is not there or stops."""
@@ -31,6 +29,7 @@ class Reader:
         self._check = ValueCheck(source, checker.complain, counts)
         self._name = source.name
         self._number = self._missed = 0
+        self._looked_ns = time.monotonic_ns()
         self._tail = b""
         self.killed = False
         frames = chance.choice((1, chance.randrange(2, 100), 1_000_000))
@@ -45,7 +44,7 @@ class Reader:
     def take(self, data: bytes) -> None:
         """Look at what it has printed."""
         *lines, self._tail = (self._tail + data).split(b"\n")
-        now_ns = time.monotonic_ns()
+        printed_ns, self._looked_ns = self._looked_ns, time.monotonic_ns()  # after the last look, for it took all
         for line in lines:
             match = LINE.fullmatch(line)
             if match is None:
@@ -62,7 +61,7 @@ class Reader:
             self._check.counts.missed += missed - self._missed
             self._number, self._missed = number, missed
             if match[4] == b"good":
-                self._check.value(int(match[5]), now_ns, slack_ns=SLACK_NS)
+                self._check.value(int(match[5]), printed_ns, slack_ns=self._checker.slack_ns)
 
     def finish(self) -> None:
         """It has ended, or does now: was that right?"""

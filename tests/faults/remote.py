@@ -14,8 +14,6 @@ from tests.faults.checks import Source, ValueCheck
 
 STREAMS = 2
 PAUSE_S = 0.1
-SLACK_NS = 1_000_000_000
-"""How much later than it was sent a value may arrive, for the machine is busy; a broken connection keeps none."""
 BREAKS = {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED, grpc.StatusCode.DEADLINE_EXCEEDED}
 """How a stream may end when its server is killed, stopped or away."""
 CALL_S = 20.0
@@ -37,7 +35,7 @@ def subscribe(checker: Checker, source: Source, name: str) -> None:
             call = stub.Subscribe(TopicDescriptor(path=f"{source.name}/stamp"), timeout=CALL_S)
             try:
                 for message in call:
-                    check.value(int(message.value), time.monotonic_ns(), slack_ns=SLACK_NS)
+                    check.value(int(message.value), time.monotonic_ns(), slack_ns=checker.slack_ns)
                     if checker.stopping.is_set():
                         call.cancel()
             except grpc.RpcError as error:
