@@ -51,7 +51,7 @@ class Ways:
         self.big = np.dtype([(f"r{at}", *_big(register)) for at, register in enumerate(self.registers)])
         assert self.struct.size == self.big.itemsize == layout.size
         self.raw = np.dtype([(f"r{at}", f"V{register.size}") for at, register in enumerate(self.registers)])
-        self.starts = [register.offset for register in self.registers]  # none lies between two of them
+        self.owner = np.repeat(np.arange(len(self.registers)), [register.size for register in self.registers])
         self.spans = [(register.offset, register.offset + register.size) for register in self.registers]
 
     # what changed
@@ -59,7 +59,9 @@ class Ways:
     def numpy_bytes(self, old: bytes, new: bytes) -> list[int]:
         """All bytes at once, then the registers that own those that differ."""
         differ = np.frombuffer(old, np.uint8) != np.frombuffer(new, np.uint8)
-        found: list[int] = np.flatnonzero(np.logical_or.reduceat(differ, self.starts)).tolist()
+        changed = np.zeros(len(self.registers), bool)
+        changed[self.owner[differ]] = True
+        found: list[int] = np.flatnonzero(changed).tolist()
         return found
 
     def numpy_record(self, old: bytes, new: bytes) -> list[int]:
