@@ -42,7 +42,10 @@ def claim(instance: str) -> SharedObject | None:
     try:
         if not shared.try_lock(SUPERVISOR_LOCK):
             refuse_second(instance)
-            raise AlreadyRunningError(f"another supervisor is just starting instance {instance!r}")
+            raise AlreadyRunningError(
+                f"another supervisor is just starting instance {instance!r}, or it is of another version of shmio: "
+                "end it with the version that started it"
+            )
         if shared.current():
             return shared
     except BaseException:

@@ -19,6 +19,7 @@ from shmio.supervisor.change import Change
 from shmio.supervisor.control import Answer, ControlServer, Reload, Request, Restart, Stop, socket_path
 from shmio.supervisor.fleet import TICK_S, Fleet
 from shmio.supervisor.managed import log
+from shmio.supervisor.notify import Notifier
 from shmio.supervisor.plan import MODULES, Plan
 from shmio.supervisor.policy import Limits
 from shmio.supervisor.reconcile import refusal
@@ -55,6 +56,7 @@ class Supervisor:
         self._limits = limits or Limits()
         self._modules = modules
         self._on_state = on_state
+        self._notifier = Notifier()
         self._selector = selectors.DefaultSelector()
         self._state = InstanceState.STARTING
         self._stopping = False
@@ -121,6 +123,8 @@ class Supervisor:
         self._stop()
 
     def _stop(self) -> None:
+        if not self._stopping:
+            self._notifier.stopping()
         self._stopping = True
         if self._change_answer is not None:
             self._change_answer.error("the instance is stopping")
@@ -167,6 +171,7 @@ class Supervisor:
         if reason:
             answer.error(reason)
             return
+        self._notifier.reloading()
         try:
             plan = self._replan()
             if reason := refusal(plan, self._plan):
@@ -174,6 +179,7 @@ class Supervisor:
             self._change = Change(self._fleet, self._segment, plan)
         except ShmioError as error:
             log.error("nothing is changed: %s", error)
+            self._notifier.ready()
             answer.error(str(error))
             return
         self._plan, self._change_answer = plan, answer
@@ -188,6 +194,7 @@ class Supervisor:
             log.error("%s", line)
         log.info("the change is over", extra=fields(kept=len(change.changes.kept)))
         if self._change_answer is not None:
+            self._notifier.ready()
             self._change_answer.ok(done=done, problems=problems, kept=list(change.changes.kept))
         self._change = self._change_answer = None
 
@@ -254,10 +261,15 @@ class Supervisor:
                 self._qualities, self._qualities_ns = self._look(), now_ns
             state = policy.assess([m.life.state is State.RUNNING for m in self._fleet], self._qualities)
         self._segment.set_state(os.getpid(), state)
+        self._notifier.beat(now_ns)
         if state is not self._state:
+            if self._state is InstanceState.STARTING and state is not InstanceState.STOPPING:
+                self._notifier.ready()
             self._state = state
             reasons = ", ".join(self._weak()) if state is InstanceState.DEGRADED else ""
-            log.info("instance %s%s", state, f": {reasons}" if reasons else "")
+            told = f"{state}: {reasons}" if reasons else str(state)
+            log.info("instance %s", told)
+            self._notifier.status(told)
             self._on_state(state)
 
     def _weak(self) -> list[str]:

@@ -8,7 +8,7 @@ import select
 from contextlib import suppress
 
 from shmio.cli.target import ask, instance_name
-from shmio.errors import NotRunningError, UnfinishedError
+from shmio.errors import FormatError, NotRunningError, UnfinishedError
 from shmio.segment import Segment, instances, leftover
 from shmio.supervisor import control
 
@@ -21,7 +21,7 @@ def execute(arguments: argparse.Namespace) -> int:
     name = instance_name(arguments)
     if name not in instances():
         raise NotRunningError(f"no instance {name!r} is running: there is nothing to stop")
-    with suppress(UnfinishedError), Segment.open(name) as segment:
+    with suppress(UnfinishedError, FormatError), Segment.open(name) as segment:
         if segment.supervised:
             _stop(segment)
             return 0

@@ -8,7 +8,7 @@ import msgspec
 
 from shmio import worker
 from shmio.config import Address, Grpc
-from shmio.endpoints.grpc.feed import Feed
+from shmio.endpoints.grpc.feeds import Feeds
 from shmio.endpoints.grpc.server import Server
 from shmio.endpoints.grpc.simlog_v1 import SimlogV1
 from shmio.errors import SegmentError
@@ -27,45 +27,43 @@ async def _serve(worker: Worker) -> None:
     worker.on_stop(lambda: loop.call_soon_threadsafe(stopping.set))
     config = msgspec.convert(worker.config, Grpc)
     tasks: set[asyncio.Task[None]] = set()
+    good_ones: set[str] = set()
     writer = worker.slot.writer
     if writer is None:
         raise SegmentError("the segment has no command queue for this process")
 
     def on_quality(source: str, good: bool) -> None:
-        worker.log.info("source %s", "good" if good else "bad", extra=fields(source=source))
+        if good != (source in good_ones):
+            worker.log.info("source %s", "good" if good else "bad", extra=fields(source=source))
+            good_ones.symmetric_difference_update({source})
         task = loop.create_task(server.set_source(source, good))
         tasks.add(task)
         task.add_done_callback(tasks.discard)
 
-    blocks = worker.segment.blocks
-    default = config.default_source or (next(iter(blocks)) if len(blocks) == 1 else None)
-    feeds = {name: Feed(block, writer, loop, on_quality) for name, block in blocks.items()}
-    service = SimlogV1(feeds, default)
+    feeds = Feeds(worker.segment, writer, loop, on_quality)
+    service = SimlogV1(feeds, config.default_source)
     server = Server(service)
-    for source in feeds:
-        await server.set_source(source, False)
-    for feed in feeds.values():
-        feed.start()
+    feeds.start()
     addresses = [Address.parse(text) for text in config.listen]
     ports = await server.start(addresses, config.tls)
     served = ", ".join(str(Address(address.host, port)) for address, port in zip(addresses, ports, strict=True))
     worker.log.info("serving %s", served)
     worker.running()
     while not stopping.is_set():
-        if not all(feed.alive for feed in feeds.values()):
+        if over := feeds.follow():
+            worker.log.info("a reload changed or ended %s", ", ".join(over))
+            service.move(over)
+        if not feeds.alive:
             raise RuntimeError("a feed ended; the endpoint starts anew")
         streams, dropped, published, refused = service.counters
-        messages = sum(feed.messages for feed in feeds.values())
-        worker.report((streams, messages, dropped, published, refused))
+        worker.report((streams, feeds.messages, dropped, published, refused))
         try:
             await asyncio.wait_for(stopping.wait(), BEAT_S)
         except TimeoutError:
             continue
-    for feed in feeds.values():
-        feed.stop()
+    feeds.stop()
     await server.stop()
-    for feed in feeds.values():
-        feed.join()
+    feeds.join()
 
 
 if __name__ == "__main__":

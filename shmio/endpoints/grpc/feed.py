@@ -80,8 +80,8 @@ class Feed:
 
     @property
     def alive(self) -> bool:
-        """Whether the block is being followed."""
-        return self._thread.is_alive() and self.inlet.alive
+        """Whether the block is being followed, as long as there is something to come."""
+        return (self._thread.is_alive() or self.block.retired) and self.inlet.alive
 
     def start(self) -> None:
         """Begin to follow the block."""
@@ -168,7 +168,10 @@ class Feed:
         while not self._stopping.is_set():
             if cursor.behind > CATCH_UP_FRAMES:
                 cursor = block.cursor(after=block.ring.head() - 1)
+            retired = block.retired
             frame = cursor.next(timeout_s=min(WAIT_S, block.stale_ns / 1e9))
+            if frame is None and retired:
+                return
             good = frame is not None and frame.assess(block.stale_ns)[0] is not Quality.BAD
             # Age by the next frame's time, if there is one: it may have been stale while nobody was awake to see it.
             until_ns = frame.publish_ns if frame else time.monotonic_ns()

@@ -17,6 +17,7 @@ class ConflatingQueue:
         self._bound = bound
         self._messages: deque[bytes] = deque()
         self._waiter: asyncio.Future[None] | None = None
+        self._ended = False
         self.dropped = 0
 
     def push(self, message: bytes) -> None:
@@ -24,17 +25,28 @@ class ConflatingQueue:
         if len(self._messages) >= self._bound:
             self.clear()
         self._messages.append(message)
-        if self._waiter is not None and not self._waiter.done():
-            self._waiter.set_result(None)
+        self._wake()
 
     def clear(self) -> None:
         """Drop what waits."""
         self.dropped += len(self._messages)
         self._messages.clear()
 
-    async def pop(self) -> bytes:
-        """The oldest message, waited for."""
+    def end(self) -> None:
+        """Have the reader end once it has read what waits."""
+        self._ended = True
+        self._wake()
+
+    def _wake(self) -> None:
+        if self._waiter is not None and not self._waiter.done():
+            self._waiter.set_result(None)
+
+    async def pop(self) -> bytes | None:
+        """The oldest message, waited for; None at the end, from where it begins anew."""
         while not self._messages:
+            if self._ended:
+                self._ended = False
+                return None
             self._waiter = asyncio.get_running_loop().create_future()
             try:
                 await self._waiter

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Collection, Mapping
 from functools import lru_cache
 from typing import Any
 
 import grpc
 from google.protobuf.empty_pb2 import Empty
 
-from shmio.endpoints.grpc.echo import Picture
+from shmio.endpoints.grpc.echo import Echo, Picture
 from shmio.endpoints.grpc.feed import CATCH_UP_FRAMES, Feed
 from shmio.endpoints.grpc.inlet import Inlet
 from shmio.endpoints.grpc.publish import Publisher
@@ -31,6 +31,7 @@ class SimlogV1:
     """Serves the registers of all sources as text values."""
 
     def __init__(self, feeds: Mapping[str, Feed], default_source: str | None) -> None:
+        """``default_source``: that of paths which name none; default: the only one."""
         self._feeds = feeds
         self._default = default_source
         self._streams: set[_Stream] = set()
@@ -66,22 +67,50 @@ class SimlogV1:
         """Stream a topic's values: the current one if it is good, then every change; of ``/in``, what is written to it.
 
         While quality is bad nothing is sent; on recovery the value is sent again. A slow client is
-        given the newest value in place of those that wait.
+        given the newest value in place of those that wait. When a reload changes the source the stream goes on, if
+        there still is such a register; else it ends with NOT_FOUND.
         """
         topic, register = await self._resolve(request.path, context)
-        feed = self._feeds[topic.source]
-        joined = feed.inlet.echo if topic.direction == "in" else feed
-        stream = _Stream()
-        joined.listen(register, encoder(register, feed.block.layout), stream)
+        stream = _Stream(topic.source)
         self._streams.add(stream)
+        told = False
         try:
-            await context.send_initial_metadata(())  # the client may wait for it, and then misses nothing
             while True:
-                yield await stream.pop()
+                joined = self._join(topic, register, stream)
+                try:
+                    if not told:
+                        await context.send_initial_metadata(())  # who waits for it misses nothing from then on
+                        told = True
+                    while (message := await stream.pop()) is not None:
+                        yield message
+                finally:
+                    joined.leave(register, stream)
+                register = await self._find_again(topic, request.path, context)
         finally:
-            joined.leave(register, stream)
             self._streams.discard(stream)
             self._dropped += stream.dropped
+
+    def move(self, sources: Collection[str]) -> None:
+        """Have the streams of these sources go over to the feeds that there are by now."""
+        for stream in self._streams:
+            if stream.source in sources:
+                stream.end()
+
+    def _join(self, topic: Topic, register: Register, stream: _Stream) -> Feed | Echo:
+        feed = self._feeds[topic.source]
+        joined = feed.inlet.echo if topic.direction == "in" else feed
+        joined.listen(register, encoder(register, feed.block.layout), stream)
+        return joined
+
+    async def _find_again(self, topic: Topic, path: str, context: Context) -> Register:
+        """The register of a stream after a reload; NOT_FOUND."""
+        try:
+            if topic.source not in self._feeds:
+                raise PathError(f"{shorten(path)}: source {topic.source} was removed by a reload")
+            return find(self._feeds[topic.source].block.layout, topic.path)
+        except PathError as error:
+            await context.abort(grpc.StatusCode.NOT_FOUND, str(error))
+            raise  # abort never returns
 
     async def publish(self, messages: AsyncIterator[bytes], context: Context) -> Empty:
         """Write the values of a stream, in its order, and answer when it has ended and all of them have."""
@@ -106,7 +135,8 @@ class SimlogV1:
         return topic, feed.inlet, find(feed.block.layout, topic.path)
 
     def _topic(self, path: str) -> Topic:
-        topic = parse_topic(path, self._feeds, self._default)
+        default = self._default or (next(iter(self._feeds)) if len(self._feeds) == 1 else None)
+        topic = parse_topic(path, self._feeds, default)
         if topic.source not in self._feeds:
             raise PathError(f"{shorten(path)}: {topic.source} is reserved, and this version serves nothing there")
         return topic
@@ -115,8 +145,9 @@ class SimlogV1:
 class _Stream(ConflatingQueue):
     """One Subscribe call, as a feed's listener."""
 
-    def __init__(self) -> None:
+    def __init__(self, source: str) -> None:
         super().__init__(QUEUE_BOUND)
+        self.source = source
         self.since = 0
 
     def deliver(self, message: bytes) -> None:

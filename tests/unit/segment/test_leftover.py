@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
-from shmio.errors import AlreadyRunningError, FormatError, NotRunningError
+from shmio.errors import AlreadyRunningError, NotRunningError
 from shmio.segment import ProcessSpec, Segment, instances
 from shmio.segment.leftover import clear
 
@@ -45,12 +47,42 @@ def test_a_living_supervisor_is_left_alone(instance: str) -> None:
         segment.unlink()
 
 
-def test_another_versions_segment_is_left_alone(instance: str) -> None:
+WORKER = """
+import os, signal, sys
+from shmio.segment.shm import SharedObject
+shared = SharedObject.open(f"shmio-{sys.argv[1]}", writable=True)
+memory = shared.map()
+print(os.getpid(), flush=True)
+signal.pause()
+"""
+
+
+@pytest.mark.parametrize("field", ["abi", "version"])
+def test_another_versions_processes_are_found_without_its_format(instance: str, field: str) -> None:
+    """Those that run a module of ours and map the segment so that they can write to it; nobody else's."""
     with Segment.create(instance, [], [ProcessSpec("cell", "source")]) as segment:
-        segment.memory[8:12] = (7).to_bytes(4, "little")
-    with pytest.raises(FormatError, match=r"ABI 7.*use one version"):
-        clear(instance)
-    assert instance in instances()
+        if field == "abi":
+            segment.memory[8:12] = (7).to_bytes(4, "little")
+        else:
+            segment.memory[176:182] = b"0.0.7\0"
+    modules = {"workers": "shmio.connectors_of_another_version", "others": "not_ours"}
+    commands = {name: [sys.executable, "-c", WORKER, instance, "-m", module] for name, module in modules.items()}
+    with ExitStack() as stack:
+        running = {}
+        for name, command in commands.items():
+            process = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
+            stack.callback(process.kill)
+            assert process.stdout is not None
+            assert int(process.stdout.readline()) == process.pid
+            running[name] = process
+        assert clear(instance) == [
+            f"segment shmio-{instance} is of another version of shmio",
+            f"stopped {modules['workers']}, pid {running['workers'].pid}, which had lost its supervisor",
+            f"removed the left-over segment shmio-{instance}",
+        ]
+        assert running["workers"].wait(10) == -signal.SIGTERM
+        assert running["others"].poll() is None
+    assert instance not in instances()
 
 
 def test_an_unfinished_segment_is_removed(instance: str) -> None:

@@ -96,7 +96,7 @@ def test_all_is_well(cell: Cell, instance: str) -> None:
     assert (source.quality, source.reason, source.cycle) == ("good", "", 5)
     assert (source.rate_hz, source.overruns) == (49.9, 3)
     assert "rate_mhz" not in source.counters
-    assert grpc.counters == {"streams": 7, "messages": 3, "dropped": 0}
+    assert grpc.counters == {"streams": 7, "messages": 3, "dropped": 0, "published": 1, "refused": 250}
     assert type(grpc) is ProcessStatus, "quality is for sources"
 
 

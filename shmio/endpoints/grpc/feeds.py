@@ -1,0 +1,82 @@
+"""The feeds of all sources that there are by now: a reload may add sources, end them, or change their layout."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Iterator, Mapping
+
+from shmio.endpoints.grpc.feed import Feed
+from shmio.segment import Segment
+
+
+class Feeds(Mapping[str, Feed]):
+    """A feed for each block of a segment, by its source's name; for the event loop's thread."""
+
+    def __init__(
+        self,
+        segment: Segment,
+        writer: int,
+        loop: asyncio.AbstractEventLoop,
+        on_quality: Callable[[str, bool], None],
+    ) -> None:
+        """``writer``: the command queue of this process. ``on_quality``: told whether a source is good by now."""
+        self._segment = segment
+        self._writer = writer
+        self._loop = loop
+        self._on_quality = on_quality
+        self._feeds: dict[str, Feed] = {}
+        self._ended: list[Feed] = []
+        self._ended_messages = 0
+
+    def __getitem__(self, source: str) -> Feed:
+        return self._feeds[source]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._feeds)
+
+    def __len__(self) -> int:
+        return len(self._feeds)
+
+    @property
+    def messages(self) -> int:
+        """Messages made since the start."""
+        return self._ended_messages + sum(feed.messages for feed in self._feeds.values())
+
+    @property
+    def alive(self) -> bool:
+        """Whether every block is being followed."""
+        return all(feed.alive for feed in self._feeds.values())
+
+    def start(self) -> None:
+        """Begin to follow all blocks that are not followed yet."""
+        for source, block in self._segment.blocks.items():
+            if source not in self._feeds:
+                feed = self._feeds[source] = Feed(block, self._writer, self._loop, self._on_quality)
+                self._on_quality(source, False)
+                feed.start()
+
+    def follow(self) -> list[str]:
+        """Take up what a reload has changed; the sources whose feed is another by now, or none.
+
+        FormatError: the segment makes no sense any more.
+        """
+        if not self._segment.refresh():
+            return []
+        over = [name for name, feed in self._feeds.items() if self._segment.blocks.get(name) is not feed.block]
+        for name in over:
+            feed = self._feeds.pop(name)
+            self._ended_messages += feed.messages
+            self._ended.append(feed)  # its threads end by themselves, when all is read
+            self._on_quality(name, False)
+        self.start()
+        return over
+
+    def stop(self) -> None:
+        """Tell all threads to end."""
+        for feed in (*self._feeds.values(), *self._ended):
+            feed.stop()
+
+    def join(self) -> None:
+        """Wait until they have."""
+        for feed in (*self._feeds.values(), *self._ended):
+            feed.join()

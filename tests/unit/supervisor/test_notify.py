@@ -1,0 +1,87 @@
+"""What a service manager hears, over a socket as its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shmio.supervisor.notify import Notifier
+from tests.unit.supervisor.harness import CELL, DEADLINE_S, Launch
+
+
+@pytest.fixture(params=["path", "abstract"])
+def manager(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+    """A service manager's end, which the environment names."""
+    name = f"@shmio-test-{os.getpid()}" if request.param == "abstract" else str(tmp_path / "notify")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(name.replace("@", "\0"))
+        manager.settimeout(DEADLINE_S)
+        monkeypatch.setenv("NOTIFY_SOCKET", name)
+        yield manager
+
+
+def heard(manager: socket.socket) -> dict[str, str]:
+    return dict(line.split("=", 1) for line in manager.recv(4096).decode().split("\n"))
+
+
+def test_a_life_as_it_is_heard(launch: Launch, manager: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WATCHDOG_USEC", "1000000")
+    cell = launch([*CELL, ("witness", "emulator", ["good"])])
+    told: list[dict[str, str]] = []
+
+    def until(key: str, value: str | None = None) -> dict[str, str]:
+        while not (told and key in told[-1] and value in (None, told[-1][key])):
+            told.append(heard(manager))
+        return told.pop()
+
+    until("READY")
+    until("STATUS", "running")
+    assert not any("READY" in message or "STOPPING" in message for message in told)
+    pid = cell.pid("witness")
+    environment = Path(f"/proc/{pid}/environ").read_bytes()
+    assert b"NOTIFY_SOCKET" not in environment
+    assert b"WATCHDOG" not in environment
+    cell.reload(CELL)
+    assert int(until("RELOADING")["MONOTONIC_USEC"]) > 0
+    until("READY", "1")
+    until("WATCHDOG", "1")
+    os.kill(cell.pid("cell"), signal.SIGKILL)
+    assert until("STATUS")["STATUS"].startswith("degraded: cell is not running")
+    cell.process.send_signal(signal.SIGTERM)
+    until("STOPPING", "1")
+    assert cell.wait_end() == 0
+
+
+def test_a_refused_reload_is_over_at_once(launch: Launch, manager: socket.socket) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    with pytest.raises(Exception, match=r"instance\.name"):
+        cell.reload(CELL, instance="other")
+    keys = [key for _ in range(4) for key in heard(manager)]
+    assert keys == ["READY", "STATUS", "RELOADING", "MONOTONIC_USEC", "READY"]
+
+
+@pytest.mark.parametrize(
+    "environment",
+    [{}, {"NOTIFY_SOCKET": "relative"}, {"NOTIFY_SOCKET": "/nowhere/at/all"}, {"NOTIFY_SOCKET": "/" + "x" * 300}],
+)
+def test_without_a_listener_nothing_fails(environment: dict[str, str]) -> None:
+    notifier = Notifier(environment)
+    notifier.ready()
+    notifier.beat(1)
+
+
+def test_another_processs_watchdog_is_not_fed(manager: socket.socket) -> None:
+    environment = {"NOTIFY_SOCKET": os.environ["NOTIFY_SOCKET"], "WATCHDOG_USEC": "1000"}
+    Notifier({**environment, "WATCHDOG_PID": "1"}).beat(1_000_000_000)
+    notifier = Notifier({**environment, "WATCHDOG_PID": str(os.getpid())})
+    notifier.beat(1_000_000_000)
+    notifier.beat(1_000_400_000)  # not half of 1 ms later
+    notifier.beat(1_000_500_000)
+    notifier.ready()
+    assert [heard(manager) for _ in range(3)] == [{"WATCHDOG": "1"}, {"WATCHDOG": "1"}, {"READY": "1"}]
