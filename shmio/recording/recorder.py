@@ -16,12 +16,13 @@ from shmio.recording.follower import Entry, Follower, Place
 from shmio.recording.output import Output
 from shmio.recording.writer import JSON, Channels, Writer
 from shmio.segment import Block, Frame, Segment
+from shmio.segment.events import EVENT_SIZE
 
 TURN_S: Final = 0.1
 CHUNK_S: Final = 0.8
 """A chunk is no longer than this: with a turn, and the time to write it, less than the second that a kill may cost."""
-BATCH: Final = 4096
-"""Entries of one block in one turn; what is left comes in the next, at once."""
+BATCH_BYTES: Final = 2 << 20
+"""About as much of one block in one turn; what is left comes in the next, at once."""
 CLOSE_S: Final = 3.0
 CHECK_S: Final = 1.0
 
@@ -66,6 +67,11 @@ class _Followed:
     channels: Channels | None = None
     lost: dict[str, _Lost] = field(default_factory=dict)
     log_ns: int = 0
+
+    @property
+    def batch(self) -> int:
+        """Entries to take in one turn."""
+        return max(16, BATCH_BYTES // (self.follower.block.layout.size + EVENT_SIZE))
 
 
 class Recorder:
@@ -127,7 +133,9 @@ class Recorder:
         self._segment.refresh()
         if self._segment.blocks is not self._known:
             self._follow(Start())
-        entries = list(chain.from_iterable(followed.follower.take(BATCH) for followed in self._followed))
+        taken = [list(followed.follower.take(followed.batch)) for followed in self._followed]
+        more = any(len(some) >= followed.batch for some, followed in zip(taken, self._followed, strict=True))
+        entries = list(chain.from_iterable(taken))
         entries.sort(key=lambda entry: entry.log_ns)  # stable: a block's own order stays
         full = self.output.full
         by_follower = {id(followed.follower): followed for followed in self._followed}
@@ -145,7 +153,7 @@ class Recorder:
         if now_s - self._checked_s >= CHECK_S:
             self._checked_s = now_s
             self.output.check()
-        return len(entries) >= BATCH
+        return more
 
     @property
     def pause_s(self) -> float:

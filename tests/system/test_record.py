@@ -1,0 +1,71 @@
+"""A whole cell is recorded, killed and looked into through the commands alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from shmio.testing.cell import CONFIG, Cell, kill, until
+
+RECORDED = CONFIG + '\n[recorder]\ndirectory = "dumps"\n'
+AXIS = "cell/Robot_800/Axs1_Pos"
+
+
+def info(cell: Cell, file: Path) -> dict[str, Any]:
+    """``info --json`` of a file of the cell."""
+    found: dict[str, Any] = json.loads(cell.run("shmio-dump", "info", "--json", str(file)).stdout)
+    return found
+
+
+def values(cell: Cell, file: Path) -> list[dict[str, Any]]:
+    lines = cell.run("shmio-dump", "cat", "--json", str(file), AXIS).stdout.splitlines()
+    return [line for line in map(json.loads, lines) if "frame" in line]
+
+
+def test_log_mode_records_a_cell_through_a_killed_recorder(make_cell: Callable[..., Cell]) -> None:
+    cell = make_cell(config=RECORDED)
+    up = cell.supervisor("up", "--detach", "--mode", "log")
+    assert up.returncode == 0, up.stderr
+    assert cell.status()["mode"] == "log"
+    assert list(cell.processes()) == ["plc", "cell", "recorder"]
+    until(lambda: cell.processes()["recorder"]["counters"]["frames"] >= 100, "frames")
+    before = cell.processes()
+    [first] = (cell.folder / "dumps").iterdir()
+    assert before["recorder"]["note"] == f"to {first.name}"
+    kill(before["recorder"]["pid"])
+    until(
+        lambda: (
+            (now := cell.processes()["recorder"])["pid"] not in (None, before["recorder"]["pid"])
+            and now["counters"]["frames"] >= 50
+        ),
+        "another recorder, at work",
+    )
+    assert cell.processes()["cell"]["pid"] == before["cell"]["pid"]
+    cell.down()
+    [second] = set((cell.folder / "dumps").iterdir()) - {first}
+    killed, whole = info(cell, first), info(cell, second)
+    assert (killed["closed"], whole["closed"]) == (False, True), cell.logs()
+    [old], [new] = killed["blocks"], whole["blocks"]
+    assert (old["first_frame"], old["frames"]) == (1, old["last_frame"]), "from the source's first frame"
+    missed = whole["missed_frames"]
+    assert new["first_frame"] == old["last_frame"] + 1 + missed
+    assert new["frames"] == new["last_frame"] - new["first_frame"] + 1
+    assert {"config/supervisor.toml", "sources/cell/db201.db"} < set(whole["attachments"])
+    assert len(values(cell, second)) > 1
+    events = [json.loads(line) for line in cell.run("shmio-dump", "cat", "--json", str(second)).stdout.splitlines()]
+    assert events[-1]["kind"] == "stopped", "to the source's last event"
+    assert values(cell, second)[-1]["quality"] == "bad"
+
+
+def test_a_live_cell_is_recorded_from_outside(cell: Cell) -> None:
+    done = cell.run("shmio-dump", "record", "--for", "2")
+    assert done.returncode == 0, done.stderr
+    [file] = (cell.folder / "dumps").iterdir()
+    found = info(cell, file)
+    assert (found["closed"], found["missed_frames"], found["recorder"]) == (True, 0, "shmio-dump")
+    assert "config/supervisor.toml" in found["attachments"], done.stderr
+    [block] = found["blocks"]
+    assert block["frames"] == block["last_frame"] - block["first_frame"] + 1 > 1
+    assert len({line["values"][AXIS.removeprefix("cell/")] for line in values(cell, file)}) > 1
