@@ -1,0 +1,41 @@
+"""The service unit: what systemd thinks of it, and what it relies on."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from shmio.testing.cell import BIN
+
+ROOT = Path(__file__).parents[2]
+UNIT = ROOT / "packaging" / "shmio@.service"
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
+def test_systemd_finds_no_fault(tmp_path: Path) -> None:
+    installed = UNIT.read_text().replace("/opt/shmio/bin/shmio-supervisor", str(BIN / "shmio-supervisor"))
+    installed = installed.replace("User=shmio", "User=root")
+    (tmp_path / "shmio@a50.service").write_text(installed)
+    unit = str(tmp_path / "shmio@a50.service")
+    verified = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True, check=False)
+    assert (verified.returncode, verified.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("result", "cleared"), [("success", True), ("timeout", True), ("signal", False), ("watchdog", False)]
+)
+def test_only_a_stop_clears_what_is_left(result: str, cleared: bool) -> None:
+    """After a crash the processes live on, for the restart to take over."""
+    (line,) = [line for line in UNIT.read_text().splitlines() if line.startswith("ExecStopPost=")]
+    script = line.partition("-c ")[2].strip("'").replace("%i", "a50").replace(">/dev/null 2>&1", "")
+    ran = subprocess.run(
+        ["/bin/sh", "-c", script.replace("/opt/shmio/bin/shmio-supervisor", "echo")],
+        env={"SERVICE_RESULT": result},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert ran.stdout == ("down -c /etc/shmio/a50/supervisor.toml\n" if cleared else "")
