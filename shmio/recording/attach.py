@@ -22,8 +22,8 @@ class ConfigFiles:
     def __init__(self, file: Path) -> None:
         self._file = file
 
-    def __call__(self, source: str | None) -> list[Attachment]:
-        """The configuration itself for None, the layout's sources for a source's name: as they are now."""
+    def __call__(self, source: str | None, block: int) -> list[Attachment]:
+        """The configuration itself for None, the layout's sources for a source's block: as they are now."""
         if source is None:
             return self._read("config", [self._file], TOML)
         try:
@@ -33,7 +33,7 @@ class ConfigFiles:
             return []
         layouts = [section.layout for section in config.source if section.name == source and section.layout]
         names = [name for layout in layouts for name in ([layout] if isinstance(layout, str) else layout)]
-        return self._read(f"sources/{source}", [config.path(name) for name in names], TEXT)
+        return self._read(f"sources/{source}/{block}", [config.path(name) for name in names], TEXT)
 
     def _read(self, folder: str, files: list[Path], media_type: str) -> list[Attachment]:
         found = []

@@ -15,7 +15,7 @@ from shmio.recording.encoding import Gap, Reason
 from shmio.recording.follower import Entry, Follower, Place
 from shmio.recording.output import Output
 from shmio.recording.writer import JSON, Channels, Writer
-from shmio.segment import Block, Frame, Segment
+from shmio.segment import Frame, Segment
 from shmio.segment.events import EVENT_SIZE
 
 TURN_S: Final = 0.1
@@ -34,6 +34,15 @@ class Attachment(NamedTuple):
     media_type: str
     data: bytes
     changed_ns: int = 0
+
+
+Attachments = Callable[[str | None, int], list[Attachment]]
+"""Gives the files to attach: those of the instance for None, those of a source for its name and its block's number."""
+
+
+def no_attachments(_source: str | None, _block: int) -> list[Attachment]:
+    """None at all."""
+    return []
 
 
 class Start(NamedTuple):
@@ -88,12 +97,9 @@ class Recorder:
         by: str,
         start: Start | None = None,
         sources: Collection[str] | None = None,
-        attachments: Callable[[str | None], list[Attachment]] = lambda _: [],
+        attachments: Attachments = no_attachments,
     ) -> None:
-        """``by``: who records. ``start``: default from the first frame. ``sources``: only these.
-
-        ``attachments`` gives the files to attach: those of the instance for None, those of a source for its name.
-        """
+        """``by``: who records. ``start``: default from the first frame. ``sources``: only these."""
         self.output = output
         self.counters = Counters()
         self._segment = segment
@@ -102,8 +108,8 @@ class Recorder:
         self._writer = Writer(output, self._about(by))
         self._followed: list[_Followed] = []
         self._blocks = 0
-        self._attached: set[str] = set()
-        self._attach(None)
+        self._attached: set[bytes] = set()
+        self._attach(attachments(None, 0))
         self._follow(start or Start())
         self._flushed_s = self._checked_s = time.monotonic()
 
@@ -192,22 +198,15 @@ class Recorder:
                 place = Place() if start.first else Place(block.ring.head(), block.events.head())
             follower = Follower(block, self._blocks, place, reason, self.log_time)
             self._followed.append(_Followed(follower, log_ns=place.log_ns))
-            self._attach_layout(block)
-            self._attach(source)
+            if block.layout.hash not in self._attached:
+                self._attached.add(block.layout.hash)
+                name = f"layouts/{block.layout.hash.hex()}.json"
+                self._attach([Attachment(name, JSON, block.layout.to_json())])
+            self._attach(self._attachments(source, self._blocks))
 
-    def _attach_layout(self, block: Block) -> None:
-        digest = block.layout.hash.hex()
-        self._put(Attachment(f"layouts/{digest}.json", JSON, block.layout.to_json()), digest)
-
-    def _attach(self, source: str | None) -> None:
-        for attachment in self._attachments(source):
-            self._put(attachment, attachment.name)
-
-    def _put(self, attachment: Attachment, key: str) -> None:
-        if key not in self._attached:
-            self._attached.add(key)
-            now_ns = self.log_time(time.monotonic_ns())
-            name, media_type, data, changed_ns = attachment
+    def _attach(self, attachments: list[Attachment]) -> None:
+        now_ns = self.log_time(time.monotonic_ns())
+        for name, media_type, data, changed_ns in attachments:
             self._writer.attach(name, media_type, data, now_ns, changed_ns)
 
     def _ended(self, followed: _Followed) -> bool:

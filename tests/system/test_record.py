@@ -52,7 +52,7 @@ def test_log_mode_records_a_cell_through_a_killed_recorder(make_cell: Callable[.
     missed = whole["missed_frames"]
     assert new["first_frame"] == old["last_frame"] + 1 + missed
     assert new["frames"] == new["last_frame"] - new["first_frame"] + 1
-    assert {"config/supervisor.toml", "sources/cell/db201.db"} < set(whole["attachments"])
+    assert {"config/supervisor.toml", "sources/cell/1/db201.db"} < set(whole["attachments"])
     assert len(values(cell, second)) > 1
     events = [json.loads(line) for line in cell.run("shmio-dump", "cat", "--json", str(second)).stdout.splitlines()]
     assert events[-1]["kind"] == "stopped", "to the source's last event"
@@ -69,3 +69,42 @@ def test_a_live_cell_is_recorded_from_outside(cell: Cell) -> None:
     [block] = found["blocks"]
     assert block["frames"] == block["last_frame"] - block["first_frame"] + 1 > 1
     assert len({line["values"][AXIS.removeprefix("cell/")] for line in values(cell, file)}) > 1
+
+
+def test_a_reload_is_recorded_in_the_same_file(make_cell: Callable[..., Cell]) -> None:
+    """A source comes, and the layout of the other changes; the recorder goes on."""
+    cell = make_cell(config=RECORDED)
+    cell.up()
+    recorder = cell.processes()["recorder"]["pid"]
+    file = cell.folder / "supervisor.toml"
+    text = file.read_text()
+    begin = text.index("[[source]]")
+    section = text[begin : text.index("[[emulator]]")]
+    layout = cell.folder / "db201.db"
+    (cell.folder / "second.db").write_text(layout.read_text())
+    layout.write_text(layout.read_text().replace("Axs1_Pos", "Axis1"))
+    second = section.replace('"cell"', '"second"')
+    file.write_text(text[:begin] + section + (second + text[begin + len(section) :]).replace("db201", "second"))
+    done = cell.supervisor("reload")
+    assert done.returncode == 0, done.stderr
+    [recording] = (cell.folder / "dumps").iterdir()
+    until(
+        lambda: (
+            {(block["source"], block["block"]) for block in info(cell, recording)["blocks"] if block["frames"] > 9}
+            == {("cell", 1), ("cell", 2), ("second", 3)}
+        ),
+        "frames of all blocks",
+    )
+    assert cell.processes()["recorder"]["pid"] == recorder
+    cell.down()
+    found = info(cell, recording)
+    assert (found["closed"], found["gap_count"]) == (True, 0)
+    assert {"sources/cell/1/db201.db", "sources/cell/2/db201.db", "sources/second/3/second.db"} < set(
+        found["attachments"]
+    )
+    old, new, second = found["blocks"]
+    assert old["layout_hash"] == second["layout_hash"] != new["layout_hash"]
+    lines = cell.run("shmio-dump", "cat", "--json", str(recording), "cell/Robot_800/Axis1", "--from", "0").stdout
+    assert all(
+        set(line["values"]) == {"Robot_800/Axis1"} for line in map(json.loads, lines.splitlines()) if "frame" in line
+    )

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -18,7 +18,7 @@ from shmio.errors import ControlError, PathError, RecordingError
 from shmio.logs import printable
 from shmio.recording.attach import ConfigFiles
 from shmio.recording.output import Output, create
-from shmio.recording.recorder import Attachment, Recorder, Start
+from shmio.recording.recorder import Attachments, Recorder, Start, no_attachments
 from shmio.segment import Segment
 from shmio.supervisor import control
 
@@ -77,13 +77,13 @@ def _record(segment: Segment, recorder: Recorder, stopping: threading.Event, dur
             return until_s is None
 
 
-def _attachments(segment: Segment) -> Callable[[str | None], list[Attachment]]:
+def _attachments(segment: Segment) -> Attachments:
     """The files of the configuration, if the supervisor says where that is."""
     try:
         return ConfigFiles(Path(control.request(segment.header.control, control.Where(), WHERE_S)["config"]))
     except (ControlError, KeyError) as error:
         _say(f"the configuration is not attached: {error}")
-        return lambda _: []
+        return no_attachments
 
 
 def _sum_up(recorder: Recorder, path: Path) -> None:

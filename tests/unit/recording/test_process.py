@@ -44,7 +44,7 @@ def test_it_records_tells_its_counters_and_closes_its_file(segment: Segment, tmp
     with Reader(file) as reader:
         list(reader.messages())
         assert reader.records.closed
-        assert {"config/supervisor.toml", "sources/cell/a.db"} < set(reader.attachments)
+        assert {"config/supervisor.toml", "sources/cell/1/a.db"} < set(reader.attachments)
         assert reader.about["recorder"] == "supervised"
     assert "5 frames, 1 events, 0 missed" in process.log.read_text()
 

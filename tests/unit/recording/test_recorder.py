@@ -162,7 +162,7 @@ def test_a_chunk_is_in_the_file_within_the_second(
 
 def test_the_file_is_plain_mcap(segment: Segment, tmp_path: Path) -> None:
     files = [Attachment("config/supervisor.toml", "application/toml", b"[instance]\n", 5)]
-    recording = recorder(segment, tmp_path, attachments=lambda source: [] if source else files)
+    recording = recorder(segment, tmp_path, attachments=lambda source, _: [] if source else files)
     writer = segment.writer("cell")
     publish(writer, 3 * RING)
     assert recording.close()
