@@ -56,14 +56,14 @@ def shmio_rings(frame: bytes) -> Iterator[list[Contender]]:
         few, usual = block.ring, segment.blocks["usual"].ring
         usual.begin()
         assert (few.slot_count, usual.slot_count) == (8, USUAL_SLOTS)
-        arguments = (frame, None, 1, 2, 3, 4, 2, 0, 0, b"")
+        arguments = (frame, None, 1, 2, 3, 4, 2, 0, 0, 0, b"")
         yield [
-            Contender(OURS, partial(few.publish, *arguments), few.latest, lambda fields: bytes(fields[10])),
+            Contender(OURS, partial(few.publish, *arguments), few.latest, lambda fields: bytes(fields[11])),
             Contender(
                 f"{OURS}, {USUAL_SLOTS} slots",
                 partial(usual.publish, *arguments),
                 usual.latest,
-                lambda fields: bytes(fields[10]),
+                lambda fields: bytes(fields[11]),
             ),
             Contender(
                 "shmio BlockWriter, Block",

@@ -58,7 +58,7 @@ typedef struct {
 
 typedef struct {
     uint64_t number, cycle;
-    int64_t publish_ns;
+    int64_t asked_ns; /* the image may be as old as this */
     unsigned quality;
     char reason[257];
     uint8_t value[8];
@@ -137,7 +137,7 @@ static bool read_frame(const Ring *ring, const Register *of, uint64_t number, Fr
     pair[1] = of->offset % 8 + of->size > 8 ? relaxed64(first + 8) : 0;
     atomic_thread_fence(memory_order_acquire);
     if (relaxed64(slot) != 2 * number + 2) return false; /* overwritten meanwhile */
-    *frame = (Frame){number, words[1], (int64_t)words[2], words[5] >> 32 & 0xFF, "", {0}};
+    *frame = (Frame){number, words[1], (int64_t)(words[2] - (words[6] >> 32) * 1000), words[5] >> 32 & 0xFF, "", {0}};
     memcpy(frame->reason, &words[8], (words[6] & 0xFFFF) > 256 ? 256 : words[6] & 0xFFFF);
     for (char *c = frame->reason; *c; c++) *c = (unsigned char)*c < 32 || *c == 127 ? '?' : *c;
     memcpy(frame->value, (const uint8_t *)pair + of->offset % 8, of->size);
@@ -148,7 +148,7 @@ static bool stale(const Frame *frame, const Ring *ring)
 {
     struct timespec now;
     clock_gettime(CLOCK_MONOTONIC, &now);
-    return now.tv_sec * INT64_C(1000000000) + now.tv_nsec - frame->publish_ns > ring->stale_ns;
+    return now.tv_sec * INT64_C(1000000000) + now.tv_nsec - frame->asked_ns > ring->stale_ns;
 }
 
 static void show(const Frame *frame, const Register *of, uint64_t missed, bool is_stale)

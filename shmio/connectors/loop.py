@@ -74,8 +74,10 @@ class _Submitted(NamedTuple):
 
     cycle: int
     asked_ns: int
+    """On the loop's clock."""
+    monotonic_ns: int
     utc_ns: int
-    """The device had what it will answer then, or later."""
+    """The device had what it will answer then, or later; so with ``monotonic_ns``."""
 
 
 class SourceLoop:
@@ -111,7 +113,11 @@ class SourceLoop:
             while True:
                 due = self._schedule.next(self._clock.now_ns())
                 self.counters.overruns += due.skipped
-                if self._clock.wait_ns(due.due_ns - self._clock.now_ns()) or not self.poll(due.cycle):
+                if self._clock.wait_ns(due.due_ns - self._clock.now_ns()):
+                    break
+                if self._clock.now_ns() >= self._schedule.due_ns(due.cycle + 1):  # held up while it waited
+                    self.counters.overruns += 1
+                elif not self.poll(due.cycle):
                     break
         finally:
             self._connector.close()
@@ -127,7 +133,7 @@ class SourceLoop:
             if self.desk.waiting:
                 self._call(lambda: self.desk.carry_out(self._connector.write))
             if len(self._under_way) < self._connector.depth:
-                self._under_way.append(_Submitted(cycle, self._clock.now_ns(), time.time_ns()))
+                self._under_way.append(_Submitted(cycle, self._clock.now_ns(), time.monotonic_ns(), time.time_ns()))
                 self._call(self._connector.submit)
             else:
                 self.counters.overruns += 1  # the device is behind by all that may be under way
@@ -159,7 +165,14 @@ class SourceLoop:
         quality = Quality.UNCERTAIN if doubt else Quality.GOOD
         self._tell(quality, doubt, asked.cycle)
         self._raw, self._read_ns = raw, asked.utc_ns
-        self._writer.publish(raw, cycle=asked.cycle, source_ns=asked.utc_ns, quality=quality, reason=doubt)
+        self._writer.publish(
+            raw,
+            cycle=asked.cycle,
+            source_ns=asked.utc_ns,
+            quality=quality,
+            reason=doubt,
+            asked_ns=asked.monotonic_ns,
+        )
         self.counters.polls += 1
         if self._connected_ns is not None and self._clock.now_ns() - self._connected_ns > STABLE_NS:
             self._backoff.reset()

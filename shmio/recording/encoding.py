@@ -20,14 +20,15 @@ FRAME: Final = "shmio.frame.v1"
 EVENT: Final = "shmio.event.v1"
 GAP: Final = "json"
 
-_FRAME: Final = struct.Struct("<QQqqqQIBBHHHI")
+_FRAME: Final = struct.Struct("<QQqqqQIBBHHHII")
 _EVENT: Final = struct.Struct("<QQQqqqQIIIIIIHBBHH")
 _EFFECTIVE: Final = 1  # flag: an effective image follows the raw one
 
 FRAME_SCHEMA: Final = b"""Little-endian. u64 number, u64 cycle, i64 publish (ns, CLOCK_MONOTONIC), i64 clock (ns since \
 the instance's start), i64 source (ns UTC), u64 event (last one before), u32 incarnation, u8 quality (0 bad, \
 1 uncertain, 2 good), u8 provenance (0 live, 1 simulated, 2 replayed, 3 injected), u16 flags (1: effective), \
-u16 reason size, u16 0, u32 image size; then reason (UTF-8), raw, effective."""
+u16 reason size, u16 0, u32 image size, u32 delay (us; age of the image when published); then reason (UTF-8), raw, \
+effective."""
 EVENT_SCHEMA: Final = b"""Little-endian. u64 number, u64 frame (last one before), u64 cycle, i64 publish (ns, \
 CLOCK_MONOTONIC), i64 clock (ns since the instance's start), i64 UTC (ns), u64 command, u32 incarnation, u32 writer, \
 u32 item, u32 items, u32 offset, u32 size, u16 kind, u8 quality, u8 mask, u16 data size, u16 text size; then data, \
@@ -72,6 +73,7 @@ def encode_frame(frame: Frame) -> bytes:
     head = _FRAME.pack(
         frame.number, frame.cycle, frame.publish_ns, frame.clock_ns, frame.source_ns, frame.event, frame.incarnation,
         frame.quality, frame.provenance, 0 if frame.effective is None else _EFFECTIVE, len(reason), 0, len(frame.raw),
+        frame.delay_us,
     )  # fmt: skip
     return b"".join((head, reason, frame.raw, frame.effective or b""))
 
@@ -81,14 +83,14 @@ def decode_frame(data: bytes) -> Frame:
     if len(data) < _FRAME.size:
         raise ValueError("a frame is shorter than its header")
     number, cycle, publish_ns, clock_ns, source_ns, event, incarnation, *rest = _FRAME.unpack_from(data)
-    quality, provenance, flags, reason_size, _, size = rest
+    quality, provenance, flags, reason_size, _, size, delay_us = rest
     raw_at = _FRAME.size + reason_size
     images = 2 if flags & _EFFECTIVE else 1
     if len(data) != raw_at + images * size or provenance > Provenance.INJECTED:
         raise ValueError("a frame contradicts its header")
     return Frame(
         number, cycle, publish_ns, clock_ns, source_ns, incarnation,
-        Quality(quality) if quality <= Quality.GOOD else Quality.BAD, Provenance(provenance), event,
+        Quality(quality) if quality <= Quality.GOOD else Quality.BAD, Provenance(provenance), event, delay_us,
         data[_FRAME.size : raw_at].decode("utf-8", "replace"),
         data[raw_at : raw_at + size],
         data[raw_at + size :] if images == 2 else None,

@@ -86,9 +86,10 @@ static PyObject *Ring_publish(Ring *self, PyObject *args)
     PyObject *effective_object, *result = NULL;
     slot_info info = {0};
     unsigned long long cycle, event;
+    unsigned int delay_us;
     long long publish_ns, clock_ns, source_ns;
-    if (!PyArg_ParseTuple(args, "y*OKLLLBBKy*", &raw, &effective_object, &cycle, &publish_ns, &clock_ns, &source_ns,
-                          &info.quality, &info.provenance, &event, &reason))
+    if (!PyArg_ParseTuple(args, "y*OKLLLBBKIy*", &raw, &effective_object, &cycle, &publish_ns, &clock_ns, &source_ns,
+                          &info.quality, &info.provenance, &event, &delay_us, &reason))
         return NULL;
     if (effective_object != Py_None && PyObject_GetBuffer(effective_object, &effective, PyBUF_SIMPLE) < 0) goto done;
     if (!Ring_writable(self)) goto done;
@@ -105,6 +106,7 @@ static PyObject *Ring_publish(Ring *self, PyObject *args)
     info.clock_ns = clock_ns;
     info.source_ns = source_ns;
     info.event = event;
+    info.delay_us = delay_us;
     info.incarnation = self->incarnation;
     info.reason_size = (uint16_t)(reason.len < (Py_ssize_t)REASON_SIZE ? reason.len : (Py_ssize_t)REASON_SIZE);
     if (effective.obj && !self->ring.effective_offset) {
@@ -126,7 +128,8 @@ static PyObject *Ring_head(Ring *self, PyObject *unused)
     return PyLong_FromUnsignedLongLong(atomic_load_explicit(&ring_head(&self->ring)->head, memory_order_acquire));
 }
 
-/* (frame, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance, event, reason, raw, effective) */
+/* (frame, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance, event, delay_us, reason, raw,
+ * effective) */
 static PyObject *Ring_copy(Ring *self, bool latest, uint64_t frame)
 {
     slot_info info;
@@ -159,10 +162,10 @@ static PyObject *Ring_copy(Ring *self, bool latest, uint64_t frame)
         Py_DECREF(effective);
         return NULL;
     }
-    return Py_BuildValue("KKLLLIBBKNNN", (unsigned long long)frame, (unsigned long long)info.cycle,
+    return Py_BuildValue("KKLLLIBBKINNN", (unsigned long long)frame, (unsigned long long)info.cycle,
                          (long long)info.publish_ns, (long long)info.clock_ns, (long long)info.source_ns,
                          (unsigned int)info.incarnation, info.quality, info.provenance, (unsigned long long)info.event,
-                         text, raw, effective);
+                         (unsigned int)info.delay_us, text, raw, effective);
 }
 
 static PyObject *Ring_latest(Ring *self, PyObject *unused)

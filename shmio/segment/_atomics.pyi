@@ -9,8 +9,9 @@ QUEUE_HEADER_SIZE: int
 RAW_OFFSET: int
 REASON_SIZE: int
 
-# frame, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance, event, reason, raw, effective
-FrameTuple: TypeAlias = tuple[int, int, int, int, int, int, int, int, int, str, bytes, bytes | None]
+# frame, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance, event, delay_us,
+# reason, raw, effective
+FrameTuple: TypeAlias = tuple[int, int, int, int, int, int, int, int, int, int, str, bytes, bytes | None]
 
 @final
 class Ring:
@@ -37,6 +38,7 @@ class Ring:
         quality: int,
         provenance: int,
         event: int,
+        delay_us: int,
         reason: bytes,
         /,
     ) -> int: ...

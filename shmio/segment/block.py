@@ -24,13 +24,15 @@ if TYPE_CHECKING:
 Bytes = bytes | bytearray | memoryview
 
 
+MAX_DELAY_US = 2**32 - 1
+
 _QUALITIES = tuple(Quality)
 _PROVENANCES = tuple(Provenance)
 
 
 def _frame(fields: FrameTuple) -> Frame:
     number, cycle, publish_ns, clock_ns, source_ns, incarnation, quality, provenance = fields[:8]
-    event, reason, raw, effective = fields[8:]
+    event, delay_us, reason, raw, effective = fields[8:]
     return Frame(
         number,
         cycle,
@@ -42,6 +44,7 @@ def _frame(fields: FrameTuple) -> Frame:
         _QUALITIES[quality] if quality < len(_QUALITIES) else Quality.BAD,
         _PROVENANCES[provenance] if provenance < len(_PROVENANCES) else Provenance.SIMULATED,
         event,
+        delay_us,
         reason,
         raw,
         effective,
@@ -151,11 +154,13 @@ class BlockWriter:
         provenance: Provenance = Provenance.LIVE,
         reason: str = "",
         effective: Bytes | None = None,
+        asked_ns: int | None = None,
     ) -> int:
         """Publish one frame of ``layout.size`` bytes and wake its readers; returns its number.
 
         ``source_ns`` is UTC, default now; 0: no image yet. ``reason`` says why quality is not
-        good; it is cut at 256 bytes.
+        good; it is cut at 256 bytes. ``asked_ns`` (CLOCK_MONOTONIC): when the device was asked for the image, which
+        may be as old as that; default now.
         """
         with self._turn:
             now_ns = time.monotonic_ns()
@@ -170,6 +175,7 @@ class BlockWriter:
                 quality,
                 provenance,
                 self.block.events.head(),
+                0 if asked_ns is None else min(-(-max(0, now_ns - asked_ns) // 1000), MAX_DELAY_US),
                 cut(reason, REASON_SIZE) if reason else b"",
             )
 
@@ -190,6 +196,7 @@ class BlockWriter:
                 self._quality if quality is None else quality,
                 Provenance.LIVE,
                 self.block.ring.head(),
+                0,
                 cut(record.text, REASON_SIZE),
             )
             self.block.ring.wake()

@@ -107,7 +107,7 @@ class Record(NamedTuple):
 
 def decode(fields: FrameTuple) -> Event:
     """An event from a ring's copy; bounds are checked, for the bytes are another process's."""
-    number, cycle, publish_ns, clock_ns, utc_ns, incarnation, quality, _, frame, text, raw, _ = fields
+    number, cycle, publish_ns, clock_ns, utc_ns, incarnation, quality, _, frame, _, text, raw, _ = fields
     kind, data_size, writer, command, item, offset, mask, items, size = _RECORD.unpack_from(raw)
     data = raw[_RECORD.size : _RECORD.size + min(data_size, EVENT_DATA_SIZE)]
     known = Quality(quality) if quality <= Quality.GOOD else Quality.BAD

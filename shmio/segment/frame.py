@@ -35,7 +35,8 @@ class Frame(NamedTuple):
 
     ``raw`` is what the source delivered, in its own byte order; ``effective`` is what consumers see, None while it
     equals raw. ``publish_ns`` is CLOCK_MONOTONIC, ``clock_ns`` the instance's clock since its start, ``source_ns``
-    UTC. ``cycle`` counts the periods of the source's schedule, so frames of two incarnations of the source's process
+    UTC. ``delay_us``: how old the image may have been already when it was published, the time of the device's answer;
+    ``cycle`` counts the periods of the source's schedule, so frames of two incarnations of the source's process
     are told apart from frames that a reader lost. ``source_ns`` of a bad frame is that of the image it repeats; 0: the
     source never had one, and the image is zeros.
     """
@@ -49,6 +50,7 @@ class Frame(NamedTuple):
     quality: Quality
     provenance: Provenance
     event: int
+    delay_us: int
     reason: str
     raw: bytes
     effective: bytes | None
@@ -59,13 +61,13 @@ class Frame(NamedTuple):
         return self.raw if self.effective is None else self.effective
 
     def age_ns(self, now_ns: int | None = None) -> int:
-        """Time since the frame was published."""
-        return (time.monotonic_ns() if now_ns is None else now_ns) - self.publish_ns
+        """The most that the image can be old: the time since the device was asked for it."""
+        return (time.monotonic_ns() if now_ns is None else now_ns) - self.publish_ns + 1000 * self.delay_us
 
     def assess(self, stale_ns: int, now_ns: int | None = None) -> tuple[Quality, str]:
         """Quality and reason as of now: a frame that is too old is never good."""
         if self.quality is not Quality.BAD:
             age_ns = self.age_ns(now_ns)
             if age_ns > stale_ns:
-                return Quality.BAD, f"stale: no frame for {age_ns / 1e9:.1f} s"
+                return Quality.BAD, f"stale: no newer frame, this one is {age_ns / 1e9:.1f} s old"
         return self.quality, self.reason

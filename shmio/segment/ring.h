@@ -72,7 +72,7 @@ typedef struct {
     uint16_t flags;
     uint16_t reason_size;
     uint16_t reserved0;
-    uint32_t reserved1;
+    uint32_t delay_us; /* how old the image may have been at publish_ns already: its source had asked for it then */
     uint64_t event; /* of a frame: number of the last event before it; of an event: of the last frame */
 } slot_info;
 _Static_assert(sizeof(slot_info) == SLOT_HEADER_SIZE - 8, "slot info");

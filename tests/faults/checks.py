@@ -24,10 +24,7 @@ FOREIGN = 60_000
 
 @dataclass(frozen=True)
 class Source:
-    """What a check must know of a source. ``truth``: None for a PLC that keeps none.
-
-    A good value may be as old as a frame may be, ``stale_ns``, and as its answer has taken, at most ``answer_ns``.
-    """
+    """What a check must know of a source. ``truth``: None for a PLC that keeps none."""
 
     name: str
     size: int
@@ -38,12 +35,11 @@ class Source:
     truth: Truth | None = None
     landed: Truth | None = None
     """What was written into the last word, where there is a truth; that word is none of the program's then."""
-    answer_ns: int = 0
 
     @property
     def oldest_ns(self) -> int:
         """Greatest age of a good value."""
-        return self.stale_ns + self.answer_ns + self.tolerance_ns
+        return self.stale_ns + self.tolerance_ns
 
 
 @dataclass

@@ -158,8 +158,7 @@ class Rig:
         sources = []
         for name, size in SIZES.items():
             period_ns, stale_ns, tolerance_ns = (ms * 10**6 for ms in (PERIODS_MS[name], STALE_MS[name], TOLERANCE_MS))
-            # The source loop takes answers that took up to stale_ms, and a frame's age does not count that time.
-            source = Source(name, size, period_ns, stale_ns, tolerance_ns, one_pdu=size < 900, answer_ns=stale_ns)
+            source = Source(name, size, period_ns, stale_ns, tolerance_ns, one_pdu=size < 900)
             files = {"truth": f"{name}.truth", "landed": f"{name}.landed.truth"}
             known = name in self.devices
             paths = {field: str(self.folder / file) if known else None for field, file in files.items()}

@@ -66,6 +66,7 @@ def frame(number: int, generation: int = FIRST, **changes: Any) -> Frame:
         quality=Quality.GOOD,
         provenance=Provenance.LIVE,
         event=0,
+        delay_us=0,
         reason="",
         raw=block(generation),
         effective=None,

@@ -414,3 +414,26 @@ def test_a_doubtful_image_is_uncertain_with_its_reason(segment: Segment) -> None
     frames = list(iter(cursor.poll, None))[:-1]
     assert [frame.quality for frame in frames] == [Quality.GOOD] * 2 + [Quality.UNCERTAIN] * 3 + [Quality.GOOD] * 3
     assert {frame.reason for frame in frames[2:5]} == {"the PLC is in STOP"}
+
+
+def test_a_cycle_that_was_held_up_in_its_wait_is_an_overrun(segment: Segment) -> None:
+    class Held(VirtualClock):
+        def wait_ns(self, duration_ns: int) -> bool:
+            ended = super().wait_ns(duration_ns)
+            if self.time_ns == 4 * PERIOD_NS:  # the process is stopped, and goes on in cycle 7
+                self.time_ns += 3 * PERIOD_NS + 1
+            return ended
+
+    clock = Held(10 * PERIOD_NS)
+    loop = SourceLoop(Device(lambda *_: None), segment.writer("cell"), Schedule(0, PERIOD_NS), clock)
+    cursor = segment.blocks["cell"].cursor()
+    loop.run()
+    frames = [frame for frame in iter(cursor.poll, None) if frame.quality is Quality.GOOD]
+    assert [frame.cycle for frame in frames] == [1, 2, 3, 7, 8, 9]
+    assert loop.counters.overruns == 3
+
+
+def test_a_frame_tells_how_long_the_device_took(segment: Segment) -> None:
+    _, _, frames = run(segment, lambda *_: None, 3)
+    assert 0 < frames[0].delay_us < 10**7
+    assert frames[-1].delay_us == 0, "a bad one has no answer"

@@ -28,7 +28,10 @@ images = st.integers(0, 50).flatmap(
 )
 
 
-@given(st.tuples(u64, u64, i64, i64, i64, u32, quality, st.sampled_from(Provenance), u64, st.text(max_size=60)), images)
+@given(
+    st.tuples(u64, u64, i64, i64, i64, u32, quality, st.sampled_from(Provenance), u64, u32, st.text(max_size=60)),
+    images,
+)
 def test_a_frame(fields: tuple[int, ...], images: tuple[bytes, bytes | None]) -> None:
     frame = Frame._make((*fields, *images))
     assert decode_frame(encode_frame(frame)) == frame

@@ -37,7 +37,7 @@ def ring_memory(slots: int = 8, size: int = 20, **wrong: int) -> bytearray:
 
 
 def publish(ring: Ring, raw: bytes, cycle: int = 1, effective: bytes | None = None, reason: bytes = b"") -> int:
-    return ring.publish(raw, effective, cycle, 10, 20, 30, 2, 0, 0, reason)
+    return ring.publish(raw, effective, cycle, 10, 20, 30, 2, 0, 0, 0, reason)
 
 
 def test_an_empty_ring_has_no_frame() -> None:
@@ -52,8 +52,8 @@ def test_a_frame_comes_out_as_it_went_in() -> None:
     ring = Ring(memory, 0, len(memory))
     assert ring.begin() == 1
     raw = bytes(range(20))
-    assert ring.publish(raw, None, 7, 100, 200, -300, 1, 3, 11, "grün".encode()) == 1
-    assert ring.latest() == (1, 7, 100, 200, -300, 1, 1, 3, 11, "grün", raw, None)
+    assert ring.publish(raw, None, 7, 100, 200, -300, 1, 3, 11, 17, "grün".encode()) == 1
+    assert ring.latest() == (1, 7, 100, 200, -300, 1, 1, 3, 11, 17, "grün", raw, None)
     assert ring.read(1) == ring.latest()
 
 
@@ -123,7 +123,7 @@ def test_a_reason_is_cut_at_its_room() -> None:
     publish(ring, bytes(20), reason=b"x" * 1000)
     latest = ring.latest()
     assert latest is not None
-    assert latest[9] == "x" * _atomics.REASON_SIZE
+    assert latest[10] == "x" * _atomics.REASON_SIZE
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -207,6 +208,21 @@ def test_a_successor_goes_on_with_the_numbers_and_has_its_own_incarnation(instan
         segment.unlink()
 
 
+def test_the_time_of_the_answer_is_part_of_the_age(instance: str) -> None:
+    with Segment.create(instance, [block()], PROCESSES) as segment:
+        writer = segment.writer("cell")
+        writer.publish(bytes(6), cycle=1, asked_ns=time.monotonic_ns() - 400_000_000)
+        frame = segment.blocks["cell"].latest()
+        assert frame is not None
+        assert frame.delay_us >= 400_000
+        assert frame.assess(500_000_000, frame.publish_ns + 50_000_000)[0] is Quality.GOOD
+        assert frame.assess(500_000_000, frame.publish_ns + 110_000_000)[0] is Quality.BAD
+        writer.publish(bytes(6), cycle=2, asked_ns=time.monotonic_ns() + 10**9)
+        assert (latest := segment.blocks["cell"].latest())
+        assert latest.delay_us == 0
+        segment.unlink()
+
+
 def test_an_old_frame_is_never_good(instance: str) -> None:
     with Segment.create(instance, [block()], PROCESSES) as segment:
         segment.writer("cell").publish(bytes(6), cycle=1)
@@ -215,7 +231,7 @@ def test_an_old_frame_is_never_good(instance: str) -> None:
         assert frame.assess(500_000_000, frame.publish_ns + 500_000_000) == (Quality.GOOD, "")
         assert frame.assess(500_000_000, frame.publish_ns + 2_500_000_001) == (
             Quality.BAD,
-            "stale: no frame for 2.5 s",
+            "stale: no newer frame, this one is 2.5 s old",
         )
         segment.unlink()
 
