@@ -11,8 +11,9 @@ import logging
 import logging.handlers
 import os
 import sys
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from datetime import UTC, datetime
+from io import TextIOWrapper
 from pathlib import Path
 
 from shmio.errors import ConfigError
@@ -43,14 +44,16 @@ class LineFormatter(logging.Formatter):
 class RotatingLog(logging.handlers.RotatingFileHandler):
     """A log file that rotates, and takes what the process prints with it if ``streams`` says so."""
 
-    def __init__(self, file: Path, *, streams: bool) -> None:
-        super().__init__(file, maxBytes=MAX_FILE_BYTES, backupCount=KEPT_FILES - 1)
+    def __init__(self, file: Path, *, streams: bool, patient: bool) -> None:
+        """``patient``: a file that cannot be opened is tried again with each record; else OSError."""
+        self._streams = False  # they lead to the file already, if it could be opened
+        super().__init__(file, maxBytes=MAX_FILE_BYTES, backupCount=KEPT_FILES - 1, delay=True)
+        try:
+            self.stream = self._open()
+        except OSError:
+            if not patient:
+                raise
         self._streams = streams
-
-    def doRollover(self) -> None:  # noqa: N802  the base class's name
-        """Begin a new file."""
-        super().doRollover()
-        self._take_streams()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a record; into a new file, where somebody removed the old one."""
@@ -59,7 +62,6 @@ class RotatingLog(logging.handlers.RotatingFileHandler):
                 Path(self.baseFilename).parent.mkdir(parents=True, exist_ok=True)
                 self.close()
                 self.stream = self._open()
-                self._take_streams()
         super().emit(record)
 
     def _removed(self) -> bool:
@@ -69,24 +71,34 @@ class RotatingLog(logging.handlers.RotatingFileHandler):
             return True
         return self.stream is not None and not os.path.samestat(there, os.fstat(self.stream.fileno()))
 
-    def _take_streams(self) -> None:
-        """The traceback of a dying interpreter must not go to a file that nobody will find."""
-        if self._streams and self.stream is not None:
-            os.dup2(self.stream.fileno(), 1)
-            os.dup2(self.stream.fileno(), 2)
+    def _open(self) -> TextIOWrapper:
+        """Whenever a file is begun: the traceback of a dying interpreter must not go to one that nobody will find."""
+        stream = super()._open()
+        if self._streams:
+            os.dup2(stream.fileno(), 1)
+            os.dup2(stream.fileno(), 2)
+        return stream
 
 
 def setup(
-    file: Path, process: str, *, source: str | None = None, console: bool = False, streams: bool = False
+    file: Path,
+    process: str,
+    *,
+    source: str | None = None,
+    console: bool = False,
+    streams: bool = False,
+    patient: bool = False,
 ) -> logging.Logger:
     """Send this process's records to ``file``, rotated at 5 MB with 3 kept; with ``console`` to standard error too.
 
     ``source``: named in each line. ``streams``: standard output and error lead to the file already; they are to follow.
+    ``patient``: a file that cannot be written is no error, it is tried again with each record.
     Returns the logger named ``shmio``. ConfigError when the file cannot be written.
     """
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        handlers: list[logging.Handler] = [RotatingLog(file, streams=streams)]
+        with suppress(OSError) if patient else nullcontext():
+            file.parent.mkdir(parents=True, exist_ok=True)
+        handlers: list[logging.Handler] = [RotatingLog(file, streams=streams, patient=patient)]
     except OSError as error:
         raise ConfigError(f"instance.log_dir: cannot write {file}: {error.strerror}") from None
     if console:

@@ -48,10 +48,8 @@ class Worker:
 
     def _set_up_log(self, file: Path) -> logging.Logger:
         source = self.name if self.kind == "source" else None
-        try:
-            return logs.setup(file, self.name, source=source, streams=True)
-        except ConfigError:  # a controller is read with or without a log
-            return logs.setup(Path(os.devnull), self.name, source=source)
+        # A controller is read with or without a log; with one as soon as the disk has room or the folder is writable.
+        return logs.setup(file, self.name, source=source, streams=True, patient=True)
 
     def _take_role(self) -> None:
         """Wait for a predecessor to be gone: the kernel frees its lock at the moment of its death."""

@@ -74,6 +74,16 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path) -> None:
         logs.setup(tmp_path / "file" / "x.log", "cell")
 
 
+def test_a_file_that_cannot_be_written_yet_is_begun_when_it_can(tmp_path: Path) -> None:
+    (tmp_path / "logs").touch()
+    log = logs.setup(tmp_path / "logs" / "x.log", "cell", patient=True)
+    log.info("lost")
+    (tmp_path / "logs").unlink()
+    log.info("kept")
+    (line,) = (tmp_path / "logs" / "x.log").read_text().splitlines()
+    assert line.endswith("kept")
+
+
 def test_a_full_disk_does_not_stop_the_process(tmp_path: Path) -> None:
     file = tmp_path / "x.log"
     file.symlink_to("/dev/full")

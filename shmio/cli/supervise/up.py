@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TextIO
 
 from shmio import logs
+from shmio.cli.supervise import logdir
 from shmio.cli.supervise.prepare import Prepared, peer, prepare
 from shmio.cli.target import config_file
 from shmio.errors import ConfigError, ControlError, ShmioError
@@ -50,9 +51,11 @@ def _foreground(prepared: Prepared) -> int:
     _say("Ctrl-C stops it, and so does closing the terminal")
     console = logging.StreamHandler(sys.stderr)
     console.setFormatter(_Console())
-    logs.setup(prepared.plan.log_dir / "supervisor.log", "supervisor")
-    logging.getLogger("shmio.supervisor").addHandler(console)
-    Supervisor(prepared.plan, replan=_replan(prepared.plan)).run()
+    plan = prepared.plan
+    with logdir.held(plan.log_dir, plan.instance):
+        logs.setup(plan.log_dir / "supervisor.log", "supervisor")
+        logging.getLogger("shmio.supervisor").addHandler(console)
+        Supervisor(plan, replan=_replan(plan)).run()
     return 0
 
 
@@ -98,15 +101,16 @@ def _detached(file: Path, mode: str, report: int) -> int:
 
     try:
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
-        prepared = prepare(file, mode)
-        logs.setup(prepared.plan.log_dir / "supervisor.log", "supervisor")
+        plan = prepare(file, mode).plan
 
         def on_state(state: State) -> None:
             if state is not State.STOPPING:
                 tell("\n".join(["ok", *supervisor.history]))
 
-        supervisor = Supervisor(prepared.plan, replan=_replan(prepared.plan), on_state=on_state)
-        supervisor.run()
+        with logdir.held(plan.log_dir, plan.instance):
+            logs.setup(plan.log_dir / "supervisor.log", "supervisor")
+            supervisor = Supervisor(plan, replan=_replan(plan), on_state=on_state)
+            supervisor.run()
     except (ShmioError, OSError) as error:
         tell(str(error))
         return 1
@@ -118,7 +122,8 @@ def _detach(prepared: Prepared) -> int:
     plan = prepared.plan
     refuse_second(plan.instance)
     log_file = plan.log_dir / "supervisor.log"
-    logs.setup(log_file, "supervisor")
+    with logdir.held(plan.log_dir, plan.instance):
+        logs.setup(log_file, "supervisor")
     command = (sys.executable, "-P", "-m", "shmio.cli.supervisor", "up")
     reader, writer = os.pipe()
     with os.fdopen(reader, "rb") as answers, log_file.open("ab") as log:

@@ -1,0 +1,35 @@
+"""A folder of log files belongs to one instance: those of another would have the same names."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from shmio.errors import ConfigError
+
+LOCK_NAME = ".instance"
+
+
+@contextmanager
+def held(folder: Path, instance: str) -> Iterator[None]:
+    """Hold a folder, which is made, as long as the supervisor lives; ConfigError when another instance has it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        fd = os.open(folder / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+    except OSError as error:
+        raise ConfigError(f"instance.log_dir: cannot write {folder / LOCK_NAME}: {error.strerror}") from None
+    with os.fdopen(fd, "r+", encoding="utf-8", errors="replace") as file:
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise ConfigError(
+                f"instance.log_dir: instance {file.read(64).strip()!r} writes its logs to {folder}: give each "
+                "instance a folder of its own"
+            ) from None
+        file.truncate(0)
+        file.write(f"{instance}\n")
+        file.flush()
+        yield
