@@ -16,6 +16,7 @@ The socket's path stands in the segment's header. Only the supervisor's own user
 from __future__ import annotations
 
 import os
+import select
 import selectors
 import socket
 import stat
@@ -150,6 +151,9 @@ class ControlServer:
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             self.answer(client, {"error": f"not a request: {error}"})
         else:
+            if _hung_up(client):  # it gave up while the supervisor was held up, and said so to its user
+                self._drop(client)
+                return
             if request.until_ns is not None and time.monotonic_ns() >= request.until_ns:
                 self.answer(client, {"error": "the request came too late and is not carried out"})
                 return
@@ -289,6 +293,13 @@ def remove_socket(path: str) -> None:
 def _trusted(client: socket.socket) -> bool:
     _, uid, _ = _CREDENTIALS.unpack(client.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
     return uid in (0, os.getuid())
+
+
+def _hung_up(client: socket.socket) -> bool:
+    """Whether the other end is closed."""
+    poll = select.poll()
+    poll.register(client, select.POLLIN)
+    return any(events & select.POLLHUP for _, events in poll.poll(0))
 
 
 def _send(client: socket.socket, message: dict[str, object]) -> None:

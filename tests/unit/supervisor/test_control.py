@@ -149,6 +149,15 @@ def test_too_many_clients_are_turned_away(served: Served) -> None:
         client.close()
 
 
+def test_a_client_that_gave_up_is_not_served(served: Served) -> None:
+    """Its user was told that the request had not been answered."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
+        client.connect(served.path)
+        client.sendall(b'{"do": "stop"}\n')
+    served.turn()
+    assert served.requests == []
+
+
 def test_a_client_that_goes_away_before_its_answer_does_no_harm(served: Served) -> None:
     served.client(b'{"do": "stop"}\n').close()
     served.turn()
