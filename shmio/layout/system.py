@@ -6,7 +6,7 @@ these agree with the length or the addresses that its source states. ``docs/refe
 - ErrorStruct, CREF, NREF: Siemens' help on GET_ERROR has the members, the one on system data types the lengths.
 - TCON_Param, TADDR_Param: Siemens' help on open user communication has every byte.
 - SSL_HEADER: Siemens' help on RDSYSST, length in the one on system data types.
-- SFB 0 to 5: the interfaces in Siemens' "System Software for S7-300/400, System and Standard Functions".
+- SFB 0 to 5: the interfaces as the simulator awlsim has them; its tests state the addresses of SFB 0.
 
 The rest is refused. Of IEC_TIMER and its like the lengths are public, but not where in them the members are.
 """
