@@ -85,19 +85,21 @@ class Supervisor:
             for line in self.history:
                 log.warning("%s", line)
             self._segment = stack.enter_context(found.segment if found else self._create(path))
-            stack.callback(self._segment.unlink)
+            if not found:
+                stack.callback(self._segment.unlink)
             self._control = ControlServer(path, self._selector, self._handle)
             stack.callback(self._control.close)
             self._fleet = Fleet(self._segment, self._selector, self._limits, self._modules)
-            stack.callback(self._fleet.kill_all)
-            log.info("supervising", extra=fields(instance=self._plan.instance, segment=self._segment.shared.name))
-            if found:
+            if found:  # until all of it is ours, a failure leaves it for the next attempt
                 for slot, child in found.children:
                     self._fleet.adopt(self._fleet.named(slot.name), child)
                 self._change = Change(self._fleet, self._segment, self._plan)
+                stack.callback(self._segment.unlink)
             else:
                 for job in self._plan.jobs:
                     self._fleet.assign(job)
+            stack.callback(self._fleet.kill_all)
+            log.info("supervising", extra=fields(instance=self._plan.instance, segment=self._segment.shared.name))
             while not self._tick():
                 for key, _ in self._selector.select(self._pause_s()):
                     key.data()

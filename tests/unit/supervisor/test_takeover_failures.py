@@ -1,0 +1,45 @@
+"""A take-over that fails leaves everything as it was: what runs goes on, for the next attempt."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tests.unit.supervisor.harness import CELL, Job, Launch
+
+
+def test_no_place_for_the_control_socket(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    before = cell.pids()
+    cell.process.kill()
+    cell.wait_end()
+    socket = cell.folder / "run" / "shmio" / f"{cell.instance}.sock"
+    socket.unlink()
+    socket.touch()
+    failing = launch()
+    assert failing.wait_end() == 1
+    assert failing.errors() == f"cannot make the control socket {socket}: Address already in use\n"
+    assert cell.pids() == before
+    socket.unlink()
+    successor = launch()
+    successor.wait_state("running")
+    assert successor.pids() == before
+    assert successor.stop() == 0
+
+
+def test_no_room_for_what_is_new(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    before = cell.pids()
+    cell.process.kill()
+    cell.wait_end()
+    many: list[Job] = [(f"more{i}", "emulator", ["good"]) for i in range(17)]
+    failing = launch([*CELL, *many])
+    assert failing.wait_end() == 1
+    assert "has room for 16 more processes, not for 17" in failing.errors()
+    assert Path(f"/dev/shm/shmio-{cell.instance}").exists()
+    assert cell.pids() == before
+    successor = launch()
+    successor.wait_state("running")
+    assert successor.pids() == before
+    assert successor.stop() == 0
