@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import selectors
+import signal
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Final
 
-from shmio.segment import Phase, ProcessSpec, Segment, Supervised
+from shmio.segment import Phase, ProcessSpec, Segment, Supervised, leftover
 from shmio.supervisor import policy
-from shmio.supervisor.managed import Managed, log_step
+from shmio.supervisor.managed import Managed, log, log_step
 from shmio.supervisor.plan import Job
 from shmio.supervisor.policy import Limits
 from shmio.supervisor.process import Adopted, Child
@@ -98,9 +100,24 @@ class Fleet:
         self._ticked_ns = now_ns
         for managed in self:
             quiet_ns = managed.quiet_ns(elapsed_ns)
+            if managed.life.state is State.STARTING:
+                self._evict(managed)
             event = policy.due(managed.life, now_ns, ready=managed.ready, quiet_ns=quiet_ns, limits=self._limits)
             if event is not None:
                 self.apply(managed, event)
+
+    def _evict(self, managed: Managed) -> None:
+        """Kill a process that holds the role and is not ours.
+
+        A dead supervisor had started it in its last moment, and it was not there yet when all was taken over.
+        """
+        if managed.child is None or managed.slot.report.pid in (0, managed.child.pid):
+            return
+        worker = leftover.holder(managed.slot, self._segment.shared)
+        if worker is not None:
+            log.warning("%s is held by pid %d, which no supervisor knows: killed", managed.name, worker.pid)
+            leftover.end([worker], [signal.SIGKILL])
+            os.close(worker.pidfd)
 
     def apply(self, managed: Managed, event: Event, note: str = "") -> None:
         """Let something happen to a process, and do what follows from it."""

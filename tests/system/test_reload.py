@@ -88,10 +88,9 @@ def test_a_new_layout_keeps_the_streams_whose_register_is_still_there(cell: Cell
     ended = stub.Subscribe(TopicDescriptor(path="cell/Inputs/3"), timeout=4 * PATIENCE_S)
     next(kept), next(ended)
     grpc_pid = cell.processes()["grpc"]["pid"]
-    source = cell.folder / "db201.db"
-    text = source.read_text()
-    assert "Inputs" in text
-    source.write_text(text.replace("Inputs", "Entries"))
+    own = (cell.folder / "db201.db").read_text().replace("Inputs", "Entries")
+    (cell.folder / "own.db").write_text(own)
+    edit(cell, 'connector = "s7"\nlayout = "db201.db"', 'connector = "s7"\nlayout = "own.db"')
     done = cell.supervisor("reload")
     assert done.stderr == ""
     assert "cell: restarted, as its configuration has changed" in done.stdout

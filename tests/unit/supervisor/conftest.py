@@ -24,5 +24,5 @@ def launch(instance: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
         return launched[-1]
 
     yield start
-    for one in launched:
+    for one in reversed(launched):  # the last one has what an earlier one left
         one.close()

@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 import re
 import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -12,7 +15,8 @@ import pytest
 from shmio.errors import ControlError
 from shmio.segment import Segment, instances
 from shmio.supervisor.control import Restart, Stop, Where
-from tests.unit.supervisor.harness import Launch, until
+from shmio.supervisor.plan import Job
+from tests.unit.supervisor.harness import CELL, HERE, ROOT, Launch, until
 
 
 def test_processes_start_in_order_and_stop_in_reverse(launch: Launch, tmp_path: Path) -> None:
@@ -173,6 +177,74 @@ def test_a_killed_supervisor_leaves_the_processes_and_the_next_one_takes_over(la
     assert successor.pids() == pids
     assert f"took over cell, pid {pids['cell']}, which had lost its supervisor" in successor.log()
     assert successor.stop() == 0
+
+
+def test_a_process_that_no_supervisor_knows_loses_its_role(launch: Launch) -> None:
+    """As one that a supervisor started in the last moment before its death."""
+    cell = launch([("plc", "emulator", ["good", "crash", "good"])], backoff_first_s=2)
+    cell.wait_state("running")
+    os.kill(cell.pid("plc"), signal.SIGKILL)
+    until(lambda: cell.of("plc").state == "backoff" and cell.of("plc").restarts == 1)
+    with Segment.open(cell.instance) as segment:
+        job = Job(
+            "plc", "emulator", cell.folder / "plc.log", {"behaviour": ["good"], "ends": str(cell.folder / "ends")}
+        )
+        description = job.describe(cell.instance, segment.header.epoch)
+        environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{HERE}"}
+        command = [sys.executable, "-m", "fake_worker"]
+        with subprocess.Popen(command, stdin=subprocess.PIPE, env=environment) as stranger:
+            assert stranger.stdin is not None
+            stranger.stdin.write(description)
+            stranger.stdin.close()
+            assert stranger.wait() == -signal.SIGKILL
+        until(lambda: cell.of("plc").state == "running")
+        assert cell.pid("plc") != stranger.pid
+    assert f"plc is held by pid {stranger.pid}, which no supervisor knows: killed" in cell.log()
+
+
+def test_a_frozen_process_is_not_taken_over(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    before = cell.pids()
+    frozen = cell.pid("cell")
+    cell.process.kill()
+    cell.wait_end()
+    os.kill(frozen, signal.SIGSTOP)
+    until(lambda: time.monotonic_ns() - heartbeat_ns(cell.instance, "cell") > 0.5e9)
+    successor = launch(hang_s=0.5)
+    successor.wait_state("running")
+    assert re.search(rf"cell, pid {frozen}, has given no heartbeat for \d s: it is replaced", successor.log())
+    after = successor.pids()
+    assert after.pop("cell") != before.pop("cell")
+    assert after == before
+
+
+def heartbeat_ns(instance: str, name: str) -> int:
+    with Segment.open(instance) as segment:
+        return segment.processes.find(name).heartbeat_ns
+
+
+def test_only_what_is_configured_otherwise_is_replaced_at_a_take_over(launch: Launch) -> None:
+    cell = launch([*CELL, ("press", "source", ["good"])])
+    cell.wait_state("running")
+    before = cell.pids()
+    with Segment.open(cell.instance) as segment:
+        epoch, inode = segment.header.epoch, segment.shared.inode
+    cell.process.kill()
+    cell.wait_end()
+    successor = launch([CELL[0], ("cell", "source", ["good", "good"]), CELL[2], ("robot", "source", ["good"])])
+    successor.wait_state("running")
+    after = successor.pids()
+    assert list(after) == ["plc", "cell", "grpc", "robot"]
+    assert (after["plc"], after["grpc"]) == (before["plc"], before["grpc"])
+    assert after["cell"] != before["cell"]
+    assert not Path(f"/proc/{before['press']}/maps").exists() or not Path(f"/proc/{before['press']}/maps").read_text()
+    with Segment.open(cell.instance) as segment:
+        assert (segment.header.epoch, segment.shared.inode) == (epoch, inode)
+        assert list(segment.blocks) == ["cell", "robot"]
+    os.kill(successor.pid("plc"), signal.SIGKILL)
+    until(lambda: successor.of("plc").restarts == 1 and successor.of("plc").state == "running")
+    assert "plc crashed: ended; its exit status is not known" in successor.log()
 
 
 def test_a_closed_terminal_stops_it_in_good_order(launch: Launch, tmp_path: Path) -> None:
