@@ -24,6 +24,7 @@ MAX_PROCESSES: Final = 256
 GENERATION_OFFSET: Final = 48  # u32 generation, u32 section count: one word, so that they move together
 CONTROL_OFFSET: Final = 208
 CONTROL_SIZE: Final = 256
+SUPERVISED_SINCE_OFFSET: Final = 496
 HEARTBEAT_OFFSET: Final = 504
 SUPERVISOR_CELL: Final = 512
 

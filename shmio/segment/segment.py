@@ -222,6 +222,11 @@ class Segment:
         return _atomics.load64(self.memory, header.HEARTBEAT_OFFSET)
 
     @property
+    def supervised_since_ns(self) -> int:
+        """CLOCK_MONOTONIC of the supervisor's start: later than the instance's, if it has taken that over."""
+        return _atomics.load64(self.memory, header.SUPERVISED_SINCE_OFFSET) or self.header.started_ns
+
+    @property
     def supervised(self) -> bool:
         """Whether a supervisor is alive."""
         return self.shared.locked(SUPERVISOR_LOCK)
@@ -232,7 +237,11 @@ class Segment:
         supervisor_beat(self.memory)
 
     def lead_to(self, control: str) -> None:
-        """Tell another path of the control socket; the supervisor's alone. Who has opened the segment keeps the old."""
+        """Tell that another supervisor begins, and the path of its control socket; its alone.
+
+        Who has opened the segment before keeps the old path.
+        """
+        _atomics.store64(self.memory, header.SUPERVISED_SINCE_OFFSET, time.monotonic_ns())
         header.write_control(self.memory, control)
         self.header = Header.read(self.memory, self.shared.name)
 

@@ -91,7 +91,7 @@ def _read(segment: Segment) -> InstanceStatus:
         status.note = "its supervisor is dead, nothing watches the processes; up takes them over, down stops them"
         status.state = str(InstanceState.DEGRADED)
     else:
-        status.supervisor = SupervisorStatus(pid, _seconds(now_ns - segment.header.started_ns))
+        status.supervisor = SupervisorStatus(pid, _seconds(now_ns - segment.supervised_since_ns))
         status.state = str(_state(state, processes))
         if silence := supervisor_silence(segment):
             status.state, status.note = str(InstanceState.DEGRADED), silence

@@ -40,7 +40,7 @@ def take_over(plan: Plan, control: str, limits: Limits) -> tuple[Found | None, l
             children, lines = _sort(segment, shared, limits)
             if segment.header.control != control:
                 remove_socket(segment.header.control)
-                segment.lead_to(control)
+            segment.lead_to(control)
             return Found(segment, children), [*done, *lines]
         done += leftover.clear_claimed(shared, plan.instance)
     except BaseException:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -98,6 +99,20 @@ def test_all_is_well(cell: Cell, instance: str) -> None:
     assert "rate_mhz" not in source.counters
     assert grpc.counters == {"streams": 7, "messages": 3, "dropped": 0, "published": 1, "refused": 250}
     assert type(grpc) is ProcessStatus, "quality is for sources"
+
+
+def test_a_supervisor_that_took_over_is_as_old_as_it_is(
+    cell: Cell, instance: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hour_ns = 3600 * 10**9
+    cell.segment.set_state(os.getpid(), State.RUNNING)
+    with monkeypatch.context() as later:
+        later.setattr("time.monotonic_ns", lambda now=time.monotonic_ns: now() + hour_ns)
+        cell.segment.lead_to("/run/other.sock")
+    monkeypatch.setattr("time.monotonic_ns", lambda now=time.monotonic_ns: now() + hour_ns + 10**9)
+    supervisor = read_status(instance).supervisor
+    assert supervisor is not None
+    assert supervisor.uptime_s < 3600
 
 
 def test_the_json_has_what_the_contract_names(cell: Cell, instance: str) -> None:
