@@ -24,5 +24,8 @@ def launch(instance: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
         return launched[-1]
 
     yield start
-    for one in reversed(launched):  # the last one has what an earlier one left
+    for one in launched:  # all of them, before what is left can be cleared
+        one.process.kill()
+        one.process.wait()
+    for one in launched:
         one.close()

@@ -16,7 +16,7 @@ from shmio.errors import ControlError
 from shmio.segment import Segment, instances
 from shmio.supervisor.control import Restart, Stop, Where
 from shmio.supervisor.plan import Job
-from tests.unit.supervisor.harness import CELL, HERE, ROOT, Launch, until
+from tests.unit.supervisor.harness import CELL, DEADLINE_S, HERE, ROOT, Launch, until
 
 
 def test_processes_start_in_order_and_stop_in_reverse(launch: Launch, tmp_path: Path) -> None:
@@ -196,7 +196,10 @@ def test_a_process_that_no_supervisor_knows_loses_its_role(launch: Launch) -> No
             assert stranger.stdin is not None
             stranger.stdin.write(description)
             stranger.stdin.close()
-            assert stranger.wait() == -signal.SIGKILL
+            try:
+                assert stranger.wait(DEADLINE_S) == -signal.SIGKILL
+            finally:
+                stranger.kill()
         until(lambda: cell.of("plc").state == "running")
         assert cell.pid("plc") != stranger.pid
     assert f"plc is held by pid {stranger.pid}, which no supervisor knows: killed" in cell.log()
