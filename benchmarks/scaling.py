@@ -1,9 +1,10 @@
 """How the cost of an instance grows: with sources, with the size of a block, with readers.
 
 Each row is an instance of its own at 50 Hz; each source has an emulated controller of its own, in a process whose CPU
-is counted apart, since a plant has real ones. *Busy* is all that the machine did, of all its cores: near 100 % the
-figures tell of the machine, no longer of shmio. *Due to frame* is from the time at which a cycle was due to the
-publishing of its frame: lateness, the read, and waiting for a core.
+is counted apart, since a plant has real ones. *All* is what the machine did, of as many times 100 % as it has cores,
+and *elsewhere* the part of it that is none of the benchmark's: with no core left, or much of that, the figures tell of
+the machine, no longer of shmio. *Due to frame* is from the time at which a cycle was due to the publishing of its
+frame: lateness, the read, and waiting for a core.
 """
 
 from __future__ import annotations
@@ -76,14 +77,13 @@ class Usage:
         self._before = {pid: CpuTime.of(pid) for pids in groups.values() for pid in pids}
 
     def percent(self) -> dict[str, float]:
-        """Of one core by group, and ``busy`` of all cores."""
-        taken_s = time.monotonic() - self._begun_s
-        cores = os.cpu_count() or 1
-        found = {"busy": 100 * (busy_s() - self._busy_s) / taken_s / cores}
+        """Of one core, by group and ``elsewhere`` and in ``all``."""
+        taken_s, found = time.monotonic() - self._begun_s, {}
+        whole = 100 * (busy_s() - self._busy_s) / taken_s
         for name, pids in self._groups.items():
             used = [CpuTime.of(pid).since(self._before[pid]) for pid in pids]
             found[name] = 100 * sum(cpu.user_s + cpu.system_s for cpu in used) / taken_s
-        return found
+        return found | {"elsewhere": max(0.0, whole - sum(found.values())), "all": whole}
 
 
 def delays_ms(running: Instance, names: Sequence[str], count: int) -> list[float]:
@@ -135,8 +135,8 @@ def measure(load: Load, duration_s: float) -> list[str]:
         missed = sum(reader.finish()["missed"] for reader in readers)
     return [
         f"{used['sources'] / load.sources:.2f}",
-        *(f"{used[name]:.2f}" for name in ("others", "controllers", "readers")),
-        *(f"{value:.2f}" for value in (used["busy"], delays[0], delays[2])),
+        *(f"{used[name]:.2f}" for name in ("others", "controllers", "readers", "elsewhere", "all")),
+        *(f"{value:.2f}" for value in (delays[0], delays[2])),
         str(overruns),
         f"{size_mb:.1f}",
         str(missed),

@@ -70,6 +70,6 @@ def test_a_growing_load_is_measured_row_by_row() -> None:
     found = re.search(r"^2 of each +(.+)$", printed("scaling"), re.MULTILINE)
     assert found is not None
     cells = [float(cell) for cell in found[1].split()]
-    assert len(cells) == 10
-    assert cells[5] > 0  # ms from due to frame
-    assert cells[9] == 0  # frames that readers missed
+    assert len(cells) == 11
+    assert cells[6] > 0  # ms from due to frame
+    assert cells[10] == 0  # frames that readers missed
