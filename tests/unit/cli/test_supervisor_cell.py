@@ -138,15 +138,34 @@ def test_down_clears_what_a_killed_supervisor_left(cell: Cell) -> None:
     assert not list((cell.folder / "run" / "shmio").iterdir())
 
 
-def test_up_tells_what_it_clears_of_a_killed_supervisor(cell: Cell) -> None:
+def test_up_tells_what_it_takes_over_of_a_killed_supervisor(cell: Cell) -> None:
     cell.run("up", "--detach", status=0)
     status = cell.status()
     os.kill(status["supervisor"]["pid"], signal.SIGKILL)
     cell.until(lambda: cell.status()["supervisor"] is None)
-    assert "up stops them and starts anew" in cell.run("status", status=0).stdout
+    assert "up takes them over, down stops them" in cell.run("status", status=0).stdout
     lines = cell.run("up", "--detach", status=0).stdout
     for process in status["processes"]:
+        assert f"took over {process['name']}, pid {process['pid']}, which had lost its supervisor\n" in lines
+    cell.run("down", status=0)
+
+
+def test_down_tells_what_it_clears_of_a_killed_supervisor(cell: Cell) -> None:
+    cell.run("up", "--detach", status=0)
+    status = cell.status()
+    os.kill(status["supervisor"]["pid"], signal.SIGKILL)
+    cell.until(lambda: cell.status()["supervisor"] is None)
+    lines = cell.run("down", status=0).stdout
+    for process in status["processes"]:
         assert f"stopped {process['name']}, pid {process['pid']}, which had lost its supervisor\n" in lines
+
+
+def test_the_logs_of_another_instance_are_left_alone(cell: Cell) -> None:
+    cell.run("up", "--detach", status=0)
+    other = cell.folder / "other.toml"
+    other.write_text((cell.folder / "supervisor.toml").read_text().replace(f'"{cell.instance}"', '"other"'))
+    refused = cell.run("up", "-c", "other.toml", status=1).stderr
+    assert refused.startswith(f"instance.log_dir: instance {cell.instance!r} writes its logs to ")
     cell.run("down", status=0)
 
 
