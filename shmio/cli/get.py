@@ -7,7 +7,8 @@ import argparse
 from shmio.cli.readings import as_json, as_line, choose, topic_path
 from shmio.cli.run import dumps
 from shmio.segment import Frame
-from shmio.segment.attach import Attachment, reading
+from shmio.segment.attach import Attachment
+from shmio.segment.view import reading
 
 HELP = "Print the present values of registers, with quality and age."
 

@@ -11,9 +11,10 @@ from shmio.layout.model import Layout, Register
 from shmio.layout.text import json_value, to_text
 from shmio.layout.topic import find, parse_topic
 from shmio.logs import printable
-from shmio.segment.attach import Attachment, Reading
+from shmio.segment.attach import Attachment
 from shmio.segment.block import Block
 from shmio.segment.frame import Quality
+from shmio.segment.view import Reading
 
 SHOWN_CHARACTERS = 60
 

@@ -13,7 +13,8 @@ from shmio.cli.run import at_least, dumps
 from shmio.errors import NotRunningError
 from shmio.layout.model import Register
 from shmio.segment import Block, Frame, Quality
-from shmio.segment.attach import Attachment, Reading, reading
+from shmio.segment.attach import Attachment
+from shmio.segment.view import Reading, reading
 
 HELP = "Print the values of registers whenever they change, the present ones first."
 IDLE_S = 0.5

@@ -5,14 +5,14 @@ The byte format is docs/reference/segment-format.md; a local program starts with
 
 from shmio.layout.write import Write
 from shmio.segment.block import Attributes, Block, BlockWriter
-from shmio.segment.build import BlockSpec
+from shmio.segment.build import BlockSpec, segment_size
 from shmio.segment.commands import Command, CommandSender
 from shmio.segment.cursor import Cursor
 from shmio.segment.events import ENDS, NO_WRITER, Event, EventKind, EventRing, Record
 from shmio.segment.frame import Frame, Provenance, Quality
 from shmio.segment.header import State
 from shmio.segment.processes import Activity, Phase, ProcessSlot, ProcessSpec, Report, Supervised
-from shmio.segment.segment import PREFIX, Segment, instances, running_instances, segment_size
+from shmio.segment.segment import PREFIX, Segment, instances, running_instances
 
 __all__ = [
     "ENDS",

@@ -1,20 +1,29 @@
-"""What a block is built from, and its sections: layout, frames, events, commands, attributes."""
+"""What a segment is built from: its blocks, their sections, and all of it at once."""
 
 from __future__ import annotations
 
+import os
+import secrets
 import struct
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import msgspec
 
+from shmio import __version__
 from shmio.layout.model import Layout
-from shmio.segment import _atomics, commands
+from shmio.segment import _atomics, commands, header
 from shmio.segment.block import Attributes
 from shmio.segment.events import EVENT_SIZE, EVENT_SLOTS
-from shmio.segment.header import SectionEntry, SectionKind
+from shmio.segment.header import HEADER_SIZE, SECTION_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
+from shmio.segment.processes import GUESTS, ProcessSpec, ProcessTable, supervisor_beat
+from shmio.segment.shm import SharedObject
 
 RING_SECONDS = 8
+SECTIONS_PER_BLOCK = 5
+SPARE_SECTIONS = 40 * SECTIONS_PER_BLOCK
+SPARE_PROCESSES = 16 + GUESTS
 EVENT_STRIDE = -(-(_atomics.RAW_OFFSET + EVENT_SIZE) // 64) * 64
 
 _RING = struct.Struct("<8Iqq")
@@ -70,9 +79,6 @@ class BlockSpec:
         ]
 
 
-SECTIONS_PER_BLOCK = 5
-
-
 def write_blocks(memory: memoryview, at: int, first: int, blocks: Sequence[BlockSpec]) -> list[SectionEntry]:
     """Write the sections of blocks from offset ``at`` on; their entries, from number ``first`` on."""
     entries: list[SectionEntry] = []
@@ -85,6 +91,52 @@ def write_blocks(memory: memoryview, at: int, first: int, blocks: Sequence[Block
             entries.append(SectionEntry(kind, False, at, size, of, block.source, digest))
             at += align(size, 64)
     return entries
+
+
+def segment_size(blocks: Sequence[BlockSpec], processes: int) -> int:
+    """Bytes of a segment built from these; what ``check`` prints."""
+    return HEADER_SIZE + sum(_table_sizes(len(blocks), processes)) + sum(block.size for block in blocks)
+
+
+def _table_sizes(blocks: int, processes: int) -> tuple[int, int]:
+    sections = SECTIONS_PER_BLOCK * blocks + SPARE_SECTIONS
+    return align(sections * SECTION_SIZE, 64), (processes + SPARE_PROCESSES) * SLOT_SIZE
+
+
+def build_segment(
+    shared: SharedObject,
+    instance: str,
+    blocks: Sequence[BlockSpec],
+    processes: Sequence[ProcessSpec],
+    mode: str,
+    control: str,
+) -> None:
+    """Make room in a new object and write all of it; the magic last."""
+    size = segment_size(blocks, len(processes))
+    sections_size, processes_size = _table_sizes(len(blocks), len(processes))
+    shared.allocate(size)
+    with memoryview(shared.map()) as memory:
+        head = Header(
+            epoch=secrets.randbits(64) | 1,
+            size=size,
+            started_utc_ns=time.time_ns(),
+            started_ns=time.monotonic_ns(),
+            sections_offset=HEADER_SIZE,
+            section_capacity=sections_size // SECTION_SIZE,
+            processes_offset=HEADER_SIZE + sections_size,
+            process_capacity=processes_size // SLOT_SIZE,
+            mode=mode,
+            instance=instance,
+            version=__version__,
+            control=control,
+        )
+        head.write(memory)
+        ProcessTable.write(memory, head, processes)
+        header.write_supervisor(memory, os.getpid(), State.STARTING)
+        supervisor_beat(memory)
+        entries = write_blocks(memory, HEADER_SIZE + sections_size + processes_size, 0, blocks)
+        header.change_sections(memory, head, entries)
+        header.finish(memory)
 
 
 def align(size: int, to: int) -> int:

@@ -2,29 +2,24 @@
 
 from __future__ import annotations
 
-import os
-import secrets
 import time
 from collections.abc import Sequence
 from contextlib import suppress
 
 import msgspec
 
-from shmio import __version__
 from shmio.errors import AlreadyRunningError, FormatError, LayoutError, NotRunningError, SegmentError, UnfinishedError
 from shmio.layout.model import Layout
 from shmio.segment import _atomics, header, shm
 from shmio.segment.block import Attributes, Block, BlockWriter
-from shmio.segment.build import SECTIONS_PER_BLOCK, BlockSpec, align, write_blocks
+from shmio.segment.build import SECTIONS_PER_BLOCK, BlockSpec, align, build_segment, write_blocks
 from shmio.segment.commands import CommandQueues
 from shmio.segment.events import EVENT_SIZE
-from shmio.segment.header import HEADER_SIZE, SECTION_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
-from shmio.segment.processes import GUESTS, SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
+from shmio.segment.header import HEADER_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
+from shmio.segment.processes import SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
 from shmio.segment.shm import SharedObject
 
 PREFIX = "shmio-"
-SPARE_SECTIONS = 40 * SECTIONS_PER_BLOCK
-SPARE_PROCESSES = 16 + GUESTS
 
 _ATTRIBUTES = msgspec.json.Decoder(Attributes)  # as in layout/document.py: built before there are threads
 
@@ -71,7 +66,7 @@ class Segment:
             if not shared.try_lock(SUPERVISOR_LOCK) or not shared.current():
                 raise AlreadyRunningError(f"another supervisor is just starting instance {instance}")
             try:
-                _build(shared, instance, blocks, processes, mode, control)
+                build_segment(shared, instance, blocks, processes, mode, control)
                 return cls(shared, instance)
             except BaseException:
                 shm.unlink(name)
@@ -282,51 +277,6 @@ def running_instances() -> list[str]:
             if segment.supervised or any(slot.alive() for slot in segment.processes):
                 found.append(name)
     return found
-
-
-def segment_size(blocks: Sequence[BlockSpec], processes: int) -> int:
-    """Bytes of a segment built from these; what ``check`` prints."""
-    return HEADER_SIZE + sum(_table_sizes(len(blocks), processes)) + sum(block.size for block in blocks)
-
-
-def _table_sizes(blocks: int, processes: int) -> tuple[int, int]:
-    sections = SECTIONS_PER_BLOCK * blocks + SPARE_SECTIONS
-    return align(sections * SECTION_SIZE, 64), (processes + SPARE_PROCESSES) * SLOT_SIZE
-
-
-def _build(
-    shared: SharedObject,
-    instance: str,
-    blocks: Sequence[BlockSpec],
-    processes: Sequence[ProcessSpec],
-    mode: str,
-    control: str,
-) -> None:
-    size = segment_size(blocks, len(processes))
-    sections_size, processes_size = _table_sizes(len(blocks), len(processes))
-    shared.allocate(size)
-    with memoryview(shared.map()) as memory:
-        head = Header(
-            epoch=secrets.randbits(64) | 1,
-            size=size,
-            started_utc_ns=time.time_ns(),
-            started_ns=time.monotonic_ns(),
-            sections_offset=HEADER_SIZE,
-            section_capacity=sections_size // SECTION_SIZE,
-            processes_offset=HEADER_SIZE + sections_size,
-            process_capacity=processes_size // SLOT_SIZE,
-            mode=mode,
-            instance=instance,
-            version=__version__,
-            control=control,
-        )
-        head.write(memory)
-        ProcessTable.write(memory, head, processes)
-        header.write_supervisor(memory, os.getpid(), State.STARTING)
-        supervisor_beat(memory)
-        entries = write_blocks(memory, HEADER_SIZE + sections_size + processes_size, 0, blocks)
-        header.change_sections(memory, head, entries)
-        header.finish(memory)
 
 
 def refuse_second(instance: str) -> None:

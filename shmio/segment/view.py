@@ -1,0 +1,103 @@
+"""What a local program gets to see: a register's reading, a frame with its layout."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any
+
+from shmio.errors import PathError
+from shmio.layout.codec import Value, codec
+from shmio.layout.model import Layout, Register
+from shmio.layout.topic import find, parse_topic
+from shmio.segment.block import Block
+from shmio.segment.frame import Frame, Provenance, Quality
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from shmio.layout.framecodec import FrameCodec
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """One register as of now. ``value`` is the last one known even while quality is bad; None if there never was one.
+
+    ``source_time`` is UTC in s, ``age_s`` the time since the frame was published.
+    """
+
+    value: Value
+    quality: Quality
+    reason: str
+    provenance: str
+    source_time: float | None
+    age_s: float | None
+
+
+@dataclass(frozen=True)
+class View:
+    """A frame with its layout: a validated copy, which nothing changes any more.
+
+    ``missed`` counts the frames lost between the one before in its stream and this one.
+    """
+
+    source: str
+    frame: Frame
+    layout: Layout
+    stale_ns: int
+    missed: int = 0
+
+    @property
+    def cycle(self) -> int:
+        """Cycle of the source's schedule."""
+        return self.frame.cycle
+
+    @property
+    def quality(self) -> Quality:
+        """Quality as of now: it turns bad with age."""
+        return self.frame.assess(self.stale_ns)[0]
+
+    @property
+    def reason(self) -> str:
+        """Why quality is not good; empty if it is."""
+        return self.frame.assess(self.stale_ns)[1]
+
+    def __getitem__(self, path: str) -> Value:
+        """The value of a register, or of an array's element, whatever the quality; PathError."""
+        topic = parse_topic(path, (self.source,), self.source)
+        if topic.direction == "in":
+            raise PathError(f"{path}: a frame holds what comes out of its source; leave out /in")
+        register = find(self.layout, topic.path)
+        return codec(register, self.layout.byte_order).decode(self.frame.image)
+
+    @cached_property
+    def array(self) -> np.ndarray[Any, np.dtype[Any]]:
+        """The whole frame decoded: a numpy structured array of shape (1,), one field for each register's path."""
+        return _frame_codec(self.layout).decode(self.frame.image)
+
+
+@lru_cache(maxsize=64)
+def _frame_codec(layout: Layout) -> FrameCodec:
+    from shmio.layout.framecodec import FrameCodec  # noqa: PLC0415  numpy only for those who ask for arrays
+
+    return FrameCodec(layout)
+
+
+def reading(block: Block, register: Register, frame: Frame | None) -> Reading:
+    """One register of one frame, with what is known about it now."""
+    if frame is None:
+        return Reading(None, Quality.BAD, "no data yet", str(Provenance.LIVE), None, None)
+    now_ns = time.monotonic_ns()
+    quality, reason = frame.assess(block.stale_ns, now_ns)
+    known = frame.source_ns != 0
+    value = codec(register, block.layout.byte_order).decode(frame.image) if known else None
+    if quality is not Quality.BAD and _holds_none(value):
+        quality, reason = Quality.BAD, f"the bytes are no {register.type}"
+    source_time = frame.source_ns / 1e9 if known else None
+    return Reading(value, quality, reason, str(frame.provenance), source_time, round(frame.age_ns(now_ns) / 1e9, 6))
+
+
+def _holds_none(value: Value) -> bool:
+    """Whether a value, or an element of it, could not be decoded."""
+    return any(map(_holds_none, value)) if isinstance(value, list) else value is None
