@@ -6,7 +6,7 @@ request                                   answer                                
 ``{"do": "stop"}``                        ``{"ok": true}``                                   all is stopped
 ``{"do": "restart", "name": "cell"}``     ``{"ok": true}``                                   the process runs again
 ``{"do": "reload"}``                      ``{"ok": true, "done": [lines], …}``               the change is over
-``{"do": "where"}``                       ``{"ok": true, "config": …, "log_dir": …}``        at once
+``{"do": "where"}``                       ``{"ok": true, "config": …, "read_ns": …, …}``     at once
 anything else                             ``{"error": "…"}``                                 at once
 ========================================  =================================================  =======================
 
@@ -62,7 +62,7 @@ class Reload(_Request, tag="reload"):
 
 
 class Where(_Request, tag="where"):
-    """Tell which configuration the instance was started from, and where it logs."""
+    """Tell which configuration the instance follows, since when (ns since 1970), and where it logs."""
 
 
 Request = Stop | Restart | Reload | Where

@@ -53,6 +53,7 @@ class Supervisor:
         """
         self._plan = plan
         self._replan = replan
+        self._read_ns = time.time_ns()
         self._limits = limits or Limits()
         self._modules = modules
         self._on_state = on_state
@@ -148,7 +149,8 @@ class Supervisor:
         elif isinstance(request, Reload):
             self._reload(answer)
         else:
-            answer.ok(config=str(self._plan.config_file), log_dir=str(self._plan.log_dir))
+            plan = self._plan
+            answer.ok(config=str(plan.config_file), read_ns=self._read_ns, log_dir=str(plan.log_dir))
 
     def _busy(self) -> str | None:
         """Why no request that changes something can be taken at present."""
@@ -174,6 +176,7 @@ class Supervisor:
             answer.error(reason)
             return
         self._notifier.reloading()
+        read_ns = time.time_ns()
         try:
             plan = self._replan()
             if reason := refusal(plan, self._plan):
@@ -184,7 +187,7 @@ class Supervisor:
             self._notifier.ready()
             answer.error(str(error))
             return
-        self._plan, self._change_answer = plan, answer
+        self._plan, self._change_answer, self._read_ns = plan, answer, read_ns
 
     def _follow_change(self, change: Change) -> None:
         if not change.step():

@@ -7,7 +7,6 @@ from contextlib import suppress
 from pathlib import Path
 
 from shmio.cli.target import ask, instance_name, open_supervised
-from shmio.segment import Segment
 from shmio.supervisor import control
 
 RESTART_S = 40.0
@@ -19,13 +18,14 @@ def execute(arguments: argparse.Namespace) -> int:
     with open_supervised(instance_name(arguments)) as segment:
         ask(segment, control.Restart(arguments.name), RESTART_S)
         print(f"{arguments.name} runs again")
-        file = Path(ask(segment, control.Where(), WHERE_S)["config"])
-        if _changed(file, segment):
-            print(f"{file} has changed since the start; restart keeps the old configuration, reload takes the new")
+        where = ask(segment, control.Where(), WHERE_S)
+        file = Path(where["config"])
+        if _changed(file, where["read_ns"]):
+            print(f"{file} has changed since it was read; restart keeps the old configuration, reload takes the new")
     return 0
 
 
-def _changed(file: Path, segment: Segment) -> bool:
+def _changed(file: Path, read_ns: int) -> bool:
     with suppress(OSError):
-        return file.stat().st_mtime_ns > segment.header.started_utc_ns
+        return file.stat().st_mtime_ns > read_ns
     return False

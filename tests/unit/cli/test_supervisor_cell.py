@@ -116,7 +116,7 @@ def test_a_day_in_the_life_of_the_cell(cell: Cell) -> None:
     moved.rename(file)
     file.write_text(file.read_text())
     changed = cell.run("restart", "grpc", status=0).stdout
-    assert changed.startswith(f"grpc runs again\n{file} has changed since the start; restart keeps the old")
+    assert changed.startswith(f"grpc runs again\n{file} has changed since it was read; restart keeps the old")
 
     down = cell.run("down", status=0).stdout
     assert down.splitlines()[-1] == f"{cell.instance} is stopped"

@@ -12,7 +12,7 @@ import pytest
 import shmio
 from shmio.errors import ControlError
 from shmio.segment import Quality, Segment
-from shmio.supervisor.control import Reload, Restart
+from shmio.supervisor.control import Reload, Restart, Where
 from tests.unit.supervisor.harness import CELL, Job, Launch, until
 
 PRESS: Job = ("press", "source", ["good"])
@@ -24,6 +24,18 @@ def test_nothing_new_touches_nothing(launch: Launch) -> None:
     before = cell.pids()
     assert cell.reload(CELL) == {"ok": True, "done": [], "problems": [], "kept": ["plc", "cell", "grpc"]}
     assert cell.pids() == before
+
+
+def test_the_configuration_is_as_old_as_its_last_good_reload(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    times = [cell.request(Where())["read_ns"]]
+    cell.reload(CELL)
+    times.append(cell.request(Where())["read_ns"])
+    (cell.folder / "plan.json").write_text("{")
+    with pytest.raises(ControlError, match="no JSON"):
+        cell.request(Reload())
+    assert times[0] < times[1] == cell.request(Where())["read_ns"]
 
 
 def test_a_source_is_added_and_nothing_else_is_touched(launch: Launch) -> None:
