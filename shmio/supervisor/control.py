@@ -19,7 +19,6 @@ import os
 import select
 import selectors
 import socket
-import stat
 import struct
 import time
 from collections.abc import Callable
@@ -30,6 +29,7 @@ from typing import Any, Final
 import msgspec
 
 from shmio.errors import ControlError, UnreachableError
+from shmio.supervisor.socketpath import remove_socket
 
 MAX_REQUEST_BYTES: Final = 4096
 MAX_ANSWER_BYTES: Final = 65536
@@ -38,7 +38,6 @@ REQUEST_S: Final = 2.0
 """Time that a client has to send its request."""
 TURN_S: Final = 0.5
 """How often a waiting client looks whether the supervisor still is."""
-MAX_PATH_BYTES: Final = 107  # sun_path holds 108 with the final zero, unix(7)
 _CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
 
@@ -241,53 +240,6 @@ def _wait(client: socket.socket, deadline: float, lost: Callable[[], str | None]
                 raise ControlError(reason) from None
             if time.monotonic() >= deadline:
                 raise
-
-
-def socket_path(instance: str) -> str:
-    """Where the control socket of an instance goes; makes the folder, mode 0700.
-
-    The first that will do of ``$XDG_RUNTIME_DIR/shmio``, ``/run/user/<uid>/shmio``, ``/tmp/shmio-<uid>``. ControlError
-    when none will: not a folder of this user, or the path is too long.
-    """
-    uid = os.getuid()
-    given = os.environ.get("XDG_RUNTIME_DIR")
-    folders = [Path(given) / "shmio"] if given and Path(given).is_absolute() else []
-    folders += [Path(f"/run/user/{uid}/shmio"), Path(f"/tmp/shmio-{uid}")]  # noqa: S108  made with care below
-    refused = []
-    for folder in folders:
-        path = folder / f"{instance}.sock"
-        if len(os.fsencode(path)) > MAX_PATH_BYTES:
-            refused.append(f"{folder}: the path is longer than {MAX_PATH_BYTES} bytes")
-            continue
-        reason = _prepare(folder, uid)
-        if reason is None:
-            return str(path)
-        refused.append(f"{folder}: {reason}")
-    raise ControlError(f"no folder for the control socket ({'; '.join(refused)})")
-
-
-def _prepare(folder: Path, uid: int) -> str | None:
-    """Make a folder that is this user's alone; why not, otherwise. A symbolic link is never followed."""
-    try:
-        with suppress(FileExistsError):
-            folder.mkdir(mode=0o700)
-        fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
-        try:
-            if os.fstat(fd).st_uid != uid:
-                return "belongs to another user"
-            os.fchmod(fd, 0o700)
-        finally:
-            os.close(fd)
-    except OSError as error:
-        return error.strerror
-    return None
-
-
-def remove_socket(path: str) -> None:
-    """Remove a socket; anything else that has the name is left, and bind tells."""
-    with suppress(FileNotFoundError):
-        if stat.S_ISSOCK(os.lstat(path).st_mode):
-            Path(path).unlink()
 
 
 def _trusted(client: socket.socket) -> bool:

@@ -16,7 +16,7 @@ from shmio.segment import Quality, Segment
 from shmio.segment import State as InstanceState
 from shmio.supervisor import policy
 from shmio.supervisor.change import Change
-from shmio.supervisor.control import Answer, ControlServer, Reload, Request, Restart, Stop, socket_path
+from shmio.supervisor.control import Answer, ControlServer, Reload, Request, Restart, Stop
 from shmio.supervisor.fleet import TICK_S, Fleet
 from shmio.supervisor.managed import log
 from shmio.supervisor.notify import Notifier
@@ -24,6 +24,7 @@ from shmio.supervisor.plan import MODULES, Plan
 from shmio.supervisor.policy import Limits
 from shmio.supervisor.reconcile import refusal
 from shmio.supervisor.signals import wake_on_signals
+from shmio.supervisor.socketpath import socket_path
 from shmio.supervisor.states import Event, State
 from shmio.supervisor.takeover import take_over
 

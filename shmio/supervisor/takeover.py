@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from shmio.errors import FormatError, SegmentError, UnfinishedError
 from shmio.segment import Activity, ProcessSlot, Segment, leftover, shm
 from shmio.segment.shm import SharedObject
-from shmio.supervisor.control import remove_socket
 from shmio.supervisor.plan import Plan
 from shmio.supervisor.policy import Limits
 from shmio.supervisor.process import Adopted
+from shmio.supervisor.socketpath import remove_socket
 
 
 @dataclass

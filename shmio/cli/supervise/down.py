@@ -11,6 +11,7 @@ from shmio.cli.target import ask, instance_name
 from shmio.errors import FormatError, NotRunningError, UnfinishedError
 from shmio.segment import Segment, instances, leftover
 from shmio.supervisor import control
+from shmio.supervisor.socketpath import remove_socket, socket_path
 
 STOP_S = 30.0
 EXIT_S = 5.0
@@ -32,8 +33,8 @@ def execute(arguments: argparse.Namespace) -> int:
 
 
 def _forget(path: str, name: str) -> None:
-    if path == control.socket_path(name):  # never what somebody else's segment names
-        control.remove_socket(path)
+    if path == socket_path(name):  # never what somebody else's segment names
+        remove_socket(path)
 
 
 def _stop(segment: Segment) -> None:

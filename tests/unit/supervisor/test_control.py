@@ -236,36 +236,3 @@ def test_asking_in_vain(tmp_path: Path) -> None:
         deaf.listen(1)
         with pytest.raises(ControlError, match=r"not answered within 0\.01 s"):
             control.request(str(tmp_path / "deaf.sock"), Stop(), 0.01)
-
-
-class TestPath:
-    @pytest.fixture(autouse=True)
-    def no_other_folder(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-
-    def test_it_lies_in_the_users_runtime_folder(self, tmp_path: Path) -> None:
-        assert control.socket_path("a50") == str(tmp_path / "shmio" / "a50.sock")
-        assert stat.S_IMODE((tmp_path / "shmio").stat().st_mode) == 0o700
-
-    def test_a_folder_that_others_may_enter_is_closed(self, tmp_path: Path) -> None:
-        (tmp_path / "shmio").mkdir(mode=0o777)
-        control.socket_path("a50")
-        assert stat.S_IMODE((tmp_path / "shmio").stat().st_mode) == 0o700
-
-    def test_a_symbolic_link_is_not_followed(self, tmp_path: Path) -> None:
-        (tmp_path / "elsewhere").mkdir()
-        (tmp_path / "shmio").symlink_to(tmp_path / "elsewhere")
-        assert not control.socket_path("a50").startswith(str(tmp_path))
-        assert not list((tmp_path / "elsewhere").iterdir())
-
-    def test_a_path_that_is_too_long_is_passed_over(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        deep = tmp_path / ("d" * 100)
-        deep.mkdir()
-        monkeypatch.setenv("XDG_RUNTIME_DIR", str(deep))
-        path = control.socket_path("a50")
-        assert not path.startswith(str(deep))
-        assert len(path.encode()) <= control.MAX_PATH_BYTES
-
-    def test_no_folder_at_all_is_an_error_that_says_why(self) -> None:
-        with pytest.raises(ControlError, match="longer than 107 bytes"):
-            control.socket_path("a" * 120)
