@@ -39,6 +39,10 @@ class Description:
     seed: int
     reader: str
     """The program of examples/reader.c, compiled."""
+    recordings: str
+    """The recorder's folder."""
+    rings_ns: Mapping[str, int]
+    """For how long each source's ring holds a frame."""
     sources: tuple[Mapping[str, Any], ...]
     """The fields of :class:`Source`, with paths of files for ``truth`` and ``landed``."""
 

@@ -12,7 +12,9 @@ from typing import Final, Self
 from tests.faults.checker import Description
 from tests.faults.checks import Counts
 
-MODULES: Final = ("local", "remote", "churn", "writing")
+MODULES: Final = ("local", "remote", "churn", "writing", "recorded")
+LATE: Final = ("slow", "recorded")
+"""How the counts begin of those who see values long after they were published."""
 END_S: Final = 20.0
 
 
@@ -45,8 +47,8 @@ class Panel:
                 self.counts |= {name: Counts(**counts) for name, counts in message["counts"].items()}
 
     def behind(self, when_ns: int) -> list[str]:
-        """Who has not seen a good value yet that the PLC got after ``when_ns``. The slow reader is not asked."""
-        return [name for name, c in self.counts.items() if c.since_ns <= when_ns and not name.startswith("slow")]
+        """Who has not seen a good value yet that the PLC got after ``when_ns``. Who is late anyway is not asked."""
+        return [n for n, counts in self.counts.items() if counts.since_ns <= when_ns and not n.startswith(LATE)]
 
     def check(self) -> None:
         """Complain of checkers that are not there any more."""

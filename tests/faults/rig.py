@@ -14,6 +14,7 @@ from typing import Final, Self
 
 import shmio
 from shmio.config import Address
+from shmio.segment import Segment
 from shmio.supervisor.status import InstanceStatus, read_status
 from shmio.testing.ports import reserved_port
 from shmio.testing.proxy import FaultProxy
@@ -66,6 +67,7 @@ program = "counter"
 listen = "{plc}"
 [grpc]
 listen = ["{grpc}"]
+[recorder]
 """
 
 
@@ -163,7 +165,10 @@ class Rig:
             known = name in self.devices
             paths = {field: str(self.folder / file) if known else None for field, file in files.items()}
             sources.append(asdict(source) | paths)
-        return Description(self.instance, str(self.grpc), seed, str(self.folder / "reader"), tuple(sources))
+        with Segment.open(self.instance) as segment:
+            rings = {name: block.ring.slot_count * block.period_ns for name, block in segment.blocks.items()}
+        reader, recordings = str(self.folder / "reader"), str(self.folder / "dumps")
+        return Description(self.instance, str(self.grpc), seed, reader, recordings, rings, tuple(sources))
 
     def supervisor(self, verb: str, *arguments: str) -> subprocess.CompletedProcess[str]:
         """Run ``shmio-supervisor`` on the instance, on a host whose clock can be set."""

@@ -9,8 +9,8 @@ from typing import Final
 
 SOURCES: Final = ("fast", "block")
 """Sources whose PLC is behind a proxy and keeps the truth."""
-WORKERS: Final = ("fast", "block", "demo", "plc", "grpc")
-"""Processes that the supervisor starts: sources, an emulator that feeds ``demo``, the endpoint."""
+WORKERS: Final = ("fast", "block", "demo", "plc", "grpc", "recorder")
+"""Processes that the supervisor starts: sources, an emulator that feeds ``demo``, the endpoint, the recorder."""
 SUPERVISOR: Final = "supervisor"
 
 PROCESS_FAULTS: Final = {"kill": 6, "pause": 3, "hang": 1, "restart": 3, "torn": 2}

@@ -174,7 +174,7 @@ class Suite:
         """No process of the instance but those it shows."""
         status = rig.status()
         known = {p.pid for p in status.processes} | {status.supervisor.pid if status.supervisor else None}
-        ours = ("shmio.connectors", "shmio.emulators", "shmio.endpoints", "shmio.cli.supervisor up")
+        ours = ("shmio.connectors", "shmio.emulators", "shmio.endpoints", "shmio.recording", "shmio.cli.supervisor up")
         deadline_s = time.monotonic() + END_S
         while True:
             strays = {
@@ -195,8 +195,8 @@ class Suite:
             self.complain(f"segments left behind: {left}")
         if processes := marked(self._instance):
             self.complain(f"processes left behind: {processes}")
-        known = {".toml", ".db", ".truth", ".so", ".log", ".1", ".2", ".3"}
+        known = {".toml", ".db", ".truth", ".mem", ".so", ".log", ".1", ".2", ".3"}
         files = [file for file in self._folder.rglob("*") if not file.is_dir() and file.suffix not in known]
-        names = {str(file.relative_to(self._folder)) for file in files} - {"clock", "reader"}
+        names = {str(file.relative_to(self._folder)) for file in files} - {"clock", "reader", "logs/.instance"}
         if names:
             self.complain(f"files left behind: {sorted(names)}")

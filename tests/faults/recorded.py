@@ -1,0 +1,169 @@
+"""What the instance's recorder leaves: every file it has ended, or was killed over, is read and held to the truth.
+
+Files are removed when they were checked, but for the newest ones, in which a new recorder looks where to go on.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+from shmio.recording.encoding import Gap
+from shmio.recording.reader import Channel, Message, Reader
+from shmio.segment import Event, Frame
+from tests.faults.checker import Checker
+from tests.faults.checks import Complain, Counts, FrameCheck, Source
+
+LOOK_S: Final = 0.1
+KEPT: Final = 3
+"""So many files remain beside the one being written."""
+REMEMBERED_NS: Final = 600 * 10**9
+"""The truth of what was published longer ago is not held any more."""
+
+
+@dataclass
+class BlockCheck:
+    """Holds the recordings of one source, one file after the other, to what is promised of them."""
+
+    source: Source
+    ring_ns: int
+    """For how long a frame is in the source's ring."""
+    complain: Complain
+    counts: Counts = field(default_factory=Counts)
+    _run: tuple[str, str] = ("", "")
+    _block: int = 0
+    _last: dict[str, int] = field(default_factory=dict)
+    _missed: dict[str, int] = field(default_factory=dict)
+    _publish_ns: int = 0
+    _away_ns: int | None = None
+
+    def __post_init__(self) -> None:
+        self._frames = FrameCheck(self.source, self.complain, self.counts)
+
+    def begin(self, epoch: str, started_ns: int, away_ns: int) -> None:
+        """A file begins. ``away_ns``: at most so long nobody had written into a file before."""
+        self._block = 0
+        self._away_ns = away_ns
+        self._epoch, self._started_ns = epoch, started_ns
+
+    def message(self, message: Message) -> None:
+        """The next frame, event or gap of this source."""
+        item = message.item
+        if isinstance(item, Gap):
+            self._change(item.block, "")
+            self._missed[item.what] = self._missed.get(item.what, 0) + item.count
+            return
+        self._change(message.channel.block, message.channel.layout)
+        if isinstance(item, Frame):
+            self._frame(item)
+        else:
+            self._event(item)
+
+    def _change(self, block: int, layout: str) -> None:
+        """Numbers go on from file to file, within a run of the instance and with the same layout."""
+        run = (self._epoch, layout or (self._run[1] if self._run[0] == self._epoch else ""))
+        if (self._block and block != self._block) or (self._run[1] and run != self._run):
+            self._last, self._missed = {}, {}
+            self._frames.begin(self._started_ns)
+        elif not self._run[0]:
+            self._frames.begin(self._started_ns)
+        self._block, self._run = block, run
+
+    def _frame(self, frame: Frame) -> None:
+        missed = self._missed.pop("frames", 0)
+        if frame.event < self._last.get("events", 0):
+            self._say(f"frame {frame.number}, of before event {frame.event + 1}, comes after a later event")
+        away_ns, self._away_ns = self._away_ns, None
+        lost_ns = frame.publish_ns - self._publish_ns
+        if away_ns is not None and "frames" in self._last and missed and lost_ns > max(0, away_ns - self.ring_ns):
+            self._say(
+                f"{missed} frames in {lost_ns / 1e6:.0f} ms before frame {frame.number} are lost, but nothing was "
+                f"recorded for at most {away_ns / 1e6:.0f} ms, and the ring holds {self.ring_ns / 1e6:.0f} ms"
+            )
+        if time.monotonic_ns() - frame.publish_ns < REMEMBERED_NS:
+            self._frames.frame(frame, missed, frame.publish_ns)
+        else:
+            self._frames.begin(self._started_ns)
+        self._last["frames"], self._publish_ns = frame.number, frame.publish_ns
+
+    def _event(self, event: Event) -> None:
+        missed = self._missed.pop("events", 0)
+        last = self._last.get("events")
+        if last is not None and event.number != last + 1 + missed:
+            self._say(f"event {event.number} comes after event {last} with {missed} missed")
+        if event.frame < self._last.get("frames", 0):
+            self._say(f"event {event.number}, of after frame {event.frame}, comes after a later frame")
+        self.counts.values += 1
+        self._last["events"] = event.number
+
+    def _say(self, problem: str) -> None:
+        self.complain(f"recording of {self.source.name}: {problem}")
+
+
+def check(file: Path, away_ns: int, checks: Mapping[str, BlockCheck]) -> None:
+    """Read one file to its end; RecordingError: it is damaged."""
+
+    def wanted(channel: Channel) -> bool:
+        return not channel.source or channel.source in checks
+
+    begun = False
+    with Reader(file) as reader:
+        for message in reader.messages(wanted):
+            if not begun:
+                begun = True
+                for block in checks.values():
+                    block.begin(reader.about["epoch"], int(reader.about["started_ns"]), away_ns)
+            source = message.item.source if isinstance(message.item, Gap) else message.channel.source
+            if source in checks:
+                checks[source].message(message)
+
+
+class Watch:
+    """Looks for files, and has them checked in the order in which they were written."""
+
+    def __init__(self, folder: Path, check: Callable[[Path, int], None]) -> None:
+        self._folder = folder
+        self._check = check
+        self._seen_ns: dict[Path, int] = {}
+        self._checked: list[Path] = []
+
+    def look(self, *, ended: bool, slack_ns: int) -> None:
+        """Check what is not being written any more: all but the newest, or, ``ended``, all."""
+        now_ns = time.time_ns()
+        for file in self._folder.glob("*.mem"):
+            self._seen_ns.setdefault(file, now_ns)  # names are no help: the clock they are of is set
+        files = sorted(self._seen_ns, key=self._seen_ns.__getitem__)
+        for file in files if ended else files[:-1]:
+            if file not in self._checked:
+                before_ns = self._checked[-1].stat().st_mtime_ns if self._checked else self._seen_ns[file]
+                self._check(file, self._seen_ns[file] - before_ns + slack_ns)
+                self._checked.append(file)
+        for file in self._checked[:-KEPT]:
+            file.unlink()
+            self._checked.remove(file)
+            del self._seen_ns[file]
+
+
+def main() -> None:
+    checker = Checker()
+    rings = checker.description.rings_ns
+    checks = {
+        source.name: BlockCheck(source, rings[source.name], checker.complain, checker.counts(f"recorded {source.name}"))
+        for source in checker.sources
+    }
+    watch = Watch(Path(checker.description.recordings), lambda file, away_ns: check(file, away_ns, checks))
+
+    def work() -> None:
+        while not checker.stopping.wait(LOOK_S):
+            watch.look(ended=False, slack_ns=checker.slack_ns)
+        watch.look(ended=True, slack_ns=checker.slack_ns)
+
+    checker.work(work)
+    checker.run()
+
+
+if __name__ == "__main__":
+    main()
