@@ -28,8 +28,8 @@ class SizeProbe:
 
     def begin(self) -> None:
         """Plan the next job."""
-        step = -(-(self._high - self._low) // (self._most + 1))
-        self._tried = list(range(self._low, self._high, step))[: self._most]
+        step = -(-(self._high - self._low + 1) // (self._most + 1))
+        self._tried = list(range(self._low + step - 1, self._high, step))[: self._most]
         self.sent = 0
         self.complete = False
 

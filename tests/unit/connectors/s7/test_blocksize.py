@@ -6,7 +6,7 @@ import contextlib
 import struct
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from snap7.datatypes import S7Area
 
@@ -17,6 +17,7 @@ from shmio.errors import ConnectorError
 ANSWER = bytes.fromhex("03000025 02f080 32 03 0000 0007 0002 0010 0000 04 03 ff04000855 00 ff040008aa 00 05000000")
 
 
+@example(sizes=(33209, 32945), pdu_size=240)
 @given(sizes=st.integers(2, 65536).flatmap(lambda size: st.tuples(st.just(size), st.integers(0, size - 1))),
        pdu_size=st.sampled_from([100, 240, 480, 960]))  # fmt: skip
 def test_finds_the_size(sizes: tuple[int, int], pdu_size: int) -> None:
