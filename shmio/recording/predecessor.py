@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
+
+from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
 from shmio.recording.encoding import EVENT, FRAME
@@ -15,8 +16,8 @@ from shmio.recording.reader import Reader
 from shmio.recording.survey import survey
 from shmio.segment import Block, Segment
 
-MAX_FILES: Final = 16
-"""How many recordings, the newest first, are looked into."""
+MAX_FILES: Final = 256
+"""How many recordings, the newest by their names first, are looked at."""
 
 log = logging.getLogger("shmio.recorder")
 
@@ -27,28 +28,41 @@ def places(directory: Path, segment: Segment, by: str) -> dict[str, Place]:
     Sources that were not recorded, or had another layout then, are left out.
     """
     found: dict[str, Place] = {}
-    for file in _newest(directory, segment.instance):
+    for file in _of_this_run(directory, segment, by):
         try:
             with Reader(file) as reader:
-                places = _places(reader, segment.blocks)
-                about = reader.about
+                found = _places(reader, segment.blocks) | found
         except (OSError, RecordingError) as error:
             log.warning("it is not known where the recording before ended: %s", error)
             continue
-        if (about.get("instance"), about.get("recorder")) != (segment.instance, by):
-            continue
-        if about.get("epoch") != f"{segment.header.epoch:016x}":
-            break
-        found = places | found
         if found.keys() >= segment.blocks.keys():
             break
     return found
 
 
-def _newest(directory: Path, instance: str) -> Iterator[Path]:
-    """The instance's recordings; their names tell when they were begun."""
-    files = sorted(directory.glob(f"{instance}-*{SUFFIX}"), reverse=True)
-    yield from files[:MAX_FILES]
+def _of_this_run(directory: Path, segment: Segment, by: str) -> list[Path]:
+    """The recordings of this run, the newest first; not by name, for the host's clock may go back."""
+    run = {"instance": segment.instance, "epoch": f"{segment.header.epoch:016x}", "recorder": by}
+    found: list[tuple[int, Path]] = []
+    for file in sorted(directory.glob(f"{segment.instance}-*{SUFFIX}"), reverse=True)[:MAX_FILES]:
+        try:
+            with Reader(file) as reader:
+                about = _about(reader)
+            if about.items() >= run.items():
+                found.append((int(about["recording_ns"]), file))
+        except (OSError, RecordingError, KeyError, ValueError) as error:
+            log.warning("%s is passed over: %s", file, error)
+    return [file for _, file in sorted(found, reverse=True)]
+
+
+def _about(reader: Reader) -> dict[str, str]:
+    """What the recorder said of the instance, at the very beginning."""
+    for record in reader.records.walk():
+        if record.opcode == Opcode.METADATA:
+            reader.note(record)
+        if record.opcode == Opcode.CHUNK or reader.about:
+            break
+    return reader.about
 
 
 def _places(reader: Reader, blocks: dict[str, Block]) -> dict[str, Place]:

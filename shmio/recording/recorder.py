@@ -127,6 +127,7 @@ class Recorder:
             "recorder": by,
             "recorder_pid": str(os.getpid()),
             "recording_utc_ns": str(time.time_ns()),
+            "recording_ns": str(self.log_time(time.monotonic_ns())),
         }
 
     def log_time(self, monotonic_ns: int) -> int:

@@ -96,6 +96,19 @@ def test_what_the_ring_no_longer_has_is_a_gap_to_the_predecessor(segment: Segmen
     assert second.counts("missed") == gap.count
 
 
+def test_a_clock_set_back_does_not_change_who_came_last(segment: Segment, tmp_path: Path) -> None:
+    writer = segment.writer("cell")
+    files = []
+    for turn, year in enumerate((2040, 2030, 2035)):
+        with Process(segment, tmp_path) as process:
+            publish(writer, 10, first=10 * turn)
+            until(lambda: process.counts("frames") == 10, "the frames of this turn")
+            process.stop()
+        files.append(process.file.rename(process.file.with_name(f"{segment.instance}-{year}0101T000000Z.mem")))
+    assert [numbers(file) for file in files] == [list(range(first, first + 10)) for first in (1, 11, 21)]
+    assert [gap for file in files for gap in gaps(file)] == []
+
+
 def test_a_recording_of_another_run_or_by_another_is_no_predecessor(segment: Segment, tmp_path: Path) -> None:
     (tmp_path / "dumps").mkdir()
     (tmp_path / "dumps" / f"{segment.instance}-20990101T000000Z.mem").write_bytes(b"nonsense")
