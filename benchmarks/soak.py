@@ -164,8 +164,8 @@ def recorded(folder: Path) -> list[str]:
         for one in info if isinstance(info, list) else [info]:
             for block in one["blocks"]:
                 frames += block["frames"]
-                if block["missed"]:
-                    problems.append(f"{file.name}: {block['missed']} frames of {block['source']} missed")
+                if missed := block["missed_frames"] + block["missed_events"]:
+                    problems.append(f"{file.name}: {missed} frames and events of {block['source']} missed")
     if len(files) != 1:
         problems.append(f"{len(files)} recordings instead of one")
     print(f"{frames} frames recorded")
