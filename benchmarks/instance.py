@@ -21,7 +21,7 @@ from shmio.errors import NotRunningError
 from shmio.segment import Segment, State
 from shmio.testing.ports import reserved_port
 
-START_S = 20.0
+START_S = 60.0
 
 _HEAD = """
 [instance]
