@@ -19,7 +19,7 @@ from shmio.layout.topic import find, parse_topic
 from shmio.logs import printable
 from shmio.segment import Block, EventKind
 from shmio.segment.attach import Attachment
-from shmio.segment.commander import TIMEOUT_S, Outcome
+from shmio.segment.commander import MIN_PERIODS, TIMEOUT_S, Outcome
 
 HELP = "Write values of registers, and print what became of each."
 MAX_TIMEOUT_S = 86_400
@@ -36,9 +36,8 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--timeout",
         type=_seconds,
-        default=TIMEOUT_S,
         metavar="S",
-        help=f"give up when no cycle came to write them in so many seconds (default {TIMEOUT_S:g})",
+        help=f"give up when no cycle came to write in so many seconds (default {TIMEOUT_S:g}, or {MIN_PERIODS} cycles)",
     )
     parser.add_argument("pairs", nargs="+", action=_Pairs, metavar="PATH VALUE", help="register or array element")
 

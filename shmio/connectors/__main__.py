@@ -16,6 +16,7 @@ from shmio.errors import ConnectorError
 from shmio.worker import BEAT_S, Worker
 
 SWITCH_S = 0.0005  # the poll thread is not to wait Python's usual 5 ms for the others
+LAST_WORDS_S = 4.0  # less than a supervisor's patience with a process that is to stop
 HANG_MARGIN_S = 30.0  # beyond its time-outs: looking up a host name has none of ours
 
 
@@ -54,8 +55,7 @@ def run(worker: Worker) -> None:
             ),
             note=loop.note,
         )
-    thread.join(timeout=1.0)
-    loop.desk.stop()
+    thread.join(timeout=min(connector.timeout_s + 0.5, LAST_WORDS_S))
     desk.join(timeout=1.0)
 
 

@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
 from typing import Final, NamedTuple
 
-from shmio.errors import ConnectorError
 from shmio.layout.write import Write, cover, merge
 from shmio.segment import BlockWriter, Command, EventKind, Record
 from shmio.segment.events import EVENT_DATA_SIZE
 
-MAX_WAITING: Final = 16_384
-"""Most items that wait for the next cycle."""
+MAX_WAITING: Final = 256
+"""Items that wait for the next cycle; what comes beyond stays in its queue. A command alone may have more."""
+MAX_WAITING_BLOCKS: Final = 4
+"""The same in bytes, as a multiple of the block's."""
+TELL_NS: Final = 1_000_000_000
+"""How often a writer that sends garbage is told."""
 
 log = logging.getLogger("shmio.source")
 
@@ -43,13 +47,16 @@ class CommandDesk:
         self._now_ns = now_ns
         self._cannot = "this source's connector cannot write" if writable is None else ""
         self._writable = cover(writer.block.layout, writable or ())
+        self._most_bytes = MAX_WAITING_BLOCKS * writer.block.layout.size
         self._turn = threading.Lock()
         self._closed = "the source is not connected yet"
         self._items: list[_Item] = []
+        self._held: Command | None = None  # taken from its queue, but there is no room for it before the next cycle
+        self._garbage_ns: dict[int, int] = {}
         self._stopped = False
 
     def open(self) -> None:
-        """The device is there: accept."""
+        """The device is there, and its block is as it should be: accept."""
         with self._turn:
             self._closed = ""
 
@@ -59,6 +66,7 @@ class CommandDesk:
             self._closed = f"the source is not connected: {reason}"
             items, self._items = self._items, []
         self._end(items, [(EventKind.EXPIRED, reason)] * len(items))
+        self._make_room()
 
     @property
     def waiting(self) -> bool:
@@ -68,27 +76,32 @@ class CommandDesk:
     def carry_out(self, write: Callable[[Sequence[Write]], list[str]]) -> None:
         """Write all that waits, each byte and bit once, the last value wins; tell what became of each item.
 
-        ConnectorError: raised by ``write``, after it has been told that nobody knows.
+        Commands go in the order in which they were accepted. Whatever ``write`` raises is raised, after it has been
+        told that nobody knows.
         """
-        with self._turn:
-            items, self._items = self._items, []
+        items = self._take(lambda _: True)
         now_ns = self._now_ns()
         late = [item for item in items if now_ns > item.command.deadline_ns]
-        self._end(late, [(EventKind.EXPIRED, "no cycle came before its deadline")] * len(late))
+        self._expire(late)
         items = [item for item in items if now_ns <= item.command.deadline_ns]
-        if not items:
-            return
-        writes, superseded = _coalesce([item.write for item in items], self._writer.block.layout.size)
+        try:
+            if items:
+                self._write(items, write)
+        finally:
+            self._make_room()
+
+    def _write(self, items: Sequence[_Item], write: Callable[[Sequence[Write]], list[str]]) -> None:
+        writes, superseded = coalesce(items, self._writer.block.layout.size)
         try:
             refusals = write(writes)
-        except ConnectorError as error:
+        except BaseException as error:
             self._end(items, [(EventKind.UNKNOWN, f"sent, but not confirmed: {error}")] * len(items))
             raise
         refused = [(write, text) for write, text in zip(writes, refusals, strict=True) if text]
-        ends = [
-            _end(item.write, refused) if place not in superseded else (EventKind.WRITTEN, _SUPERSEDED)
-            for place, item in enumerate(items)
-        ]
+        ends = [_end(item.write, refused) for item in items]
+        for place in superseded:  # what took its place was written, or it was not
+            if ends[place][0] is EventKind.WRITTEN:
+                ends[place] = EventKind.WRITTEN, _SUPERSEDED
         self._end(items, ends)
 
     def run(self) -> None:
@@ -101,33 +114,68 @@ class CommandDesk:
                 taken = False
                 for writer in range(queues.writers):  # one of each in turn
                     taken |= self._take_one(writer)
+            self._expire(self._take(lambda item: self._now_ns() > item.command.deadline_ns))
             if not self._stopped:
-                queues.wait(seen)
+                queues.wait(seen, self._patience_ns())
 
     def stop(self) -> None:
         """Make :meth:`run` return; from any thread."""
         self._stopped = True
         self._writer.block.commands.wake()
 
+    def _take(self, which: Callable[[_Item], bool]) -> list[_Item]:
+        """Take what waits and is of this kind."""
+        with self._turn:
+            kinds = [(item, which(item)) for item in self._items]
+            self._items = [item for item, wanted in kinds if not wanted]
+        return [item for item, wanted in kinds if wanted]
+
+    def _expire(self, items: Sequence[_Item]) -> None:
+        self._end(items, [(EventKind.EXPIRED, "no cycle came before its deadline")] * len(items))
+
+    def _patience_ns(self) -> int:
+        """Until the first deadline of what waits."""
+        with self._turn:
+            deadlines = [item.command.deadline_ns for item in self._items]
+        return max(0, min(deadlines) - self._now_ns()) + 1_000_000 if deadlines else -1
+
+    def _make_room(self) -> None:
+        """What was held for want of room can be judged."""
+        if self._held is not None:
+            self._writer.block.commands.wake()
+
     def _take_one(self, writer: int) -> bool:
-        """Judge the oldest command of a writer; whether there was one."""
+        """Judge the oldest command of a writer; whether there was one, and room for it."""
+        if self._held is not None:
+            command, self._held = self._held, None
+            return self._judge(command)
         try:
             record = self._writer.block.commands.pop(writer)
             if record is None:
                 return False
             command = Command.unpack(writer, record)
         except ValueError as error:
-            log.warning("writer %d sent what is no command: %s", writer, error)
-            self._writer.event(Record(EventKind.REJECTED, f"not a command: {error}", writer))
+            self._garbage(writer, error)
             return True
-        self._judge(command)
-        return True
+        return self._judge(command)
 
-    def _judge(self, command: Command) -> None:
+    def _garbage(self, writer: int, error: ValueError) -> None:
+        """A writer that sends what is no command is told now and then, however much it sends."""
+        now_ns = time.monotonic_ns()
+        if now_ns - self._garbage_ns.get(writer, -TELL_NS) >= TELL_NS:
+            self._garbage_ns[writer] = now_ns
+            log.warning("writer %d sends what is no command: %s", writer, error)
+            self._writer.event(Record(EventKind.REJECTED, f"not a command: {error}", writer))
+
+    def _judge(self, command: Command) -> bool:
+        """Accept or reject; False if there is no room before the next cycle, and the command is held."""
         reason = self._refusal(command)
         if reason:
             self._writer.event(_record(EventKind.REJECTED, _Item(command, 0), len(command.writes), reason))
-            return
+            return True
+        if not self._has_room(command):
+            self._held = command
+            return False
         items = [_Item(command, place) for place in range(len(command.writes))]
         for item in items:  # outside the lock, which the loop must never wait for long
             for part in _parts(item):
@@ -138,6 +186,15 @@ class CommandDesk:
                 self._items += items
         if closed:
             self._end(items, [(EventKind.EXPIRED, closed)] * len(items))
+        return True
+
+    def _has_room(self, command: Command) -> bool:
+        with self._turn:
+            items = list(self._items)
+        if not items:
+            return True
+        size = sum(len(item.write.data) for item in items) + sum(len(write.data) for write in command.writes)
+        return len(items) + len(command.writes) <= MAX_WAITING and size <= self._most_bytes
 
     def _refusal(self, command: Command) -> str:
         """Why a command is not accepted; empty if it is."""
@@ -150,8 +207,6 @@ class CommandDesk:
             return self._cannot
         if self._closed:
             return self._closed
-        if len(self._items) + len(command.writes) > MAX_WAITING:
-            return f"{len(self._items)} writes wait already"
         for write in command.writes:
             stop = write.offset + len(write.data)
             if stop > len(self._writable):
@@ -172,22 +227,37 @@ class CommandDesk:
 _SUPERSEDED: Final = "superseded by a later write of the same cycle"
 
 
-def _coalesce(writes: Sequence[Write], size: int) -> tuple[list[Write], set[int]]:
-    """What has to be written so that the last value of each bit wins, and the places of those that left nothing."""
-    image, mask = bytearray(size), bytearray(size)
+def coalesce(items: Sequence[_Item], size: int) -> tuple[list[Write], set[int]]:
+    """What has to be written so that the last value of each bit wins, and the places of items that left nothing.
+
+    Neighbours are joined within a command only: it is one client's, who wanted all or nothing.
+    """
+    taken = bytearray(size)
+    kept: list[tuple[_Item, bytes]] = []  # the last first, with the bits that nothing later writes
     superseded = set()
-    for place in reversed(range(len(writes))):
-        offset, bit, data = writes[place]
-        fresh = False
-        for at, byte in enumerate(data, offset):
-            free = (bit or 0xFF) & ~mask[at]
-            if free:
-                image[at] |= byte & free
-                mask[at] |= free
-                fresh = True
-        if not fresh:
+    for place in reversed(range(len(items))):
+        offset, mask, data = items[place].write
+        own = bytes(~later & (mask or 0xFF) & 0xFF for later in taken[offset : offset + len(data)])
+        if not any(own):
             superseded.add(place)
-    return merge(image, mask, [(write.offset, write.offset + len(write.data)) for write in writes]), superseded
+            continue
+        for at, bits in enumerate(own, offset):
+            taken[at] |= bits
+        kept.append((items[place], own))
+    writes: list[Write] = []
+    image, bits_kept = bytearray(size), bytearray(size)
+    for _, group in groupby(reversed(kept), key=lambda pair: id(pair[0].command)):
+        ranges = []
+        for item, own in group:
+            offset, stop = item.write.offset, item.write.offset + len(own)
+            ranges.append((offset, stop))
+            for at, (bits, byte) in enumerate(zip(own, item.write.data, strict=True), offset):
+                image[at] = image[at] & ~bits | byte & bits
+                bits_kept[at] |= bits
+        writes += merge(image, bits_kept, ranges)
+        for start, stop in ranges:
+            bits_kept[start:stop] = bytes(stop - start)
+    return writes, superseded
 
 
 def _end(write: Write, refused: Sequence[tuple[Write, str]]) -> tuple[EventKind, str]:

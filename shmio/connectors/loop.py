@@ -99,6 +99,7 @@ class SourceLoop:
         self.desk = CommandDesk(writer, writable if connector.can_write else None, clock.now_ns)
         self._backoff = Backoff()
         self._connected_ns: int | None = None
+        self._accepting = False
         self._under_way: deque[_Submitted] = deque()
         self._state: tuple[Quality, str] | None = None  # as last told; the reason without its numbers
         last = writer.block.latest()
@@ -120,6 +121,7 @@ class SourceLoop:
                 elif not self.poll(due.cycle):
                     break
         finally:
+            self.desk.stop()
             self._connector.close()
             cycle = self._schedule.next(self._clock.now_ns()).cycle
             self._disconnected(cycle, "the source was stopped")
@@ -127,10 +129,12 @@ class SourceLoop:
 
     def poll(self, cycle: int) -> bool:
         """One cycle: connect if need be, write, ask, publish what comes. False: told to stop while backing off."""
+        self._writer.cycle = cycle
         try:
             if self._connected_ns is None:
                 self._connect()
             if self.desk.waiting:
+                self._drain()
                 self._call(lambda: self.desk.carry_out(self._connector.write))
             if len(self._under_way) < self._connector.depth:
                 self._under_way.append(_Submitted(cycle, self._clock.now_ns(), time.monotonic_ns(), time.time_ns()))
@@ -141,6 +145,11 @@ class SourceLoop:
         except ConnectorError as error:
             return self._fail(cycle, str(error) or "the connector gave no reason")
         return True
+
+    def _drain(self) -> None:
+        """Publish what was asked for before a write: no frame that follows its event is older than it."""
+        while self._under_way:
+            self._collect(self._clock.now_ns() + round(self._connector.timeout_s * 1e9))
 
     def _collect(self, until_ns: int) -> None:
         """Publish the images that come until the next cycle is due."""
@@ -174,6 +183,9 @@ class SourceLoop:
             asked_ns=asked.monotonic_ns,
         )
         self.counters.polls += 1
+        if not self._accepting:  # not before an image has shown that the block is as its layout says
+            self._accepting = True
+            self.desk.open()
         if self._connected_ns is not None and self._clock.now_ns() - self._connected_ns > STABLE_NS:
             self._backoff.reset()
 
@@ -181,7 +193,7 @@ class SourceLoop:
         self._call(self._connector.connect)
         self._connected_ns = self._clock.now_ns()
         self.counters.connects += 1
-        self.desk.open()
+        self._accepting = False
 
     def _call(self, hook: Callable[[], _Result]) -> _Result:
         """Call a hook, and let the main thread see since when."""

@@ -59,11 +59,22 @@ class Glob:
         for char in path:
             if char == "/" and states & final:
                 return True
-            stay = self._crossing if char == "/" else self._stars
-            states = self._close(((states & self._literals.get(char, 0)) << 1) | (states & stay))
+            states = self._step(states, char)
             if not states:
                 return False
         return bool(states & final)
+
+    def reaches(self, path: str) -> bool:
+        """Whether the pattern may match something below the path, as an array's element."""
+        states = self._start
+        for char in f"{path}/":
+            states = self._step(states, char)
+        return states != 0
+
+    def _step(self, states: int, char: str) -> int:
+        """The states after one more character."""
+        stay = self._crossing if char == "/" else self._stars
+        return self._close(((states & self._literals.get(char, 0)) << 1) | (states & stay))
 
     def _literal(self, char: str) -> None:
         self._literals[char] = self._literals.get(char, 0) | 1 << self._final

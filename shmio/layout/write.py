@@ -1,8 +1,8 @@
-"""What a new value of a register changes in a block: bytes, or single bits whose neighbours stay as they are."""
+"""What a new value of a register changes in a block: bytes, or a single bit whose neighbours stay as they are."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 from shmio.errors import PathError
@@ -24,22 +24,22 @@ class Write(NamedTuple):
     data: bytes
 
 
-def encode(register: Register, value: object, byte_order: ByteOrder = "big") -> list[Write]:
-    """The writes that give a register, an array or an element this value; ValueRangeError."""
+def encode(register: Register, value: object, byte_order: ByteOrder = "big") -> Write:
+    """The write that gives a register, an array or an element this value; ValueRangeError.
+
+    An array of bits is whole bytes: what fills up a row's last byte belongs to nobody.
+    """
     image = bytearray(register.offset + register.size)
     codec(register, byte_order).encode_into(value, image)
-    if register.type != "BOOL":
-        return [Write(register.offset, 0, bytes(image[register.offset :]))]
-    if not register.dims:
-        return [Write(register.offset, 1 << (register.bit or 0), bytes(image[register.offset :]))]
-    return merge(image, bit_mask(register, len(image)), [(register.offset, len(image))])
+    mask = 0 if register.bit is None or register.dims else 1 << register.bit
+    return Write(register.offset, mask, bytes(image[register.offset :]))
 
 
-def bit_mask(register: Register, size: int) -> bytearray:
-    """An image of ``size`` bytes in which exactly the register's bits are set."""
-    mask = bytearray(size)
-    _set_bits(register, mask)
-    return mask
+def bits_of(register: Register) -> bytes:
+    """A mask of ``size`` bytes in which the bits that the register's :func:`encode` writes are set."""
+    if register.bit is None or register.dims:
+        return b"\xff" * register.size
+    return bytes([1 << register.bit])
 
 
 def cover(layout: Layout, patterns: Iterable[str]) -> bytes:
@@ -48,18 +48,21 @@ def cover(layout: Layout, patterns: Iterable[str]) -> bytes:
     for pattern in patterns:
         if "*" not in pattern:
             try:
-                _set_bits(find(layout, pattern), mask)
+                _add(mask, find(layout, pattern))
                 continue
             except PathError:  # a structure: what is below it
                 pass
         glob = Glob(pattern)
         for register in layout.registers:
             if glob.matches(register.path):
-                _set_bits(register, mask)
-            elif register.dims:
+                _add(mask, register)
+            elif register.dims and glob.reaches(register.path):
                 for element in _elements(layout, register):
                     if glob.matches(element.path):
-                        _set_bits(element, mask)
+                        _add(mask, element)
+    for register in layout.registers:
+        if register.type == "BOOL" and register.dims:
+            _fill_rows(mask, register)
     return bytes(mask)
 
 
@@ -92,7 +95,7 @@ def _joined(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
     return joined
 
 
-def _elements(layout: Layout, register: Register) -> Iterable[Register]:
+def _elements(layout: Layout, register: Register) -> Iterator[Register]:
     index = [low for low, _ in register.dims]
     for _ in range(register.count):
         yield layout.element(register, tuple(index))
@@ -104,12 +107,17 @@ def _elements(layout: Layout, register: Register) -> Iterable[Register]:
             index[place] = low
 
 
-def _set_bits(register: Register, mask: bytearray) -> None:
-    element = register.element
-    if register.type == "BOOL":
-        for flat in range(register.count):
-            byte, bit = element_position(element, register.shape, flat) if register.dims else (0, register.bit)
-            mask[register.offset + byte] |= 1 << (bit or 0)
-        return
-    for start in range(register.offset, register.offset + register.size, element.stride):
-        mask[start : start + element.size] = b"\xff" * element.size
+def _add(mask: bytearray, register: Register) -> None:
+    for at, bits in enumerate(bits_of(register), register.offset):
+        mask[at] |= bits
+
+
+def _fill_rows(mask: bytearray, register: Register) -> None:
+    """Where all bits of a row's last byte are covered one by one, the byte is."""
+    own = bytearray(register.size)
+    for flat in range(register.count):
+        byte, bit = element_position(register.element, register.shape, flat)
+        own[byte] |= 1 << (bit or 0)
+    for at, bits in enumerate(own, register.offset):
+        if mask[at] & bits == bits:
+            mask[at] = 0xFF

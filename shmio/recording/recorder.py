@@ -19,6 +19,8 @@ from shmio.segment import Frame, Segment
 from shmio.segment.events import EVENT_SIZE
 
 TURN_S: Final = 0.1
+LIVELY: Final = 256
+"""Entries of one block in one turn from which on the next turn comes sooner: many commands turn an event ring fast."""
 CHUNK_S: Final = 0.8
 """A chunk is no longer than this: with a turn, and the time to write it, less than the second that a kill may cost."""
 BATCH_BYTES: Final = 2 << 20
@@ -111,6 +113,7 @@ class Recorder:
         self._attached: set[bytes] = set()
         self._attach(attachments(None, 0))
         self._follow(start or Start())
+        self._lively = False
         self._flushed_s = self._checked_s = time.monotonic()
 
     def _about(self, by: str) -> dict[str, str]:
@@ -142,6 +145,7 @@ class Recorder:
             self._follow(Start())
         taken = [list(followed.follower.take(followed.batch)) for followed in self._followed]
         more = any(len(some) >= followed.batch for some, followed in zip(taken, self._followed, strict=True))
+        self._lively = any(len(some) > LIVELY for some in taken)
         entries = list(chain.from_iterable(taken))
         entries.sort(key=lambda entry: entry.log_ns)  # stable: a block's own order stays
         full = self.output.full
@@ -166,7 +170,9 @@ class Recorder:
     def pause_s(self) -> float:
         """How long to wait between two turns: far less than any ring holds."""
         rings = [followed.follower.block.ring for followed in self._followed]
-        return min([TURN_S, *(ring.slot_count * ring.period_ns / 8e9 for ring in rings)])
+        return min(
+            [TURN_S / 10 if self._lively else TURN_S, *(ring.slot_count * ring.period_ns / 8e9 for ring in rings)]
+        )
 
     @property
     def problem(self) -> str:

@@ -71,12 +71,15 @@ static bool Ring_writable(Ring *self)
     return false;
 }
 
-static PyObject *Ring_begin(Ring *self, PyObject *unused)
+static PyObject *Ring_begin(Ring *self, PyObject *args)
 {
-    (void)unused;
-    if (!Ring_writable(self)) return NULL;
+    a32 *stored = &ring_head(&self->ring)->incarnation;
+    unsigned int incarnation = 0;
+    if (!PyArg_ParseTuple(args, "|I", &incarnation) || !Ring_writable(self)) return NULL;
     /* Only the one writer changes it; readers see it in frames. */
-    self->incarnation = atomic_fetch_add_explicit(&ring_head(&self->ring)->incarnation, 1, memory_order_relaxed) + 1;
+    if (!incarnation) incarnation = atomic_load_explicit(stored, memory_order_relaxed) + 1;
+    self->incarnation = incarnation;
+    atomic_store_explicit(stored, incarnation, memory_order_relaxed);
     return PyLong_FromUnsignedLong(self->incarnation);
 }
 
@@ -248,7 +251,7 @@ static PyGetSetDef Ring_fields[] = {
 
 #define METHOD(type, name, flags, doc) {#name, (PyCFunction)(void (*)(void))type##_##name, flags, doc}
 static PyMethodDef Ring_methods[] = {
-    METHOD(Ring, begin, METH_NOARGS, "Take the writer's part: a new incarnation."),
+    METHOD(Ring, begin, METH_VARARGS, "Take the writer's part under a new incarnation, or the one given."),
     METHOD(Ring, publish, METH_VARARGS, "Write the next frame and wake all who wait."),
     METHOD(Ring, head, METH_NOARGS, "Number of the newest whole frame; 0: none yet."),
     METHOD(Ring, latest, METH_NOARGS, "A validated copy of the newest frame, or None."),

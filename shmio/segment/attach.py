@@ -24,7 +24,7 @@ from shmio.layout.codec import Value
 from shmio.layout.model import Register
 from shmio.layout.topic import find, parse_topic
 from shmio.segment.block import Block
-from shmio.segment.commander import TIMEOUT_S, Commander, Outcome
+from shmio.segment.commander import Commander, Outcome
 from shmio.segment.cursor import Cursor
 from shmio.segment.frame import Frame, Quality
 from shmio.segment.processes import Activity, Report
@@ -158,7 +158,7 @@ class Attachment:
         frame = self._next(block, cursor, timeout_s)
         return None if frame is None else View(block.source, frame, block.layout, block.stale_ns)
 
-    def write(self, values: Mapping[str, object], timeout_s: float = TIMEOUT_S) -> list[Outcome]:
+    def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
         """Write registers, arrays or elements of one source by their paths, as one command; what became of each.
 
         The attachment must be ``writable``. All values are accepted by the source or none; what the device says is

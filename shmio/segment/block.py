@@ -138,10 +138,11 @@ class BlockWriter:
         self.block = block
         self._clock_ns = clock_ns
         self._turn = threading.Lock()  # so that frames and events are in one order
-        self._cycle = 0
+        self.cycle = 0
+        """The present cycle, which events are stamped with."""
         self._quality = Quality.BAD
         self.incarnation = block.ring.begin()
-        block.events.ring.begin()
+        block.events.ring.begin(self.incarnation)
         self.event(Record(EventKind.STARTED, f"pid {os.getpid()}"))
 
     def publish(
@@ -164,7 +165,7 @@ class BlockWriter:
         """
         with self._turn:
             now_ns = time.monotonic_ns()
-            self._cycle, self._quality = cycle, quality
+            self._quality = quality
             return self.block.ring.publish(
                 raw,
                 effective,
@@ -189,7 +190,7 @@ class BlockWriter:
             number = self.block.events.ring.publish(
                 record.pack(),
                 None,
-                self._cycle,
+                self.cycle,
                 now_ns,
                 self._clock_ns(now_ns),
                 time.time_ns(),

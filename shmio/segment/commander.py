@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final
 from shmio.errors import CommandError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
-from shmio.layout.write import Write, bit_mask, cover, encode
+from shmio.layout.write import Write, bits_of, cover, encode
 from shmio.segment.commands import CommandSender
 from shmio.segment.events import ENDS, Event, EventKind
 
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from shmio.segment.cursor import Cursor
 
 TIMEOUT_S: Final = 2.0
-"""How long a command may wait for its source, unless told otherwise."""
+MIN_PERIODS: Final = 3
+"""A command may wait for its source so long, or so many cycles if that is longer, unless told otherwise."""
 PATIENCE_S: Final = 1.0
 """What is added for the device's answer to arrive."""
 
@@ -45,8 +46,7 @@ class Ticket:
 
     number: int
     paths: tuple[str, ...]
-    owners: tuple[int, ...]
-    """For each item of the command the place of its path."""
+    """What each item of the command writes."""
     incarnation: int
     until_ns: int
     events: Cursor[Event]
@@ -59,43 +59,38 @@ class Commander:
         self.block = block
         self._sender = CommandSender(block, writer)
 
+    @property
+    def timeout_s(self) -> float:
+        """How long a command may wait, unless told otherwise."""
+        return max(TIMEOUT_S, MIN_PERIODS * self.block.period_ns / 1e9)
+
     @cached_property
     def _writable(self) -> bytes:
         return cover(self.block.layout, self.block.attributes.writable)
 
-    def submit(self, values: Mapping[str, object], timeout_s: float = TIMEOUT_S) -> Ticket:
+    def submit(self, values: Mapping[str, object], timeout_s: float | None = None) -> Ticket:
         """Send values of registers, whole arrays or elements by their paths in the block, as one command.
 
         All or none is accepted by the source. PathError: no such register; CommandError: not writable, or the source
         takes nothing; ValueRangeError: a value does not fit. Nothing has been sent then. Never waits.
         """
         writes: list[Write] = []
-        owners: list[int] = []
-        for place, (path, value) in enumerate(values.items()):
+        for path, value in values.items():
             register = self._register(path)
             try:
-                items = encode(register, value, self.block.layout.byte_order)
+                writes.append(encode(register, value, self.block.layout.byte_order))
             except ValueRangeError as error:
                 raise ValueRangeError(f"{self.block.source}/{path}: {error}") from None
-            writes += items
-            owners += [place] * len(items)
-        deadline_ns = time.monotonic_ns() + round(timeout_s * 1e9)
+        wait_s = self.timeout_s if timeout_s is None else timeout_s
+        deadline_ns = time.monotonic_ns() + round(wait_s * 1e9)
         events, incarnation = self.block.events.cursor(), self.block.incarnation
         number = self._sender.submit(writes, deadline_ns)
         until_ns = deadline_ns + round(PATIENCE_S * 1e9)
-        return Ticket(number, tuple(values), tuple(owners), incarnation, until_ns, events)
-
-    def accepted(self, ticket: Ticket) -> None:
-        """Wait until the source has taken the command; CommandError with its reason if it did not."""
-        event = self._next(ticket)
-        if event is None or event.kind == EventKind.REJECTED:
-            raise CommandError(f"{self.block.source}: {event.text if event else self._silence(ticket)}")
-        # What follows is read again by outcomes.
-        ticket.events = self.block.events.cursor(after=event.number - 1)
+        return Ticket(number, tuple(values), incarnation, until_ns, events)
 
     def outcomes(self, ticket: Ticket) -> list[Outcome]:
         """Wait until all is over and say what became of each value, in the order they were given."""
-        open_items = set(range(len(ticket.owners)))
+        open_items = set(range(len(ticket.paths)))
         ends: dict[int, Event] = {}
         while open_items and (event := self._next(ticket)) is not None:
             if event.kind == EventKind.REJECTED:
@@ -106,19 +101,19 @@ class Commander:
                 ends |= dict.fromkeys(ended, event)
         return [self._outcome(ticket, place, path, ends) for place, path in enumerate(ticket.paths)]
 
-    def write(self, values: Mapping[str, object], timeout_s: float = TIMEOUT_S) -> list[Outcome]:
+    def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
         """:meth:`submit` and wait for the :meth:`outcomes`."""
         return self.outcomes(self.submit(values, timeout_s))
 
     def _register(self, path: str) -> Register:
         source = self.block.source
         register = find(self.block.layout, path)
-        mask = bit_mask(register, register.offset + register.size)
-        for at in range(register.offset, len(mask)):
-            if mask[at] & ~self._writable[at]:
-                raise CommandError(
-                    f"{source}/{path} is not writable; the configuration has to name it in the source's `writable`"
-                )
+        own = bits_of(register)
+        allowed = self._writable[register.offset : register.offset + register.size]
+        if any(bits & ~covered for bits, covered in zip(own, allowed, strict=True)):
+            raise CommandError(
+                f"{source}/{path} is not writable; the configuration has to name it in the source's `writable`"
+            )
         return register
 
     def _next(self, ticket: Ticket) -> Event | None:
@@ -135,13 +130,10 @@ class Commander:
         return None
 
     def _outcome(self, ticket: Ticket, place: int, path: str, ends: Mapping[int, Event]) -> Outcome:
-        """The worst of a value's items."""
-        items = [item for item, owner in enumerate(ticket.owners) if owner == place]
-        if any(item not in ends for item in items):
+        end = ends.get(place)
+        if end is None:
             return Outcome(path, EventKind.UNKNOWN, self._silence(ticket))
-        events = [ends[item] for item in items]
-        worst = max(events, key=lambda event: (event.kind != EventKind.WRITTEN, event.kind, event.text == ""))
-        return Outcome(path, EventKind(worst.kind), worst.text)
+        return Outcome(path, EventKind(end.kind), end.text)
 
     def _silence(self, ticket: Ticket) -> str:
         if self.block.retired:

@@ -6,6 +6,7 @@ is done, and in which order; what became of a command is in the block's events.
 
 from __future__ import annotations
 
+import os
 import secrets
 import struct
 import threading
@@ -72,7 +73,7 @@ class Command:
 
 
 def capacity_for(layout_size: int) -> int:
-    """Bytes of a queue's data: whole arrays, and the block as a whole, have room several times."""
+    """Bytes of a queue's data: any array, and the block as a whole if it is a few of them, has room more than once."""
     wanted = max(MIN_CAPACITY, 4 * layout_size)
     return 1 << (wanted - 1).bit_length()
 
@@ -112,10 +113,9 @@ class CommandQueues:
 
     def push(self, writer: int, record: bytes) -> bool:
         """Put a record into a writer's queue and ring the source's bell; False when there is no room."""
-        if not _atomics.queue_push(self._memory, self._queue(writer), self.capacity, record):
-            return False
-        self.wake()
-        return True
+        taken = _atomics.queue_push(self._memory, self._queue(writer), self.capacity, record)
+        self.wake()  # also of a full one: its last writer may have died before it could ring
+        return taken
 
     def pop(self, writer: int) -> bytes | None:
         """The oldest record of a writer's queue; for the source alone. ValueError: it was broken, and is empty now."""
@@ -146,6 +146,7 @@ class CommandSender:
         self.block = block
         self.writer = writer
         self._turn = threading.Lock()
+        self._pid = os.getpid()  # two processes on one queue would overwrite each other's commands
         # Never the number of a predecessor's command, whose outcome may still come.
         self._next = secrets.randbits(62) + 1
 
@@ -162,7 +163,12 @@ class CommandSender:
             record = Command(self.writer, number, self.block.incarnation, deadline_ns, tuple(writes)).pack()
             queues = self.block.commands
             if len(record) + 8 > queues.capacity:
-                raise CommandError(f"{source}: a command of {len(record)} bytes; {queues.capacity - 8} are the most")
+                most = queues.capacity - 8
+                raise CommandError(
+                    f"{source}: a command of {len(record)} bytes, {most} are the most: write fewer at once"
+                )
+            if self._pid != os.getpid():
+                raise CommandError("this process is a copy, made by fork, of the one that attached: attach anew in it")
             if not queues.push(self.writer, record):
                 raise CommandError(f"{source}: its command queue is full: it takes none at present, or too many come")
             return number

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple, Protocol
 
 from shmio.layout.model import Register
-from shmio.layout.write import bit_mask
+from shmio.layout.write import bits_of
 from shmio.segment import Block, Event, EventKind
 
 
@@ -43,7 +43,7 @@ class InChannel:
         self.encode = encode
         self.listeners: set[Listener] = set()
         self.start, self.stop = register.offset, register.offset + register.size
-        self.bits = int.from_bytes(bit_mask(register, self.stop)[self.start :], "big")
+        self.bits = int.from_bytes(bits_of(register), "big")
 
 
 Message = tuple[InChannel, bytes]

@@ -113,7 +113,7 @@ class Inlet:
             ticket = self._commander.submit({register.path: value}, self._timeout_s)
             record_bytes, events = _cost(register)
             self._pending[ticket.number] = _Pending(
-                set(range(len(ticket.owners))), ticket.incarnation, ticket.until_ns, record_bytes, events, done
+                set(range(len(ticket.paths))), ticket.incarnation, ticket.until_ns, record_bytes, events, done
             )
             self._untaken_bytes += record_bytes
             self._open_events += events

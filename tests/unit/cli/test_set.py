@@ -245,7 +245,7 @@ def test_what_nobody_knows_is_said_with_what_to_do(device: Device, capsys: pytes
 def test_it_waits_no_longer_than_told(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.idle = True
     assert main(["set", "--timeout", "0.01", "cell/count", "1"]) == 1
-    assert "the source gave no answer in time" in capsys.readouterr().err
+    assert "no cycle came before its deadline" in capsys.readouterr().err
 
 
 def test_sources_have_a_command_each_and_what_was_written_is_told(

@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shmio.connectors.desk import MAX_WAITING, CommandDesk, _coalesce
+from shmio.connectors.desk import MAX_WAITING, CommandDesk, _Item, coalesce
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
 from shmio.segment import (
     BlockSpec,
     BlockWriter,
+    Command,
     CommandSender,
     Cursor,
     Event,
@@ -117,7 +118,7 @@ def test_of_one_cycle_the_last_value_wins_and_is_written_once(bench: Bench) -> N
     second = bench.accepted(Write(0, 0, b"\0\2"))
     device: list[Write] = []
     bench.desk.carry_out(confirm(device))
-    assert device == [Write(0, 0, b"\0\2"), Write(2, 1, b"\1")]
+    assert device == [Write(2, 1, b"\1"), Write(0, 0, b"\0\2")], "in the order of what counts"
     ends = [bench.event() for _ in range(3)]
     assert [(end.command, end.item, end.kind, end.text) for end in ends] == [
         (first, 0, EventKind.WRITTEN, "superseded by a later write of the same cycle"),
@@ -232,18 +233,73 @@ def test_a_long_write_is_told_in_parts(bench: Bench) -> None:
     assert [(part.item, part.offset, part.size) for part in (first, second)] == [(0, 6, 256), (0, 262, 44)]
 
 
-def test_what_waits_has_a_bound(bench: Bench) -> None:
-    many = [Write(0, 0, b"\0\0")] * 512
-    texts: list[str] = []
-    for _ in range(MAX_WAITING // 512 + 1):
-        number = bench.send(*many)
-        while True:
+def test_what_waits_has_a_bound_and_the_rest_its_turn(bench: Bench) -> None:
+    numbers = [bench.send(*[Write(0, 0, b"\0\0")] * 100) for _ in range(5)]
+    device: list[Write] = []
+    seen: list[tuple[int, EventKind]] = []
+
+    def until(commands: int) -> None:
+        while sum(kind is EventKind.ACCEPTED for _, kind in seen) < 100 * commands:
             event = bench.event()
-            assert event.command == number
-            texts.append(event.text)
-            if event.kind == EventKind.REJECTED or event.item == 511:
-                break
-    assert texts[-1] == f"{MAX_WAITING} writes wait already"
+            seen.append((event.command, EventKind(event.kind)))
+
+    until(2)
+    assert len(bench.desk._items) <= MAX_WAITING
+    for commands in (2, 4, 5):
+        until(commands)
+        while not bench.desk.waiting:  # accepted is told before it waits
+            pass
+        bench.desk.carry_out(confirm(device))
+    accepted = [command for command, kind in seen if kind is EventKind.ACCEPTED]
+    assert accepted == [number for number in numbers for _ in range(100)]
+
+
+def test_a_superseded_value_is_not_written_when_what_took_its_place_was_refused(bench: Bench) -> None:
+    first, second = bench.accepted(Write(0, 0, b"\0\1")), bench.accepted(Write(0, 0, b"\0\2"))
+    bench.desk.carry_out(lambda writes: ["no"] * len(writes))
+    ends = [bench.event() for _ in range(2)]
+    assert [(end.command, end.kind, end.text) for end in ends] == [
+        (first, EventKind.REFUSED, "no"),
+        (second, EventKind.REFUSED, "no"),
+    ]
+
+
+def test_commands_go_in_the_order_in_which_they_were_accepted(bench: Bench) -> None:
+    """First the data, then the strobe that tells of them, though it lies before them."""
+    bench.accepted(Write(100, 0, b"DATA"))
+    bench.accepted(Write(2, 1, b"\1"))
+    bench.accepted(Write(104, 0, b"MORE"))
+    device: list[Write] = []
+    bench.desk.carry_out(confirm(device))
+    assert device == [Write(100, 0, b"DATA"), Write(2, 1, b"\1"), Write(104, 0, b"MORE")]
+
+
+def test_what_waits_expires_at_its_deadline_though_no_cycle_comes(bench: Bench) -> None:
+    number = bench.accepted(Write(0, 0, b"\0\0"), deadline_ns=1_000)
+    bench.now_ns = 2_000
+    bench.desk._writer.block.commands.wake()
+    event = bench.event()
+    assert (event.kind, event.command) == (EventKind.EXPIRED, number)
+    assert not bench.desk.waiting
+
+
+def test_whatever_a_write_raises_the_end_is_told(bench: Bench) -> None:
+    bench.accepted(Write(0, 0, b"\0\0"))
+
+    def defect(_: Sequence[Write]) -> list[str]:
+        raise ZeroDivisionError("a defect")
+
+    with pytest.raises(ZeroDivisionError):
+        bench.desk.carry_out(defect)
+    assert bench.event().kind == EventKind.UNKNOWN
+
+
+def test_a_writer_of_garbage_is_told_once_a_second(bench: Bench, writer: BlockWriter) -> None:
+    for _ in range(50):
+        while not writer.block.commands.push(2, b"garbage"):
+            pass
+    assert bench.event().kind == EventKind.REJECTED
+    bench.accepted(Write(0, 0, b"\0\0"))  # the next event is about this one
 
 
 def test_what_is_no_command_is_told_and_passed_over(bench: Bench, writer: BlockWriter) -> None:
@@ -282,7 +338,12 @@ def test_coalesced_writes_leave_what_the_single_ones_would(items: list[tuple[int
         return bytes(changed)
 
     writes = [Write(*item) for item in items]
-    merged, superseded = _coalesce(writes, 10)
+    commands = [
+        Command(0, place // 3, 1, FAR, tuple(writes[place - place % 3 : place - place % 3 + 3]))
+        for place in range(len(writes))
+    ]
+    first = {command.id: command for command in commands}
+    merged, superseded = coalesce([_Item(first[place // 3], place % 3) for place in range(len(writes))], 10)
     assert apply(before, merged) == apply(before, writes)
     assert apply(before, [w for place, w in enumerate(writes) if place not in superseded]) == apply(before, writes)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
+from typing import ClassVar
 
 import msgspec
 import pytest
@@ -437,3 +438,44 @@ def test_a_frame_tells_how_long_the_device_took(segment: Segment) -> None:
     _, _, frames = run(segment, lambda *_: None, 3)
     assert 0 < frames[0].delay_us < 10**7
     assert frames[-1].delay_us == 0, "a bad one has no answer"
+
+
+def test_no_frame_behind_the_end_of_a_write_is_older_than_it(segment: Segment) -> None:
+    """With several cycles under way, too."""
+
+    class Register(Pipe):
+        can_write = True
+        value = 0
+        answers: ClassVar[list[int]] = []
+
+        def submit(self) -> None:
+            super().submit()
+            self.answers.append(self.value)
+
+        def read(self) -> bytes:
+            if self.clock.time_ns > 30 * PERIOD_NS:
+                self.command()
+            return int(self.answers.pop(0)).to_bytes(4, "big")
+
+        def command(self) -> None:
+            if not self.value and not loop.desk.waiting:
+                sender.submit([Write(0, 0, (77).to_bytes(4, "big"))], 10**18)
+                loop.desk._take_one(4)
+
+        def write(self, writes: Sequence[Write]) -> list[str]:
+            assert not self.asked_ns, "reads under way"
+            self.value = int.from_bytes(writes[-1].data, "big")
+            return [""] * len(writes)
+
+    sender = CommandSender(segment.blocks["cell"], 4)
+    clock = VirtualClock(60 * PERIOD_NS)
+    device = Register(clock, 5 * PERIOD_NS // 2, 4)
+    block = segment.blocks["cell"]
+    cursor = block.cursor()
+    loop = SourceLoop(device, segment.writer("cell"), Schedule(0, PERIOD_NS), clock, ["count"])
+    loop.run()
+    events = [event for n in range(1, block.events.head() + 1) if (event := block.events.read(n))]
+    (written,) = (event.number for event in events if event.kind == EventKind.WRITTEN)
+    frames = [frame for frame in iter(cursor.poll, None) if frame.quality is Quality.GOOD]
+    assert {int.from_bytes(frame.raw, "big") for frame in frames if frame.event >= written} == {77}
+    assert {int.from_bytes(frame.raw, "big") for frame in frames if frame.event < written} == {0}

@@ -80,21 +80,12 @@ def both(*answers: Answer) -> Answer:
 
 
 def test_each_value_has_its_outcome_in_the_order_given(writer: BlockWriter, source: list[Answer]) -> None:
-    # `bits` takes one write of a byte and three of bits.
-    source.append(both(tell(EventKind.REFUSED, 0, 1, "no"), tell(EventKind.WRITTEN, 1, 4)))
+    source.append(both(tell(EventKind.REFUSED, 0, 1, "no"), tell(EventKind.WRITTEN, 1, 1)))
     outcomes = Commander(writer.block, 5).write({"count": 7, "bits": [True] * 11})
     assert [(o.path, o.kind, o.text, o.done) for o in outcomes] == [
         ("count", EventKind.REFUSED, "no", False),
         ("bits", EventKind.WRITTEN, "", True),
     ]
-
-
-def test_of_a_value_in_several_writes_the_worst_counts(writer: BlockWriter, source: list[Answer]) -> None:
-    source.append(
-        both(tell(EventKind.WRITTEN, 0, 2), tell(EventKind.UNKNOWN, 2, 1, "cut"), tell(EventKind.WRITTEN, 3, 1))
-    )
-    (outcome,) = Commander(writer.block, 5).write({"bits": [False] * 11})
-    assert (outcome.kind, outcome.text) == (EventKind.UNKNOWN, "cut")
 
 
 def test_a_rejected_command_is_rejected_for_all(writer: BlockWriter, source: list[Answer]) -> None:
@@ -103,14 +94,19 @@ def test_a_rejected_command_is_rejected_for_all(writer: BlockWriter, source: lis
     assert [(o.kind, o.text) for o in outcomes] == [(EventKind.REJECTED, "not connected")] * 2
 
 
-def test_acceptance_can_be_waited_for_alone(writer: BlockWriter, source: list[Answer]) -> None:
+def test_a_copy_by_fork_cannot_write(writer: BlockWriter, monkeypatch: pytest.MonkeyPatch) -> None:
     commander = Commander(writer.block, 5)
-    source += [both(tell(EventKind.ACCEPTED), tell(EventKind.WRITTEN)), tell(EventKind.REJECTED, text="no")]
-    ticket = commander.submit({"count": 7})
-    commander.accepted(ticket)
-    assert [outcome.kind for outcome in commander.outcomes(ticket)] == [EventKind.WRITTEN]
-    with pytest.raises(CommandError, match="cell: no"):
-        commander.accepted(commander.submit({"count": 8}))
+    monkeypatch.setattr("os.getpid", lambda: 1)
+    with pytest.raises(CommandError, match="attach anew"):
+        commander.submit({"count": 7})
+    assert writer.block.commands.pop(5) is None
+
+
+def test_of_a_slow_source_a_command_waits_for_some_cycles(instance: str) -> None:
+    block = BlockSpec("cell", LAYOUT, 5_000_000_000, 10**11, 1 << 16)
+    with Segment.create(instance, [block], PROCESSES) as segment:
+        assert Commander(segment.blocks["cell"], 5).timeout_s == 15
+        segment.unlink()
 
 
 def test_silence_is_unknown_after_the_time_is_over(writer: BlockWriter) -> None:

@@ -32,7 +32,8 @@ def test_a_writer_begins_with_an_event_of_its_own(writer: BlockWriter) -> None:
 
 
 def test_an_event_comes_out_as_it_went_in(writer: BlockWriter) -> None:
-    writer.publish(b"\0\1", cycle=7)
+    writer.publish(b"\0\1", cycle=6)
+    writer.cycle = 7
     data = bytes(range(200))
     number = writer.event(Record(EventKind.ACCEPTED, "grün", 4, 99, 3, 1, 12, 0, 200, data))
     event = writer.block.events.read(number)
