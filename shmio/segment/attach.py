@@ -138,8 +138,9 @@ class Attachment:
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             rest_s = TURN_S if deadline_s is None else deadline_s - time.monotonic()
+            retired = block.retired  # before looking: what was published before the end is still read
             frame = cursor.next(min(rest_s, TURN_S))
-            if frame is not None or block.retired:
+            if frame is not None or retired:
                 return frame
             if not self.current:
                 raise NotRunningError(f"instance {self.instance!r} has stopped")

@@ -77,8 +77,11 @@ class Block:
         commands: CommandQueues,
         attributes: Attributes,
         retired: Callable[[], bool] = lambda: False,
+        section: int = 0,
     ) -> None:
         self.source = source
+        self.section = section
+        """Index of its layout's section: tells the blocks of one run of the instance apart."""
         self.layout = layout
         self.ring = ring
         self.events = EventRing(events, retired)

@@ -141,7 +141,7 @@ class Segment:
         head = self.header
         return Block(
             described.name, layout, frames, events, queues, attributes,
-            lambda: header.retired(memory, head, layout_at),
+            lambda: header.retired(memory, head, layout_at), layout_at,
         )  # fmt: skip
 
     @property
