@@ -121,8 +121,9 @@ class Attachment:
                 yield View(block.source, frame, block.layout, block.stale_ns, cursor.missed - missed)
                 missed = cursor.missed
             elif block.retired:
-                block = self._successor(block)
-                cursor, missed = block.cursor(after=0), 0
+                if not cursor.behind:
+                    block = self._successor(block)
+                    cursor, missed = block.cursor(after=0), 0
             else:
                 return
 
