@@ -28,12 +28,15 @@ from typing import Any
 
 from common import HERE, ROOT, begin, db201, report_spread
 
-from shmio.segment import BlockSpec, ProcessSpec, Segment
+from shmio.segment import Block, BlockSpec, ProcessSpec, Segment
 
 OURS = "shmio Cursor.next, frame"
 FRAME = bytes(range(256)) * 9
 FRAME = FRAME[: db201().size]
 POLL_S = 0.001
+PAGE = 4096
+WARM_UP = 3
+"""Rounds that do not count, each time a way is begun."""
 PATIENCE_NS = 10 * 10**9
 
 Wait = Callable[[], bytes | None]
@@ -90,9 +93,9 @@ class Readers:
     def measure(self, way: Way, count: int, rounds: int, rest_s: float) -> tuple[list[float], list[float]]:
         """(the writer's call, until the last of ``count`` readers is back), in µs, for each round."""
         active = self._orders[:count]
-        self._tell(active, (way.name, rounds), "ready")
+        self._tell(active, (way.name, WARM_UP + rounds), "ready")
         calls, lasts = [], []
-        for _ in range(rounds):
+        for _ in range(WARM_UP + rounds):
             self._arrivals[:count] = [0] * count
             time.sleep(rest_s * random.uniform(1, 2))  # all are back in their waits; and no step with who polls
             begun_ns = time.monotonic_ns()
@@ -107,7 +110,7 @@ class Readers:
             lasts.append((max(arrivals) - begun_ns) / 1000)
         for order in active:
             order.recv()
-        return calls, lasts
+        return calls[WARM_UP:], lasts[WARM_UP:]
 
     @staticmethod
     def _tell(active: Sequence[Connection], order: object, answer: str) -> None:
@@ -160,8 +163,14 @@ def threads(ways: Sequence[Way], count: int) -> Iterator[Readers]:
 # -- ways: shmio -------------------------------------------------------------------------------------------------------
 
 
+def _opened(instance: str) -> Block:
+    segment = Segment.open(instance)
+    segment.memory[::PAGE].tobytes()  # as after 8 s: no page is touched for the first time while we time
+    return segment.blocks["cell"]
+
+
 def _next_frame(instance: str) -> Wait:
-    cursor = Segment.open(instance).blocks["cell"].cursor()
+    cursor = _opened(instance).cursor()
 
     def wait() -> bytes:
         frame = cursor.next()
@@ -172,7 +181,7 @@ def _next_frame(instance: str) -> Wait:
 
 
 def _bell(instance: str) -> Wait:
-    ring = Segment.open(instance).blocks["cell"].ring
+    ring = _opened(instance).ring
     seen = ring.doorbell()
 
     def wait() -> None:
@@ -185,7 +194,7 @@ def _bell(instance: str) -> Wait:
 
 
 def _polled_frame(instance: str) -> Wait:
-    cursor = Segment.open(instance).blocks["cell"].cursor()
+    cursor = _opened(instance).cursor()
 
     def wait() -> bytes:
         while (frame := cursor.poll()) is None:
@@ -202,6 +211,8 @@ def shmio_ways(count: int) -> Iterator[list[Way]]:
     segment = Segment.create(name, [BlockSpec("cell", db201(), 20_000_000, 10**9, 1 << 26)], [ProcessSpec("cell", "")])
     try:
         writer = segment.writer("cell")
+        for _ in range(writer.block.ring.slot_count):
+            writer.publish(FRAME, cycle=1)
 
         def publish(_: int) -> None:
             writer.publish(FRAME, cycle=1)
@@ -400,7 +411,7 @@ def measure_native(counts: Sequence[int], rounds: int) -> None:
 
 def main() -> None:
     quick = begin("Wake-up: from a publish to the readers that wait")
-    counts, rounds = ((1, 3), 10) if quick else ((1, 5, 50), 500)
+    counts, rounds = ((1, 3), 10) if quick else ((1, 5, 50), 300)
     most = max(counts)
     context = multiprocessing.get_context("spawn")
     with ExitStack() as stack:

@@ -16,6 +16,7 @@
 #define FRAME_SIZE 2180u
 #define MAX_READERS 256
 #define SLOTS 8u
+#define WARM_UP 3 /* rounds that do not count */
 
 enum { RING, EVENTFD, WAYS };
 static const char *const names[WAYS] = {"ring,frame", "eventfd"};
@@ -55,7 +56,7 @@ static void follow(int way, int reader, int rounds)
     prctl(PR_SET_PDEATHSIG, SIGKILL);
     uint64_t last = atomic_load(&ring_head(&ring)->head), value;
     atomic_store(&arrivals[reader], 1); /* ready */
-    for (int round = 0; round < rounds; round++) {
+    for (int round = 0; round < rounds + WARM_UP; round++) {
         if (way == RING)
             wait_ring(&last);
         else if (read(events[reader], &value, sizeof value) != sizeof value)
@@ -106,15 +107,16 @@ static void measure(int way, int readers, int rounds)
         if (pid == 0) follow(way, reader, rounds);
     }
     last_arrival(readers, rest_us);
-    for (int round = 0; round < rounds; round++) {
+    for (int round = 0; round < rounds + WARM_UP; round++) {
         for (int reader = 0; reader < readers; reader++) atomic_store(&arrivals[reader], 0);
         rest(rest_us);
         int64_t begun_ns = now_ns();
         call(way, readers);
         int64_t called_ns = now_ns();
         rest(rest_us);
-        printf("%s %lld %lld\n", names[way], (long long)(called_ns - begun_ns),
-               (long long)(last_arrival(readers, rest_us) - begun_ns));
+        int64_t last_ns = last_arrival(readers, rest_us);
+        if (round >= WARM_UP)
+            printf("%s %lld %lld\n", names[way], (long long)(called_ns - begun_ns), (long long)(last_ns - begun_ns));
     }
     for (int reader = 0; reader < readers; reader++) wait(NULL);
 }
