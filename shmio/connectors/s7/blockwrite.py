@@ -2,6 +2,8 @@
 
 Jobs under way at once may be served in any order. So writes that touch the same bits never are: the batch is cut into
 waves, each of which is confirmed before the next is sent. What is in no other's way goes out at once.
+
+Nothing is sorted: items fill the jobs in the order of the writes, and jobs are sent in that order.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from types import TracebackType
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.blockread import BlockRead
 from shmio.connectors.s7.blocksize import SizeProbe
-from shmio.connectors.s7.blockwrite import waves
+from shmio.connectors.s7.blockwrite import BlockWrite, waves
 from shmio.connectors.s7.explain import OUT_OF_RANGE, RefusedError, explain_size
 from shmio.connectors.s7.mode import ModeQuestion
 from shmio.connectors.s7.options import S7Options
@@ -24,6 +24,7 @@ from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.write import Write
 
 MAX_DEPTH = 4  # reads under way at once; more would only be older when they come
+LONGEST_WRITE_S = 20  # of a batch, however many jobs it is; ``timeout`` if that is longer
 
 
 class S7Client:
@@ -151,21 +152,28 @@ class S7Client:
             return read.data
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Write within ``timeout``, while reads may be under way; what the controller refused, in words, for each.
+        """Write in this order, while reads may be under way; what the controller refused, in words, for each.
 
         A text is empty when the controller has confirmed the write. What does not fit one PDU is several jobs, so it is
-        not one instant of the controller, and may be done in part. ConnectorError: the session is lost; nothing is
+        not one instant of the controller, and may be done in part; jobs under way at once it may serve in any order.
+        Each answer must come within ``timeout`` of the one before: a slow controller is not taken for a dead one.
+        ConnectorError: the session is lost, or all of it took longer than LONGEST_WRITE_S and ``timeout``; nothing is
         known of any of them.
         """
         if self._transport is None:
             raise ConnectorError("not connected")
         outcomes = [""] * len(writes)
         with self._dropping_on_error:
-            deadline_ns = time.monotonic_ns() + self._timeout_ns
+            begun_ns = time.monotonic_ns()
+            end_ns = begun_ns + max(self._timeout_ns, LONGEST_WRITE_S * 1_000_000_000)
             for wave in waves(self.db_number, self.pdu_size, writes, outcomes):
                 self._window.add(wave, urgent=True)
                 self._flush()
-                self._finish(wave, deadline_ns)
+                self._finish_wave(wave, end_ns)
+            spent_ns = time.monotonic_ns() - begun_ns  # what waited behind the writes is not late for that
+            self._mode.deadline_ns += spent_ns
+            for read in self._under_way:
+                read.deadline_ns += spent_ns
         return outcomes
 
     def close(self) -> None:
@@ -212,23 +220,47 @@ class S7Client:
 
     def _advance(self, operation: Operation, until_ns: int) -> bool:
         """Send and receive until an operation is complete; False if it is not at ``until_ns``."""
-        transport, window = self._transport, self._window
-        assert transport is not None  # noqa: S101 - for the type checker
         while not operation.complete:
-            if not transport.receive(until_ns):
+            if self._step(until_ns) is None:
                 return False
-            while (frame := transport.frame()) is not None:
-                window.accept(frame)
-            if window.idle and transport.left:
-                raise ConnectorError("unexpected bytes after the last answer")
-            self._flush()
             if not operation.complete and time.monotonic_ns() >= until_ns:
                 return False
         return True
 
+    def _step(self, until_ns: int) -> int | None:
+        """Receive once, send what may be sent then; how many answers came, None if nothing did until ``until_ns``."""
+        transport, window = self._transport, self._window
+        assert transport is not None  # noqa: S101 - for the type checker
+        if not transport.receive(until_ns):
+            return None
+        answers = 0
+        while (frame := transport.frame()) is not None:
+            window.accept(frame)
+            answers += 1
+        if window.idle and transport.left:
+            raise ConnectorError("unexpected bytes after the last answer")
+        self._flush()
+        return answers
+
     def _finish(self, operation: Operation, deadline_ns: int) -> None:
         if not self._advance(operation, deadline_ns):
             raise TimeoutError
+
+    def _finish_wave(self, wave: BlockWrite, end_ns: int) -> None:
+        """Wait for all jobs of a wave, ``timeout`` from answer to answer, no longer than ``end_ns``."""
+        deadline_ns = time.monotonic_ns() + self._timeout_ns
+        while not wave.complete:
+            answers = self._step(min(deadline_ns, end_ns))
+            now_ns = time.monotonic_ns()
+            if answers:
+                deadline_ns = now_ns + self._timeout_ns
+            if now_ns >= deadline_ns:
+                raise TimeoutError
+            if now_ns >= end_ns and not wave.complete:
+                limit_s = max(self.options.timeout / 1000, LONGEST_WRITE_S)
+                raise ConnectorError(
+                    f"{self.options.peer} has not served all writes of a cycle within {limit_s:g} s: write less at once"
+                )
 
     def _explained(self, refusal: RefusedError, deadline_ns: int) -> RefusedError:
         """Find out how long the block is, when it is shorter than it should be: the next step depends on it."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from shmio.connectors.base import Connector
-from shmio.connectors.s7.client import S7Client
+from shmio.connectors.s7.client import LONGEST_WRITE_S, S7Client
 from shmio.connectors.s7.options import S7Options
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout
@@ -23,11 +23,11 @@ class S7Connector(Connector):
         if number is None:
             raise ConfigError(f"dbNumber: this key is needed, for the layout {layout.name!r} has no number in its name")
         self._client = S7Client(options, number, layout.size)
-        self._timeout_s = options.timeout / 1000
+        self._timeout_s = max(options.timeout / 1000, LONGEST_WRITE_S)
 
     @property
     def timeout_s(self) -> float:
-        """``timeout``; connecting, reading and writing have it each."""
+        """``timeout``, which connecting and reading have each, or what a batch of writes may take: the longer one."""
         return self._timeout_s
 
     @property
@@ -57,7 +57,7 @@ class S7Connector(Connector):
         return self._client.collect(until_ns)
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Write bytes and single bits."""
+        """Write bytes and single bits, in this order."""
         return self._client.write(writes)
 
     def close(self) -> None:

@@ -43,7 +43,9 @@ class ModeQuestion:
     count = 1
 
     def __init__(self) -> None:
-        self._due_ns = self._deadline_ns = 0
+        self._due_ns = 0
+        self.deadline_ns = 0
+        """Until when the answer to an open question must have come."""
         self._known = False  # it has answered at least once
         self._failures = 0
         self._supported = True
@@ -58,12 +60,12 @@ class ModeQuestion:
 
     def overdue(self, now_ns: int) -> bool:
         """Whether the answer should have come."""
-        return not self.complete and now_ns >= self._deadline_ns
+        return not self.complete and now_ns >= self.deadline_ns
 
     def begin(self, now_ns: int, deadline_ns: int) -> None:
         """Start a question."""
         self._due_ns = now_ns + INTERVAL_NS
-        self._deadline_ns = deadline_ns
+        self.deadline_ns = deadline_ns
         self.sent = 0
         self.complete = False
 

@@ -22,7 +22,7 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
     rack: Annotated[int, msgspec.Meta(ge=0, le=7)] = 0
     slot: Annotated[int, msgspec.Meta(ge=0, le=31)] | None = None
     timeout: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 5000
-    """Milliseconds for one whole operation: connecting, or reading the block."""
+    """Milliseconds for one whole operation: connecting, or reading the block; and for each answer to a write."""
     packetSize: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
     """The most data bytes in one read; what the controller grants bounds it too."""
     dbNumber: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini

@@ -55,7 +55,7 @@ def parse_write_answer(frame: memoryview, count: int) -> bytes:
     """Check the answer to a write of ``count`` items; the return code of each. RefusedError: the whole job was."""
     data_length = pdu.check_answer(frame)
     codes = frame[pdu.HEADER_END + 2 :]
-    if len(codes) != data_length or frame[pdu.HEADER_END] != _WRITE:
+    if len(frame) < pdu.HEADER_END + 2 or len(codes) != data_length or frame[pdu.HEADER_END] != _WRITE:
         raise ConnectorError("not an answer to a write")
     if frame[pdu.HEADER_END + 1] != count or data_length != count:
         raise ConnectorError(f"answer with {data_length} return codes, {count} items were written")

@@ -13,6 +13,7 @@ from snap7.datatypes import S7Area
 from shmio.connectors.s7.blocksize import SizeProbe, parse_readable
 from shmio.emulators.s7_jobs import Jobs, Memory, Traits
 from shmio.errors import ConnectorError
+from tests.unit.connectors.s7 import noise as frames
 
 ANSWER = bytes.fromhex("03000025 02f080 32 03 0000 0007 0002 0010 0000 04 03 ff04000855 00 ff040008aa 00 05000000")
 
@@ -57,7 +58,8 @@ def test_answers_of_a_wrong_length(data: str) -> None:
         parse_readable(memoryview(head + items), 3)
 
 
-@given(st.binary(min_size=7, max_size=60) | st.builds(lambda cut, tail: (ANSWER[:cut] + tail).ljust(7, b"\0"),
+@given(frames.answers(3, b"\x04\x03", ANSWER[21:]) |
+       st.binary(min_size=7, max_size=60) | st.builds(lambda cut, tail: (ANSWER[:cut] + tail).ljust(7, b"\0"),
        st.integers(0, 35), st.binary(max_size=20)))  # fmt: skip
 def test_noise_gives_an_answer_or_a_connector_error(noise: bytes) -> None:
     with contextlib.suppress(ConnectorError):

@@ -96,6 +96,30 @@ def test_many_small_writes_go_in_few_jobs() -> None:
     assert len(list(waves(201, 960, [Write(0, 0, b"ab"), Write(1, 4, b"\4"), Write(1, 4, b"\0")], [""] * 3))) == 3
 
 
+def items(requests: bytes) -> list[tuple[int, bool]]:
+    """First bit, and whether it is a write of a bit, of each item of these jobs, as they are sent."""
+    found = []
+    for request in split(requests):
+        places = range(19, 19 + 12 * request[18], 12)
+        found += [(int.from_bytes(request[at + 9 : at + 12], "big"), request[at + 3] == 1) for at in places]
+    return found
+
+
+@settings(max_examples=30)
+@given(order=st.permutations(range(90)), pdu_size=st.sampled_from([100, 240, 960]), size=st.sampled_from([1, 3, 300]))
+def test_data_before_their_strobe(order: list[int], pdu_size: int, size: int) -> None:
+    """The order of the writes is that within a job and from job to job, wherever in the block they are."""
+    writes: list[Write] = []
+    wanted = []
+    for data, strobe in zip(order[:45], order[45:], strict=True):
+        at = SIZE + size * data
+        writes += [Write(at, 0, bytes(size)), Write(strobe, 1 << strobe % 8, b"\xff")]
+        wanted += [(8 * part, False) for part in range(at, at + size, pdu_size - 28)]
+        wanted.append((8 * strobe + strobe % 8, True))
+    (wave,) = waves(201, pdu_size, writes, [""] * len(writes))
+    assert items(wave.take(2, 0) + wave.take(wave.count - 2, 2)) == wanted  # as the controller has room for jobs
+
+
 def test_a_refused_item_among_good_ones() -> None:
     block = bytearray(SIZE)
     writes = [Write(0, 0, b"good"), Write(SIZE - 1, 0, b"xy"), Write(SIZE, 1, b"\1"), Write(9, 2, b"\2")]

@@ -9,10 +9,43 @@ import time
 import pytest
 
 from shmio.connectors.s7.client import S7Client
+from shmio.connectors.s7.connector import S7Connector
+from shmio.connectors.s7.options import S7Options
 from shmio.emulators.s7_jobs import Fault, Traits
 from shmio.errors import ConnectorError
+from shmio.layout.model import Layout, Register
 from shmio.layout.write import Write
 from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc, assert_recovers
+
+
+class Clock:
+    """The real one, moved on by hand: answers come seconds apart, and nobody waits for them."""
+
+    def __init__(self) -> None:
+        self._moved_ns = 0
+
+    def monotonic_ns(self) -> int:
+        return time.monotonic_ns() + self._moved_ns
+
+    def move(self, by_s: int) -> None:
+        self._moved_ns += by_s * 10**9
+
+    def slow_down(self, plc: Plc, answer_s: int) -> None:
+        """Have each answer take so long."""
+
+        def pass_on(frame: bytes) -> bytes:
+            self.move(answer_s)
+            return frame
+
+        plc.proxy.edit(pass_on)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr("shmio.connectors.s7.client.time", made)
+    monkeypatch.setattr("shmio.connectors.s7.transport.time", made)
+    return made
 
 
 def image(client: S7Client) -> bytes:
@@ -157,3 +190,40 @@ def test_a_read_that_is_refused_does_not_spoil_a_write(make_plc: MakePlc) -> Non
     with pytest.raises(ConnectorError, match="DB201 has no 2180 bytes but 1000 bytes"):
         client.collect(time.monotonic_ns() + 10**10)
     assert not client.connected
+
+
+SCATTERED = [Write(2 * place, 1 << place % 8, b"\xff") for place in range(60)]  # three jobs
+
+
+def test_a_slow_controller_is_not_a_dead_one(make_plc: MakePlc, clock: Clock) -> None:
+    """Each answer has the whole time-out; reads and the operating mode, which waited behind them, are not late."""
+    plc = make_plc(Traits(max_jobs=1))
+    client = plc.connected(timeout=5000)
+    clock.slow_down(plc, 4)
+    clock.move(2)
+    client.submit()  # three jobs more, of which one is under way, and the question for the operating mode
+    assert client.write(SCATTERED) == [""] * 60
+    submitted = threading.Event()
+    plc.proxy.edit(lambda frame: frame if frame[8] != 7 or submitted.wait(10) else None)  # 7: that of the mode
+    assert client.collect(clock.monotonic_ns() + 10**10) is not None
+    client.submit()
+    submitted.set()
+    assert client.collect(clock.monotonic_ns() + 10**10) == bytes(plc.block)
+    assert all(plc.block[write.offset] & write.mask for write in SCATTERED)
+
+
+@pytest.mark.parametrize(("timeout_s", "most_s"), [(5, 20), (30, 30)])
+def test_a_batch_does_not_take_for_ever(make_plc: MakePlc, clock: Clock, timeout_s: int, most_s: int) -> None:
+    """The process of a source is taken for hung when a call does not return."""
+    plc = make_plc(Traits(max_jobs=1))
+    client = plc.connected(timeout=1000 * timeout_s)
+    clock.slow_down(plc, 4)
+    with pytest.raises(ConnectorError, match=f"has not served all writes of a cycle within {most_s} s: write less"):
+        client.write([Write(2 * place, 1, b"\1") for place in range(180)])  # nine jobs
+    assert_recovers(plc, client)
+
+
+@pytest.mark.parametrize(("timeout", "longest_s"), [(2000, 20), (20_500, 20.5)])
+def test_the_connector_tells_how_long_a_batch_may_take(timeout: int, longest_s: float) -> None:
+    layout = Layout("DB201", 201, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
+    assert S7Connector(S7Options(host="192.0.2.1", timeout=timeout), layout).timeout_s == longest_s

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from shmio.connectors.s7.mode import INTERVAL_NS, ModeQuestion, parse_mode_answer
 from shmio.errors import ConnectorError
+from tests.unit.connectors.s7 import noise as frames
 
 
 def answer(mode: int = 0x48, *, code: int = 0xFF, szl: int = 0x0424, records: int = 1, error: int = 0) -> memoryview:
@@ -140,7 +141,8 @@ def test_refuses_a_wrong_answer(frame: memoryview) -> None:
         parse_mode_answer(frame)
 
 
-@given(st.binary(min_size=7, max_size=80) | st.builds(lambda cut, tail: (GOOD[:cut] + tail).ljust(7, b"\0"),
+@given(frames.answers(7, GOOD[17:29], GOOD[29:]) | frames.answers(3, b"", GOOD[29:]) |
+       st.binary(min_size=7, max_size=80) | st.builds(lambda cut, tail: (GOOD[:cut] + tail).ljust(7, b"\0"),
        st.integers(0, 61), st.binary(max_size=30)))  # fmt: skip
 def test_noise_gives_a_mode_or_none_or_a_connector_error(noise: bytes) -> None:
     with contextlib.suppress(ConnectorError):

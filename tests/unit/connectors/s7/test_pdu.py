@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from shmio.connectors.s7 import pdu
 from shmio.errors import ConnectorError
+from tests.unit.connectors.s7 import noise as frames
 
 GOOD_ANSWER = bytes.fromhex("0300001d 02f080 32 03 0000 1234 0002 0008 00 00 04 01 ff 04 0020 deadbeef")
 CONFIRM = bytes.fromhex("03000016 11 d0 0001 0007 00 c0010a c1020100 c2020101")
@@ -142,7 +143,7 @@ NOISE = st.binary(min_size=7, max_size=80) | st.builds(
 )
 
 
-@given(NOISE)
+@given(frames.answers(3, b"\x04\x01", b"\xff\x04\x00\x20\xde\xad\xbe\xef") | frames.answers(3, GRANT[-8:], b"") | NOISE)
 def test_noise_gives_an_answer_or_a_connector_error(noise: bytes) -> None:
     frame = memoryview(noise)
     with contextlib.suppress(ConnectorError):

@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextlib
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from shmio.connectors.s7 import writepdu
 from shmio.connectors.s7.explain import RefusedError
 from shmio.errors import ConnectorError
+from tests.unit.connectors.s7 import noise as frames
 
 ANSWER = bytes.fromhex("03000018 02f080 32 03 0000 0007 0002 0003 00 00 05 03 ff 0a ff")
 
@@ -55,6 +56,9 @@ def changed(**at: int) -> memoryview:
         (changed(_19=4), "not an answer to a write"),
         (changed(_20=2), "3 return codes, 3 items"),
         (memoryview(ANSWER[:18]), "too short"),
+        (memoryview(frames.answer(3, b"", b"")), "not an answer to a write"),
+        (memoryview(frames.answer(3, b"\x05", b"")), "not an answer to a write"),
+        (memoryview(frames.answer(3, b"", b"\x05\x03\xff")), "not an answer to a write"),
     ],
 )
 def test_refuses_a_wrong_answer(frame: memoryview, text: str) -> None:
@@ -74,7 +78,10 @@ def test_a_job_that_is_refused_as_a_whole(head: str) -> None:
         writepdu.parse_write_answer(memoryview(frame), 3)
 
 
-@given(st.binary(min_size=7, max_size=60) | st.builds(lambda cut, tail: (ANSWER[:cut] + tail).ljust(7, b"\0"),
+@example(frames.answer(3, b"", b""), 1)
+@example(frames.answer(3, b"\x05", b""), 1)
+@given(frames.answers(3, b"\x05\x03", b"\xff\x0a\xff") |
+       st.binary(min_size=7, max_size=60) | st.builds(lambda cut, tail: (ANSWER[:cut] + tail).ljust(7, b"\0"),
        st.integers(0, 24), st.binary(max_size=20)), st.integers(1, 20))  # fmt: skip
 def test_noise_gives_codes_or_a_connector_error(noise: bytes, count: int) -> None:
     with contextlib.suppress(ConnectorError):
