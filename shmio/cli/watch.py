@@ -32,9 +32,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(cell: Attachment, options: argparse.Namespace) -> int:
     """Print a line for each change until interrupted, or until the instance ends."""
-    chosen = choose(cell, options.patterns)
-    width = max(len(topic_path(*item)) for item in chosen)
-    for printed, (block, register, now) in enumerate(_news(cell, chosen), 1):
+    for printed, (block, register, now, width) in enumerate(_news(cell, options.patterns), 1):
         path = topic_path(block, register)
         if options.json:
             print(dumps({"path": path, **as_json(now, register)}), flush=True)
@@ -45,24 +43,42 @@ def execute(cell: Attachment, options: argparse.Namespace) -> int:
     raise NotRunningError(f"instance {cell.instance!r} has stopped")
 
 
-def _news(cell: Attachment, chosen: list[Selected]) -> Iterator[News]:
-    """What all blocks report; a thread waits on each. Ends when the instance does."""
-    registers: dict[str, tuple[Block, list[Register]]] = {}
-    for block, register in chosen:
-        registers.setdefault(block.source, (block, []))[1].append(register)
+def _news(cell: Attachment, patterns: list[str]) -> Iterator[tuple[Block, Register, Reading, int]]:
+    """What all blocks report, with the width of their paths; a thread waits on each. Ends when the instance does.
+
+    PathError: after a reload, there is no such register any more.
+    """
     news: queue.Queue[list[News]] = queue.Queue(WAITING_FRAMES)
-    for block, wanted in registers.values():
-        threading.Thread(target=_follow, args=(block, wanted, news), daemon=True).start()
+    followed: set[int] = set()
+    width = _follow_new(choose(cell, patterns), followed, news)
     while True:
         try:
-            yield from news.get(timeout=IDLE_S)
+            batch = news.get(timeout=IDLE_S)
         except queue.Empty:
             if not cell.current:
                 return
+            continue
+        if not batch:  # a reload has ended a block
+            if not cell.current:
+                return
+            width = _follow_new(choose(cell, patterns), followed, news)
+        yield from ((*item, width) for item in batch)
+
+
+def _follow_new(chosen: list[Selected], followed: set[int], news: queue.Queue[list[News]]) -> int:
+    """Have a thread follow each block that none follows yet; the width of the longest path."""
+    registers: dict[int, tuple[Block, list[Register]]] = {}
+    for block, register in chosen:
+        if block.section not in followed:
+            registers.setdefault(block.section, (block, []))[1].append(register)
+    followed.update(registers)
+    for block, wanted in registers.values():
+        threading.Thread(target=_follow, args=(block, wanted, news), daemon=True).start()
+    return max(len(topic_path(*item)) for item in chosen)
 
 
 def _follow(block: Block, registers: list[Register], news: queue.Queue[list[News]]) -> None:
-    """Report each register's reading, then every change of value or quality."""
+    """Report each register's reading, then every change of value or quality; an empty list when the block ends."""
     shown: list[tuple[str, Quality, str] | None] = [None] * len(registers)
     cursor = block.cursor()
     frame: Frame | None = block.latest()
@@ -77,12 +93,18 @@ def _follow(block: Block, registers: list[Register], news: queue.Queue[list[News
                 changes.append((block, register, now))
         if changes:
             news.put(changes)
+        if block.retired:
+            news.put([])
+            return
         if cursor.behind > WAITING_FRAMES:
             cursor = block.cursor(after=block.ring.head() - 1)
         frame = cursor.next(timeout_s=min(IDLE_S, block.stale_ns / 1e9)) or block.latest()
 
 
 def _clock(now: Reading) -> str:
+    """The value's own time; of one that is bad, when that was noticed."""
+    if now.quality is Quality.BAD:
+        return datetime.now(UTC).astimezone().strftime("%H:%M:%S.%f")[:-3]
     if now.source_time is None:
         return "-" * 12
     return datetime.fromtimestamp(now.source_time, UTC).astimezone().strftime("%H:%M:%S.%f")[:-3]

@@ -103,7 +103,7 @@ class Attachment:
         frame = block.latest()
         if frame is None:
             raise QualityError(f"source {block.source}: no data yet")
-        return View(block.source, frame, block.layout, block.stale_ns)
+        return _view(block, frame)
 
     def stream(self, source: str | None = None, timeout_s: float | None = None) -> Iterator[View]:
         """Every frame from this call on, once, in order, gaps counted; ends after ``timeout_s`` without one.
@@ -118,7 +118,7 @@ class Attachment:
         while True:
             frame = self._next(block, cursor, timeout_s)
             if frame is not None:
-                yield View(block.source, frame, block.layout, block.stale_ns, cursor.missed - missed)
+                yield _view(block, frame, cursor.missed - missed)
                 missed = cursor.missed
             elif block.retired:
                 if not cursor.behind:
@@ -153,12 +153,21 @@ class Attachment:
     ) -> View | None:
         """The newest frame as soon as it is newer than ``after`` (default: than now); None when the time is over.
 
-        None at once too when a reload ends the block meanwhile.
+        A frame of the block that a reload has put in the place of ``after``'s is newer.
         """
         block = self.block(source)
-        cursor = block.cursor(after=None if after is None else max(after.frame.number, block.ring.head() - 1))
-        frame = self._next(block, cursor, timeout_s)
-        return None if frame is None else View(block.source, frame, block.layout, block.stale_ns)
+        deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+        head = block.ring.head()
+        last = 0 if after is None or after.section != block.section else after.frame.number
+        cursor = block.cursor(after=head if after is None else max(last, head - 1, 0))
+        while True:
+            frame = self._next(block, cursor, None if deadline_s is None else deadline_s - time.monotonic())
+            if frame is not None:
+                return _view(block, frame)
+            if not block.retired:
+                return None
+            block = self._successor(block)
+            cursor = block.cursor(after=0)
 
     def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
         """Write registers, arrays or elements of one source by their paths, as one command; what became of each.
@@ -203,6 +212,10 @@ class Attachment:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def _view(block: Block, frame: Frame, missed: int = 0) -> View:
+    return View(block.source, frame, block.layout, block.stale_ns, missed, block.section)
 
 
 def take_guest(segment: Segment) -> int:

@@ -47,6 +47,8 @@ class View:
     layout: Layout
     stale_ns: int
     missed: int = 0
+    section: int = 0
+    """Which of the blocks that its source has had; a reload may give it another, whose frames count from 1."""
 
     @property
     def cycle(self) -> int:

@@ -12,6 +12,7 @@ import shmio
 from shmio.errors import NotRunningError, PathError, SegmentError
 from shmio.layout.model import Layout, Register
 from shmio.segment import BlockSpec, ProcessSpec, Quality, Segment, shm
+from shmio.segment.view import View
 
 OLD = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))
 NEW = Layout(
@@ -135,3 +136,35 @@ def test_readers_and_changes_at_once(segment: Segment) -> None:
     for reader in readers:
         reader.join()
     assert problems == []
+
+
+def test_wait_goes_on_with_the_new_block(segment: Segment) -> None:
+    old = segment.writer("cell")
+    for cycle in range(1, 11):
+        old.publish(b"\0\1", cycle=cycle)
+    with shmio.attach(segment.instance) as reader:
+        last = reader.frame("cell")
+        segment.change(add=[spec("cell", NEW)], retire=["cell"])
+        new = segment.writer("cell")
+        new.publish(struct.pack(">fh", 0.5, 3), cycle=11)
+        view = reader.wait("cell", after=last, timeout_s=20)
+        assert view is not None
+        assert (view["count"], view.cycle) == (3, 11)
+        assert reader.wait("cell", after=view, timeout_s=0) is None
+
+
+def test_who_waits_is_woken_by_the_new_block(segment: Segment) -> None:
+    segment.writer("cell").publish(b"\0\1", cycle=1)
+    views: list[View | None] = []
+    with shmio.attach(segment.instance) as reader:
+        waiter = threading.Thread(target=lambda: views.append(reader.wait("cell", timeout_s=60)))
+        waiter.start()
+        segment.change(add=[spec("cell", NEW)], retire=["cell"])
+        writer = segment.writer("cell")
+        cycle = 1
+        while waiter.is_alive():
+            writer.publish(struct.pack(">fh", 0.5, 4), cycle=(cycle := cycle + 1))
+            waiter.join(0.01)
+    assert views
+    assert views[0] is not None
+    assert views[0]["count"] == 4
