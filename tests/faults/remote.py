@@ -18,6 +18,8 @@ BREAKS = {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED, grpc.StatusCod
 """How a stream may end when its server is killed, stopped or away."""
 CALL_S = 20.0
 """A stream is begun anew after this long: a server that is frozen for ever does not hold its client."""
+UNDER_WAY_NS = 3_000_000_000
+"""What an endpoint had sent off when it was stopped (``pause``) comes when it goes on; a v1 message has no quality."""
 OPTIONS = [
     ("grpc.initial_reconnect_backoff_ms", 100),
     ("grpc.min_reconnect_backoff_ms", 100),
@@ -35,7 +37,7 @@ def subscribe(checker: Checker, source: Source, name: str) -> None:
             call = stub.Subscribe(TopicDescriptor(path=f"{source.name}/stamp"), timeout=CALL_S)
             try:
                 for message in call:
-                    check.value(int(message.value), time.monotonic_ns(), slack_ns=checker.slack_ns)
+                    check.value(int(message.value), time.monotonic_ns(), slack_ns=checker.slack_ns + UNDER_WAY_NS)
                     if checker.stopping.is_set():
                         call.cancel()
             except grpc.RpcError as error:
