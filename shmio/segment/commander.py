@@ -59,6 +59,10 @@ class Commander:
         self.block = block
         self._sender = CommandSender(block, writer)
 
+    def prepare(self) -> None:
+        """Find out what is writable, which takes seconds for a big layout; else the first :meth:`submit` does it."""
+        _ = self._writable
+
     @property
     def timeout_s(self) -> float:
         """How long a command may wait, unless told otherwise."""

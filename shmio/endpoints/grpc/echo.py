@@ -35,6 +35,9 @@ class Listener(Protocol):
     def deliver(self, message: bytes) -> None:
         """Take one message for this stream."""
 
+    def fail(self, reason: str) -> None:
+        """End: what comes next is not all there was."""
+
 
 class InChannel:
     """One register as somebody listens to its ``/in``."""
@@ -64,8 +67,9 @@ class Echo:
     """Turns accepted writes of all writers into messages, in the order in which the source accepted them.
 
     A register is shown when a command has written all of it. One of which only a part is written, as an array's
-    element, is shown when that is known to be all, with the rest as of the newest frame. ``listen`` and ``leave``
-    belong to the event loop's thread, ``follow`` to that of the events.
+    element, is shown when that is known to be all, with the rest as of the frame before the command. A command whose
+    first events nobody followed is passed over: it could only be shown in part. ``listen``, ``leave`` and ``fail``
+    belong to the event loop's thread, ``follow`` and ``skip`` to that of the events.
     """
 
     def __init__(self, block: Block) -> None:
@@ -74,7 +78,8 @@ class Echo:
         self._table: tuple[InChannel, ...] = ()
         self._frame = -1  # the image is this frame, and what was accepted since
         self._image = bytearray(block.layout.size)
-        self._command = _NOBODY
+        self._command = _NOBODY  # the one accepted last; it is not known at first, nor after a gap
+        self._whole = False  # whether the image and the mask have all of it so far
         self._mask = bytearray(block.layout.size)  # what the command has written
         self._partly: dict[InChannel, Event] = {}  # channels it has written a part of
 
@@ -94,30 +99,65 @@ class Echo:
             del self._channels[register]
             self._table = tuple(self._channels.values())
 
+    @property
+    def busy(self) -> bool:
+        """Whether anybody listens."""
+        return bool(self._channels)
+
+    def fail(self, reason: str) -> None:
+        """End all streams."""
+        for channel in self._table:
+            for listener in channel.listeners:
+                listener.fail(reason)
+
+    def skip(self) -> None:
+        """Events were missed: what is known of the command they may have belonged to is worth nothing."""
+        self._command, self._whole, self._frame = _NOBODY, False, -1
+        self._partly.clear()
+
     def follow(self, event: Event) -> list[Message]:
         """The messages that an event gives rise to."""
-        command = (event.incarnation, event.writer, event.command)
+        command = _command(event)
         if event.kind != EventKind.ACCEPTED:
             # Ends of commands before it may come between the parts of one.
             return self._rest() if command == self._command or event.kind == EventKind.STARTED else []
-        messages = self._rest() if command != self._command else []
+        messages: list[Message] = []
         table = self._table
-        if not table:
-            self._frame, self._command = -1, _NOBODY
-            return messages
         if command != self._command:
-            self._command, self._mask = command, bytearray(len(self._image))
+            messages = self._rest()
+            self._whole = bool(table) and (self._command != _NOBODY or self._begins(event))
+            self._command = command
+            if self._whole:
+                self._begin(event.frame)
+        if not table:
+            self._whole, self._frame = False, -1
+        if not self._whole:
+            return messages
         self._apply(event)
         for channel in table:
             if channel.start < event.offset + len(event.data) and event.offset < channel.stop:
                 self._touch(channel, event, messages)
         return messages
 
-    def _apply(self, event: Event) -> None:
-        if event.frame != self._frame:
-            frame = self._block.read(event.frame) or self._block.latest()
-            self._frame = event.frame
+    def _begins(self, event: Event) -> bool:
+        """Whether it is surely the first of its command, by the events before it."""
+        for number in range(event.number - 1, 0, -1):
+            before = self._block.events.read(number)
+            if before is None:
+                return False
+            if before.kind == EventKind.ACCEPTED:
+                return _command(before) != _command(event)
+        return True
+
+    def _begin(self, number: int) -> None:
+        """A command begins, behind this frame; frames that come between its parts must not undo the first ones."""
+        if number != self._frame:
+            frame = self._block.read(number) or self._block.latest()
+            self._frame = number
             self._image = bytearray(len(self._image)) if frame is None else bytearray(frame.image)
+        self._mask = bytearray(len(self._image))
+
+    def _apply(self, event: Event) -> None:
         start, stop = event.offset, event.offset + len(event.data)
         if event.mask:
             self._image[start] = self._image[start] & ~event.mask | event.data[0] & event.mask
@@ -150,3 +190,7 @@ class Echo:
         message = channel.encode(_Written(event.frame, event.clock_ns, bytes(self._image)))
         if message is not None:
             messages.append((channel, message))
+
+
+def _command(event: Event) -> tuple[int, int, int]:
+    return event.incarnation, event.writer, event.command

@@ -83,6 +83,11 @@ class Feed:
         """Whether the block is being followed, as long as there is something to come."""
         return (self._thread.is_alive() or self.block.retired) and self.inlet.alive
 
+    @property
+    def over(self) -> bool:
+        """Whether nothing is left of it: neither a thread nor a stream."""
+        return not (self._thread.is_alive() or self._channels) and self.inlet.over
+
     def start(self) -> None:
         """Begin to follow the block."""
         self._thread.start()

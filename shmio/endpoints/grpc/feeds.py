@@ -40,7 +40,7 @@ class Feeds(Mapping[str, Feed]):
     @property
     def messages(self) -> int:
         """Messages made since the start."""
-        return self._ended_messages + sum(feed.messages for feed in self._feeds.values())
+        return self._ended_messages + sum(feed.messages for feed in (*self._feeds.values(), *self._ended))
 
     @property
     def alive(self) -> bool:
@@ -60,16 +60,22 @@ class Feeds(Mapping[str, Feed]):
 
         FormatError: the segment makes no sense any more.
         """
+        self._prune()
         if not self._segment.refresh():
             return []
         over = [name for name, feed in self._feeds.items() if self._segment.blocks.get(name) is not feed.block]
         for name in over:
             feed = self._feeds.pop(name)
-            self._ended_messages += feed.messages
             self._ended.append(feed)  # its threads end by themselves, when all is read
             self._on_quality(name, False)
         self.start()
         return over
+
+    def _prune(self) -> None:
+        """Forget the feeds of which nothing is left, and with them what they hold of the segment."""
+        over = [feed for feed in self._ended if feed.over]
+        self._ended_messages += sum(feed.messages for feed in over)
+        self._ended = [feed for feed in self._ended if feed not in over]
 
     def stop(self) -> None:
         """Tell all threads to end."""

@@ -14,16 +14,15 @@ from shmio.endpoints.grpc.echo import Echo, Message
 from shmio.errors import CommandError
 from shmio.layout.model import Register
 from shmio.segment import ENDS, Block, Event, EventKind
-from shmio.segment.commander import PATIENCE_S, TIMEOUT_S, Commander
+from shmio.segment.commander import PATIENCE_S, Commander
 from shmio.segment.events import EVENT_DATA_SIZE
 
 log = logging.getLogger("shmio.grpc")
 
 MAX_OPEN: Final = 512
 """Events that may be outstanding: a quarter of the ring, so that none is overwritten before it is read."""
-MIN_PERIODS: Final = 3
-"""A command waits for so many cycles at least: of a slow source it must not expire between two."""
-BATCH: Final = 256
+BATCH: Final = 32
+"""Most events that are handed to the event loop at once, so that streams get their turn in between."""
 WAIT_S: Final = 0.2
 
 _RETIRED: Final = "the source was changed or removed by a reload"
@@ -36,14 +35,12 @@ Done = Callable[[str], None]
 class _Pending:
     """A command whose end has not come."""
 
-    open_items: set[int]
     incarnation: int
     until_ns: int
     record_bytes: int
     events: int
     done: Done
     taken: bool = False
-    reason: str = ""
 
 
 class Inlet:
@@ -59,7 +56,7 @@ class Inlet:
         self._writer = writer
         self._loop = loop
         self._commander = Commander(block, writer)
-        self._timeout_s = max(TIMEOUT_S, MIN_PERIODS * block.period_ns / 1e9)
+        self._prepared = False
         self._pending: dict[int, _Pending] = {}
         self._untaken_bytes = 0  # of records that may still lie in the queue
         self._open_events = 0
@@ -75,6 +72,11 @@ class Inlet:
     def alive(self) -> bool:
         """Whether the block's events are being followed, as long as there are any."""
         return self._thread.is_alive() or self.block.retired
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing is left of it: no thread, no value under way, no stream."""
+        return not (self._thread.is_alive() or self._pending or self._turn.locked() or self.echo.busy)
 
     def start(self) -> None:
         """Begin to follow the events."""
@@ -92,7 +94,7 @@ class Inlet:
 
     def ready(self, register: Register) -> bool:
         """Whether :meth:`send` would not have to wait."""
-        return not self._turn.locked() and self._has_room(register)
+        return self._prepared and not self._turn.locked() and self._has_room(register)
 
     async def send(self, register: Register, value: object, done: Done) -> None:
         """Send a value as soon as there is room; ``done`` is called when its end is known, a bounded time later.
@@ -101,6 +103,9 @@ class Inlet:
         called then.
         """
         async with self._turn:
+            if not self._prepared:  # not on the loop: for a big layout it takes seconds
+                await asyncio.to_thread(self._commander.prepare)
+                self._prepared = True
             while not self._has_room(register):
                 self._freed = self._loop.create_future()
                 await self._freed
@@ -110,11 +115,9 @@ class Inlet:
                 raise CommandError(
                     f"source {self.block.source} does not answer; shmio-supervisor status says how it fares"
                 )
-            ticket = self._commander.submit({register.path: value}, self._timeout_s)
+            ticket = self._commander.submit({register.path: value})
             record_bytes, events = _cost(register)
-            self._pending[ticket.number] = _Pending(
-                set(range(len(ticket.paths))), ticket.incarnation, ticket.until_ns, record_bytes, events, done
-            )
+            self._pending[ticket.number] = _Pending(ticket.incarnation, ticket.until_ns, record_bytes, events, done)
             self._untaken_bytes += record_bytes
             self._open_events += events
             if self._timer is None:
@@ -145,14 +148,9 @@ class Inlet:
         if not pending.taken:
             pending.taken = True
             self._untaken_bytes -= pending.record_bytes
-        if event.kind not in ENDS:
-            return
-        if event.kind != EventKind.WRITTEN:
-            pending.reason = f"{EventKind(event.kind)}: {event.text}"
-        stop = event.item + event.items
-        pending.open_items -= {item for item in pending.open_items if event.item <= item < stop}
-        if event.kind == EventKind.REJECTED or not pending.open_items:
-            self._end(event.command, pending.reason)
+        if event.kind in ENDS:  # of the one item there is
+            written = event.kind == EventKind.WRITTEN
+            self._end(event.command, "" if written else f"{EventKind(event.kind)}: {event.text}")
 
     def _restarted(self, event: Event) -> None:
         """A successor rejects what its predecessor had not taken; of what it had taken nobody knows."""
@@ -213,6 +211,7 @@ class Inlet:
 
     def _follow(self) -> None:
         cursor = self._cursor
+        missed = 0
         while not self._stopping.is_set():
             retired = self.block.retired
             event = cursor.next(WAIT_S)
@@ -221,16 +220,23 @@ class Inlet:
                     self._loop.call_soon_threadsafe(self._retired)
                     return
                 continue
-            batch = [event]
-            while len(batch) < BATCH and (event := cursor.poll()) is not None:
-                batch.append(event)
-            messages = [message for event in batch for message in self.echo.follow(event)]
-            ours = [event for event in batch if event.writer == self._writer or event.kind == EventKind.STARTED]
+            ours: list[Event] = []
+            messages: list[Message] = []
+            for left in reversed(range(BATCH)):
+                if cursor.missed != missed:
+                    self.echo.skip()
+                    reason = f"{cursor.missed - missed} events of source {self.block.source} were missed"
+                    self._loop.call_soon_threadsafe(self.echo.fail, reason)
+                    missed = cursor.missed
+                messages += self.echo.follow(event)
+                if event.writer == self._writer or event.kind == EventKind.STARTED:
+                    ours.append(event)
+                if not left or (event := cursor.poll()) is None:
+                    break
             if ours or messages:
                 self._loop.call_soon_threadsafe(self._on_events, ours, messages)
 
 
 def _cost(register: Register) -> tuple[int, int]:
     """At most so many bytes in the queue, and events until the end, has a write of the register."""
-    items = register.count if register.type == "BOOL" else 1
-    return 64 + 24 * items + register.size, 1 + items + register.size // EVENT_DATA_SIZE
+    return 88 + register.size, 2 + register.size // EVENT_DATA_SIZE

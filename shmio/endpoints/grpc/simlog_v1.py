@@ -3,26 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable, Collection, Mapping
-from functools import lru_cache
-from typing import Any
+from functools import lru_cache, partial
+from typing import Any, Final
 
 import grpc
 from google.protobuf.empty_pb2 import Empty
 
-from shmio.endpoints.grpc.echo import Echo, Picture
+from shmio.endpoints.grpc.echo import Picture
 from shmio.endpoints.grpc.feed import CATCH_UP_FRAMES, Feed
 from shmio.endpoints.grpc.inlet import Inlet
 from shmio.endpoints.grpc.publish import Publisher
-from shmio.endpoints.grpc.queue import ConflatingQueue
+from shmio.endpoints.grpc.queue import ConflatingQueue, UnbrokenQueue
 from shmio.errors import PathError
 from shmio.layout.codec import codec
 from shmio.layout.model import Layout, Register
 from shmio.layout.text import to_text, wire_type
 from shmio.layout.topic import Topic, find, parse_topic, shorten
+from shmio.segment.events import EVENT_SLOTS
 from shmio.wire import simlog_v1_pb2 as wire
 
 SERVICE = wire.DESCRIPTOR.services_by_name["SimlogAPI"].full_name
-QUEUE_BOUND = 2 * CATCH_UP_FRAMES  # a feed that catches up delivers so many at once
+QUEUE_BOUND: Final = 2 * CATCH_UP_FRAMES  # a feed that catches up delivers so many at once
+EVENT_BOUND: Final = 2 * EVENT_SLOTS  # an inlet that catches up delivers half of it at once
+EVENT_BOUND_BYTES: Final = 8 << 20
 
 Context = grpc.aio.ServicerContext[Any, Any]
 
@@ -34,7 +37,7 @@ class SimlogV1:
         """``default_source``: that of paths which name none; default: the only one."""
         self._feeds = feeds
         self._default = default_source
-        self._streams: set[_Stream] = set()
+        self._streams: set[_OutStream | _InStream] = set()
         self._dropped = 0
         self._publisher = Publisher(self._locate_in)
 
@@ -67,16 +70,17 @@ class SimlogV1:
         """Stream a topic's values: the current one if it is good, then every change; of ``/in``, what is written to it.
 
         While quality is bad nothing is sent; on recovery the value is sent again. A slow client is
-        given the newest value in place of those that wait. When a reload changes the source the stream goes on, if
-        there still is such a register; else it ends with NOT_FOUND.
+        given the newest value in place of those that wait; but its stream of ``/in``, where none replaces another, ends
+        with RESOURCE_EXHAUSTED. When a reload changes the source the stream goes on, if there still is such a register;
+        else it ends with NOT_FOUND.
         """
         topic, register = await self._resolve(request.path, context)
-        stream = _Stream(topic.source)
+        stream = _InStream(topic.source) if topic.direction == "in" else _OutStream(topic.source)
         self._streams.add(stream)
         told = False
         try:
             while True:
-                joined = self._join(topic, register, stream)
+                leave = self._join(register, stream)
                 try:
                     if not told:
                         await context.send_initial_metadata(())  # who waits for it misses nothing from then on
@@ -84,7 +88,11 @@ class SimlogV1:
                     while (message := await stream.pop()) is not None:
                         yield message
                 finally:
-                    joined.leave(register, stream)
+                    leave()
+                if isinstance(stream, _InStream) and stream.failure:
+                    await context.abort(
+                        grpc.StatusCode.RESOURCE_EXHAUSTED, f"{shorten(request.path)}: {stream.failure}"
+                    )
                 register = await self._find_again(topic, request.path, context)
         finally:
             self._streams.discard(stream)
@@ -96,11 +104,16 @@ class SimlogV1:
             if stream.source in sources:
                 stream.end()
 
-    def _join(self, topic: Topic, register: Register, stream: _Stream) -> Feed | Echo:
-        feed = self._feeds[topic.source]
-        joined = feed.inlet.echo if topic.direction == "in" else feed
-        joined.listen(register, encoder(register, feed.block.layout), stream)
-        return joined
+    def _join(self, register: Register, stream: _OutStream | _InStream) -> Callable[[], None]:
+        """Have the stream listen; how it leaves again."""
+        feed = self._feeds[stream.source]
+        encode = encoder(register, feed.block.layout)
+        if isinstance(stream, _InStream):
+            echo = feed.inlet.echo
+            echo.listen(register, encode, stream)
+            return partial(echo.leave, register, stream)
+        feed.listen(register, encode, stream)
+        return partial(feed.leave, register, stream)
 
     async def _find_again(self, topic: Topic, path: str, context: Context) -> Register:
         """The register of a stream after a reload; NOT_FOUND."""
@@ -142,8 +155,8 @@ class SimlogV1:
         return topic
 
 
-class _Stream(ConflatingQueue):
-    """One Subscribe call, as a feed's listener."""
+class _OutStream(ConflatingQueue):
+    """One Subscribe call of what comes out of a source, as a feed's listener."""
 
     def __init__(self, source: str) -> None:
         super().__init__(QUEUE_BOUND)
@@ -155,6 +168,17 @@ class _Stream(ConflatingQueue):
 
     def lose(self) -> None:
         self.clear()
+
+
+class _InStream(UnbrokenQueue):
+    """One Subscribe call of ``/in``, as an echo's listener."""
+
+    def __init__(self, source: str) -> None:
+        super().__init__(EVENT_BOUND, EVENT_BOUND_BYTES)
+        self.source = source
+
+    def deliver(self, message: bytes) -> None:
+        self.push(message)
 
 
 def encoder(register: Register, layout: Layout) -> Callable[[Picture], bytes | None]:

@@ -3,16 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 import pytest
 
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
-from tests.unit.endpoints.harness import LAYOUT, STALE_NS, WRITABLE
+from tests.unit.endpoints.harness import LAYOUT, SOON_STALE_NS, STALE_NS, TIMEOUT_S, WRITABLE
+
+
+@contextmanager
+def _segment(instance: str, stale_ns: int) -> Iterator[Segment]:
+    block = BlockSpec("cell", LAYOUT, 20_000_000, stale_ns, 1 << 20, Attributes("test", WRITABLE))
+    with Segment.create(instance, [block], [ProcessSpec("cell", "source")]) as segment:
+        yield segment
+        segment.unlink()
 
 
 @pytest.fixture
 def segment(instance: str) -> Iterator[Segment]:
-    block = BlockSpec("cell", LAYOUT, 20_000_000, STALE_NS, 1 << 20, Attributes("test", WRITABLE))
-    with Segment.create(instance, [block], [ProcessSpec("cell", "source")]) as segment:
+    with _segment(instance, STALE_NS) as segment:
         yield segment
-        segment.unlink()
+
+
+@pytest.fixture
+def soon_stale(instance: str) -> Iterator[Segment]:
+    """Of tests about age."""
+    with _segment(instance, SOON_STALE_NS) as segment:
+        yield segment
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No command expires because the host is busy."""
+    monkeypatch.setattr("shmio.segment.commander.TIMEOUT_S", TIMEOUT_S)

@@ -40,8 +40,11 @@ LAYOUT = Layout(
     ),
 )
 WRITABLE = ("axis", "running", "inputs", "step", "bits", "name", "long")
-STALE_NS = 300_000_000
-TIMEOUT_S = 10
+STALE_NS = 60_000_000_000
+"""No source is taken for stale because the host is busy."""
+SOON_STALE_NS = 300_000_000
+TIMEOUT_S = 60
+"""When a test gives up; nothing waits for it to pass."""
 
 
 def image(

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import Awaitable, Callable
 from typing import Any
 
+import grpc
+import pytest
+
 import shmio
-from shmio.segment import CommandSender, Segment, Write
-from tests.unit.endpoints.harness import Endpoint, endpoint, image, listening, value
+from shmio.endpoints.grpc.echo import Picture
+from shmio.segment import CommandSender, EventKind, Record, Segment, Write
+from shmio.segment.events import EVENT_SLOTS
+from tests.unit.endpoints.harness import LAYOUT, TIMEOUT_S, Endpoint, endpoint, image, listening, serve, value
 from tests.unit.endpoints.plant import Plant
 from tests.unit.endpoints.test_publish import message, publish
 
@@ -99,14 +105,143 @@ def test_elements_and_arrays_see_each_others_writes(segment: Segment) -> None:
     with_plant(segment, test)
 
 
+def accept(served: Endpoint, command: int, offset: int, data: bytes, *, item: int = 0) -> None:
+    """Tell of a part of an accepted write, as a source does."""
+    served.writer.event(Record(EventKind.ACCEPTED, "", 7, command, item, 1, offset, 0, len(data), data))
+
+
 def test_a_long_write_is_shown_once_and_whole(segment: Segment) -> None:
-    async def test(served: Endpoint, device: Plant) -> None:
+    async def test(served: Endpoint) -> None:
+        served.publish(image())
         array, element = await joined(served, "cell/long/in", "cell/long/300/in")
         for number in range(1, 21):
-            await publish(served, [message("cell/step", "1"), message("cell/long", str([number] * 600))])
-        assert [await value(array) for _ in range(20)] == [str([n] * 600).replace(" ", "") for n in range(1, 21)]
+            for offset, size in ((26, 256), (282, 256), (538, 88)):
+                accept(served, number, offset, bytes([number]) * size)
+                served.publish(image(step=number))  # in the middle of the write, and without it
+        shown = [await value(array) for _ in range(20)]
+        assert [set(text.strip("[]").split(",")) for text in shown] == [{str(number)} for number in range(1, 21)]
         assert [await value(element) for _ in range(20)] == [str(number) for number in range(1, 21)]
         for stream in (array, element):
+            stream.cancel()
+
+    serve(segment, test)
+
+
+def test_who_joins_in_the_middle_of_a_write_is_shown_the_next_one(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        events = served.feeds["cell"].inlet._cursor
+
+        async def heard() -> bool:
+            return events.behind == 0
+
+        served.publish(image())
+        accept(served, 1, 26, b"\1" * 256)
+        await served.until(heard)
+        (array,) = await joined(served, "cell/long/in")
+        accept(served, 1, 282, b"\1" * 256)
+        accept(served, 1, 538, b"\1" * 88)
+        accept(served, 2, 27, b"\2")
+        accept(served, 3, 12, b"\0\0")
+        assert (await value(array))[:7] == "[0,2,0,"
+        array.cancel()
+
+    serve(segment, test)
+
+
+class Gate:
+    """A listener to ``running`` that holds the thread of the events at its first message."""
+
+    def __init__(self, served: Endpoint) -> None:
+        self._reached, self._open = threading.Event(), threading.Event()
+        self._echo = served.feeds["cell"].inlet.echo
+        self._echo.listen(LAYOUT.registers[2], self._encode, self)
+        served.writer.event(Record(EventKind.ACCEPTED, "", 7, 1, 0, 1, 8, 8, 1, b"\x08"))
+        assert self._reached.wait(TIMEOUT_S)
+
+    def _encode(self, picture: Picture) -> None:
+        self._reached.set()
+        assert self._open.wait(TIMEOUT_S)
+
+    def open(self) -> None:
+        self._open.set()
+        self._echo.leave(LAYOUT.registers[2], self)
+
+    def deliver(self, message: bytes) -> None:
+        raise AssertionError
+
+    def fail(self, reason: str) -> None:
+        pass
+
+
+async def end(stream: Any) -> tuple[list[str], grpc.aio.AioRpcError]:
+    """All that still comes, and how the stream ends."""
+    values: list[str] = []
+    while True:
+        try:
+            values.append(await value(stream))
+        except grpc.aio.AioRpcError as error:
+            return values, error
+
+
+def test_events_that_were_missed_end_the_stream(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        served.publish(image())
+        step, array = await joined(served, "cell/step/in", "cell/long/in")
+        gate = Gate(served)
+        accept(served, 2, 26, b"\1" * 256)  # nobody will hear of it
+        for number in range(2 * EVENT_SLOTS):
+            accept(served, 3, 282, bytes([number % 256]) * 256)
+        gate.open()
+        for stream in (step, array):
+            values, error = await end(stream)
+            assert values == []
+            assert error.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+            assert "events of source cell were missed" in str(error.details())
+        await served.until(lambda: listening(served, 0))
+        (again,) = await joined(served, "cell/long/in")
+        accept(served, 3, 538, b"\1" * 88)  # of the command of which it does not know the first part
+        accept(served, 4, 28, b"\4")
+        accept(served, 5, 12, b"\0\0")
+        assert (await value(again))[:7] == "[0,0,4,"
+        again.cancel()
+
+    serve(segment, test)
+
+
+def test_a_listener_that_is_too_slow_is_told_so(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shmio.endpoints.grpc.simlog_v1.EVENT_BOUND", 8)
+
+    async def test(served: Endpoint) -> None:
+        served.publish(image())
+        slow, other = await joined(served, "cell/step/in", "cell/inputs/in")
+        gate = Gate(served)
+        for number in range(2, 40):
+            accept(served, number, 12, bytes([0, number]))
+        accept(served, 40, 10, b"\5\6")
+        gate.open()  # they reach the loop many at once
+        values, error = await end(slow)
+        assert values == [str(number) for number in range(2, 2 + len(values))]
+        assert error.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+        assert error.details() == "cell/step/in: 8 messages wait to be read: the client is too slow for what is written"
+        assert await value(other) == "[5,6]"
+        assert served.service.counters[1] > 0
+        other.cancel()
+
+    serve(segment, test)
+
+
+def test_a_burst_arrives_whole_and_in_order(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        streams = await joined(served, "cell/step/in", "cell/step/in")
+        block = served.feeds["cell"].block
+        sender, events = CommandSender(block, 7), block.events.cursor()
+        for number in range(400):  # not once is it the event loop's turn meanwhile
+            command = sender.submit([Write(12, 0, number.to_bytes(2, "big"))], FAR_NS)
+            while (event := events.next(TIMEOUT_S)) is not None and event.command != command:
+                pass
+            assert event is not None
+        for stream in streams:
+            assert [await value(stream) for _ in range(400)] == [str(number) for number in range(400)]
             stream.cancel()
 
     with_plant(segment, test)

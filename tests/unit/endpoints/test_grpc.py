@@ -13,13 +13,23 @@ from grpc_health.v1 import health_pb2
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from shmio.config import Address, Tls
-from shmio.endpoints.grpc.queue import ConflatingQueue
+from shmio.endpoints.grpc.queue import ConflatingQueue, UnbrokenQueue
 from shmio.endpoints.grpc.server import Server
 from shmio.errors import ConfigError, EndpointError
 from shmio.segment import Quality, Segment
 from shmio.wire import simlog_v1_pb2 as wire
 from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
-from tests.unit.endpoints.harness import LAYOUT, STALE_NS, TIMEOUT_S, Endpoint, code, image, listening, serve, value
+from tests.unit.endpoints.harness import (
+    LAYOUT,
+    SOON_STALE_NS,
+    TIMEOUT_S,
+    Endpoint,
+    code,
+    image,
+    listening,
+    serve,
+    value,
+)
 
 
 @pytest.mark.parametrize(
@@ -131,42 +141,60 @@ def test_a_subscriber_of_a_bad_source_waits_for_it(segment: Segment) -> None:
     serve(segment, test)
 
 
-def test_health_follows_quality_and_age(segment: Segment) -> None:
+def test_health_follows_quality_and_age(soon_stale: Segment) -> None:
     async def test(served: Endpoint) -> None:
         serving, not_serving = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
 
-        async def is_now(status: int) -> bool:
+        async def is_now(status: int, quality: Quality | None = None) -> bool:
+            if quality is not None:
+                served.publish(image(), quality)
             return await served.health("source.cell") == status
 
         assert await served.health("") == serving
         assert await served.health("simulation.server.SimlogAPI") == serving
         assert await served.health("source.cell") == not_serving
-        served.publish(image())
-        await served.until(lambda: is_now(serving))
-        served.publish(image(), Quality.BAD)
-        await served.until(lambda: is_now(not_serving))
-        served.publish(image())
-        await served.until(lambda: is_now(serving))
+        await served.until(lambda: is_now(serving, Quality.GOOD))
+        await served.until(lambda: is_now(not_serving, Quality.BAD))
+        await served.until(lambda: is_now(serving, Quality.GOOD))
         await served.until(lambda: is_now(not_serving))  # no frame for longer than stale_ns
 
-    serve(segment, test)
+    serve(soon_stale, test)
 
 
-def test_a_value_that_went_stale_is_sent_again_when_frames_come_again(segment: Segment) -> None:
+def test_a_value_that_went_stale_is_sent_again_when_frames_come_again(soon_stale: Segment) -> None:
     async def test(served: Endpoint) -> None:
-        served.publish(image(step=5))
+        serving, not_serving = health_pb2.HealthCheckResponse.SERVING, health_pb2.HealthCheckResponse.NOT_SERVING
         stream = served.subscribe("cell/step")
-        assert await value(stream) == "5"
+
+        async def good() -> bool:
+            served.publish(image(step=5))
+            return await served.health("source.cell") == serving
 
         async def stale() -> bool:
-            return await served.health("source.cell") == health_pb2.HealthCheckResponse.NOT_SERVING
+            return await served.health("source.cell") == not_serving
 
-        await served.until(stale)
-        served.publish(image(step=5))
-        assert await value(stream) == "5"
+        async def sent(count: int) -> bool:
+            served.publish(image(step=5))
+            await asyncio.sleep(0)
+            return len(got) >= count
+
+        async def read() -> None:
+            while True:
+                got.append(await value(stream))
+
+        got: list[str] = []
+        reading = asyncio.ensure_future(read())
+        await served.until(lambda: sent(1))
+        for _ in range(3):
+            await served.until(good)
+            await served.until(stale)
+            before = len(got)
+            await served.until(lambda seen=before: sent(seen + 1))  # type: ignore[misc]
+        assert set(got) == {"5"}
+        reading.cancel()
         stream.cancel()
 
-    serve(segment, test)
+    serve(soon_stale, test)
 
 
 def test_what_is_not_built_yet_says_so(segment: Segment) -> None:
@@ -268,6 +296,30 @@ def test_a_slow_reader_gets_the_newest_value_and_the_loss_is_counted() -> None:
     asyncio.run(test())
 
 
+def test_events_wait_all_or_the_queue_ends() -> None:
+    async def test() -> None:
+        waiting = UnbrokenQueue(bound=3, bound_bytes=10)
+        for text in (b"much longer than that", b""):
+            waiting.push(text)
+            assert await waiting.pop() == text
+        for number in range(3):
+            waiting.push(bytes([number]))
+        assert [await waiting.pop() for _ in range(3)] == [b"\x00", b"\x01", b"\x02"]
+        assert (waiting.failure, waiting.dropped) == ("", 0)
+        waiting.push(b"123456")
+        waiting.push(b"12345")
+        assert await waiting.pop() is None
+        assert waiting.failure.startswith("1 messages wait to be read")
+        assert waiting.dropped == 2
+        many = UnbrokenQueue(bound=3, bound_bytes=10)
+        for _ in range(5):
+            many.push(b"")
+        assert await many.pop() is None
+        assert many.dropped == 5
+
+    asyncio.run(test())
+
+
 class Recorder:
     """A listener that keeps what it gets."""
 
@@ -283,14 +335,14 @@ class Recorder:
         self.lost += 1
 
 
-def test_who_joins_while_the_source_stalls_gets_the_value_of_a_register_that_never_changes(segment: Segment) -> None:
+def test_who_joins_while_the_source_stalls_gets_the_value_of_a_register_that_never_changes(soon_stale: Segment) -> None:
     async def test(served: Endpoint) -> None:
         step = LAYOUT.registers[4]
         feed = served.feeds["cell"]
         served.publish(image(step=7))
         frame = feed.block.latest()
         assert frame is not None
-        while not frame.age_ns() > STALE_NS:  # noqa: ASYNC110  age is what is waited for
+        while not frame.age_ns() > SOON_STALE_NS:  # noqa: ASYNC110  age is what is waited for
             await asyncio.sleep(0.01)
         late = Recorder()
         feed.listen(step, lambda f: f.image[12:14], late)
@@ -304,7 +356,7 @@ def test_who_joins_while_the_source_stalls_gets_the_value_of_a_register_that_nev
         assert set(late.got) == {b"\0\x07"}
         feed.leave(step, late)
 
-    serve(segment, test)
+    serve(soon_stale, test)
 
 
 def test_what_waits_is_dropped_when_the_source_turns_bad(segment: Segment) -> None:

@@ -1,0 +1,52 @@
+"""The feeds of an instance that is reloaded."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import weakref
+
+from shmio.endpoints.grpc.feeds import Feeds
+from shmio.segment import Attributes, BlockSpec, Segment
+from tests.unit.endpoints.harness import LAYOUT, STALE_NS, TIMEOUT_S, WRITABLE, WRITER, image
+from tests.unit.endpoints.test_grpc import Recorder
+
+
+def test_what_a_reload_ended_is_forgotten_when_its_streams_are_gone(segment: Segment, instance: str) -> None:
+    step = LAYOUT.registers[4]
+
+    async def run(opened: Segment) -> None:
+        feeds = Feeds(opened, WRITER, asyncio.get_running_loop(), lambda source, good: None)
+        feeds.start()
+        old = feeds["cell"]
+        stream = Recorder()
+        old.listen(step, lambda frame: frame.image[12:14], stream)
+        segment.writer("cell").publish(image(step=1), cycle=1)
+        async with asyncio.timeout(TIMEOUT_S):
+            while not feeds.messages:  # noqa: ASYNC110  another thread's doing
+                await asyncio.sleep(0)
+        counted = feeds.messages
+        spec = BlockSpec("cell", LAYOUT, 10_000_000, STALE_NS, 1 << 20, Attributes("test", WRITABLE))
+        segment.change(retire=["cell"], add=[spec])
+        async with asyncio.timeout(TIMEOUT_S):
+            while feeds["cell"] is old:
+                feeds.follow()
+                await asyncio.sleep(0)
+        old.join()
+        feeds.follow()
+        assert old in feeds._ended  # a stream has not gone over yet
+        old.leave(step, stream)
+        gone = weakref.ref(old)
+        del old
+        async with asyncio.timeout(TIMEOUT_S):
+            while gone() is not None:
+                feeds.follow()
+                await asyncio.sleep(0)
+                gc.collect()
+        assert feeds.messages == counted
+        assert feeds.alive
+        feeds.stop()
+        feeds.join()
+
+    with Segment.open(instance, writable=True) as opened:
+        asyncio.run(run(opened))
