@@ -25,7 +25,8 @@ def test_systemd_finds_no_fault(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("result", "cleared"), [("success", True), ("timeout", True), ("signal", False), ("watchdog", False)]
+    ("result", "cleared"),
+    [("success", True), ("timeout", True), ("signal", False), ("watchdog", False), ("oom-kill", False)],
 )
 def test_only_a_stop_clears_what_is_left(result: str, cleared: bool) -> None:
     """After a crash the processes live on, for the restart to take over."""
@@ -39,3 +40,8 @@ def test_only_a_stop_clears_what_is_left(result: str, cleared: bool) -> None:
         check=True,
     )
     assert ran.stdout == ("down -c /etc/shmio/a50/supervisor.toml\n" if cleared else "")
+
+
+def test_out_of_memory_costs_one_process() -> None:
+    """By systemd's own default the whole service would be stopped."""
+    assert "OOMPolicy=continue" in UNIT.read_text().splitlines()
