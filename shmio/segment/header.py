@@ -17,7 +17,7 @@ ABI_VERSION: Final = 1
 HEADER_SIZE: Final = 4096
 SECTION_SIZE: Final = 128
 SLOT_SIZE: Final = 1024
-MAX_SECTIONS: Final = 1024
+MAX_SECTIONS: Final = 2048
 MAX_PROCESSES: Final = 256
 
 # Offsets of what changes while the segment lives.

@@ -10,6 +10,7 @@ import pytest
 from shmio.config import Config, Emulator, Grpc, Instance, Recorder, Source
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout, Register
+from shmio.segment import Segment
 from shmio.supervisor.plan import MAX_PROCESSES, MODULES, RANKS, make_plan
 
 LAYOUT = Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
@@ -65,6 +66,15 @@ def test_log_mode_records_and_serves_nothing(tmp_path: Path) -> None:
         "buffer_mb": 16,
         "config_file": str(tmp_path / "s.toml"),
     }
+
+
+def test_as_many_sources_as_there_can_be_processes_fit_in_a_segment(tmp_path: Path, instance: str) -> None:
+    count = MAX_PROCESSES - 2
+    layouts = {f"cell{i}": LAYOUT for i in range(count)} | {"plc": LAYOUT}
+    plan = make_plan(config(tmp_path, count), layouts, config_file=tmp_path / "s.toml")
+    with Segment.create(instance, plan.blocks, plan.processes) as segment:
+        segment.unlink()
+        assert len(segment.blocks) == count
 
 
 def test_too_many_processes_are_refused(tmp_path: Path) -> None:
