@@ -183,15 +183,22 @@ class Segment:
     def change(self, add: Sequence[BlockSpec] = (), retire: Sequence[str] = ()) -> None:
         """Add blocks and end others, which readers see in this order; the supervisor's alone.
 
-        A name in both gets a new block in place of the old. Nothing has changed after SegmentError: no room in shared
-        memory or in the section table.
+        A name in both gets a new block in place of the old. SegmentError: no room, and nothing has changed.
         """
         at = self.reserve(add)
-        entries = self._sections()
-        memory = memoryview(self.shared.map())
-        ending = [self.blocks[name] for name in retire]
-        indices = [i for i, entry in enumerate(entries) if not entry.retired and entry.name in retire]
-        header.change_sections(memory, self.header, write_blocks(memory, at, len(entries), add), indices)
+        first = len(self._sections())  # which maps what has been added, too
+        self._change(write_blocks(self.memory, at, first, add), [self.blocks[name] for name in retire])
+
+    def end_replaced(self) -> None:
+        """End what a supervisor that died within :meth:`change` has replaced and not ended; its successor's alone."""
+        replaced = [block for block in self._known.values() if block not in self.blocks.values()]
+        self._change((), replaced)  # even if there is none: the generation may not have been told
+
+    def _change(self, add: Sequence[SectionEntry], ending: Sequence[Block]) -> None:
+        layouts = {block.section for block in ending}
+        parts = enumerate(self._sections())
+        indices = [i for i, part in parts if (i if part.kind == SectionKind.LAYOUT else part.layout) in layouts]
+        header.change_sections(self.memory, self.header, add, indices)
         self.refresh()
         for block in ending:  # who waits there is to look
             block.ring.wake()

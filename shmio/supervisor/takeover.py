@@ -41,6 +41,7 @@ def take_over(plan: Plan, control: str, limits: Limits) -> tuple[Found | None, l
             if segment.header.control != control:
                 remove_socket(segment.header.control)
             segment.lead_to(control)
+            segment.end_replaced()
             return Found(segment, children), [*done, *lines]
         done += leftover.clear_claimed(shared, plan.instance)
     except BaseException:

@@ -11,7 +11,7 @@ import pytest
 import shmio
 from shmio.errors import NotRunningError, PathError, SegmentError
 from shmio.layout.model import Layout, Register
-from shmio.segment import BlockSpec, ProcessSpec, Quality, Segment, shm
+from shmio.segment import BlockSpec, ProcessSpec, Quality, Segment, header, shm
 from shmio.segment.view import View
 
 OLD = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))
@@ -75,6 +75,33 @@ def test_who_waits_on_an_ended_block_is_woken_and_told(segment: Segment) -> None
         assert "source 'press' was removed" in str(problems[0])
         with pytest.raises(PathError, match="no source 'press'"):
             reader.block("press")
+
+
+def test_a_change_cut_off_by_the_supervisors_death_is_completed(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = header._set_table_state
+
+    def die(memory: memoryview, generation: int, count: int) -> None:
+        whole(memory, generation, count)
+        raise SystemExit
+
+    with shmio.attach(segment.instance) as reader:
+        held, other = reader.block("cell"), reader.block("press")
+        waiter = threading.Thread(target=held.cursor().next)
+        waiter.start()
+        with monkeypatch.context() as patched:
+            patched.setattr(header, "_set_table_state", die)
+            with pytest.raises(SystemExit):
+                segment.change(add=[spec("cell", NEW)], retire=["cell"])
+        assert not held.retired, "the new block is there, and the old one has not been ended"
+        with Segment.open(segment.instance, writable=True) as successor:
+            successor.end_replaced()
+            assert successor.blocks["cell"].layout == NEW
+        waiter.join(20)
+        assert not waiter.is_alive()
+        assert (held.retired, other.retired, reader.block("cell").retired) == (True, False, False)
+        assert reader.block("cell").layout == NEW
 
 
 def test_a_held_block_says_that_it_is_over_and_keeps_its_last_frame(segment: Segment) -> None:
