@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from shmio.segment import Segment
+from shmio.supervisor import policy
 from shmio.supervisor.fleet import Fleet
 from shmio.supervisor.plan import Job, Plan
 from shmio.supervisor.reconcile import reconcile
@@ -51,12 +52,11 @@ class Change:
         return life.starts > 0 and life.state in SETTLED
 
     def _stop(self) -> bool:
-        """Have all end that must; whether they have."""
+        """Have all end that must, rank by rank, so that a recorder has the last of a source; whether they have."""
         leaving = [self._fleet.named(name) for name in self._leaving]
-        for managed in leaving:
-            if managed.life.state not in (State.STOPPED, State.STOPPING):
-                self._fleet.apply(managed, Event.STOP)
-        return all(managed.life.state is State.STOPPED for managed in leaving)
+        for index in policy.to_stop([(managed.rank, managed.life) for managed in leaving]):
+            self._fleet.apply(leaving[index], Event.STOP)
+        return policy.all_gone([(managed.rank, managed.life) for managed in leaving])
 
     def _turn(self) -> None:
         """Between the old and the new."""
