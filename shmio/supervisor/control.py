@@ -41,9 +41,8 @@ TURN_S: Final = 0.5
 _CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
 
-class _Request(msgspec.Struct, tag_field="do", forbid_unknown_fields=True, kw_only=True):
-    until_ns: int | None = None
-    """CLOCK_MONOTONIC at which the client gives up: from then on it is not carried out."""
+class _Request(msgspec.Struct, tag_field="do", forbid_unknown_fields=True):
+    """What all requests have in common."""
 
 
 class Stop(_Request, tag="stop"):
@@ -153,9 +152,6 @@ class ControlServer:
             if _hung_up(client):  # it gave up while the supervisor was held up, and said so to its user
                 self._drop(client)
                 return
-            if request.until_ns is not None and time.monotonic_ns() >= request.until_ns:
-                self.answer(client, {"error": "the request came too late and is not carried out"})
-                return
             self._handle(request, Answer(self, client))
 
     def answer(self, client: socket.socket, message: dict[str, object]) -> None:
@@ -207,8 +203,7 @@ def request(
         try:
             client.settimeout(timeout_s)
             client.connect(path)
-            timed = msgspec.structs.replace(message, until_ns=round(deadline * 1e9))
-            client.sendall(msgspec.json.encode(timed) + b"\n")
+            client.sendall(msgspec.json.encode(message) + b"\n")
             while not received.endswith(b"\n"):
                 data = _wait(client, deadline, lost)
                 if not data or len(received) > MAX_ANSWER_BYTES:
