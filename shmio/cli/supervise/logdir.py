@@ -18,7 +18,8 @@ def held(folder: Path, instance: str) -> Iterator[None]:
     """Hold a folder, which is made, as long as the supervisor lives; ConfigError when another instance has it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        fd = os.open(folder / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        # It is truncated: not what a link put there by somebody leads to.
+        fd = os.open(folder / LOCK_NAME, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
     except OSError as error:
         raise ConfigError(f"instance.log_dir: cannot write {folder / LOCK_NAME}: {error.strerror}") from None
     with os.fdopen(fd, "r+", encoding="utf-8", errors="replace") as file:

@@ -23,3 +23,11 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     (tmp_path / "logs").touch()
     with pytest.raises(ConfigError, match=r"instance\.log_dir: cannot write .*logs"), held(tmp_path / "logs", "a50"):
         pass
+
+
+def test_what_a_link_leads_to_is_not_touched(tmp_path: Path) -> None:
+    (tmp_path / "precious").write_text("as it was")
+    (tmp_path / LOCK_NAME).symlink_to("precious")
+    with pytest.raises(ConfigError, match=r"instance\.log_dir: cannot write"), held(tmp_path, "a50"):
+        pass
+    assert (tmp_path / "precious").read_text() == "as it was"
