@@ -63,6 +63,8 @@ def read_tables(file: Path) -> dict[str, Any]:
         raise ConfigError(f"{file}: not UTF-8 at byte {error.start}") from None
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise ConfigError(f"{file}: not TOML: {error}") from None
+    except ValueError:  # more digits than int() takes
+        raise ConfigError(f"{file}: a number in it has too many digits") from None
 
 
 def _resolve(tables: dict[str, Any], folder: Path) -> Config:

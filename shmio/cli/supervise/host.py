@@ -34,7 +34,10 @@ def _check_group(name: str | None) -> None:
 
 def _check_folder(key: str, folder: Path) -> None:
     """Whether it is there, or can be made, and can be written."""
-    place = next(path for path in (folder, *folder.parents) if path.exists())
+    try:
+        place = next(path for path in (folder, *folder.parents) if path.exists())
+    except OSError as error:  # a name too long, a folder above that cannot be searched
+        raise ConfigError(f"{key}: {folder}: {error.strerror}") from None
     if not place.is_dir():
         raise ConfigError(f"{key}: {place} is no folder")
     if not os.access(place, os.W_OK | os.X_OK):

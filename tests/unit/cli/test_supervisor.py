@@ -195,6 +195,7 @@ def test_check_tells_what_the_instance_takes(example: Edit, instance: str, capsy
         ('name = "a50"', 'name = "a50"\nlog_dir = "db201.db"', "instance.log_dir: "),
         ('name = "a50"', 'name = "a50"\nlog_dir = "db201.db/logs"', "instance.log_dir: "),
         ('directory = "dumps"', 'directory = "db201.db"', "recorder.directory: "),
+        ('directory = "dumps"', f'directory = "{"x" * 300}"', "recorder.directory: "),
         ("[grpc]", '[grpc]\ntls = {certificate = "db201.db", key = "k"}', "grpc.tls.key: "),
         ("[grpc]", '[grpc]\ntls = {certificate = "db201.db", key = "db201.db"}', "grpc.tls.certificate: "),
         ('connector = "s7"', 'connector = "s8"', "source[0].connector: no connector 's8'; there are:"),
