@@ -195,10 +195,10 @@ def _maps(pid: int, inode: int, right: str = "") -> bool:
     return False
 
 
-def end(workers: Iterable[Worker], signals: Iterable[signal.Signals] = (signal.SIGTERM, signal.SIGKILL)) -> None:
-    """Have processes end, by one signal after the other; returns when they have, or after ``GRACE_S`` for each."""
+def end(workers: Iterable[Worker]) -> None:
+    """Have processes end, by SIGTERM, then SIGKILL; returns when they have, or after ``GRACE_S`` for each signal."""
     alive = {worker.pidfd for worker in workers}
-    for sign in signals:
+    for sign in (signal.SIGTERM, signal.SIGKILL):
         alive -= _ended(alive, 0)
         for fd in alive:
             with suppress(ProcessLookupError):

@@ -7,10 +7,10 @@ import selectors
 import signal
 import time
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from contextlib import suppress
 from typing import Final
 
-from shmio.segment import Phase, ProcessSpec, Segment, Supervised, leftover
+from shmio.segment import ProcessSpec, Segment, Supervised, leftover
 from shmio.supervisor import policy
 from shmio.supervisor.managed import Managed, log, log_step
 from shmio.supervisor.plan import Job
@@ -109,15 +109,19 @@ class Fleet:
     def _evict(self, managed: Managed) -> None:
         """Kill a process that holds the role and is not ours.
 
-        A dead supervisor had started it in its last moment, and it was not there yet when all was taken over.
+        A dead supervisor had started it in its last moment, and it was not there yet when all was taken over. Its end
+        is not waited for: the loop has others to look after.
         """
-        if managed.child is None or managed.slot.report.pid in (0, managed.child.pid):
+        pid = managed.slot.report.pid
+        if managed.child is None or pid in (0, managed.child.pid, managed.evicted_pid):
             return
         worker = leftover.holder(managed.slot, self._segment.shared)
         if worker is not None:
             log.warning("%s is held by pid %d, which no supervisor knows: killed", managed.name, worker.pid)
-            leftover.end([worker], [signal.SIGKILL])
+            with suppress(ProcessLookupError):
+                signal.pidfd_send_signal(worker.pidfd, signal.SIGKILL)
             os.close(worker.pidfd)
+            managed.evicted_pid = pid
 
     def apply(self, managed: Managed, event: Event, note: str = "") -> None:
         """Let something happen to a process, and do what follows from it."""
@@ -162,12 +166,3 @@ class Fleet:
     def _publish(self, managed: Managed) -> None:
         life = managed.life
         managed.slot.supervised = Supervised(PHASES[life.state], life.restarts, life.spawned_ns, life.note)
-
-    def kill_all(self) -> None:
-        """Leave no process behind, should the loop itself have failed; after a stop there is none."""
-        for managed in self:
-            if managed.child is not None:
-                managed.child.kill()
-                managed.child.reap()
-                managed.life = replace(managed.life, state=State.STOPPED)
-                managed.slot.supervised = Supervised(Phase.STOPPED)

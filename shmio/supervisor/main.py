@@ -18,7 +18,7 @@ from shmio.supervisor import policy
 from shmio.supervisor.change import Change
 from shmio.supervisor.control import Answer, ControlServer, Reload, Request, Restart, Stop
 from shmio.supervisor.fleet import TICK_S, Fleet
-from shmio.supervisor.managed import log
+from shmio.supervisor.managed import brief, log
 from shmio.supervisor.notify import Notifier
 from shmio.supervisor.plan import MODULES, Plan
 from shmio.supervisor.policy import Limits
@@ -77,7 +77,8 @@ class Supervisor:
         """Start everything, or take over what a dead supervisor left; watch it; return when all is stopped as asked.
 
         AlreadyRunningError: another supervisor has the instance. SegmentError, ControlError: no room for the segment,
-        no place for the socket. ShmioError: a process could not be started, or the segment was removed; all is stopped.
+        no place for the socket. ShmioError: a process could not be started, or the segment was removed, and all is
+        stopped; or the supervisor itself failed, and left what runs to the next one, as a killed one does.
         """
         with ExitStack() as stack:
             stack.callback(self._selector.close)
@@ -87,8 +88,9 @@ class Supervisor:
             for line in self.history:
                 log.warning("%s", line)
             self._segment = stack.enter_context(found.segment if found else self._create(path))
+            fresh = stack.enter_context(ExitStack())  # undone by a failure before anything runs
             if not found:
-                stack.callback(self._segment.unlink)
+                fresh.callback(self._segment.unlink)
             self._control = ControlServer(path, self._selector, self._handle)
             stack.callback(self._control.close)
             self._fleet = Fleet(self._segment, self._selector, self._limits, self._modules)
@@ -96,15 +98,12 @@ class Supervisor:
                 for slot, child in found.children:
                     self._fleet.adopt(self._fleet.named(slot.name), child)
                 self._change = Change(self._fleet, self._segment, self._plan)
-                stack.callback(self._segment.unlink)
             else:
                 for job in self._plan.jobs:
                     self._fleet.assign(job)
-            stack.callback(self._fleet.kill_all)
             log.info("supervising", extra=fields(instance=self._plan.instance, segment=self._segment.shared.name))
-            while not self._tick():
-                for key, _ in self._selector.select(self._pause_s()):
-                    key.data()
+            fresh.pop_all()
+            self._loop()
             self._segment.set_state(os.getpid(), InstanceState.STOPPED)
             self._control.retire()
             self._segment.unlink()  # before the answers: who asked may start the instance again at once
@@ -113,6 +112,16 @@ class Supervisor:
             log.info("stopped")
         if self._failure is not None:
             raise ShmioError(self._failure)
+
+    def _loop(self) -> None:
+        try:
+            while not self._tick():
+                for key, _ in self._selector.select(self._pause_s()):
+                    key.data()
+        except Exception as error:  # noqa: BLE001 - the last place to tell of it
+            log.exception("the supervisor failed; what runs goes on")
+            why = f"the supervisor failed: {brief(error)}"
+            raise ShmioError(f"{why}; its processes go on, and shmio-supervisor up takes them over") from None
 
     def _create(self, path: str) -> Segment:
         plan = self._plan
@@ -183,10 +192,12 @@ class Supervisor:
             if reason := refusal(plan, self._plan):
                 raise ShmioError(f"{plan.config_file}: {reason}")
             self._change = Change(self._fleet, self._segment, plan)
-        except ShmioError as error:
-            log.error("nothing is changed: %s", error)
+        except Exception as error:  # noqa: BLE001 - whatever a connector's own check raises, what runs goes on
+            expected = isinstance(error, ShmioError)
+            reason = str(error) if expected else f"the reload failed: {brief(error)}"
+            log.error("nothing is changed: %s", reason, exc_info=not expected)
             self._notifier.ready()
-            answer.error(str(error))
+            answer.error(reason)
             return
         self._plan, self._change_answer, self._read_ns = plan, answer, read_ns
 

@@ -24,6 +24,8 @@ class Managed:
         self.life = Life()
         self.child: Child | Adopted | None = None
         self.waiting: list[Answer] = []
+        self.evicted_pid = 0
+        """The process last killed for holding the role of this one."""
         self._job: Job | None = None
         self._beat_ns = 0
         self._quiet_ns = 0
@@ -115,3 +117,8 @@ def log_step(managed: Managed, before: Life, action: Action | None, limits: Limi
         log.info("%s stopped", name)
     elif action is Action.KILL and before.state is life.state:
         log.warning("%s does not stop: killed", name)
+
+
+def brief(error: Exception) -> str:
+    """An error that nobody expected, in one line; its traceback is for the log."""
+    return " ".join(f"{type(error).__name__}: {error}".split())[:300]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -61,8 +62,7 @@ modules = dict.fromkeys(("source", "emulator", "grpc"), "fake_worker")
 
 
 def tell(state: State) -> None:
-    sys.stdout.write(f"{state}\n")
-    sys.stdout.flush()
+    os.write(1, f"{state}\n".encode())
 
 
 try:

@@ -177,6 +177,27 @@ def test_a_killed_supervisor_leaves_the_processes_and_the_next_one_takes_over(la
     assert successor.stop() == 0
 
 
+def test_a_supervisor_that_fails_leaves_all_to_the_next_one(launch: Launch) -> None:
+    """Whatever the reason; here it tells its state to somebody who has gone."""
+    cell = launch([*CELL, ("press", "source", ["good", "unfit"])])
+    cell.wait_state("running")
+    before = cell.pids()
+    assert cell.process.stdout is not None
+    cell.process.stdout.close()
+    os.kill(cell.pid("press"), signal.SIGKILL)
+    assert cell.wait_end() == 1
+    assert cell.errors() == (
+        "the supervisor failed: BrokenPipeError: [Errno 32] Broken pipe; its processes go on, and shmio-supervisor up "
+        "takes them over\n"
+    )
+    assert "Traceback" in cell.log()
+    successor = launch()
+    successor.wait_state("running")
+    before.pop("press")
+    assert successor.pids() == before
+    assert successor.stop() == 0
+
+
 def test_a_process_that_no_supervisor_knows_loses_its_role(launch: Launch) -> None:
     """As one that a supervisor started in the last moment before its death."""
     cell = launch([("plc", "emulator", ["good", "crash", "good"])], backoff_first_s=2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from pathlib import Path
@@ -122,6 +123,33 @@ def test_a_wrong_configuration_changes_nothing(launch: Launch) -> None:
             cell.request(Reload())
         assert segment.generation == generation
     assert cell.pids() == before
+
+
+def test_a_reload_that_fails_by_a_fault_changes_nothing(launch: Launch) -> None:
+    """As of a connector that is not ours."""
+    cell = launch()
+    cell.wait_state("running")
+    before = cell.pids()
+    (cell.folder / "plan.json").write_text("{}")
+    with pytest.raises(ControlError, match=r"^the reload failed: KeyError: 'jobs'$"):
+        cell.request(Reload())
+    assert "Traceback" in cell.log()
+    assert cell.pids() == before
+    assert cell.reload(CELL)["done"] == []
+
+
+def test_what_goes_is_stopped_in_the_order_of_a_stop(launch: Launch) -> None:
+    cell = launch([*CELL, ("press", "source", ["stubborn"])], grace_s=3600)
+    cell.wait_state("running")
+    press = cell.pid("press")
+    reloading = threading.Thread(target=cell.reload, args=(CELL[1:],))
+    reloading.start()
+    until(lambda: cell.of("press").note == "stopping")
+    plc = cell.of("plc")
+    assert (plc.state, plc.note) == ("running", ""), "an emulator, or a recorder, outlives the sources"
+    os.kill(press, signal.SIGKILL)
+    reloading.join()
+    assert list(cell.pids()) == ["cell", "grpc"]
 
 
 @pytest.mark.parametrize(
