@@ -112,6 +112,12 @@ def test_an_error_in_the_configuration_changes_nothing(cell: Cell) -> None:
     (line,) = done.stderr.splitlines()
     assert "period_ms" in line
     edit(cell, "period_ms = -1", "period_ms = 20")
+    edit(cell, "[grpc]", f'[recorder]\ndirectory = "{"x" * 300}"\n\n[grpc]')
+    done = cell.supervisor("reload")
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert "recorder.directory: " in done.stderr
+    assert "File name too long" in done.stderr
+    edit(cell, f'[recorder]\ndirectory = "{"x" * 300}"\n\n[grpc]', "[grpc]")
     edit(cell, "[instance]", '[instance]\nlog_dir = "elsewhere"')
     done = cell.supervisor("reload")
     assert done.returncode == 1
