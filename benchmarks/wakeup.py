@@ -57,6 +57,7 @@ class Way:
 
 def follow(waiters: dict[str, Callable[[], Wait]], orders: Connection, arrivals: MutableSequence[int], at: int) -> None:
     """A reader: waits as often as it is told, in the way it is told, and notes when it returned."""
+    orders.send("here")
     while (order := orders.recv()) is not None:
         name, times = order
         wait = waiters[name]()
@@ -89,6 +90,8 @@ class Readers:
     def __init__(self, orders: Sequence[Connection], arrivals: MutableSequence[int]) -> None:
         self._orders = orders
         self._arrivals = arrivals
+        for reader in orders:  # nobody may still be starting while others are timed
+            assert reader.recv() == "here"
 
     def measure(self, way: Way, count: int, rounds: int, rest_s: float) -> tuple[list[float], list[float]]:
         """(the writer's call, until the last of ``count`` readers is back), in µs, for each round."""
