@@ -22,13 +22,13 @@ def run(worker: Worker) -> None:
     """Record until told to stop."""
     settings = msgspec.convert({k: v for k, v in worker.config.items() if k != "config_file"}, Settings)
     directory, segment = Path(settings.directory), worker.segment
-    known = places(directory, segment, BY)
+    worker.running()  # its search for what its predecessor has may take a while
+    known = places(directory, segment, BY, worker.slot.beat)
     path, fd = create(directory, segment.instance)
     output = Output(path, fd, limit_bytes=settings.buffer_bytes, fsync_s=settings.fsync_s)
     files = ConfigFiles(Path(worker.config["config_file"]))
     recorder = Recorder(segment, output, by=BY, start=Start(known), attachments=files)
     worker.log.info("recording to %s%s", path, ", going on where its predecessor ended" if known else "")
-    worker.running()
     _record(worker, recorder)
     if not recorder.close():
         worker.log.error("%s; it was not closed", output.problem or path)

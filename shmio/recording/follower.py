@@ -54,6 +54,7 @@ class Follower:
         """
         self.block = block
         self.number = number
+        self.begin = place
         self.done = False
         self._log_time = log_time
         self._log_ns = place.log_ns

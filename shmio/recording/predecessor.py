@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
@@ -22,16 +24,16 @@ MAX_FILES: Final = 256
 log = logging.getLogger("shmio.recorder")
 
 
-def places(directory: Path, segment: Segment, by: str) -> dict[str, Place]:
+def places(directory: Path, segment: Segment, by: str, beat: Callable[[], object] = lambda: None) -> dict[str, Place]:
     """For each source the last frame and event that recorders of this kind (``by``) have of this run of the instance.
 
-    Sources that were not recorded, or had another layout then, are left out.
+    Sources that were not recorded, or had another block then, are left out. ``beat`` is called now and then.
     """
     found: dict[str, Place] = {}
     for file in _of_this_run(directory, segment, by):
         try:
             with Reader(file) as reader:
-                found = _places(reader, segment.blocks) | found
+                found = _places(reader, segment.blocks, beat) | found
         except (OSError, RecordingError) as error:
             log.warning("it is not known where the recording before ended: %s", error)
             continue
@@ -44,7 +46,9 @@ def _of_this_run(directory: Path, segment: Segment, by: str) -> list[Path]:
     """The recordings of this run, the newest first; not by name, for the host's clock may go back."""
     run = {"instance": segment.instance, "epoch": f"{segment.header.epoch:016x}", "recorder": by}
     found: list[tuple[int, Path]] = []
-    for file in sorted(directory.glob(f"{segment.instance}-*{SUFFIX}"), reverse=True)[:MAX_FILES]:
+    name = re.compile(rf"{re.escape(segment.instance)}-\d{{8}}T\d{{6}}Z(_\d+)?{re.escape(SUFFIX)}")  # not of a50-test
+    files = [file for file in directory.glob(f"{segment.instance}-*{SUFFIX}") if name.fullmatch(file.name)]
+    for file in sorted(files, reverse=True)[:MAX_FILES]:
         try:
             with Reader(file) as reader:
                 about = _about(reader)
@@ -65,24 +69,27 @@ def _about(reader: Reader) -> dict[str, str]:
     return reader.about
 
 
-def _places(reader: Reader, blocks: dict[str, Block]) -> dict[str, Place]:
-    found = survey(reader)
-    last: dict[str, dict[str, tuple[int, int]]] = {}  # by source and encoding: number, log time; the last block's
-    for track in found.tracks.values():
-        channel = track.channel
+def _places(reader: Reader, blocks: dict[str, Block], beat: Callable[[], object]) -> dict[str, Place]:
+    found = survey(reader, beat)
+    frames: dict[str, tuple[int, int]] = {}  # by source: number, log time
+    events: dict[str, tuple[int, int]] = {}
+    for channel in reader.channels.values():
         block = blocks.get(channel.source)
-        if channel.encoding not in (FRAME, EVENT) or block is None or block.layout.hash.hex() != channel.layout:
+        # The section, for a block that a reload has made anew counts from 1 again.
+        if block is None or channel.section != block.section or channel.encoding not in (FRAME, EVENT):
             continue
         what = "frames" if channel.encoding == FRAME else "events"
-        missed_to = found.missed_to.get((channel.source, channel.block, what), 0)
-        number = max(track.numbers(reader)[1], missed_to)
-        if number <= (block.ring.head() if what == "frames" else block.events.head()):
-            last.setdefault(channel.source, {})[what] = number, track.last_ns
+        track = found.tracks.get(channel.number)
+        number = track.numbers(reader)[1] if track else channel.after
+        number = max(number, found.missed_to.get((channel.source, channel.block, what), 0))
+        (frames if channel.encoding == FRAME else events)[channel.source] = number, track.last_ns if track else 0
+    places = {
+        source: Place(number, events[source][0], max(log_ns, events[source][1]))
+        for source, (number, log_ns) in frames.items()
+        if source in events
+    }
     return {
-        source: Place(
-            sides.get("frames", (0, 0))[0],
-            sides.get("events", (0, 0))[0],
-            max(log_ns for _, log_ns in sides.values()),
-        )
-        for source, sides in last.items()
+        source: place
+        for source, place in places.items()
+        if place.frame <= blocks[source].ring.head() and place.event <= blocks[source].events.head()
     }

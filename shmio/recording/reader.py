@@ -44,6 +44,9 @@ class Channel:
     topic: str
     source: str = ""
     block: int = 0
+    section: int = 0
+    after: int = 0
+    """Number behind which the recording of this kind began."""
     layout: str = ""
 
 
@@ -179,9 +182,16 @@ class Reader:
             found = ChannelRecord.read(stream(content))
             about = found.metadata
             if found.message_encoding in (FRAME, EVENT):
-                block = int(about["block"])
+                block, section, after = (int(about[name]) for name in ("block", "section", "after"))
                 channel = Channel(
-                    found.id, found.message_encoding, found.topic, about["source"], block, about["layout"]
+                    found.id,
+                    found.message_encoding,
+                    found.topic,
+                    about["source"],
+                    block,
+                    section,
+                    after,
+                    about["layout"],
                 )
             elif (found.topic, found.message_encoding) == (GAPS_TOPIC, GAP):
                 channel = Channel(found.id, found.message_encoding, found.topic)

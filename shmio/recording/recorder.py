@@ -234,10 +234,8 @@ class Recorder:
             self._writer.gap(item, log_ns)
             return
         if followed.channels is None:
-            block = follower.block
-            followed.channels = self._writer.open_block(
-                block.source, follower.number, block.layout, block.period_ns, block.stale_ns
-            )
+            after_frame, after_event, _ = follower.begin
+            followed.channels = self._writer.open_block(follower.block, follower.number, after_frame, after_event)
         if isinstance(item, Frame):
             self.counters.frames += 1
             self._writer.frame(followed.channels, item, log_ns)

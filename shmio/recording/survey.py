@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -19,6 +19,7 @@ MAX_GAPS: Final = 1000
 MAX_DAMAGE: Final = 20
 """Damaged places that are told."""
 MAX_BLOCKS: Final = 10_000
+BEAT_CHUNKS: Final = 500
 
 _INDEX: Final = struct.Struct("<HI")  # channel, bytes of the entries
 _ENTRY: Final = struct.Struct("<QQ")  # log time, offset
@@ -72,9 +73,13 @@ class Survey:
     """What could not be read."""
 
 
-def survey(reader: Reader) -> Survey:
-    """Walk through the file. RecordingError: it is no recording of ours; damage within it is noted only."""
+def survey(reader: Reader, beat: Callable[[], object] = lambda: None) -> Survey:
+    """Walk through the file. RecordingError: it is no recording of ours; damage within it is noted only.
+
+    ``beat`` is called now and then: a long recording takes a while.
+    """
     found = Survey()
+    chunks = 0
     chunk: Record | None = None
     counts: list[_Count] | None = []
     for record in reader.records.walk():
@@ -87,6 +92,9 @@ def survey(reader: Reader) -> Survey:
             chunk = None
         if record.opcode == Opcode.CHUNK:
             chunk, counts = record, []
+            chunks += 1
+            if chunks % BEAT_CHUNKS == 0:
+                beat()
         elif record.opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
             try:
                 reader.note(record)

@@ -9,7 +9,6 @@ from typing import IO, Final, cast
 import mcap.writer
 
 from shmio import __version__
-from shmio.layout.model import Layout
 from shmio.recording.encoding import (
     EVENT,
     EVENT_SCHEMA,
@@ -23,7 +22,7 @@ from shmio.recording.encoding import (
     encode_gap,
 )
 from shmio.recording.output import Output
-from shmio.segment import Event, Frame
+from shmio.segment import Block, Event, Frame
 
 PROFILE: Final = "shmio"
 ABOUT: Final = "shmio"
@@ -61,19 +60,21 @@ class Writer:
         """Attach a file."""
         self._mcap.add_attachment(changed_ns, now_ns, name, media_type, data)
 
-    def open_block(self, source: str, number: int, layout: Layout, period_ns: int, stale_ns: int) -> Channels:
-        """Begin a block: the ``number``-th in this recording. Its layout was attached before."""
+    def open_block(self, block: Block, number: int, after_frame: int, after_event: int) -> Channels:
+        """Begin a block: the ``number``-th in this recording, behind these numbers. Its layout was attached before."""
         self.flush()  # a channel's record is in the chunk of its block's first message, for readers without an index
         about = {
-            "source": source,
+            "source": block.source,
             "block": str(number),
-            "layout": layout.hash.hex(),
-            "period_ns": str(period_ns),
-            "stale_ns": str(stale_ns),
+            "section": str(block.section),
+            "layout": block.layout.hash.hex(),
+            "period_ns": str(block.period_ns),
+            "stale_ns": str(block.stale_ns),
         }
+        frames, events = about | {"after": str(after_frame)}, about | {"after": str(after_event)}
         return Channels(
-            self._mcap.register_channel(f"{source}/frames", FRAME, self._schema(FRAME, FRAME_SCHEMA), about),
-            self._mcap.register_channel(f"{source}/events", EVENT, self._schema(EVENT, EVENT_SCHEMA), about),
+            self._mcap.register_channel(f"{block.source}/frames", FRAME, self._schema(FRAME, FRAME_SCHEMA), frames),
+            self._mcap.register_channel(f"{block.source}/events", EVENT, self._schema(EVENT, EVENT_SCHEMA), events),
         )
 
     def _schema(self, name: str, text: bytes) -> int:

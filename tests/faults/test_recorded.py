@@ -56,7 +56,7 @@ def feed(
     for item in items:
         encoding = FRAME if isinstance(item, Frame) else EVENT if isinstance(item, Event) else "json"
         source = "" if isinstance(item, Gap) else "cell"
-        check.message(Message(Channel(1, encoding, "", source, block, layout), 0, item))
+        check.message(Message(Channel(1, encoding, "", source, block, layout=layout), 0, item))
 
 
 def test_good_recordings_pass(check: BlockCheck, found: list[str]) -> None:

@@ -13,7 +13,7 @@ import pytest
 
 from shmio.recording.encoding import Reason
 from shmio.recording.reader import Reader
-from shmio.segment import Activity, Event, Segment
+from shmio.segment import Activity, BlockSpec, Event, Segment
 from shmio.testing.cell import kill, until
 from tests.unit.recording.harness import RING, Process, gaps, numbers, publish
 
@@ -107,6 +107,47 @@ def test_a_clock_set_back_does_not_change_who_came_last(segment: Segment, tmp_pa
         files.append(process.file.rename(process.file.with_name(f"{segment.instance}-{year}0101T000000Z.mem")))
     assert [numbers(file) for file in files] == [list(range(first, first + 10)) for first in (1, 11, 21)]
     assert [gap for file in files for gap in gaps(file)] == []
+
+
+def test_events_are_not_recorded_again_by_later_recorders_of_a_quiet_cell(segment: Segment, tmp_path: Path) -> None:
+    writer = segment.writer("cell")
+    events: list[list[int]] = []
+    for turn in range(3):
+        with Process(segment, tmp_path) as process:
+            publish(writer, 10, first=10 * turn)
+            until(lambda: process.counts("frames") == 10, "the frames of this turn")
+            process.stop()
+        events.append(numbers(process.file, kind=Event))
+    assert events == [[1], [], []]
+
+
+def test_a_block_made_anew_is_not_taken_for_the_one_before(segment: Segment, tmp_path: Path) -> None:
+    publish(segment.writer("cell"), 20)
+    with Process(segment, tmp_path) as process:
+        until(lambda: process.counts("frames") == 20, "the old block's")
+        process.stop()
+    old = segment.blocks["cell"]
+    spec = BlockSpec("cell", old.layout, old.period_ns, old.stale_ns, 1 << 22)
+    segment.change(add=[spec], retire=["cell"])
+    publish(segment.writer("cell"), 30)
+    with Process(segment, tmp_path) as process:
+        until(lambda: process.counts("frames") == 30, "all of the new block's")
+        process.stop()
+    assert numbers(process.file) == list(range(1, 31))
+
+
+def test_the_recordings_of_an_instance_with_a_longer_name_are_not_its_own(segment: Segment, tmp_path: Path) -> None:
+    writer = segment.writer("cell")
+    files = []
+    for turn in range(2):
+        with Process(segment, tmp_path) as process:
+            publish(writer, 10, first=10 * turn)
+            until(lambda: process.counts("frames") == 10, "the frames of this turn")
+            process.stop()
+        files.append(process.file)
+        for number in range(300):
+            (tmp_path / "dumps" / f"{segment.instance}-test-20990101T{number:06}Z.mem").write_bytes(b"")
+    assert numbers(files[1]) == list(range(11, 21))
 
 
 def test_a_recording_of_another_run_or_by_another_is_no_predecessor(segment: Segment, tmp_path: Path) -> None:
