@@ -31,10 +31,11 @@ class Clock:
         self._moved_ns += by_s * 10**9
 
     def slow_down(self, plc: Plc, answer_s: int) -> None:
-        """Have each answer take so long."""
+        """Have each answer to a write take so long; to others none, for one of these may come at any time."""
 
         def pass_on(frame: bytes) -> bytes:
-            self.move(answer_s)
+            if frame[8] == 3 and frame[19] == 5:  # the answer to a job; its function
+                self.move(answer_s)
             return frame
 
         plc.proxy.edit(pass_on)
