@@ -24,7 +24,7 @@ _NAMES: Final = 1000
 def create(directory: Path, instance: str, now: datetime | None = None) -> tuple[Path, int]:
     """Make a new file, named after the instance and the time (UTC), and its folder; path and descriptor.
 
-    A file that is there is never touched. RecordingError.
+    A file that is there is never touched; a new one is its user's alone, as the segment is. RecordingError.
     """
     stem = f"{instance}-{(now or datetime.now(UTC)).strftime('%Y%m%dT%H%M%SZ')}"
     try:
@@ -32,7 +32,7 @@ def create(directory: Path, instance: str, now: datetime | None = None) -> tuple
         for turn in range(1, _NAMES):
             path = directory / f"{stem}{f'_{turn}' if turn > 1 else ''}{SUFFIX}"
             with suppress(FileExistsError):
-                return path, os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+                return path, os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     except OSError as error:
         raise RecordingError(f"cannot make a recording in {directory}: {error.strerror}") from None
     raise RecordingError(f"cannot make a recording in {directory}: all names for this second are taken")

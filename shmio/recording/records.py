@@ -48,7 +48,7 @@ class Records:
         """Whether the recorder closed it: index and footer are there."""
         self.damage = ""
         """Where and why the walk ended before the footer."""
-        self._fd = os.open(file, os.O_RDONLY | os.O_CLOEXEC)
+        self._fd = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a FIFO would wait for its writer
         try:
             self.size = os.fstat(self._fd).st_size
             start = os.pread(self._fd, len(MAGIC), 0)
