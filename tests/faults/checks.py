@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from shmio.segment import EventKind, Frame, Quality
+from shmio.segment import Frame, Quality
+from tests.faults.plc import OTHERS
 from tests.faults.truth import Truth, Words, generations, places
 
 Complain = Callable[[str], None]
@@ -34,7 +35,7 @@ class Source:
     one_pdu: bool
     truth: Truth | None = None
     landed: Truth | None = None
-    """What was written into the last word, where there is a truth; that word is none of the program's then."""
+    """What was written into the last two words, where there is a truth; they are none of the program's then."""
 
     @property
     def oldest_ns(self) -> int:
@@ -66,7 +67,7 @@ class FrameCheck:
     _started_ns: int = 0
 
     def __post_init__(self) -> None:
-        self._own = self.source.size if self.source.truth is None else self.source.size - 8
+        self._own = self.source.size if self.source.truth is None else self.source.size - OTHERS
         self._places = places(self._own)
 
     def begin(self, started_ns: int) -> None:
@@ -194,48 +195,6 @@ class ValueCheck:
         self.counts.since_ns = max(self.counts.since_ns, since_ns)
 
 
-SURELY_NOT = {EventKind.REJECTED, EventKind.REFUSED, EventKind.EXPIRED}
-"""Outcomes after which the device has never had the value."""
-
-
-@dataclass
-class WriteCheck:
-    """Holds what a writer is told of its values to what the PLC got; each value is written once."""
-
-    source: Source
-    complain: Complain
-    counts: Counts = field(default_factory=Counts)
-    _known: dict[int, tuple[EventKind, int | None]] = field(default_factory=dict)
-
-    def _since_ns(self, value: int) -> int | None:
-        return None if self.source.landed is None else self.source.landed.since_ns(value)
-
-    def outcome(self, value: int, kind: EventKind, text: str) -> None:
-        """What the writer was told of ``value``."""
-        since_ns = self._since_ns(value)
-        self._known[value] = kind, since_ns
-        self.counts.values += 1
-        if kind is EventKind.WRITTEN:
-            self.counts.good += 1
-            if since_ns is None:
-                self.complain(f"{self.source.name}: {value} was reported as written, but the PLC never got it")
-            else:
-                self.counts.since_ns = max(self.counts.since_ns, since_ns)
-        elif kind in SURELY_NOT and since_ns is not None:
-            self.complain(f"{self.source.name}: {value} was reported as {kind.name} ({text}), but the PLC got it")
-        elif kind is not EventKind.UNKNOWN and kind not in SURELY_NOT:
-            self.complain(f"{self.source.name}: {value} ended as {kind.name}")
-
-    def again(self, value: int) -> None:
-        """Look later: what was surely not sent does not come late, what was written does not come twice."""
-        kind, before_ns = self._known[value]
-        since_ns = self._since_ns(value)
-        if kind is not EventKind.UNKNOWN and since_ns != before_ns:
-            self.complain(f"{self.source.name}: {value} was {kind.name}, and came to the PLC later, at {since_ns}")
-        for old in [key for key in self._known if key < value]:
-            del self._known[old]
-
-
 @dataclass(frozen=True)
 class Process:
     """A process as the instance's status shows it."""
@@ -247,8 +206,10 @@ class Process:
 Processes = Mapping[str, Process]
 
 
-def check_restarts(before: Processes, after: Processes, hit: set[str], *, replaced: bool, complain: Complain) -> None:
-    """Who was hit has a successor; nobody else was touched.
+def check_restarts(
+    before: Processes, after: Processes, hit: set[str], renewed: set[str], *, replaced: bool, complain: Complain
+) -> None:
+    """Who was hit or ``renewed`` has a successor; nobody else was touched.
 
     ``replaced``: all of the instance was, since it has another segment: then no process is of before.
     """
@@ -259,10 +220,10 @@ def check_restarts(before: Processes, after: Processes, hit: set[str], *, replac
         then = before[name]
         if now.pid is None:
             complain(f"{name} is not there")
-        elif replaced or name in hit:
+        elif replaced or name in hit | renewed:
             if now.pid == then.pid:
                 complain(f"{name} was to be replaced, but is pid {now.pid} as before")
-            if not replaced and now.restarts <= then.restarts:
+            if not (replaced or name in renewed) and now.restarts <= then.restarts:
                 complain(f"{name} was restarted, but counts {now.restarts} restarts as before")
         elif now != then:
             complain(f"{name} was not hit, but went from {then} to {now}")

@@ -10,6 +10,7 @@ from typing import Final
 
 from shmio.segment import Segment
 from shmio.testing.cell import kill, until
+from tests.faults.configuration import Configuration
 from tests.faults.deface import deface
 from tests.faults.midwrite import MidWrite
 from tests.faults.rig import Device, Rig
@@ -42,6 +43,8 @@ class Inflictor:
             "hang": self._hang,
             "restart": self._restart,
             "torn": self._torn,
+            "relayout": lambda f: self._rig.reload(lambda configuration: configuration.relayout(f.target)),
+            "reload": lambda _: self._rig.reload(Configuration.toggle_extra),
             "supervisor_kill": self._supervisor_kill,
             "supervisor_pause": self._pause,
             "clock": lambda f: self._rig.set_clock(f.number % 3 and round((f.number / 2**31 - 1) * 30 * DAY_NS)),

@@ -8,7 +8,7 @@ from functools import partial
 
 import shmio
 from shmio.errors import NotRunningError, QualityError, SegmentError
-from shmio.segment import Quality
+from shmio.segment import Block, Quality
 from shmio.segment.attach import Attachment
 from tests.faults.checker import Checker
 from tests.faults.checks import FrameCheck, Source
@@ -40,11 +40,20 @@ def follow(checker: Checker, source: Source, *, slow: bool) -> None:
     check = FrameCheck(source, checker.complain, checker.counts(f"{'slow' if slow else 'stream'} {source.name}"))
 
     def work(attachment: Attachment) -> None:
+        block = attachment.block(source.name)
+        drain(attachment, block, block.ring.head())
+        while block.retired and attachment.current and not checker.stopping.is_set():
+            block = attachment.block(source.name)
+            drain(attachment, block, 0)
+
+    def drain(attachment: Attachment, block: Block, after: int) -> None:
         check.begin(started_ns(attachment))
-        cursor = attachment.block(source.name).cursor(after=(after := attachment.block(source.name).ring.head()))
+        cursor = block.cursor(after=after)
         delivered = missed = 0
         while attachment.current and not checker.stopping.is_set():
             frame = cursor.next(timeout_s=TURN_S)
+            if frame is None and block.retired and not cursor.behind:
+                break
             if frame is not None:
                 delivered += 1
                 check.frame(frame, cursor.missed - missed, time.monotonic_ns())
@@ -65,13 +74,17 @@ def look(checker: Checker, source: Source) -> None:
 
     def work(attachment: Attachment) -> None:
         check.begin(started_ns(attachment))
-        number = 0
+        number = section = 0
         while attachment.current and not checker.stopping.wait(LOOK_S):
             try:
-                frame = attachment.frame(source.name).frame
+                view = attachment.frame(source.name)
             except QualityError:
                 continue  # no frame yet
             now_ns = time.monotonic_ns()
+            frame = view.frame
+            if view.section != section:  # a reload has made the block anew
+                number, section = 0, view.section
+                check.begin(started_ns(attachment))
             if frame.number < number:
                 checker.complain(f"{source.name}: frame {frame.number} is the newest after {number}")
             if frame.number > number:

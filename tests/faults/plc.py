@@ -1,8 +1,8 @@
 """An emulated S7 PLC, as a process, whose block changes all the time and that keeps the truth about it.
 
-``python -m tests.faults.plc TRUTH LANDED PORT SIZE PERIOD_MS``. The program leaves the last word of the block to
-others; what they write there is noted in LANDED, another file of truth, before they are answered. It prints a line when
-it listens, and ends with its standard input.
+``python -m tests.faults.plc TRUTH LANDED PORT SIZE PERIOD_MS``. The program leaves the last two words of the block to
+others; what they write there is noted in LANDED, another file of truth, before they are answered. It prints a line
+when it listens, and ends with its standard input.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from tests.faults.truth import Truth, image, places
 
 NUMBER = 7
 WORD = 8
+OTHERS = 2 * WORD
+"""What the program leaves to others, at the block's end: a word for local writers, one for those by gRPC."""
 
 
 class Noting:
@@ -27,27 +29,30 @@ class Noting:
         self._lock = threading.Lock()
         self._block = block
         self._landed = landed
-        self._last = bytes(WORD)
+        self._last = [bytes(WORD)] * 2
 
     def __enter__(self) -> None:
         self._lock.acquire()
 
     def __exit__(self, *_: object) -> None:
-        if (word := bytes(self._block[-WORD:])) != self._last:
-            self._last = word
-            self._landed.land(int.from_bytes(word, "big"), time.monotonic_ns())
+        tail = bytes(self._block[-OTHERS:])
+        words = [tail[:WORD], tail[WORD:]]
+        for word, last in zip(words, self._last, strict=True):
+            if word != last:
+                self._landed.land(int.from_bytes(word, "big"), time.monotonic_ns())
+        self._last = words
         self._lock.release()
 
 
 def play(server: S7Server, block: bytearray, truth: Truth, period_s: float, stopping: threading.Event) -> None:
     """Run the program until told to stop."""
-    of = places(len(block) - WORD)
+    of = places(len(block) - OTHERS)
     due_s = time.monotonic()
     while True:
         with server.lock:  # nobody reads between what is told and what is
             generation = truth.newest + 1
             truth.record(generation, time.monotonic_ns())
-            block[:-WORD] = image(generation, of)
+            block[:-OTHERS] = image(generation, of)
         if not server.running:
             server.start()
             print("ready", flush=True)

@@ -11,8 +11,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from shmio.recording.encoding import Gap
-from shmio.recording.reader import Channel, Message, Reader
+from shmio.recording.encoding import FRAME, Gap
+from shmio.recording.reader import Channel, Reader
 from shmio.segment import Event, Frame
 from tests.faults.checker import Checker
 from tests.faults.checks import Complain, Counts, FrameCheck, Source
@@ -35,8 +35,8 @@ class BlockCheck:
     """For how long a frame is in the source's ring."""
     complain: Complain
     counts: Counts = field(default_factory=Counts)
-    _run: tuple[str, str] = ("", "")
-    _block: int = 0
+    _block: tuple[str, int] | None = None
+    """Epoch of the instance, section of the block: numbers go on from file to file within it."""
     _last: dict[str, int] = field(default_factory=dict)
     _missed: dict[str, int] = field(default_factory=dict)
     _publish_ns: int = 0
@@ -47,32 +47,21 @@ class BlockCheck:
 
     def begin(self, epoch: str, started_ns: int, away_ns: int) -> None:
         """A file begins. ``away_ns``: at most so long nobody had written into a file before."""
-        self._block = 0
         self._away_ns = away_ns
         self._epoch, self._started_ns = epoch, started_ns
 
-    def message(self, message: Message) -> None:
-        """The next frame, event or gap of this source."""
-        item = message.item
+    def item(self, item: Frame | Event | Gap, section: int) -> None:
+        """The next frame, event or gap of this source, of the block in this section."""
+        if (self._epoch, section) != self._block:
+            self._block = self._epoch, section
+            self._last, self._missed = {}, {}
+            self._frames.begin(self._started_ns)
         if isinstance(item, Gap):
-            self._change(item.block, "")
             self._missed[item.what] = self._missed.get(item.what, 0) + item.count
-            return
-        self._change(message.channel.block, message.channel.layout)
-        if isinstance(item, Frame):
+        elif isinstance(item, Frame):
             self._frame(item)
         else:
             self._event(item)
-
-    def _change(self, block: int, layout: str) -> None:
-        """Numbers go on from file to file, within a run of the instance and with the same layout."""
-        run = (self._epoch, layout or (self._run[1] if self._run[0] == self._epoch else ""))
-        if (self._block and block != self._block) or (self._run[1] and run != self._run):
-            self._last, self._missed = {}, {}
-            self._frames.begin(self._started_ns)
-        elif not self._run[0]:
-            self._frames.begin(self._started_ns)
-        self._block, self._run = block, run
 
     def _frame(self, frame: Frame) -> None:
         missed = self._missed.pop("frames", 0)
@@ -118,9 +107,11 @@ def check(file: Path, away_ns: int, checks: Mapping[str, BlockCheck]) -> None:
                 begun = True
                 for block in checks.values():
                     block.begin(reader.about["epoch"], int(reader.about["started_ns"]), away_ns)
-            source = message.item.source if isinstance(message.item, Gap) else message.channel.source
-            if source in checks:
-                checks[source].message(message)
+            item, channel = message.item, message.channel
+            if isinstance(item, Gap):
+                channel = next(c for c in reader.channels.values() if c.encoding == FRAME and c.block == item.block)
+            if channel.source in checks:
+                checks[channel.source].item(item, channel.section)
 
 
 class Watch:

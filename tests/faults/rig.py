@@ -6,7 +6,9 @@ import os
 import struct
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -20,7 +22,7 @@ from shmio.testing.ports import reserved_port
 from shmio.testing.proxy import FaultProxy
 from tests.faults.checker import Description
 from tests.faults.checks import Process, Source
-from tests.faults.plc import NUMBER
+from tests.faults.configuration import EXTRA, PERIODS_MS, SIZES, STALE_MS, Configuration
 from tests.faults.truth import Truth
 
 ROOT: Final = Path(__file__).parents[2]
@@ -30,45 +32,6 @@ MARK: Final = "SHMIO_FAULTS"
 """A variable in the environment of every process of a run: none of them can hide."""
 TOLERANCE_MS: Final = 100
 """What a loaded machine and the way through the network may add to an age."""
-
-SIZES: Final = {"fast": 408, "block": 2192, "demo": 408}
-PERIODS_MS: Final = {"fast": 5, "block": 20, "demo": 20}
-STALE_MS: Final = {"fast": 300, "block": 500, "demo": 500}
-
-_DB = """DATA_BLOCK DB{number}
-{{ S7_Optimized_Access := 'FALSE' }}
-   STRUCT
-      stamp : LWord;
-      rest : Array[1..{rest}] of LWord;
-      command : LWord;
-   END_STRUCT;
-BEGIN
-END_DATA_BLOCK
-"""
-_SOURCE = """
-[[source]]
-name = "{name}"
-connector = "s7"
-layout = "{name}.db"
-host = "127.0.0.1"
-port = {port}
-dbNumber = {number}
-timeout = 400
-period_ms = {period_ms}
-stale_ms = {stale_ms}
-writable = ["command"]
-"""
-_OTHERS = """
-[[emulator]]
-name = "plc"
-kind = "s7"
-layout = "demo.db"
-program = "counter"
-listen = "{plc}"
-[grpc]
-listen = ["{grpc}"]
-[recorder]
-"""
 
 
 class Device:
@@ -126,6 +89,7 @@ class Rig:
         compile_c(HERE / "clock.c", folder / "clock.so", "-shared", "-fPIC", "-ldl")
         compile_c(ROOT / "examples/reader.c", folder / "reader")
         self.devices: dict[str, Device] = {}
+        self._turn = threading.Lock()
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -140,20 +104,14 @@ class Rig:
         self._stack.close()
 
     def _build(self, stack: ExitStack) -> None:
-        ports = {name: stack.enter_context(reserved_port()) for name in ("fast", "block", "plc", "grpc")}
-        text = f'[instance]\nname = "{self.instance}"\nring_mb = 1\n'
-        for name, size in SIZES.items():
-            (self.folder / f"{name}.db").write_text(_DB.format(number=NUMBER, rest=size // 8 - 2))
-            port = ports["plc"].port
-            if name in ports:
-                device = self.devices[name] = Device(name, self.folder, ports[name], self.environment)
-                stack.callback(device.stop)
-                port = device.proxy.address.port
-            times = {"period_ms": PERIODS_MS[name], "stale_ms": STALE_MS[name]}
-            text += _SOURCE.format(name=name, port=port, number=NUMBER, **times)
+        reserved = {name: stack.enter_context(reserved_port()) for name in ("fast", "block", "plc", "grpc")}
+        ports = {name: reserved[name] for name in ("plc", "grpc")}
+        for name in ("fast", "block"):
+            device = self.devices[name] = Device(name, self.folder, reserved[name], self.environment)
+            stack.callback(device.stop)
+            ports[name] = device.proxy.address
         self.grpc = ports["grpc"]
-        self.config = self.folder / "supervisor.toml"
-        self.config.write_text(text + _OTHERS.format(plc=ports["plc"], grpc=self.grpc))
+        self.configuration = Configuration(self.folder, self.instance, ports)
 
     def description(self, seed: int) -> Description:
         """What checkers are told."""
@@ -174,7 +132,7 @@ class Rig:
         """Run ``shmio-supervisor`` on the instance, on a host whose clock can be set."""
         preload = {"LD_PRELOAD": str(self.folder / "clock.so"), "SHMIO_FAULTS_CLOCK": str(self._clock)}
         return subprocess.run(
-            [sys.executable, "-P", "-m", "shmio.cli.supervisor", verb, "-c", str(self.config), *arguments],
+            [sys.executable, "-P", "-m", "shmio.cli.supervisor", verb, "-c", str(self.configuration.file), *arguments],
             env=self.environment | preload | {"XDG_RUNTIME_DIR": str(self.folder)},
             cwd=self.folder,
             capture_output=True,
@@ -188,6 +146,14 @@ class Rig:
         done = self.supervisor("up", "--detach")
         if done.returncode:
             raise RuntimeError(f"up failed: {done.stderr}")
+
+    def reload(self, change: Callable[[Configuration], None]) -> None:
+        """Change the configuration and have the instance take it."""
+        with self._turn:
+            change(self.configuration)
+            done = self.supervisor("reload")
+        if done.returncode:
+            raise RuntimeError(f"reload failed: {done.stderr}")
 
     def down(self) -> None:
         """Stop the instance."""
@@ -211,8 +177,9 @@ class Rig:
         return read_status(self.instance)
 
     def processes(self) -> dict[str, Process]:
-        """The processes that the supervisor started, as ``status`` tells it."""
-        return {p.name: Process(p.pid, p.restarts) for p in self.status().processes if p.kind != "guest"}
+        """The processes that the supervisor started, as ``status`` tells it, but for the source that comes and goes."""
+        processes = [p for p in self.status().processes if p.kind != "guest" and p.name != EXTRA]
+        return {p.name: Process(p.pid, p.restarts) for p in processes}
 
 
 def compile_c(source: Path, program: Path, *arguments: str) -> None:

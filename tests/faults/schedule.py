@@ -13,17 +13,19 @@ WORKERS: Final = ("fast", "block", "demo", "plc", "grpc", "recorder")
 """Processes that the supervisor starts: sources, an emulator that feeds ``demo``, the endpoint, the recorder."""
 SUPERVISOR: Final = "supervisor"
 
-PROCESS_FAULTS: Final = {"kill": 6, "pause": 3, "hang": 1, "restart": 3, "torn": 2}
+PROCESS_FAULTS: Final = {"kill": 6, "pause": 3, "hang": 1, "restart": 3, "torn": 2, "relayout": 2}
 DEVICE_FAULTS: Final = {
     "delay": 2, "cut": 2, "cut_after": 2, "freeze": 2, "refuse": 2, "garble": 2, "late": 2, "reference": 2, "drop": 2,
     "plc_kill": 2, "plc_pause": 2,
 }  # fmt: skip
-OTHER_FAULTS: Final = {"supervisor_kill": 3, "supervisor_pause": 2, "clock": 3, "midwrite": 3}
+OTHER_FAULTS: Final = {"supervisor_kill": 3, "supervisor_pause": 2, "clock": 3, "midwrite": 3, "reload": 2}
 WEIGHTS: Final = PROCESS_FAULTS | DEVICE_FAULTS | OTHER_FAULTS
 """How often each kind comes, relative to the others."""
 
 RESTARTING: Final = {"kill", "hang", "restart", "torn"}
 """Kinds after which the target is another process."""
+RENEWING: Final = {"relayout"}
+"""Kinds after which the target is new: another process, and its restarts count from 0."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +69,7 @@ def rounds(seed: int) -> Iterator[Round]:
 def _fault(kind: str, chance: random.Random) -> Fault:
     target = kind
     if kind in PROCESS_FAULTS:
-        target = chance.choice(("fast", "block", "demo") if kind == "torn" else WORKERS)
+        target = chance.choice(("fast", "block", "demo") if kind in ("torn", "relayout") else WORKERS)
     elif kind in DEVICE_FAULTS:
         target = f"device of {chance.choice(SOURCES)}"
     elif kind.startswith(SUPERVISOR):

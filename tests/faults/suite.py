@@ -19,11 +19,13 @@ from tests.faults.midwrite import MidWrite
 from tests.faults.panel import Panel
 from tests.faults.resources import Resources
 from tests.faults.rig import Rig, marked
-from tests.faults.schedule import RESTARTING, Fault, Round, rounds
+from tests.faults.schedule import RENEWING, RESTARTING, Fault, Round, rounds
 
 RECOVERY_S: Final = 30.0
 """All is well again within this time after a fault, at the latest."""
 LOOK_S: Final = 0.02
+MOST_CHANGES: Final = 30
+"""So many blocks are changed by reloads before the instance is started anew; it has room for 40."""
 HISTORY: Final = 20
 MOST_VIOLATIONS: Final = 10
 """So many are kept; the others are counted."""
@@ -110,6 +112,8 @@ class Suite:
         return self.record
 
     def _round(self, rig: Rig, panel: Panel, turn: Round) -> None:
+        if rig.configuration.changes >= MOST_CHANGES:
+            self._renew(rig, panel)
         before, epoch = rig.processes(), self._epoch(rig)
         begun_s = time.monotonic()
         ended: list[tuple[int, str]] = []
@@ -119,8 +123,9 @@ class Suite:
         for thread in threads:
             thread.join()
         hit = {fault.target for fault in turn.faults if fault.kind in RESTARTING}
+        renewed = {fault.target for fault in turn.faults if fault.kind in RENEWING}
         ended_ns, last = max(ended)
-        took_s = self._await_recovery(rig, panel, ended_ns, {name: before[name] for name in hit})
+        took_s = self._await_recovery(rig, panel, ended_ns, {name: before[name] for name in hit | renewed})
         self.record.rounds += 1
         self.record.faults.update(fault.kind for fault in turn.faults)
         if took_s is not None:
@@ -135,10 +140,17 @@ class Suite:
             self.record.adopted += not replaced
         elif replaced:
             self.complain("the instance has another segment, but its supervisor was not hit")
-        check_restarts(before, rig.processes(), hit, replaced=replaced, complain=self.complain)
+        check_restarts(before, rig.processes(), hit, renewed, replaced=replaced, complain=self.complain)
         self._check_processes(rig)
         panel.check()
         self._stopping.wait(turn.rest_s)
+
+    def _renew(self, rig: Rig, panel: Panel) -> None:
+        """Stop and start the instance, as one does when its shared memory has no room for further blocks."""
+        rig.down()
+        rig.up()
+        rig.configuration.changes = 0
+        self._await_recovery(rig, panel, time.monotonic_ns(), {})
 
     def _inflict(self, fault: Fault, begun_s: float, ended: list[tuple[int, str]]) -> None:
         time.sleep(max(0.0, begun_s + fault.after_s - time.monotonic()))

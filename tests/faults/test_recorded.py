@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from shmio.recording.encoding import EVENT, FRAME, Gap, Reason
-from shmio.recording.reader import Channel, Message
+from shmio.recording.encoding import Gap, Reason
 from shmio.segment import Event, EventKind, Frame, Quality
 from shmio.segment.events import NO_WRITER
 from tests.faults import recorded
@@ -38,8 +37,8 @@ def good(number: int, **changes: Any) -> Frame:
     return frame(number, **{"raw": image(FIRST + 2 * number, places(SIZE)), **changes})
 
 
-def gap(first: int, last: int, what: str = "frames", block: int = 1) -> Gap:
-    return Gap("cell", block, what, first, last, last - first + 1, Reason.NOT_RUNNING)
+def gap(first: int, last: int, what: str = "frames") -> Gap:
+    return Gap("cell", 1, what, first, last, last - first + 1, Reason.NOT_RUNNING)
 
 
 def event(number: int, frame: int) -> Event:
@@ -48,15 +47,11 @@ def event(number: int, frame: int) -> Event:
     )
 
 
-def feed(
-    check: BlockCheck, *items: Item, epoch: str = "1", away_ns: int = 0, block: int = 1, layout: str = "a"
-) -> None:
+def feed(check: BlockCheck, *items: Item, epoch: str = "1", away_ns: int = 0, section: int = 0) -> None:
     """One file."""
     check.begin(epoch, STARTED_NS, away_ns)
     for item in items:
-        encoding = FRAME if isinstance(item, Frame) else EVENT if isinstance(item, Event) else "json"
-        source = "" if isinstance(item, Gap) else "cell"
-        check.message(Message(Channel(1, encoding, "", source, block, layout=layout), 0, item))
+        check.item(item, section)
 
 
 def test_good_recordings_pass(check: BlockCheck, found: list[str]) -> None:
@@ -64,7 +59,7 @@ def test_good_recordings_pass(check: BlockCheck, found: list[str]) -> None:
     feed(check, gap(5, 9), good(10, event=2), away_ns=RING_NS + 6 * PERIOD_NS)  # the ring was overrun
     feed(check, good(11, event=2), good(12, event=2))
     feed(check, good(1), epoch="2")  # another run
-    feed(check, good(1), epoch="2", layout="b")  # another layout
+    feed(check, good(1), epoch="2", section=5)  # a reload has made the block anew
     assert found == []
     assert (check.counts.frames, check.counts.missed) == (7, 7)
 

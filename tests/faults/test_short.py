@@ -14,7 +14,7 @@ pytestmark = pytest.mark.timeout(400)
 
 SHORT_S = 0.3
 NUMBER = 0x1234_5678
-TARGETS = {"kill": "fast", "hang": "grpc", "pause": "block", "restart": "plc", "torn": "fast"}
+TARGETS = {"kill": "fast", "hang": "grpc", "pause": "block", "restart": "plc", "torn": "fast", "relayout": "block"}
 
 
 def one(*targets: tuple[str, str]) -> Round:

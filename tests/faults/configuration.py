@@ -1,0 +1,98 @@
+"""The configuration of the instance under test: written for its start, and written anew for each reload."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from shmio.config import Address
+from tests.faults.plc import NUMBER, OTHERS
+
+SIZES: Final = {"fast": 408, "block": 2192, "demo": 408}
+PERIODS_MS: Final = {"fast": 5, "block": 20, "demo": 20}
+STALE_MS: Final = {"fast": 300, "block": 500, "demo": 500}
+NAMES: Final = ("rest", "other")
+"""What the words after the first are called; another name is another layout, of the same size."""
+EXTRA: Final = "extra"
+"""A source that comes and goes."""
+EMULATED: Final = "plc.db"
+"""The emulator's own layout: it does not change when the source ``demo`` does."""
+
+_DB = """DATA_BLOCK DB{number}
+{{ S7_Optimized_Access := 'FALSE' }}
+   STRUCT
+      stamp : LWord;
+      {name} : Array[1..{words}] of LWord;
+      command : LWord;
+      remote : LWord;
+   END_STRUCT;
+BEGIN
+END_DATA_BLOCK
+"""
+_SOURCE = """
+[[source]]
+name = "{name}"
+connector = "s7"
+layout = "{layout}.db"
+host = "127.0.0.1"
+port = {port}
+dbNumber = {number}
+timeout = 400
+period_ms = {period_ms}
+stale_ms = {stale_ms}
+writable = ["command", "remote"]
+"""
+_OTHERS = """
+[[emulator]]
+name = "plc"
+kind = "s7"
+layout = "{layout}"
+program = "counter"
+listen = "{plc}"
+[grpc]
+listen = ["{grpc}"]
+[recorder]
+"""
+
+
+class Configuration:
+    """supervisor.toml and the layouts. ``ports``: of the devices as the sources see them, of ``plc`` and ``grpc``."""
+
+    def __init__(self, folder: Path, instance: str, ports: Mapping[str, Address]) -> None:
+        self.file = folder / "supervisor.toml"
+        self.changes = 0
+        """Of blocks, since :meth:`__init__`."""
+        self._folder = folder
+        self._instance = instance
+        self._ports = ports
+        self._extra = False
+        for name in SIZES:
+            self._write_layout(name, NAMES[0])
+        (folder / EMULATED).write_bytes((folder / "demo.db").read_bytes())
+        self._write()
+
+    def relayout(self, source: str) -> None:
+        """Give a source's registers other names."""
+        now = (self._folder / f"{source}.db").read_text()
+        self._write_layout(source, next(name for name in NAMES if name not in now))
+        self.changes += 1
+
+    def toggle_extra(self) -> None:
+        """Add a further source, on the same PLC as ``demo``, or remove it."""
+        self._extra = not self._extra
+        self.changes += self._extra
+        self._write()
+
+    def _write_layout(self, source: str, name: str) -> None:
+        words = (SIZES[source] - OTHERS) // 8 - 1
+        (self._folder / f"{source}.db").write_text(_DB.format(number=NUMBER, name=name, words=words))
+
+    def _write(self) -> None:
+        text = f'[instance]\nname = "{self._instance}"\nring_mb = 1\n'
+        for name in (*SIZES, *([EXTRA] if self._extra else [])):
+            layout = name if name in SIZES else "demo"
+            port = self._ports.get(name, self._ports["plc"]).port
+            times = {"period_ms": PERIODS_MS[layout], "stale_ms": STALE_MS[layout]}
+            text += _SOURCE.format(name=name, layout=layout, port=port, number=NUMBER, **times)
+        self.file.write_text(text + _OTHERS.format(layout=EMULATED, plc=self._ports["plc"], grpc=self._ports["grpc"]))
