@@ -212,7 +212,8 @@ class Supervisor:
         log.info("the change is over", extra=fields(kept=len(change.changes.kept)))
         if self._change_answer is not None:
             self._notifier.ready()
-            self._change_answer.ok(done=done, problems=problems, kept=list(change.changes.kept))
+            told = {"done": done, "problems": problems, "kept": list(change.changes.kept)}
+            self._change_answer.ok(warnings=change.warnings(), **told)
         self._change = self._change_answer = None
 
     def _pause_s(self) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -73,6 +73,8 @@ class Plan:
     log_dir: Path
     blocks: tuple[BlockSpec, ...]
     jobs: tuple[Job, ...]
+    warnings: tuple[str, ...] = ()
+    """What is odd about its configuration, a line each."""
 
     @property
     def processes(self) -> list[ProcessSpec]:
@@ -85,7 +87,14 @@ class Plan:
         return segment_size(self.blocks, len(self.jobs))
 
 
-def make_plan(config: Config, layouts: Mapping[str, Layout], *, config_file: Path, mode: str = "live") -> Plan:
+def make_plan(
+    config: Config,
+    layouts: Mapping[str, Layout],
+    *,
+    config_file: Path,
+    mode: str = "live",
+    warnings: Sequence[str] = (),
+) -> Plan:
     """Plan an instance. ``layouts``: of each source and emulator, by its name.
 
     ConfigError: too many processes.
@@ -124,4 +133,5 @@ def make_plan(config: Config, layouts: Mapping[str, Layout], *, config_file: Pat
         log_dir=log_dir,
         blocks=blocks,
         jobs=tuple(Job(name, kind, log_dir / f"{name}.log", section) for name, kind, section in sections),
+        warnings=tuple(warnings),
     )

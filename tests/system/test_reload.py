@@ -104,6 +104,16 @@ def test_a_new_layout_keeps_the_streams_whose_register_is_still_there(cell: Cell
     kept.cancel()
 
 
+def test_what_is_odd_is_told_as_check_tells_it(cell: Cell) -> None:
+    edit(cell, "period_ms = 20", 'period_ms = 20\nwritable = ["Outpts"]')
+    done = cell.supervisor("reload")
+    file = cell.folder / "supervisor.toml"
+    warning = f"{file}: warning: source[0].writable: 'Outpts' names nothing in DB201"
+    assert (done.returncode, done.stderr) == (0, f"{warning}\n")
+    assert "cell: restarted" in done.stdout
+    assert warning in cell.supervisor("check", "-c", str(file)).stdout.splitlines()
+
+
 def test_an_error_in_the_configuration_changes_nothing(cell: Cell) -> None:
     before = cell.processes()
     edit(cell, "period_ms = 20", "period_ms = -1")

@@ -19,9 +19,9 @@ def execute(arguments: argparse.Namespace) -> int:
     for source, block in zip(prepared.config.source, plan.blocks, strict=True):
         print(printable(f"  {_describe(block, peer(source))}"))
     print(f"  segment {PREFIX}{plan.instance}: {plan.segment_bytes / 1e6:.2f} MB of shared memory")
-    for warning in prepared.warnings:
+    for warning in plan.warnings:
         print(printable(warning))
-    count = len(prepared.warnings)
+    count = len(plan.warnings)
     print(f"usable, with {count} warning{'s' * (count != 1)}" if count else "no faults found")
     return 0
 

@@ -23,12 +23,11 @@ EMULATOR_KINDS = ("s7",)
 
 @dataclass(frozen=True)
 class Prepared:
-    """A configuration that can be started, and what is odd about it, a line each."""
+    """A configuration that can be started."""
 
     config: Config
     plan: Plan
     layouts: dict[str, Layout]
-    warnings: list[str]
 
 
 def prepare(file: Path, mode: str = "live") -> Prepared:
@@ -51,8 +50,8 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
         odd = _odd(config, layouts)
     except ConfigError as error:
         raise ConfigError(f"{file}: {named(str(error), msgspec.to_builtins(config))}") from None
-    plan = make_plan(config, layouts, config_file=file, mode=mode)
-    return Prepared(config, plan, layouts, [*files.warnings, *(f"{file}: warning: {text}" for text in odd)])
+    warnings = [*files.warnings, *(f"{file}: warning: {text}" for text in odd)]
+    return Prepared(config, make_plan(config, layouts, config_file=file, mode=mode, warnings=warnings), layouts)
 
 
 def peer(source: Source) -> str:

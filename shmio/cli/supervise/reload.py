@@ -21,6 +21,8 @@ def execute(arguments: argparse.Namespace) -> int:
         if arguments.config is not None:
             _check_file(arguments.config, Path(ask(segment, control.Where(), WHERE_S)["config"]), segment.instance)
         answer = ask(segment, control.Reload(), RELOAD_S)
+        for line in answer["warnings"]:
+            print(printable(line), file=sys.stderr)
         for line in answer["done"]:
             print(printable(line))
         kept = len(answer["kept"])

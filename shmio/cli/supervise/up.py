@@ -40,7 +40,7 @@ def execute(arguments: argparse.Namespace) -> int:
     if arguments.report is not None:
         return _detached(file, arguments.mode, arguments.report)
     prepared = prepare(file, arguments.mode)
-    for warning in prepared.warnings:
+    for warning in prepared.plan.warnings:
         _say(warning, sys.stderr)
     return _detach(prepared) if arguments.detach else _foreground(prepared)
 

@@ -46,6 +46,7 @@ def make(settings: dict[str, Any]) -> Plan:
             Job(name, kind, folder / f"{name}.log", {"behaviour": behaviour, "ends": str(folder / "ends")})
             for name, kind, behaviour, *_ in settings["jobs"]
         ),
+        warnings=tuple(settings.get("warnings", ())),
     )
 
 

@@ -23,8 +23,18 @@ def test_nothing_new_touches_nothing(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()
-    assert cell.reload(CELL) == {"ok": True, "done": [], "problems": [], "kept": ["plc", "cell", "grpc"]}
+    quiet: dict[str, Any] = {"warnings": [], "done": [], "problems": []}
+    assert cell.reload(CELL) == {"ok": True, **quiet, "kept": ["plc", "cell", "grpc"]}
     assert cell.pids() == before
+
+
+def test_what_is_odd_is_told_as_far_as_an_answer_has_room(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    assert cell.reload(CELL, warnings=["odd", "odder"])["warnings"] == ["odd", "odder"]
+    told = cell.reload(CELL, warnings=["é" * 1000] * 1000)["warnings"]
+    assert 0 < len(told) < 100
+    assert told[-1] == f"… and {1000 - len(told) + 1} more warnings: shmio-supervisor check prints them"
 
 
 def test_the_configuration_is_as_old_as_its_last_good_reload(launch: Launch) -> None:
