@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from enum import Enum
 from typing import Any, ClassVar
 
 import msgspec
@@ -11,6 +12,26 @@ import msgspec
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.write import Write
+
+
+class Lost(Enum):
+    """What is known of a write that had no answer when the connection was lost."""
+
+    UNSENT = "unsent"
+    """Surely not carried out: the device was not given a byte of it."""
+    UNKNOWN = "unknown"
+
+
+class WriteLostError(ConnectorError):
+    """The connection was lost before all writes had their answers."""
+
+    def __init__(self, message: str, outcomes: Sequence[str | Lost]) -> None:
+        """``outcomes``: of each write, as :meth:`Connector.write` returns it, or what is known of it."""
+        super().__init__(message)
+        self.outcomes = tuple(outcomes)
+
+    def __reduce__(self) -> tuple[type[WriteLostError], tuple[str, tuple[str | Lost, ...]]]:
+        return type(self), (str(self), self.outcomes)
 
 
 class Connector(ABC):
@@ -81,6 +102,6 @@ class Connector(ABC):
         """Change these bytes and bits in the device; for each "" if it confirmed, else its refusal in words.
 
         A write of a bit leaves its neighbours alone; one of bytes may be longer than the protocol takes at once.
-        ConnectorError: the connection is lost, and what became of them is not known.
+        WriteLostError: the connection is lost, and what became of each; ConnectorError: nothing is known of any.
         """
         raise ConnectorError("this connector cannot write")

@@ -11,9 +11,11 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
-from typing import Final, NamedTuple
+from typing import Final
 
-from shmio.layout.write import Write, cover, merge
+from shmio.connectors.base import Lost, WriteLostError
+from shmio.connectors.batch import End, Item, coalesce, ends
+from shmio.layout.write import Write, cover
 from shmio.segment import BlockWriter, Command, EventKind, Record
 from shmio.segment.events import EVENT_DATA_SIZE
 
@@ -25,17 +27,6 @@ TELL_NS: Final = 1_000_000_000
 """How often a writer that sends garbage is told."""
 
 log = logging.getLogger("shmio.source")
-
-
-class _Item(NamedTuple):
-    """One accepted write of a command."""
-
-    command: Command
-    place: int
-
-    @property
-    def write(self) -> Write:
-        return self.command.writes[self.place]
 
 
 class CommandDesk:
@@ -50,7 +41,7 @@ class CommandDesk:
         self._most_bytes = MAX_WAITING_BLOCKS * writer.block.layout.size
         self._turn = threading.Lock()
         self._closed = "the source is not connected yet"
-        self._items: list[_Item] = []
+        self._items: list[Item] = []
         self._held: Command | None = None  # taken from its queue, but there is no room for it before the next cycle
         self._garbage_ns: dict[int, int] = {}
         self._stopped = False
@@ -77,7 +68,7 @@ class CommandDesk:
         """Write all that waits, each byte and bit once, the last value wins; tell what became of each item.
 
         Commands go in the order in which they were accepted. Whatever ``write`` raises is raised, after it has been
-        told that nobody knows.
+        told of each item what is known.
         """
         items = self._take(lambda _: True)
         now_ns = self._now_ns()
@@ -90,19 +81,20 @@ class CommandDesk:
         finally:
             self._make_room()
 
-    def _write(self, items: Sequence[_Item], write: Callable[[Sequence[Write]], list[str]]) -> None:
+    def _write(self, items: Sequence[Item], write: Callable[[Sequence[Write]], list[str]]) -> None:
         writes, superseded = coalesce(items, self._writer.block.layout.size)
+        outcomes: Sequence[str | Lost] = [Lost.UNKNOWN] * len(writes)
+        error = ""
         try:
-            refusals = write(writes)
-        except BaseException as error:
-            self._end(items, [(EventKind.UNKNOWN, f"sent, but not confirmed: {error}")] * len(items))
+            outcomes = write(writes)
+        except WriteLostError as lost:
+            outcomes, error = lost.outcomes, str(lost)
             raise
-        refused = [(write, text) for write, text in zip(writes, refusals, strict=True) if text]
-        ends = [_end(item.write, refused) for item in items]
-        for place in superseded:  # what took its place was written, or it was not
-            if ends[place][0] is EventKind.WRITTEN:
-                ends[place] = EventKind.WRITTEN, _SUPERSEDED
-        self._end(items, ends)
+        except BaseException as unforeseen:
+            error = str(unforeseen)
+            raise
+        finally:
+            self._end(items, ends(items, writes, superseded, outcomes, error))
 
     def run(self) -> None:
         """Take commands until :meth:`stop`."""
@@ -123,14 +115,14 @@ class CommandDesk:
         self._stopped = True
         self._writer.block.commands.wake()
 
-    def _take(self, which: Callable[[_Item], bool]) -> list[_Item]:
+    def _take(self, which: Callable[[Item], bool]) -> list[Item]:
         """Take what waits and is of this kind."""
         with self._turn:
             kinds = [(item, which(item)) for item in self._items]
             self._items = [item for item, wanted in kinds if not wanted]
         return [item for item, wanted in kinds if wanted]
 
-    def _expire(self, items: Sequence[_Item]) -> None:
+    def _expire(self, items: Sequence[Item]) -> None:
         self._end(items, [(EventKind.EXPIRED, "no cycle came before its deadline")] * len(items))
 
     def _patience_ns(self) -> int:
@@ -171,12 +163,12 @@ class CommandDesk:
         """Accept or reject; False if there is no room before the next cycle, and the command is held."""
         reason = self._refusal(command)
         if reason:
-            self._writer.event(_record(EventKind.REJECTED, _Item(command, 0), len(command.writes), reason))
+            self._writer.event(_record(EventKind.REJECTED, Item(command, 0), len(command.writes), reason))
             return True
         if not self._has_room(command):
             self._held = command
             return False
-        items = [_Item(command, place) for place in range(len(command.writes))]
+        items = [Item(command, place) for place in range(len(command.writes))]
         for item in items:  # outside the lock, which the loop must never wait for long
             for part in _parts(item):
                 self._writer.event(part)
@@ -216,7 +208,7 @@ class CommandDesk:
                 return f"bytes {write.offset} to {stop - 1} are not writable; name them in the source's `writable`"
         return ""
 
-    def _end(self, items: Sequence[_Item], ends: Sequence[tuple[EventKind, str]]) -> None:
+    def _end(self, items: Sequence[Item], ends: Sequence[End]) -> None:
         """Tell what became of accepted items: one event for neighbours in a command that ended alike."""
         both = zip(items, ends, strict=True)
         for (_, (kind, text)), group in groupby(both, key=lambda pair: (id(pair[0].command), pair[1])):
@@ -224,60 +216,14 @@ class CommandDesk:
                 self._writer.event(_record(kind, first, count, text))
 
 
-_SUPERSEDED: Final = "superseded by a later write of the same cycle"
-
-
-def coalesce(items: Sequence[_Item], size: int) -> tuple[list[Write], set[int]]:
-    """What has to be written so that the last value of each bit wins, and the places of items that left nothing.
-
-    Neighbours are joined within a command only: it is one client's, who wanted all or nothing.
-    """
-    taken = bytearray(size)
-    kept: list[tuple[_Item, bytes]] = []  # the last first, with the bits that nothing later writes
-    superseded = set()
-    for place in reversed(range(len(items))):
-        offset, mask, data = items[place].write
-        own = bytes(~later & (mask or 0xFF) & 0xFF for later in taken[offset : offset + len(data)])
-        if not any(own):
-            superseded.add(place)
-            continue
-        for at, bits in enumerate(own, offset):
-            taken[at] |= bits
-        kept.append((items[place], own))
-    writes: list[Write] = []
-    image, bits_kept = bytearray(size), bytearray(size)
-    for _, group in groupby(reversed(kept), key=lambda pair: id(pair[0].command)):
-        ranges = []
-        for item, own in group:
-            offset, stop = item.write.offset, item.write.offset + len(own)
-            ranges.append((offset, stop))
-            for at, (bits, byte) in enumerate(zip(own, item.write.data, strict=True), offset):
-                image[at] = image[at] & ~bits | byte & bits
-                bits_kept[at] |= bits
-        writes += merge(image, bits_kept, ranges)
-        for start, stop in ranges:
-            bits_kept[start:stop] = bytes(stop - start)
-    return writes, superseded
-
-
-def _end(write: Write, refused: Sequence[tuple[Write, str]]) -> tuple[EventKind, str]:
-    """The end of an item, from the merged writes that the device refused."""
-    start, stop = write.offset, write.offset + len(write.data)
-    for other, text in refused:
-        same_bits = not write.mask or not other.mask or write.mask == other.mask
-        if same_bits and other.offset < stop and start < other.offset + len(other.data):
-            return EventKind.REFUSED, text
-    return EventKind.WRITTEN, ""
-
-
-def _record(kind: EventKind, item: _Item, count: int, text: str = "") -> Record:
+def _record(kind: EventKind, item: Item, count: int, text: str = "") -> Record:
     command, write = item.command, item.write
     return Record(
         kind, text, command.writer, command.id, item.place, count, write.offset, write.mask, len(write.data)
     )  # fmt: skip
 
 
-def _parts(item: _Item) -> Iterator[Record]:
+def _parts(item: Item) -> Iterator[Record]:
     """The events that tell of an accepted item with its data; several if these are long."""
     command, (offset, mask, data) = item.command, item.write
     for start in range(0, len(data), EVENT_DATA_SIZE):
@@ -287,7 +233,7 @@ def _parts(item: _Item) -> Iterator[Record]:
         )  # fmt: skip
 
 
-def _runs(items: Sequence[_Item]) -> Iterator[tuple[_Item, int]]:
+def _runs(items: Sequence[Item]) -> Iterator[tuple[Item, int]]:
     """Consecutive places of one command as (first, count)."""
     first, count = items[0], 1
     for item in items[1:]:

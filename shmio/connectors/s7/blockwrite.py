@@ -9,9 +9,10 @@ Nothing is sorted: items fill the jobs in the order of the writes, and jobs are 
 from __future__ import annotations
 
 from bisect import bisect_right, insort
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
+from shmio.connectors.base import Lost
 from shmio.connectors.s7 import writepdu
 from shmio.connectors.s7.explain import ITEM_OK, RefusedError, explain_write
 from shmio.layout.write import Write
@@ -33,12 +34,13 @@ class BlockWrite:
         self._outcomes = outcomes
         self._jobs = list(_fill(items, pdu_size))
         self.count = len(self._jobs)
-        self.sent = self._answered = 0
+        self.sent = 0
+        self._answered: set[int] = set()
 
     @property
     def complete(self) -> bool:
         """Whether every job is answered."""
-        return self._answered == self.count
+        return len(self._answered) == self.count
 
     def take(self, count: int, first: int) -> bytes:
         """Give the next requests, with the references from ``first`` on (16 bits, wrapping)."""
@@ -60,7 +62,14 @@ class BlockWrite:
             for item, code in zip(job, codes, strict=True):
                 if code != ITEM_OK:
                     self._refuse(item, explain_write(code, self._db_number, item.last))
-        self._answered += 1
+        self._answered.add(index)
+
+    def unanswered(self) -> Iterator[tuple[int, Lost | None]]:
+        """For each item, the index of its write, and what is known of it if it has no answer."""
+        for index, job in enumerate(self._jobs):
+            known = None if index in self._answered else Lost.UNKNOWN if index < self.sent else Lost.UNSENT
+            for item in job:
+                yield item.write, known
 
     def _refuse(self, item: _Item, reason: str) -> None:
         self._outcomes[item.write] = self._outcomes[item.write] or reason
@@ -79,6 +88,23 @@ def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list
         wave += _items(db_number, pdu_size, place, write)
     if wave:
         yield BlockWrite(db_number, pdu_size, wave, outcomes)
+
+
+def ends(outcomes: Sequence[str], begun: Iterable[BlockWrite]) -> list[str | Lost]:
+    """What became of each write of a batch when the session was lost in the last of the waves that were begun."""
+    parts: list[set[Lost | None]] = [set() for _ in outcomes]
+    for wave in begun:
+        for write, known in wave.unanswered():
+            parts[write].add(known)
+    return [_end(text, known) for text, known in zip(outcomes, parts, strict=True)]
+
+
+def _end(text: str, parts: set[Lost | None]) -> str | Lost:
+    if Lost.UNKNOWN in parts:
+        return Lost.UNKNOWN
+    if not text and None in parts and Lost.UNSENT in parts:  # done in part: neither written nor surely not
+        return Lost.UNKNOWN
+    return text if None in parts else Lost.UNSENT
 
 
 def _span(write: Write) -> tuple[int, int]:

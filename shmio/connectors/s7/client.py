@@ -9,16 +9,16 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Sequence
-from types import TracebackType
 
+from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.blockread import BlockRead
 from shmio.connectors.s7.blocksize import SizeProbe
-from shmio.connectors.s7.blockwrite import BlockWrite, waves
+from shmio.connectors.s7.blockwrite import BlockWrite, ends, waves
 from shmio.connectors.s7.explain import OUT_OF_RANGE, RefusedError, explain_size
 from shmio.connectors.s7.mode import ModeQuestion
 from shmio.connectors.s7.options import S7Options
-from shmio.connectors.s7.transport import Transport, named
+from shmio.connectors.s7.transport import DroppingOnError, Transport
 from shmio.connectors.s7.window import Operation, Window
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.write import Write
@@ -51,7 +51,7 @@ class S7Client:
         self._under_way: deque[BlockRead] = deque()
         self._idle: list[BlockRead] = []
         self._mode = ModeQuestion()
-        self._dropping_on_error = _DroppingOnError(self)
+        self._dropping_on_error = DroppingOnError(self.close, options)
 
     @property
     def connected(self) -> bool:
@@ -84,7 +84,7 @@ class S7Client:
         ConnectorError: nobody there, not an S7 controller, session refused.
         """
         self.close()
-        with _DroppingOnError(self, opening=True):
+        with DroppingOnError(self.close, self.options, opening=True):
             self._transport = transport = Transport(self.options.host, self.options.port, self._timeout_ns)
             deadline_ns = transport.deadline_ns
             transport.send(pdu.connect_request(self.options.rack, self.options.cpu_slot), deadline_ns)
@@ -157,23 +157,27 @@ class S7Client:
         A text is empty when the controller has confirmed the write. What does not fit one PDU is several jobs, so it is
         not one instant of the controller, and may be done in part; jobs under way at once it may serve in any order.
         Each answer must come within ``timeout`` of the one before: a slow controller is not taken for a dead one.
-        ConnectorError: the session is lost, or all of it took longer than LONGEST_WRITE_S and ``timeout``; nothing is
-        known of any of them.
+        WriteLostError: the session is lost, or all of it took longer than LONGEST_WRITE_S and ``timeout``.
         """
         if self._transport is None:
-            raise ConnectorError("not connected")
+            raise WriteLostError("not connected", [Lost.UNSENT] * len(writes))
         outcomes = [""] * len(writes)
-        with self._dropping_on_error:
-            begun_ns = time.monotonic_ns()
-            end_ns = begun_ns + max(self._timeout_ns, LONGEST_WRITE_S * 1_000_000_000)
-            for wave in waves(self.db_number, self.pdu_size, writes, outcomes):
-                self._window.add(wave, urgent=True)
-                self._flush()
-                self._finish_wave(wave, end_ns)
-            spent_ns = time.monotonic_ns() - begun_ns  # what waited behind the writes is not late for that
-            self._mode.deadline_ns += spent_ns
-            for read in self._under_way:
-                read.deadline_ns += spent_ns
+        begun: list[BlockWrite] = []
+        try:
+            with self._dropping_on_error:
+                begun_ns = time.monotonic_ns()
+                end_ns = begun_ns + max(self._timeout_ns, LONGEST_WRITE_S * 1_000_000_000)
+                for wave in waves(self.db_number, self.pdu_size, writes, outcomes):
+                    begun.append(wave)
+                    self._window.add(wave, urgent=True)
+                    self._flush()
+                    self._finish_wave(wave, end_ns)
+                spent_ns = time.monotonic_ns() - begun_ns  # what waited behind the writes is not late for that
+                self._mode.deadline_ns += spent_ns
+                for read in self._under_way:
+                    read.deadline_ns += spent_ns
+        except ConnectorError as error:
+            raise WriteLostError(str(error), ends(outcomes, begun)) from None
         return outcomes
 
     def close(self) -> None:
@@ -216,7 +220,12 @@ class S7Client:
         """Send what may be sent."""
         assert self._transport is not None  # noqa: S101 - for the type checker
         if self._window.waiting and (requests := self._window.due()):
-            self._transport.send(requests, time.monotonic_ns() + self._timeout_ns)
+            try:
+                self._transport.send(requests, time.monotonic_ns() + self._timeout_ns)
+            except OSError:
+                if not self._transport.taken:
+                    self._window.take_back()
+                raise
 
     def _advance(self, operation: Operation, until_ns: int) -> bool:
         """Send and receive until an operation is complete; False if it is not at ``until_ns``."""
@@ -276,22 +285,3 @@ class S7Client:
         except (ConnectorError, OSError, EOFError):
             return refusal
         return RefusedError(explain_size(self.db_number, self.size, probe.found), OUT_OF_RANGE)
-
-
-class _DroppingOnError:
-    """Closes the client on any way out of a ``with`` block but the good one, and names the error for people."""
-
-    def __init__(self, client: S7Client, *, opening: bool = False) -> None:
-        self._client = client
-        self._opening = opening
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        if error is not None:
-            self._client.close()
-            if (clear := named(error, self._client.options, opening=self._opening)) is not None:
-                raise clear from None

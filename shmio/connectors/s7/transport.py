@@ -5,6 +5,9 @@ from __future__ import annotations
 import select
 import socket
 import time
+from collections.abc import Callable
+from contextlib import suppress
+from types import TracebackType
 
 from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.options import S7Options
@@ -32,6 +35,8 @@ class Transport:
                 break
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket.setblocking(False)
+        self.taken = 0
+        """Bytes of the last ``send`` that are on their way, or were when it failed."""
         self.reserve(1, 512)  # more than any connection confirm
 
     def reserve(self, frames: int, longest: int) -> None:
@@ -50,16 +55,14 @@ class Transport:
 
         What it answers meanwhile waits in the kernel: with so few requests under way, it fits there.
         """
-        try:
-            sent = self._socket.send(data)
-        except BlockingIOError:
-            sent = 0
-        while sent < len(data):
-            data = data[sent:]
+        self.taken = 0
+        with suppress(BlockingIOError):
+            self.taken = self._socket.send(data)
+        while self.taken < len(data):
             _, ready, _ = select.select((), (self._socket,), (), _left_s(deadline_ns))
             if not ready:
                 raise TimeoutError
-            sent = self._socket.send(data)
+            self.taken += self._socket.send(data[self.taken :])
 
     def receive(self, until_ns: int) -> bool:
         """Take what the socket has, once there is something; False: nothing came. EOFError: the peer closed.
@@ -126,3 +129,23 @@ def named(error: BaseException, options: S7Options, *, opening: bool = False) ->
     if isinstance(error, OSError):
         return ConnectorError(f"{peer} cannot be reached: {error.strerror or error}")
     return None
+
+
+class DroppingOnError:
+    """Closes a connection on any way out of a ``with`` block but the good one, and names the error for people."""
+
+    def __init__(self, close: Callable[[], None], options: S7Options, *, opening: bool = False) -> None:
+        self._close = close
+        self._options = options
+        self._opening = opening
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if error is not None:
+            self._close()
+            if (clear := named(error, self._options, opening=self._opening)) is not None:
+                raise clear from None

@@ -20,9 +20,8 @@ class Operation(Protocol):
     def count(self) -> int:
         """Requests in all."""
 
-    @property
-    def sent(self) -> int:
-        """Requests given by ``take``."""
+    sent: int
+    """Requests given by ``take``."""
 
     @property
     def complete(self) -> bool:
@@ -43,6 +42,7 @@ class Window:
         self.reference = reference
         self._queue: deque[Operation] = deque()
         self._under_way: dict[int, tuple[Operation, int]] = {}
+        self._given: list[tuple[Operation, int]] = []  # by the last ``due``: whose, from which of its requests on
 
     @property
     def idle(self) -> bool:
@@ -64,9 +64,11 @@ class Window:
     def due(self) -> bytes | memoryview:
         """Give what may be sent now; empty if nothing may."""
         parts: list[bytes | memoryview] = []
+        self._given.clear()
         while self._queue and (free := self.jobs - len(self._under_way)) > 0:
             operation = self._queue[0]
             begin = operation.sent
+            self._given.append((operation, begin))
             parts.append(operation.take(min(free, operation.count - begin), self.reference))
             for index in range(begin, operation.sent):
                 self._under_way[self.reference] = operation, index
@@ -74,6 +76,11 @@ class Window:
             if operation.sent == operation.count:
                 self._queue.popleft()
         return parts[0] if len(parts) == 1 else b"".join(parts)
+
+    def take_back(self) -> None:
+        """Know that what ``due`` gave last has not gone out, not a byte of it; the connection is lost."""
+        for operation, begin in self._given:
+            operation.sent = begin
 
     def accept(self, frame: memoryview) -> None:
         """Hand an answer to the operation that asked; ConnectorError if none did."""

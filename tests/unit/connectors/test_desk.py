@@ -9,7 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from shmio.connectors.desk import MAX_WAITING, CommandDesk, _Item, coalesce
+from shmio.connectors.base import Lost, WriteLostError
+from shmio.connectors.batch import Item, coalesce
+from shmio.connectors.desk import MAX_WAITING, CommandDesk
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
 from shmio.segment import (
@@ -214,6 +216,41 @@ def test_a_lost_connection_leaves_the_end_unknown(bench: Bench) -> None:
     assert (event.kind, event.text) == (EventKind.UNKNOWN, "sent, but not confirmed: cut")
 
 
+def test_of_a_lost_batch_each_item_has_the_end_that_is_known(bench: Bench) -> None:
+    """Confirmed and refused before the loss, under way at that moment, never sent; one is superseded."""
+    first = bench.accepted(Write(0, 0, b"\0\0"), Write(6, 0, b"a"), Write(8, 0, b"b"), Write(10, 0, b"c"))
+    second = bench.accepted(Write(10, 0, b"d"), Write(2, 1, b"\1"), Write(2, 2, b"\2"))
+
+    def lost(writes: Sequence[Write]) -> list[str]:
+        assert len(writes) == 6
+        raise WriteLostError("cut", ["", "no", Lost.UNKNOWN, Lost.UNSENT, Lost.UNSENT, Lost.UNSENT])
+
+    with pytest.raises(ConnectorError):
+        bench.desk.carry_out(lost)
+    ends = [bench.event() for _ in range(5)]
+    assert [(end.command, end.item, end.items, end.kind, end.text) for end in ends] == [
+        (first, 0, 1, EventKind.WRITTEN, ""),
+        (first, 1, 1, EventKind.REFUSED, "no"),
+        (first, 2, 1, EventKind.UNKNOWN, "sent, but not confirmed: cut"),
+        (first, 3, 1, EventKind.EXPIRED, "not sent: cut"),
+        (second, 0, 3, EventKind.EXPIRED, "not sent: cut"),
+    ]
+
+
+def test_an_item_of_which_a_part_was_done_is_not_expired(bench: Bench) -> None:
+    """The bytes that a later item did not take were written, the others were not."""
+    bench.accepted(Write(6, 0, b"abcd"))
+    bench.accepted(Write(8, 0, b"xy"))
+
+    def lost(writes: Sequence[Write]) -> list[str]:
+        assert writes == [Write(6, 0, b"ab"), Write(8, 0, b"xy")]
+        raise WriteLostError("", ["", Lost.UNSENT])
+
+    with pytest.raises(ConnectorError):
+        bench.desk.carry_out(lost)
+    assert [bench.event().kind for _ in range(2)] == [EventKind.UNKNOWN, EventKind.EXPIRED]
+
+
 def test_the_refusal_of_one_item_is_told_of_that_item(bench: Bench) -> None:
     bench.accepted(Write(0, 0, b"\0\0"), Write(2, 1, b"\1"), Write(2, 2, b"\2"), Write(6, 0, b"\0"))
     bench.desk.carry_out(lambda writes: ["access denied" if write.mask == 2 else "" for write in writes])
@@ -343,7 +380,7 @@ def test_coalesced_writes_leave_what_the_single_ones_would(items: list[tuple[int
         for place in range(len(writes))
     ]
     first = {command.id: command for command in commands}
-    merged, superseded = coalesce([_Item(first[place // 3], place % 3) for place in range(len(writes))], 10)
+    merged, superseded = coalesce([Item(first[place // 3], place % 3) for place in range(len(writes))], 10)
     assert apply(before, merged) == apply(before, writes)
     assert apply(before, [w for place, w in enumerate(writes) if place not in superseded]) == apply(before, writes)
 

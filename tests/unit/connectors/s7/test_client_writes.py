@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+import socket
 import threading
 import time
 
 import pytest
 
+from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.s7.client import S7Client
 from shmio.connectors.s7.connector import S7Connector
 from shmio.connectors.s7.options import S7Options
@@ -180,6 +182,73 @@ def test_the_connection_is_lost_in_mid_write(make_plc: MakePlc, count: int) -> N
     with pytest.raises(ConnectorError, match="not connected"):
         client.write([Write(0, 0, b"x")])
     assert_recovers(plc, client)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_of_each_write_it_is_known_what_a_lost_connection_did_to_it(make_plc: MakePlc, jobs: int) -> None:
+    """Jobs go out as others are answered: what is after those under way was never sent, and never comes."""
+    plc = make_plc(Traits(max_pdu_size=240, max_jobs=jobs))
+    client = plc.connected(timeout=300)
+    writes = [Write(SIZE, 0, b"?"), *(Write(at, 0, b"\xee" * 200) for at in range(0, 2000, 200))]  # a job each
+    before = bytes(plc.block)
+    answered = 0
+
+    def cut_at_the_third(frame: bytes) -> bytes | None:
+        nonlocal answered
+        answered += frame[8] == 3 and frame[19] == 5
+        return None if answered >= 3 else frame
+
+    plc.proxy.edit(cut_at_the_third)
+    with pytest.raises(WriteLostError, match="no answer within 300 ms") as lost:
+        client.write(writes)
+    assert isinstance(lost.value.outcomes[0], str)
+    assert "no byte" in lost.value.outcomes[0]
+    assert lost.value.outcomes[1:] == ("", *[Lost.UNKNOWN] * jobs, *[Lost.UNSENT] * (9 - jobs))
+    assert_recovers(plc, client)
+    unsent = 200 * (1 + jobs)
+    assert plc.block[:200] == b"\xee" * 200
+    assert plc.block[unsent:] == before[unsent:]
+
+
+def test_what_a_dead_connection_does_not_even_take_was_not_sent(plc: Plc, monkeypatch: pytest.MonkeyPatch) -> None:
+    client = plc.connected()
+    before = bytes(plc.block)
+
+    def reset(_: socket.socket, __: bytes) -> int:
+        raise ConnectionResetError
+
+    with monkeypatch.context() as patch:
+        patch.setattr("shmio.connectors.s7.transport.socket.socket.send", reset)
+        with pytest.raises(WriteLostError, match="closed the connection") as lost:
+            client.write([Write(0, 0, b"one"), Write(9, 2, b"\2")])
+    assert lost.value.outcomes == (Lost.UNSENT, Lost.UNSENT)
+    assert_recovers(plc, client)
+    assert plc.block == before
+
+
+def test_a_job_that_went_out_in_part_may_have_been_carried_out(plc: Plc, monkeypatch: pytest.MonkeyPatch) -> None:
+    client = plc.connected()
+    send = socket.socket.send
+    sent: list[int] = []
+
+    def send_once(to: socket.socket, data: bytes) -> int:
+        if sent:
+            raise ConnectionResetError
+        sent.append(send(to, bytes(data)[:5]))
+        return sent[0]
+
+    with monkeypatch.context() as patch:
+        patch.setattr("shmio.connectors.s7.transport.socket.socket.send", send_once)
+        with pytest.raises(WriteLostError) as lost:
+            client.write([Write(0, 0, b"one")])
+    assert lost.value.outcomes == (Lost.UNKNOWN,)
+    assert_recovers(plc, client)
+
+
+def test_without_a_session_nothing_is_sent(plc: Plc) -> None:
+    with pytest.raises(WriteLostError, match="not connected") as lost:
+        plc.client().write([Write(0, 0, b"x")] * 2)
+    assert lost.value.outcomes == (Lost.UNSENT,) * 2
 
 
 def test_a_read_that_is_refused_does_not_spoil_a_write(make_plc: MakePlc) -> None:

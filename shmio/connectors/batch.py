@@ -1,0 +1,96 @@
+"""What waits for a cycle as one batch of writes, and what the batch's outcomes mean for each of the items. No I/O."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby
+from typing import Final, NamedTuple
+
+from shmio.connectors.base import Lost
+from shmio.layout.write import Write, merge
+from shmio.segment import Command, EventKind
+
+End = tuple[EventKind, str]
+"""What became of an item, and why."""
+
+_SUPERSEDED: Final = "superseded by a later write of the same cycle"
+
+
+class Item(NamedTuple):
+    """One accepted write of a command."""
+
+    command: Command
+    place: int
+
+    @property
+    def write(self) -> Write:
+        """The write itself."""
+        return self.command.writes[self.place]
+
+
+def coalesce(items: Sequence[Item], size: int) -> tuple[list[Write], set[int]]:
+    """What has to be written so that the last value of each bit wins, and the places of items that left nothing.
+
+    Neighbours are joined within a command only: it is one client's, who wanted all or nothing.
+    """
+    taken = bytearray(size)
+    kept: list[tuple[Item, bytes]] = []  # the last first, with the bits that nothing later writes
+    superseded = set()
+    for place in reversed(range(len(items))):
+        offset, mask, data = items[place].write
+        own = bytes(~later & (mask or 0xFF) & 0xFF for later in taken[offset : offset + len(data)])
+        if not any(own):
+            superseded.add(place)
+            continue
+        for at, bits in enumerate(own, offset):
+            taken[at] |= bits
+        kept.append((items[place], own))
+    writes: list[Write] = []
+    image, bits_kept = bytearray(size), bytearray(size)
+    for _, group in groupby(reversed(kept), key=lambda pair: id(pair[0].command)):
+        ranges = []
+        for item, own in group:
+            offset, stop = item.write.offset, item.write.offset + len(own)
+            ranges.append((offset, stop))
+            for at, (bits, byte) in enumerate(zip(own, item.write.data, strict=True), offset):
+                image[at] = image[at] & ~bits | byte & bits
+                bits_kept[at] |= bits
+        writes += merge(image, bits_kept, ranges)
+        for start, stop in ranges:
+            bits_kept[start:stop] = bytes(stop - start)
+    return writes, superseded
+
+
+def ends(
+    items: Sequence[Item], writes: Sequence[Write], superseded: set[int], outcomes: Sequence[str | Lost], error: str
+) -> list[End]:
+    """What became of each item.
+
+    ``writes`` and ``superseded``: what :func:`coalesce` made of them; ``outcomes``: of the writes; ``error``: by which
+    some were lost.
+    """
+    lost = any(isinstance(outcome, Lost) for outcome in outcomes)
+    told = [(write, outcome) for write, outcome in zip(writes, outcomes, strict=True) if outcome or lost]
+    found = [_end(item.write, told, error) for item in items]
+    for place in superseded:  # what took its place was written, or it was not
+        if found[place][0] is EventKind.WRITTEN:
+            found[place] = EventKind.WRITTEN, _SUPERSEDED
+    return found
+
+
+def _end(write: Write, told: Sequence[tuple[Write, str | Lost]], error: str) -> End:
+    """The end of an item, from those of the writes; ``told`` may leave out what was confirmed unless some were lost."""
+    outcomes = [outcome for other, outcome in told if _share_bits(write, other)]
+    refusal = next((outcome for outcome in outcomes if outcome and isinstance(outcome, str)), "")
+    lost = Lost.UNSENT in outcomes
+    if Lost.UNKNOWN in outcomes or (lost and "" in outcomes):  # done in part: neither written nor surely not
+        return EventKind.UNKNOWN, f"sent, but not confirmed: {error}"
+    if refusal:
+        return EventKind.REFUSED, refusal
+    return (EventKind.EXPIRED, f"not sent: {error}") if lost else (EventKind.WRITTEN, "")
+
+
+def _share_bits(one: Write, other: Write) -> bool:
+    if one.mask and other.mask and one.mask != other.mask:
+        return False
+    return other.offset < one.offset + len(one.data) and one.offset < other.offset + len(other.data)
