@@ -2,7 +2,8 @@
 
 A reader of its own follows every frame: cycles must follow each other, quality must stay good. What the subscribers got
 is held against how often their registers changed; the recording against the frames. Memory and descriptors of each
-process are taken every few seconds; what the second half holds more than the second quarter is growth.
+process are taken every few seconds; what the second half holds more than the second quarter is growth. A witness, a
+process that only sleeps at the same rate, tells when the machine itself made loops late.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ REGISTERS = [f"Robot_800/Axs{axis}_Pos" for axis in range(1, 6)]
 FIRST_S = 1.0
 """Overruns in the first second do not count: everybody is starting."""
 SAMPLE_S = 5.0
+NEAR_S = 0.1
+"""What happens within this time of each other has one cause."""
 
 
 @dataclass
@@ -40,6 +43,8 @@ class Follower:
     frames: int = 0
     bad: int = 0
     skipped: int = 0
+    skips: list[tuple[float, int]] = field(default_factory=list)
+    """When a frame came for which cycles had been skipped (CLOCK_MONOTONIC, s), and how many."""
     changes: dict[str, int] = field(default_factory=lambda: dict.fromkeys(REGISTERS, 0))
     stopping: threading.Event = field(default_factory=threading.Event)
 
@@ -54,7 +59,9 @@ class Follower:
                 continue
             self.frames += 1
             self.bad += frame.quality is not Quality.GOOD
-            self.skipped += 0 if cycle is None else frame.cycle - cycle - 1
+            if cycle is not None and frame.cycle - cycle > 1:
+                self.skipped += frame.cycle - cycle - 1
+                self.skips.append((frame.publish_ns / 1e9, frame.cycle - cycle - 1))
             cycle = frame.cycle
             for path, decoder in decoders.items():
                 value = decoder.decode(frame.image)
@@ -107,9 +114,11 @@ def soak(running: Instance, duration_s: float) -> list[str]:
     follower = Follower(running.segment.blocks["cell"])
     thread = threading.Thread(target=follower.run)
     sizes: dict[str, list[Size]] = {name: [] for name in running.pids}
-    with Child("subscriber.py", running.grpc, *(f"cell/{path}" for path in REGISTERS)) as subscribers:
+    paths = [f"cell/{path}" for path in REGISTERS]
+    with Child("witness.py", PERIOD_MS) as witness, Child("subscriber.py", running.grpc, *paths) as subscribers:
         thread.start()
-        end_s = time.monotonic() + duration_s
+        begun_s = time.monotonic()
+        end_s = begun_s + duration_s
         while (rest_s := end_s - time.monotonic()) > 0:
             time.sleep(min(SAMPLE_S, rest_s))
             for name, pid in running.pids.items():
@@ -117,6 +126,7 @@ def soak(running: Instance, duration_s: float) -> list[str]:
         follower.stopping.set()
         thread.join()
         messages = int(subscribers.finish()["messages"])
+        delays = [(at_s, late_s) for at_s, late_s in witness.finish()]
     after = slots["cell"].counters
     rows, problems = [], []
     for name, taken in sizes.items():
@@ -135,6 +145,13 @@ def soak(running: Instance, duration_s: float) -> list[str]:
         f"{follower.frames} frames, {overruns} overruns, {failures} failures, {follower.bad} not good, "
         f"{follower.skipped} cycles skipped, {follower.missed} missed by the reader; {changes} changes, "
         f"{messages} messages received, {slots['grpc'].counters['dropped']} dropped"
+    )
+    for at_s, count in follower.skips:
+        near = [f"{late_s * 1000:.0f} ms late" for when_s, late_s in delays if abs(when_s - at_s) < NEAR_S + late_s]
+        print(f"at {at_s - begun_s:.1f} s: {count} cycles skipped; the witness was {', '.join(near) or 'in time'}")
+    print(
+        f"the witness was late by {PERIOD_MS / 2:g} ms and more {len(delays)} times, "
+        f"by {max((late_s for _, late_s in delays), default=0) * 1000:.0f} ms at most"
     )
     for name, value in (
         ("overruns after the first second", overruns),
