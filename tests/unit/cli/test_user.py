@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import threading
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -64,42 +65,40 @@ def test_watch_ends_with_ctrl_c(running: str, monkeypatch: pytest.MonkeyPatch) -
     assert main(["watch", "--instance", running, "cell/a"]) == 130
 
 
-def test_watch_goes_on_with_the_block_that_a_reload_has_made(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+def watching(*arguments: str) -> subprocess.Popen[str]:
+    program = "import sys; from shmio.cli.user import main; sys.exit(main())"
+    command = [sys.executable, "-P", "-c", program, "watch", *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_watch_goes_on_with_the_block_that_a_reload_has_made(instance: str) -> None:
     wide = Layout(
         "DB1", 1, 4, False, (Register("b", "INT", (), 0, None, 2, 1), Register("a", "INT", (), 2, None, 2, 1))
     )
     spec = BlockSpec("cell", LAYOUT, 20_000_000, 3600 * 10**9, 1 << 16)
     with Segment.create(instance, [spec], []) as segment:
         segment.writer("cell").publish(b"\0\7", cycle=1, source_ns=1)
-        printed: list[int] = []
-        thread = threading.Thread(
-            target=lambda: printed.append(main(["watch", "--instance", instance, "-n", "2", "cell/a"]))
-        )
-        thread.start()
-        out = ""
-        while "cell/a  7" not in out:
-            out += capsys.readouterr().out
-        segment.change(add=[BlockSpec("cell", wide, 20_000_000, 3600 * 10**9, 1 << 16)], retire=["cell"])
-        segment.writer("cell").publish(b"\0\0\0\x08", cycle=2, source_ns=1)
-        thread.join(20)
+        with watching("--instance", instance, "-n", "2", "cell/a") as watch:
+            assert watch.stdout is not None
+            assert "cell/a  7" in watch.stdout.readline()
+            segment.change(add=[BlockSpec("cell", wide, 20_000_000, 3600 * 10**9, 1 << 16)], retire=["cell"])
+            segment.writer("cell").publish(b"\0\0\0\x08", cycle=2, source_ns=1)
+            out, err = watch.communicate(timeout=20)
         segment.unlink()
-    assert printed == [0]
-    assert "cell/a  8" in capsys.readouterr().out
+    assert (watch.returncode, err) == (0, "")
+    assert "cell/a  8" in out
 
 
-def test_watch_says_when_a_reload_has_taken_its_register(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_watch_says_when_a_reload_has_taken_its_register(instance: str) -> None:
     other = Layout("DB1", 1, 2, False, (Register("other", "INT", (), 0, None, 2, 1),))
     spec = BlockSpec("cell", LAYOUT, 20_000_000, 3600 * 10**9, 1 << 16)
     with Segment.create(instance, [spec], []) as segment:
         segment.writer("cell").publish(b"\0\7", cycle=1, source_ns=1)
-        ended: list[int] = []
-        thread = threading.Thread(target=lambda: ended.append(main(["watch", "--instance", instance, "cell/a"])))
-        thread.start()
-        out = ""
-        while "cell/a  7" not in out:
-            out += capsys.readouterr().out
-        segment.change(add=[BlockSpec("cell", other, 20_000_000, 3600 * 10**9, 1 << 16)], retire=["cell"])
-        thread.join(20)
+        with watching("--instance", instance, "cell/a") as watch:
+            assert watch.stdout is not None
+            assert "cell/a  7" in watch.stdout.readline()
+            segment.change(add=[BlockSpec("cell", other, 20_000_000, 3600 * 10**9, 1 << 16)], retire=["cell"])
+            _, err = watch.communicate(timeout=20)
         segment.unlink()
-    assert ended == [1]
-    assert "no such register" in capsys.readouterr().err
+    assert watch.returncode == 1
+    assert "no such register" in err
