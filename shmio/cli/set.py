@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import shlex
+from collections.abc import Sequence
 
 from shmio.cli.readings import topic_path
 from shmio.cli.run import dumps
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.codec import Value
+from shmio.layout.glob import select
 from shmio.layout.lists import split_array
 from shmio.layout.literal import parse_literal
 from shmio.layout.model import Register
@@ -23,16 +26,16 @@ from shmio.segment.commander import MIN_PERIODS, TIMEOUT_S, Outcome
 
 HELP = "Write values of registers, and print what became of each."
 MAX_TIMEOUT_S = 86_400
+MATCHES = 3
+"""So many of a pattern's registers are named to who meant one of them."""
 
+_NEGATIVE = re.compile(r"-(?:\.?[0-9]|Infinity\Z)")
 _QUOTED = frozenset({"CHAR", "WCHAR", "STRING", "WSTRING"})
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the verb's own arguments."""
-    parser.epilog = (
-        "VALUE is JSON or an S7 literal: 5, -1.5, true, 16#FF, T#1s, '\"text\"'. Before one that begins with a minus "
-        "and is no plain number, put -- in front of the first PATH."
-    )
+    parser.epilog = "VALUE is JSON or an S7 literal: 5, -1.5e-3, true, 16#FF, T#1s, '\"text\"'."
     parser.add_argument(
         "--timeout",
         type=_seconds,
@@ -42,6 +45,14 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("pairs", nargs="+", action=_Pairs, metavar="PATH VALUE", help="register or array element")
 
 
+def shield(words: Sequence[str]) -> list[str]:
+    """The command line with a space in front of what begins as a negative number, which argparse takes for options.
+
+    It knows ``-1.5`` itself, but not ``-1.5e-3``, ``-16#FF`` or ``-Infinity``.
+    """
+    return [f" {word}" if _NEGATIVE.match(word) else word for word in words]
+
+
 class _Pairs(argparse.Action):
     """PATH VALUE, as often as wanted."""
 
@@ -49,7 +60,7 @@ class _Pairs(argparse.Action):
         self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: object, _: str | None = None
     ) -> None:
         """Keep them as pairs; wrong usage when one is single."""
-        words = list(values) if isinstance(values, list) else []
+        words = [word[_NEGATIVE.match(word[1:]) is not None :] for word in values] if isinstance(values, list) else []
         if len(words) % 2:
             parser.error(f"{words[-1]!r} has no value: give PATH VALUE [PATH VALUE ...]")
         namespace.pairs = list(zip(words[::2], words[1::2], strict=True))
@@ -69,12 +80,13 @@ def execute(cell: Attachment, options: argparse.Namespace) -> int:
         except ValueRangeError as error:
             raise ValueRangeError(f"{name}: {str(error).removeprefix(f'{register.path}: ')}") from None
     outcomes: dict[str, Outcome] = {}
+    failed: list[tuple[str, Outcome]] = []
     try:
         for values in wanted.values():
             outcomes |= zip(values, cell.write(values, options.timeout), strict=True)
+        failed = [(path, outcome) for path, outcome in outcomes.items() if not outcome.done]
     finally:  # also of what was written before a later source took nothing
-        _print(outcomes, options.json)
-    failed = [(path, outcome) for path, outcome in outcomes.items() if not outcome.done]
+        _print(outcomes, options.json, failed[0][1].text if failed else "")
     if failed:
         more = f" (and {len(failed) - 1} more)" if failed[1:] else ""
         raise CommandError(_complaint(*failed[0]) + more)
@@ -131,16 +143,25 @@ def _target(cell: Attachment, path: str) -> tuple[Block, Register]:
     if topic.source not in sources:
         raise PathError(f"{path}: nothing is served under {topic.source} in this version")
     block = cell.block(topic.source)
-    return block, find(block.layout, topic.path)
+    try:
+        return block, find(block.layout, topic.path)
+    except PathError:
+        if "*" not in topic.path:
+            raise
+    chosen = [topic_path(block, block.layout.registers[index]) for index in select(block.layout, [topic.path])]
+    some = f"{', '.join(chosen[:MATCHES])}{', …' if chosen[MATCHES:] else ''}" if chosen else "nothing"
+    raise PathError(f"{path}: set takes one register, not a pattern; this one matches {some}")
 
 
-def _print(outcomes: dict[str, Outcome], as_json: bool) -> None:
+def _print(outcomes: dict[str, Outcome], as_json: bool, complaint: str) -> None:
+    """Each outcome; for people without the reason that the error line gives."""
     if as_json:
         print(dumps({path: {"outcome": str(end.kind), "reason": end.text} for path, end in outcomes.items()}))
         return
     width = max((len(printable(path)) for path in outcomes), default=0)
     for path, end in outcomes.items():
-        print(f"{printable(path):<{width}}  {end.kind}{f': {printable(end.text)}' if end.text else ''}")
+        reason = f": {printable(end.text)}" if end.text and end.text != complaint else ""
+        print(f"{printable(path):<{width}}  {end.kind}{reason}")
 
 
 def _complaint(path: str, outcome: Outcome) -> str:
@@ -160,5 +181,7 @@ def _seconds(text: str) -> float:
     except ValueError:
         seconds = math.nan
     if not 0 < seconds <= MAX_TIMEOUT_S:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds above 0, at most {MAX_TIMEOUT_S}")
+        raise argparse.ArgumentTypeError(
+            f"{text.strip()!r} is not a number of seconds above 0, at most {MAX_TIMEOUT_S}"
+        )
     return seconds

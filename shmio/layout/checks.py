@@ -27,15 +27,12 @@ def to_int(value: object, name: str) -> int:
 def to_float(value: object, name: str) -> float:
     """Return a float; whole numbers are taken, bools are not.
 
-    Raises ValueRangeError: not a number, or too large.
+    Raises ValueRangeError: not a number; OverflowError: too large for any float.
     """
     number: Any = value
     if isinstance(value, bool | str | bytes) or not hasattr(value, "__float__"):
         raise ValueRangeError(f"{name}: expected a number, found {brief(value)}")
-    try:
-        return float(number)
-    except OverflowError:
-        raise out_of_range(value, name) from None
+    return float(number)
 
 
 def to_bool(value: object, name: str) -> bool:
@@ -61,9 +58,9 @@ def encode_text(value: object, encoding: str, name: str) -> bytes:
         raise ValueRangeError(f"{name}: cannot hold the character {value[error.start]!r}") from None
 
 
-def out_of_range(value: object, name: str) -> ValueRangeError:
+def out_of_range(value: object, name: str, least: object, most: object) -> ValueRangeError:
     """Return the error for a value outside the type's range."""
-    return ValueRangeError(f"{name}: {brief(value)} is out of range")
+    return ValueRangeError(f"{name}: {brief(value)} is out of range {least}..{most}")
 
 
 def brief(value: object) -> str:

@@ -37,6 +37,9 @@ class Moment:
         ns = self._to_ns(data, offset)
         if ns is None or not self._bounds[0] <= ns <= self._bounds[1]:
             return None
+        return self._text(ns)
+
+    def _text(self, ns: int) -> str:
         if self._digits is None:
             return calendar.format_day(ns // calendar.NS_PER_DAY)
         return calendar.format_moment(ns, self._digits)
@@ -47,8 +50,10 @@ class Moment:
         if ns is None:
             example = "2024-02-29" + ("" if self._digits is None else "T12:34:56.789")
             raise ValueRangeError(f"{self._name}: expected text such as {example!r}, found {brief(value)}")
-        if not self._bounds[0] <= ns <= self._bounds[1] or ns % self._step:
-            raise out_of_range(value, self._name)
+        if not self._bounds[0] <= ns <= self._bounds[1]:
+            raise out_of_range(value, self._name, *map(self._text, self._bounds))
+        if ns % self._step:
+            raise ValueRangeError(f"{self._name}: {brief(value)} is finer than the type, such as {self._text(ns)}")
         return self._from_ns(ns)
 
 

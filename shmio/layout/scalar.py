@@ -25,6 +25,7 @@ Formats: Siemens, "STEP 7 Professional", chapter "Data types".
 from __future__ import annotations
 
 import struct
+import sys
 from collections.abc import Callable
 from typing import Protocol
 
@@ -36,8 +37,10 @@ from shmio.layout.types import ElementType
 
 Scalar = bool | int | float | str | None
 
+REAL_MAX = 3.4028235e38  # of 32 bits, in the fewest digits
 MAX_TOD_MS = 86_399_999
 MAX_LTOD_NS = calendar.NS_PER_DAY - 1
+MAX_S5_MS = 9_990_000
 _S5_BASES_MS = (10, 100, 1000, 10_000)
 
 
@@ -58,7 +61,7 @@ class _Number:
 
     def __init__(self, name: str, order: str, code: str, limit: int | None = None) -> None:
         self.plain = code if limit is None else ""
-        self._name = name
+        self._name, self._code = name, code
         self._struct = struct.Struct(order + code)
         self._limit = limit
         self._convert: Callable[[object, str], float] = to_float if code in "fd" else to_int
@@ -68,13 +71,23 @@ class _Number:
         return value if self._limit is None or value <= self._limit else None
 
     def encode(self, value: object) -> bytes:
-        number = self._convert(value, self._name)
         try:
+            number = self._convert(value, self._name)
             if self._limit is None or number <= self._limit:
                 return self._struct.pack(number)
         except (struct.error, OverflowError):
             pass
-        raise out_of_range(value, self._name)
+        raise out_of_range(value, self._name, *bounds(self._code, self._limit))
+
+
+def bounds(code: str, limit: int | None = None) -> tuple[float, float]:
+    """The least and the greatest number that a struct code can hold; ``limit`` if that is less."""
+    if code in "fd":
+        most = REAL_MAX if code == "f" else sys.float_info.max
+        return -most, most
+    bits = 8 * struct.calcsize(f"={code}")
+    least, most = (-(1 << bits - 1), (1 << bits - 1) - 1) if code.islower() else (0, (1 << bits) - 1)
+    return least, most if limit is None else limit
 
 
 class _Text:
@@ -139,9 +152,9 @@ class _S5Time:
         for code, base in enumerate(_S5_BASES_MS):  # the finest base that can hold it
             if 0 <= ms <= 999 * base and ms % base == 0:
                 return self._struct.pack(code << 12 | int(str(ms // base), 16))
-        if 0 <= ms <= 9_990_000:
+        if 0 <= ms <= MAX_S5_MS:
             raise ValueRangeError(f"S5TIME: {ms} ms needs more than three digits of any time base")
-        raise out_of_range(value, "S5TIME")
+        raise out_of_range(value, "S5TIME", 0, MAX_S5_MS)
 
 
 class _Opaque:

@@ -16,10 +16,10 @@ import msgspec
 import numpy as np
 
 from shmio.errors import ValueRangeError
-from shmio.layout.checks import brief, to_bool
+from shmio.layout.checks import brief, out_of_range, to_bool
 from shmio.layout.codec import Value, flatten
 from shmio.layout.model import Register
-from shmio.layout.scalar import Scalar, scalar_codec
+from shmio.layout.scalar import Scalar, bounds, scalar_codec
 from shmio.layout.types import ElementType
 
 WireType = Literal["double", "int", "bool", "string"]
@@ -126,7 +126,7 @@ def _read(text: str, element: ElementType) -> Scalar:
     if base in _FLOATS:
         number = float(text)
         if math.isinf(number):
-            raise ValueRangeError(f"{element.name}: {brief(text)} is out of range")
+            raise out_of_range(text, element.name, *bounds("f" if base == "REAL" else "d"))
         _check(number, element)
         return number
     exact = Decimal(text)  # "5.0" and "1.0E2" are whole numbers, and 2^63-1 keeps all its digits

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import signal
+import struct
 import threading
 import time
 from collections.abc import Iterator
@@ -18,7 +19,7 @@ from shmio.cli.user import main
 from shmio.connectors.desk import CommandDesk
 from shmio.errors import ConnectorError, ValueRangeError
 from shmio.layout.model import Layout, Register
-from shmio.segment import Attributes, BlockSpec, BlockWriter, Segment, Write
+from shmio.segment import Attributes, BlockSpec, BlockWriter, Segment
 
 LAYOUT = Layout(
     "DB1",
@@ -44,7 +45,7 @@ class Device:
 
     def __init__(self, writer: BlockWriter) -> None:
         self.memory = bytearray(LAYOUT.size)
-        self.refusal = ""
+        self.refusals: dict[int, str] = {}
         self.lost = False
         self.idle = False
         self.taken = threading.Event()
@@ -83,7 +84,7 @@ class Device:
         for offset, mask, data in writes:
             assert mask in (0, 1)
             self.memory[offset : offset + len(data)] = data
-        return [self.refusal if write == Write(0, 0, b"\0\1") else "" for write in writes]
+        return [self.refusals.get(write.offset, "") for write in writes]
 
 
 @pytest.fixture
@@ -142,14 +143,17 @@ def test_a_value_is_json_or_a_literal(path: str, text: str, value: object) -> No
     ("path", "text", "message"),
     [
         ("count", "x", "expected a literal such as 0"),
-        ("count", "40000", "out of range"),
+        ("count", "40000", r"INT: 40000 is out of range -32768\.\.32767$"),
+        ("count", "16#1FFFF", r"out of range -32768\.\.32767"),
         ("count", "1.5", "expected a whole number"),
         ("count", "[1]", "expected one INT"),
         ("count", "null", "expected one INT"),
         ("count", "true", "expected a number"),
         ("run", "2", "expected true or false"),
         ("speed", '"fast"', "expected a number"),
-        ("speed", "1e400", "out of range"),
+        ("speed", "1e400", r"out of range -3\.4028235e\+38\.\.3\.4028235e\+38"),
+        ("speed", "1e39", r"out of range -3\.4028235e\+38\.\.3\.4028235e\+38"),
+        ("wait", "2147483648", r"out of range -2147483648\.\.2147483647"),
         ("name", "hello", "put text in quotes, and these in quotes for the shell"),
         ("name", "5", "put text in quotes"),
         ("wait", "T#1x", "expected a literal"),
@@ -159,7 +163,7 @@ def test_a_value_is_json_or_a_literal(path: str, text: str, value: object) -> No
         ("row", "[1, 2, 3, 16#4]", "found 4"),
         ("row", "5(0)", "found 4"),
         ("row", "7", "found 1"),
-        ("row", "[1,2,300]", "out of range"),
+        ("row", "[1,2,300]", r"BYTE: 300 is out of range 0\.\.255"),
         ("row", "[[1,2,3]]", "found"),
         ("count", "9" * 6000, "expected a literal"),
         ("row", "[" * 20_000, "found"),
@@ -185,7 +189,7 @@ def test_values_are_written_and_each_end_is_printed(device: Device, capsys: pyte
 
 
 def test_json_is_an_object_by_path(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
-    device.refusal = "locked"
+    device.refusals = {0: "locked"}
     assert main(["set", "--json", "cell/count", "1", "cell/run", "true"]) == 1
     out, err = capsys.readouterr()
     assert json.loads(out) == {
@@ -202,7 +206,11 @@ def test_json_is_an_object_by_path(device: Device, capsys: pytest.CaptureFixture
         (["nothing/count", "1"], "name the source first"),
         (["cell/count/out", "1"], "leave out /out"),
         (["model/clock", "1"], "nothing is served under model"),
-        (["cell/count", "70000"], "cell/count: INT: "),
+        (["cell/count", "70000"], "cell/count: INT: 70000 is out of range -32768..32767\n"),
+        (["cell/*n*", "1"], "cell/*n*: set takes one register, not a pattern; this one matches cell/count, cell/run, "),
+        (["cell/**", "1"], "this one matches cell/count, cell/run, cell/speed, …\n"),
+        (["cell/c*", "1"], "this one matches cell/count\n"),
+        (["cell/z*", "1"], "this one matches nothing\n"),
         (["cell/row", "[1]"], "cell/row: expected all"),
         (
             ["cell/secret", "1"],
@@ -227,11 +235,21 @@ def test_a_source_without_its_device_says_so(device: Device, capsys: pytest.Capt
     device.desk.close("no answer from 10.0.0.1")
     assert main(["set", "cell/count", "1", "cell/run", "true"]) == 1
     out, err = capsys.readouterr()
-    assert out.splitlines()[0] == "cell/count  rejected: the source is not connected: no answer from 10.0.0.1"
+    assert out.splitlines() == ["cell/count  rejected", "cell/run    rejected"]
     assert err == (
         "cell/count: not written, the source took nothing: the source is not connected: no answer from 10.0.0.1; "
         "see shmio-supervisor status (and 1 more)\n"
     )
+
+
+def test_a_reason_that_is_not_that_of_the_error_stands_beside_its_value(
+    device: Device, capsys: pytest.CaptureFixture[str]
+) -> None:
+    device.refusals = {0: "locked", 4: "worn out"}
+    assert main(["set", "cell/count", "1", "cell/speed", "2", "cell/run", "true"]) == 1
+    out, err = capsys.readouterr()
+    assert out.splitlines() == ["cell/count  refused", "cell/speed  refused: worn out", "cell/run    written"]
+    assert err == "cell/count: refused by the device: locked (and 1 more)\n"
 
 
 def test_what_nobody_knows_is_said_with_what_to_do(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
@@ -277,10 +295,34 @@ def test_wrong_usage_is_2(capsys: pytest.CaptureFixture[str], arguments: list[st
     assert "usage: shmio" in capsys.readouterr().err
 
 
-def test_what_begins_with_a_minus_goes_behind_two(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["set", "cell/count", "-3"]) == 0
-    assert main(["set", "--", "cell/speed", "-1.5e-3"]) == 0
-    assert device.memory[:2] == b"\xff\xfd"
+@pytest.mark.parametrize(
+    ("path", "text", "value"),
+    [
+        ("cell/count", "-3", -3),
+        ("cell/count", "-16#A", -10),
+        ("cell/speed", "-1.5e-3", pytest.approx(-1.5e-3)),
+        ("cell/speed", "-Infinity", -math.inf),
+    ],
+)
+@pytest.mark.parametrize("before", [[], ["--"], ["--timeout", "60"]])
+def test_a_negative_number_is_no_option(
+    device: Device, path: str, text: str, value: float, before: list[str]
+) -> None:
+    assert main(["set", *before, path, text]) == 0
+    at, form = (0, ">h") if path == "cell/count" else (4, ">f")
+    assert struct.unpack_from(form, device.memory, at)[0] == value
+
+
+def test_what_a_negative_number_has_to_be_is_said_without_the_help_of_a_space(
+    device: Device, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for arguments, said in (
+        (["--timeout", "-1e3", "cell/speed", "1"], "'-1e3' is not a number of seconds above 0"),
+        (["cell/speed", "1", "-1e3"], "'-1e3' has no value"),
+    ):
+        with pytest.raises(SystemExit):
+            main(["set", *arguments])
+        assert said in capsys.readouterr().err
 
 
 def test_ctrl_c_while_waiting_is_clean(device: Device, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
