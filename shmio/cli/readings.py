@@ -9,7 +9,7 @@ from shmio.errors import PathError
 from shmio.layout.glob import select
 from shmio.layout.model import Layout, Register
 from shmio.layout.text import json_value, to_text
-from shmio.layout.topic import find, parse_topic
+from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.logs import printable
 from shmio.segment.attach import Attachment
 from shmio.segment.block import Block
@@ -36,20 +36,20 @@ def choose(cell: Attachment, patterns: list[str]) -> list[Selected]:
         if topic.source not in sources:
             raise PathError(f"{pattern}: nothing is served under {topic.source} in this version")
         block = cell.block(topic.source)
-        registers = registers_at(block.layout, topic.path)
+        registers = registers_at(block.layout, topic)
         if not registers:
             raise PathError(f"{pattern}: no register of {topic.source} has such a path")
         chosen |= {(topic.source, register.path): (block, register) for register in registers}
     return list(chosen.values())
 
 
-def registers_at(layout: Layout, path: str) -> list[Register]:
-    """Registers of a path within a block, or of a glob, which may match none; all for an empty path. PathError."""
-    if not path:
+def registers_at(layout: Layout, topic: Topic) -> list[Register]:
+    """Registers of a topic's path, or of a glob, which may match none; all for an empty path. PathError."""
+    if not topic.path:
         return list(layout.registers)
-    if "*" in path or layout.members(path):
-        return [layout.registers[i] for i in select(layout, [path])]
-    return [find(layout, path)]
+    if "*" in topic.path or layout.members(topic.path):
+        return [layout.registers[i] for i in select(layout, [topic.path])]
+    return [look_up(layout, topic)]
 
 
 def topic_path(block: Block, register: Register) -> str:

@@ -18,7 +18,7 @@ from shmio.layout.lists import split_array
 from shmio.layout.literal import parse_literal
 from shmio.layout.model import Register
 from shmio.layout.text import from_text, wire_type
-from shmio.layout.topic import find, parse_topic
+from shmio.layout.topic import look_up, parse_topic
 from shmio.logs import printable
 from shmio.segment import Block, EventKind
 from shmio.segment.attach import Attachment
@@ -144,7 +144,7 @@ def _target(cell: Attachment, path: str) -> tuple[Block, Register]:
         raise PathError(f"{path}: nothing is served under {topic.source} in this version")
     block = cell.block(topic.source)
     try:
-        return block, find(block.layout, topic.path)
+        return block, look_up(block.layout, topic)
     except PathError:
         if "*" not in topic.path:
             raise

@@ -94,6 +94,11 @@ class Layout:
         return {register.path: index for index, register in enumerate(self.registers)}
 
     @cached_property
+    def in_any_case(self) -> Mapping[str, str]:
+        """Paths of registers and structures by themselves in lower case."""
+        return {path.lower(): path for path in (*self._below, *self.by_path)}
+
+    @cached_property
     def hash(self) -> bytes:
         """SHA-256 of the canonical JSON: equal for equal layouts."""
         return hashlib.sha256(self.to_json()).digest()

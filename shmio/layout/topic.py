@@ -10,7 +10,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, cast
 
 from shmio.config import RESERVED_SOURCES
@@ -21,6 +21,8 @@ Direction = Literal["in", "out"]
 
 MAX_TOPIC = 16_384
 _NEAR_CANDIDATES = 500
+_NEAR_CHARACTERS = 200
+_SOURCES_SHOWN = 4
 
 _SCHEME = re.compile(r"([^/:]+)://")
 _INDEX = re.compile(r"0|-?[1-9][0-9]{0,9}")
@@ -32,12 +34,14 @@ _RESERVED = re.compile(r"[/%+#]")
 class Topic:
     """A register's path within a source, and a direction if one was named.
 
-    ``path`` is in canonical encoding and empty when the text named only the source.
+    ``path`` is in canonical encoding and empty when the text named only the source. ``named``: whether the text named
+    the source, which else is the default one.
     """
 
     source: str
     path: str
     direction: Direction | None = None
+    named: bool = field(default=True, compare=False)
 
     def __str__(self) -> str:
         return "/".join(part for part in (self.source, self.path, self.direction) if part)
@@ -105,13 +109,13 @@ def parse_topic(text: str, sources: Collection[str], default: str | None) -> Top
         else:
             named = False
     if source is None:
-        raise PathError(f"{shorten(text)}: name the source first; there is no default source")
+        raise PathError(f"{shorten(text)}: {_which(shorten(text.partition('/')[0]), sources)}")
     head, _, last = rest.rpartition("/")
     direction: Direction | None = None
     if last in ("in", "out"):
         direction, rest = cast(Direction, last), head
     if rest:
-        return Topic(source, canonical_path(rest), direction)
+        return Topic(source, canonical_path(rest), direction, named)
     if not named:
         raise PathError(f"{shorten(text)!r}: the path names no register")
     return Topic(source, "", direction)
@@ -123,7 +127,26 @@ def _source_of_scheme(scheme: str, sources: Collection[str]) -> str:
     for source in (*sources, *sorted(RESERVED_SOURCES)):
         if source.lower() == scheme.lower():
             return source
-    raise PathError(f"{shorten(scheme)}://: no source of this name")
+    raise PathError(f"{shorten(scheme)}://: no source of this name; there are: {', '.join(sources)}")
+
+
+def _which(first: str, sources: Collection[str]) -> str:
+    """What to say of a path whose first segment is no source, where none can be left out."""
+    if not sources:
+        return "there is no source"
+    some = [f"{source}/…" for source in sources][:_SOURCES_SHOWN]
+    more = ", …" if len(sources) > len(some) else ""
+    return f"there are {len(sources)} sources, and {first!r} is none of them: write {' or '.join(some)}{more}"
+
+
+def look_up(layout: Layout, topic: Topic) -> Register:
+    """As :func:`find`; the PathError says which source was taken when the topic named none."""
+    try:
+        return find(layout, topic.path)
+    except PathError as error:
+        if topic.named:
+            raise
+        raise PathError(f"{error}; looked for in source {topic.source}, as the path begins with no source") from None
 
 
 def find(layout: Layout, path: str) -> Register:
@@ -157,9 +180,30 @@ def _unknown(layout: Layout, path: str) -> str:
     if names and all(map(_INDEX.fullmatch, names)):
         numbers = sorted(map(int, names))
         return f"{shorten(prefix + missing)}: the index is outside {numbers[0]}..{numbers[-1]}"
-    near = difflib.get_close_matches(missing[:200], names, n=3)
-    hint = f"; near: {', '.join(prefix + name for name in near)}" if near else ""
-    return f"{shorten(path)}: no such register in {layout.name}{hint}"
+    near = ", ".join(_near(layout, path))
+    return f"{shorten(path)}: no such register in {layout.name}{f'; near: {near}' if near else ''}"
+
+
+def _near(layout: Layout, path: str) -> list[str]:
+    """Up to three paths of registers, elements or structures that are like this one, whatever the case."""
+    paths, wanted = layout.in_any_case, path[:_NEAR_CHARACTERS].lower()
+    head, indices = wanted, ""
+    while not (same := paths.get(head)) and _INDEX.fullmatch(last := head.rpartition("/")[2]):
+        head, indices = head.removesuffix(last).removesuffix("/"), f"/{last}{indices}"
+    if same and (not indices or (same in layout.by_path and layout.registers[layout.by_path[same]].dims)):
+        return [f"{same}{indices}"]
+    known = wanted
+    while known and not (below := layout.members(paths.get(known, ""))):
+        known = known.rpartition("/")[0]
+    names: dict[str, None] = {}
+    for index in below if known else range(len(layout.registers)):
+        name = layout.registers[index].path.lower()
+        while len(name) > len(known) and name not in names:
+            names[name] = None
+            name = name.rpartition("/")[0]
+        if len(names) >= _NEAR_CANDIDATES:
+            break
+    return [paths[name] for name in difflib.get_close_matches(wanted, names, n=3)]
 
 
 def _where_it_ends(layout: Layout, path: str) -> tuple[str, str, list[str]]:

@@ -22,7 +22,7 @@ from collections.abc import Iterator, Mapping
 from shmio.errors import CommandError, NotRunningError, PathError, QualityError, SegmentError
 from shmio.layout.codec import Value
 from shmio.layout.model import Register
-from shmio.layout.topic import find, parse_topic
+from shmio.layout.topic import look_up, parse_topic
 from shmio.segment.block import Block
 from shmio.segment.commander import Commander, Outcome
 from shmio.segment.cursor import Cursor
@@ -83,7 +83,7 @@ class Attachment:
         if topic.direction == "in":
             raise PathError(f"{path}: what goes into a source cannot be read yet; leave out /in")
         block = blocks[topic.source]
-        return block, find(block.layout, topic.path)
+        return block, look_up(block.layout, topic)
 
     def read(self, path: str) -> Reading:
         """A register with quality, reason and age; PathError."""

@@ -94,7 +94,7 @@ def _views(reader: Reader, channels: Sequence[Channel], patterns: Sequence[str])
             if channel.source != topic.source:
                 continue
             try:
-                registers = {register.path: register for register in registers_at(layout, topic.path)}
+                registers = {register.path: register for register in registers_at(layout, topic)}
             except PathError as error:  # it may be in the layout that came after a change
                 problem = error
             else:

@@ -18,7 +18,7 @@ from shmio.errors import PathError
 from shmio.layout.codec import codec
 from shmio.layout.model import Layout, Register
 from shmio.layout.text import to_text, wire_type
-from shmio.layout.topic import Topic, find, parse_topic, shorten
+from shmio.layout.topic import Topic, find, look_up, parse_topic, shorten
 from shmio.segment.events import EVENT_SLOTS
 from shmio.wire import simlog_v1_pb2 as wire
 
@@ -137,7 +137,7 @@ class SimlogV1:
                 await context.abort(
                     grpc.StatusCode.INVALID_ARGUMENT, f"{shorten(path)}: a structure; version 1 serves single registers"
                 )
-            return topic, find(layout, topic.path)
+            return topic, look_up(layout, topic)
         except PathError as error:
             await context.abort(grpc.StatusCode.NOT_FOUND, str(error))
             raise  # abort never returns
@@ -145,7 +145,7 @@ class SimlogV1:
     def _locate_in(self, path: str) -> tuple[Topic, Inlet, Register]:
         topic = self._topic(path)
         feed = self._feeds[topic.source]
-        return topic, feed.inlet, find(feed.block.layout, topic.path)
+        return topic, feed.inlet, look_up(feed.block.layout, topic)
 
     def _topic(self, path: str) -> Topic:
         default = self._default or (next(iter(self._feeds)) if len(self._feeds) == 1 else None)

@@ -172,7 +172,7 @@ def test_a_path_that_names_nothing_is_refused(file: str, said: Output) -> None:
     assert said()[1] == ["cell/x*: no register of this recording has such a path"]
     assert main(["cat", file, "cell/speed"]) == 0, "it is in the second layout only"
     assert main(["cat", file, "count"]) == 1
-    assert "name the source first" in said()[1][0]
+    assert said()[1] == ["count: there are 2 sources, and 'count' is none of them: write cell/… or press/…"]
 
 
 def test_a_recording_that_was_not_closed_is_read_and_that_is_told(file: str, said: Output) -> None:

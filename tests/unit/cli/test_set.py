@@ -203,7 +203,9 @@ def test_json_is_an_object_by_path(device: Device, capsys: pytest.CaptureFixture
     ("arguments", "message"),
     [
         (["cell/nothing", "1"], "no such register in DB1"),
-        (["nothing/count", "1"], "name the source first"),
+        (["nothing/count", "1"], "there are 2 sources, and 'nothing' is none of them: write cell/… or other/…"),
+        (["cell/COUNT", "1"], "near: count"),
+        (["nope://count", "1"], "no source of this name; there are: cell, other"),
         (["cell/count/out", "1"], "leave out /out"),
         (["model/clock", "1"], "nothing is served under model"),
         (["cell/count", "70000"], "cell/count: INT: 70000 is out of range -32768..32767\n"),
@@ -305,9 +307,7 @@ def test_wrong_usage_is_2(capsys: pytest.CaptureFixture[str], arguments: list[st
     ],
 )
 @pytest.mark.parametrize("before", [[], ["--"], ["--timeout", "60"]])
-def test_a_negative_number_is_no_option(
-    device: Device, path: str, text: str, value: float, before: list[str]
-) -> None:
+def test_a_negative_number_is_no_option(device: Device, path: str, text: str, value: float, before: list[str]) -> None:
     assert main(["set", *before, path, text]) == 0
     at, form = (0, ">h") if path == "cell/count" else (4, ">f")
     assert struct.unpack_from(form, device.memory, at)[0] == value

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from shmio.errors import PathError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Layout
-from shmio.layout.topic import MAX_TOPIC, Topic, decode_segment, encode_segment, find, parse_topic
+from shmio.layout.topic import MAX_TOPIC, Topic, decode_segment, encode_segment, find, look_up, parse_topic
 
 SOURCES = ("cell", "sim", "Robot")
 
@@ -77,8 +77,24 @@ def test_malformed(text: str) -> None:
 
 def test_without_default_the_source_must_be_named() -> None:
     assert parse_topic("cell/a", SOURCES, None) == Topic("cell", "a", None)
-    with pytest.raises(PathError, match="no default source"):
+    with pytest.raises(
+        PathError, match=r"^a/b: there are 3 sources, and 'a' is none of them: write cell/… or sim/… or R"
+    ):
         parse_topic("a/b", SOURCES, None)
+    with pytest.raises(PathError, match=r"or s3/…, …$"):
+        parse_topic("a/b", [f"s{number}" for number in range(200)], None)
+    with pytest.raises(PathError, match="a: there is no source"):
+        parse_topic("a", [], None)
+    with pytest.raises(PathError, match=r"nope://: no source of this name; there are: cell, sim, Robot"):
+        parse_topic("nope://a", SOURCES, "cell")
+
+
+def test_a_path_without_a_source_says_where_it_was_looked_for(layout: Layout) -> None:
+    with pytest.raises(PathError, match=r"^b: no such register in DB1; looked for in source cell, as the path begins"):
+        look_up(layout, parse_topic("b/out", SOURCES, "cell"))
+    with pytest.raises(PathError, match=r"^b: no such register in DB1$"):
+        look_up(layout, parse_topic("cell/b", SOURCES, "cell"))
+    assert look_up(layout, parse_topic("Inputs/3", SOURCES, "cell")).offset == 3
 
 
 @given(st.text(st.characters(exclude_categories=["Cs"]), min_size=1))
@@ -137,6 +153,14 @@ def test_find(layout: Layout, path: str, offset: int, bit: int | None, type_: st
         ("Zones/1", "a structure"),
         ("Robot/Axs3", "no such register in DB1; near: Robot/Axs2, Robot/Axs1"),
         ("inputs", "near: Inputs"),
+        ("inputs/5", "near: Inputs/5"),
+        ("ROBOT/axs2", "near: Robot/Axs2"),
+        ("robot", "near: Robot"),
+        ("rboot/axs2", "near: Robot/Axs2, "),
+        ("cell/Robot/Axs2", "near: Robot/Axs2, "),
+        ("zones/2/Level/1", "near: Zones/2/Level/1"),
+        ("zones/7/level", "near: Zones/2/Level, Zones/1/Level"),
+        ("Robot/5", "no such register in DB1; near: Robot/Axs2, Robot/Axs1"),
         ("Inputs/10", "outside [0..9]"),
         ("Inputs/05", "no such register"),
         ("Inputs/+5", "no such register"),
