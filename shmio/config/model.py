@@ -65,8 +65,8 @@ class Emulator(Section):
     name: Name
     kind: Text
     layout: Text | Texts
-    program: Text
     listen: Text
+    program: Text = "idle"
     block: Text | None = None
     dbNumber: DbNumber | None = None  # noqa: N815 - named as the source's
     insecure: bool = False

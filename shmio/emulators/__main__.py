@@ -12,10 +12,11 @@ from shmio.worker import BEAT_S, Worker
 
 
 def run(worker: Worker) -> None:
-    """Play until told to stop. The compiled layout comes with the process's description."""
-    layout = Layout.from_json(worker.config["layout"].encode())
+    """Play until told to stop. The compiled layouts come with the process's description."""
     config = worker.config
-    emulator = Emulator(layout, config["program"], Address.parse(config["listen"]), db_number=config["dbNumber"])
+    first, *others = (Layout.from_json(layout.encode()) for layout in config["layouts"])
+    listen = Address.parse(config["listen"])
+    emulator = Emulator(first, config["program"], listen, db_number=config["dbNumber"], others=others)
     with emulator:
         worker.log.info("playing %s", worker.config["program"], extra=fields(address=emulator.address))
         worker.running()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Sequence
 from types import TracebackType
 from typing import Self
 
@@ -19,7 +20,7 @@ from shmio.layout.model import Layout
 
 
 class Emulator:
-    """Runs a program on one data block and serves that block over S7. Use ``with``, or ``start`` and ``stop``, once.
+    """Runs a program on a data block and serves that and others over S7. Use ``with``, or ``start`` and ``stop``, once.
 
     The program's cycles follow an absolute schedule, so they do not drift; cycles that come too late are left out and
     counted. Clients read and write between cycles, never within one. A client that stops the emulated CPU stops the
@@ -33,22 +34,22 @@ class Emulator:
         listen: Address,
         *,
         db_number: int | None = None,
+        others: Sequence[Layout] = (),
         max_clients: int = 16,
         traits: Traits | None = None,
     ) -> None:
         """Prepare to serve the block as DB ``db_number``, by default the layout's own.
 
-        ``traits``: what it grants, and what is wrong with it. ConfigError: no such program, the layout does not suit
-        it, or there is no number.
+        ``others``: blocks that the program leaves alone, served beside it under their own numbers. ``traits``: what
+        the server grants, and what is wrong with it. ConfigError: no such program, the layout does not suit it, a
+        block without a number, or a number twice.
         """
-        number = db_number if db_number is not None else layout.number
-        if number is None:
-            raise ConfigError(f"dbNumber: the layout {layout.name!r} names no number; give one")
         self._program = program(program_name, layout)
         self._period_s = self._program.period_ms / 1000
-        self._frame, _ = initial_frame(layout)
         self._server = S7Server(listen, max_clients=max_clients, traits=traits)
-        self._server.add_block(number, self._frame)
+        self._frame = self._serve(layout, db_number)
+        for other in others:
+            self._serve(other)
         self._thread = threading.Thread(target=self._run, name=f"program-{program_name}", daemon=True)
         self._stopping = threading.Event()
         self._failure: Exception | None = None
@@ -96,6 +97,15 @@ class Emulator:
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
         self.stop()
+
+    def _serve(self, layout: Layout, number: int | None = None) -> bytearray:
+        """Serve a block with its initial values, under ``number`` or its own."""
+        number = layout.number if number is None else number
+        if number is None:
+            raise ConfigError(f"dbNumber: the layout {layout.name!r} names no number; give one")
+        frame, _ = initial_frame(layout)
+        self._server.add_block(number, frame)
+        return frame
 
     def _step(self, cycle: int) -> None:
         with self._server.lock:

@@ -7,6 +7,7 @@ from typing import Protocol
 
 from shmio.emulators.a50 import A50
 from shmio.emulators.counter import Counter
+from shmio.emulators.idle import Idle
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout
 
@@ -26,7 +27,8 @@ class Program(Protocol):
         """
 
 
-PROGRAMS: Mapping[str, Callable[[Layout], Program]] = {"a50": A50, "counter": Counter}
+IDLE = "idle"
+PROGRAMS: Mapping[str, Callable[[Layout], Program]] = {"a50": A50, "counter": Counter, IDLE: Idle}
 
 
 def program(name: str, layout: Layout) -> Program:

@@ -90,12 +90,13 @@ class Plan:
 def make_plan(
     config: Config,
     layouts: Mapping[str, Layout],
+    emulated: Mapping[str, Sequence[Layout]],
     *,
     config_file: Path,
     mode: str = "live",
     warnings: Sequence[str] = (),
 ) -> Plan:
-    """Plan an instance. ``layouts``: of each source and emulator, by its name.
+    """Plan an instance. ``layouts``: of each source, by its name; ``emulated``: all blocks of each emulator.
 
     ConfigError: too many processes.
     """
@@ -113,8 +114,8 @@ def make_plan(
     )
     sections: list[tuple[str, str, dict[str, Any]]] = []
     for emulator in config.emulator:
-        layout = layouts[emulator.name].to_json().decode()
-        sections.append((emulator.name, "emulator", msgspec.to_builtins(emulator) | {"layout": layout}))
+        served = [layout.to_json().decode() for layout in emulated[emulator.name]]
+        sections.append((emulator.name, "emulator", msgspec.to_builtins(emulator) | {"layouts": served}))
     sections += [(source.name, "source", msgspec.to_builtins(source)) for source in config.source]
     if config.grpc and mode != "log":
         sections.append(("grpc", "grpc", msgspec.to_builtins(config.grpc)))

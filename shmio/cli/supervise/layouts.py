@@ -28,6 +28,10 @@ class LayoutFiles:
 
         ConfigError: no such file or block, or none is chosen; LayoutError.
         """
+        return _choose(key, section, self.all(key, section), number)
+
+    def all(self, key: str, section: Source | Emulator) -> tuple[Layout, ...]:
+        """Every data block of a section's files; ConfigError: no such file; LayoutError."""
         if section.layout is None:
             raise ConfigError(f"{key}.layout: this key is needed: the data block's source (.db), and its UDTs")
         names = [section.layout] if isinstance(section.layout, str) else section.layout
@@ -36,7 +40,7 @@ class LayoutFiles:
             compiled = compile_files(paths, f"{key}.layout: ")
             self._compiled[paths] = compiled.layouts
             self.warnings += [line for line in summarize(compiled.warnings) if line not in self.warnings]
-        return _choose(key, section, self._compiled[paths], number)
+        return self._compiled[paths]
 
 
 def _choose(key: str, section: Source | Emulator, layouts: Sequence[Layout], number: int | None) -> Layout:

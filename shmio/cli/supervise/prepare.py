@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +29,9 @@ class Prepared:
     config: Config
     plan: Plan
     layouts: dict[str, Layout]
+    """Of each source, by its name."""
+    emulated: dict[str, tuple[Layout, ...]]
+    """All blocks of each emulator, by its name."""
 
 
 def prepare(file: Path, mode: str = "live") -> Prepared:
@@ -42,16 +46,14 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
     try:
         check_host(config)
         _check_listening(config)
-        layouts = {}
-        for index, source in enumerate(config.source):
-            layouts[source.name] = _check_source(index, source, files)
-        for index, emulator in enumerate(config.emulator):
-            layouts[emulator.name] = _check_emulator(index, emulator, files)
+        layouts = {source.name: _check_source(i, source, files) for i, source in enumerate(config.source)}
+        emulated = {emulator.name: _check_emulator(i, emulator, files) for i, emulator in enumerate(config.emulator)}
         odd = _odd(config, layouts)
     except ConfigError as error:
         raise ConfigError(f"{file}: {named(str(error), msgspec.to_builtins(config))}") from None
     warnings = [*files.warnings, *(f"{file}: warning: {text}" for text in odd)]
-    return Prepared(config, make_plan(config, layouts, config_file=file, mode=mode, warnings=warnings), layouts)
+    plan = make_plan(config, layouts, emulated, config_file=file, mode=mode, warnings=warnings)
+    return Prepared(config, plan, layouts, emulated)
 
 
 def peer(source: Source) -> str:
@@ -87,22 +89,34 @@ def _check_source(index: int, source: Source, files: LayoutFiles) -> Layout:
     return layout
 
 
-def _check_emulator(index: int, emulator: Emulator, files: LayoutFiles) -> Layout:
-    from shmio.emulators.programs import program  # noqa: PLC0415
+def _check_emulator(index: int, emulator: Emulator, files: LayoutFiles) -> tuple[Layout, ...]:
+    """The blocks it serves: the one its program runs on, or all of its files if that runs on none."""
+    from shmio.emulators.programs import IDLE, program  # noqa: PLC0415
 
     key = f"emulator[{index}]"
     if emulator.kind not in EMULATOR_KINDS:
         raise ConfigError(f"{key}.kind: {emulator.kind!r} is none; there are: {', '.join(EMULATOR_KINDS)}")
+    if emulator.program == IDLE and emulator.block is None and emulator.dbNumber is None:
+        layouts = files.all(key, emulator)
+        _check_numbers(key, layouts)
+        return layouts
     layout = files.get(key, emulator, emulator.dbNumber)
-    if layout.number is None and emulator.dbNumber is None:
-        raise ConfigError(
-            f"{key}.dbNumber: this key is needed, for the data block {layout.name!r} has no number in its name"
-        )
+    if emulator.dbNumber is None:
+        _check_numbers(key, (layout,))
     try:
         program(emulator.program, layout)
     except ConfigError as error:
         raise ConfigError(f"{key}.{error}") from None
-    return layout
+    return (layout,)
+
+
+def _check_numbers(key: str, layouts: Sequence[Layout]) -> None:
+    """Each block must have a number; the compiler gives none twice."""
+    for layout in layouts:
+        if layout.number is None:
+            alone = f'; block = "{layout.name}" beside it, to serve that block alone' if len(layouts) > 1 else ""
+            why = f"the data block {layout.name!r} has no number in its name"
+            raise ConfigError(f"{key}.dbNumber: this key is needed, for {why}{alone}")
 
 
 def _check_listening(config: Config) -> None:

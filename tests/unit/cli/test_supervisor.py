@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from shmio.cli import target
+from shmio.cli.supervise.prepare import prepare
 from shmio.cli.supervisor import main
 from shmio.config import load
 from shmio.layout.model import Layout, Register
@@ -149,6 +150,35 @@ def test_an_emulator_plays_a_block_without_a_number(example: Edit, capsys: pytes
     assert main(["check"]) == 1
     assert "emulator[0].dbNumber: this key is needed" in capsys.readouterr().err
     example('program = "a50"', 'program = "a50"\ndbNumber = 7')
+    assert main(["check"]) == 0
+
+
+def test_an_idle_emulator_plays_all_blocks_of_its_files(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    """And so several sources can read it, each its own."""
+    Path("two.db").write_text(block("DB7", "Int") + Path("db201.db").read_text())
+    example('layout = "db201.db"\nprogram = "a50"', 'layout = "two.db"')
+    assert main(["check"]) == 0
+    assert [layout.number for layout in prepare(Path("supervisor.toml")).emulated["plc"]] == [7, 201]
+    example('layout = "two.db"', 'layout = "two.db"\ndbNumber = 201')
+    assert [layout.number for layout in prepare(Path("supervisor.toml")).emulated["plc"]] == [201]
+    example("dbNumber = 201", 'dbNumber = 201\nprogram = "a50"')
+    assert main(["check"]) == 0
+    example("dbNumber = 201\n", "")
+    capsys.readouterr()
+    assert main(["check"]) == 1
+    assert (
+        "emulator[0].layout: it holds several data blocks (DB7, DB201); choose one by block" in capsys.readouterr().err
+    )
+
+
+def test_an_idle_emulator_needs_a_number_for_each_block(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("two.db").write_text(Path("db201.db").read_text() + block('"Cell"', "Int"))
+    example('layout = "db201.db"\nprogram = "a50"', 'layout = "two.db"')
+    assert main(["check"]) == 1
+    error = capsys.readouterr().err
+    assert "emulator[0].dbNumber: this key is needed, for the data block 'Cell' has no number in its name; " in error
+    assert 'block = "Cell" beside it, to serve that block alone' in error
+    example('layout = "two.db"', 'layout = "two.db"\nblock = "Cell"\ndbNumber = 9')
     assert main(["check"]) == 0
 
 

@@ -64,6 +64,7 @@ def test_the_whole_contract_is_read(folder: Path) -> None:
     assert (source.name, source.period_ns, source.writable) == ("cell", 20_000_000, ["Outputs", "Robot_*/*"])
     assert config.path("db201.db") == folder / "db201.db"
     assert config.emulator[0].program == "a50"
+    assert load(written(folder, WHOLE.replace('program = "a50"\n', ""))).emulator[0].program == "idle"
     assert config.grpc is not None
     assert config.grpc.listen == ["127.0.0.1:8089", "[::1]:8090"]
 
@@ -137,7 +138,7 @@ def test_tls_files_are_relative_to_the_config(folder: Path) -> None:
             r"recorder\.directroy: unknown key; did you mean directory",
         ),
         ("[instance]", "[recorder]\nbuffer_mb = 0\n[instance]", r"recorder\.buffer_mb: expected a number > 0"),
-        ('program = "a50"\n', "", r'emulator\[0\]\.program: this key is needed \(emulator "plc"\)$'),
+        ('kind = "s7"\n', "", r'emulator\[0\]\.kind: this key is needed \(emulator "plc"\)$'),
         (
             'program = "a50"',
             'programm = "a50"',

@@ -14,6 +14,7 @@ from shmio.segment import Segment
 from shmio.supervisor.plan import MAX_PROCESSES, MODULES, RANKS, make_plan
 
 LAYOUT = Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
+PLAYED = {"plc": [LAYOUT]}
 
 
 def config(folder: Path, sources: int = 1) -> Config:
@@ -27,7 +28,7 @@ def config(folder: Path, sources: int = 1) -> Config:
 
 
 def test_blocks_and_processes_follow_the_configuration(tmp_path: Path) -> None:
-    plan = make_plan(config(tmp_path), {"cell0": LAYOUT, "plc": LAYOUT}, config_file=tmp_path / "s.toml")
+    plan = make_plan(config(tmp_path), {"cell0": LAYOUT}, PLAYED, config_file=tmp_path / "s.toml")
     [block] = plan.blocks
     assert (block.source, block.layout, block.period_ns) == ("cell0", LAYOUT, 10_000_000)
     assert block.slots == 8, "ring_mb bounds it"
@@ -37,7 +38,7 @@ def test_blocks_and_processes_follow_the_configuration(tmp_path: Path) -> None:
 
 
 def test_a_process_is_told_what_it_needs(tmp_path: Path) -> None:
-    plan = make_plan(config(tmp_path), {"cell0": LAYOUT, "plc": LAYOUT}, config_file=tmp_path / "s.toml")
+    plan = make_plan(config(tmp_path), {"cell0": LAYOUT}, PLAYED, config_file=tmp_path / "s.toml")
     emulator, source, grpc = (json.loads(job.describe(plan.instance, 77)) for job in plan.jobs)
     assert {key: source[key] for key in ("instance", "epoch", "name", "kind")} == {
         "instance": "a50",
@@ -47,15 +48,17 @@ def test_a_process_is_told_what_it_needs(tmp_path: Path) -> None:
     }
     assert source["log_file"] == str(tmp_path / "logs" / "cell0.log")
     assert source["config"]["connector"] == "s7"
-    assert Layout.from_json(emulator["config"]["layout"].encode()) == LAYOUT
+    assert [Layout.from_json(text.encode()) for text in emulator["config"]["layouts"]] == [LAYOUT]
     assert grpc["config"]["listen"] == ["127.0.0.1:0"]
 
 
 def test_log_mode_records_and_serves_nothing(tmp_path: Path) -> None:
     recorded = config(tmp_path)
     recorded.recorder = Recorder(directory="dumps", fsync_s=2)
-    layouts = {"cell0": LAYOUT, "plc": LAYOUT}
-    live, log = (make_plan(recorded, layouts, config_file=tmp_path / "s.toml", mode=mode) for mode in ("live", "log"))
+    layouts = {"cell0": LAYOUT}
+    live, log = (
+        make_plan(recorded, layouts, PLAYED, config_file=tmp_path / "s.toml", mode=mode) for mode in ("live", "log")
+    )
     assert [job.kind for job in live.jobs] == ["emulator", "source", "grpc", "recorder"]
     assert [job.kind for job in log.jobs] == ["emulator", "source", "recorder"]
     recorder = log.jobs[-1]
@@ -70,8 +73,8 @@ def test_log_mode_records_and_serves_nothing(tmp_path: Path) -> None:
 
 def test_as_many_sources_as_there_can_be_processes_fit_in_a_segment(tmp_path: Path, instance: str) -> None:
     count = MAX_PROCESSES - 2
-    layouts = {f"cell{i}": LAYOUT for i in range(count)} | {"plc": LAYOUT}
-    plan = make_plan(config(tmp_path, count), layouts, config_file=tmp_path / "s.toml")
+    layouts = {f"cell{i}": LAYOUT for i in range(count)}
+    plan = make_plan(config(tmp_path, count), layouts, PLAYED, config_file=tmp_path / "s.toml")
     with Segment.create(instance, plan.blocks, plan.processes) as segment:
         segment.unlink()
         assert len(segment.blocks) == count
@@ -79,9 +82,9 @@ def test_as_many_sources_as_there_can_be_processes_fit_in_a_segment(tmp_path: Pa
 
 def test_too_many_processes_are_refused(tmp_path: Path) -> None:
     count = MAX_PROCESSES - 1
-    layouts = {f"cell{i}": LAYOUT for i in range(count)} | {"plc": LAYOUT}
+    layouts = {f"cell{i}": LAYOUT for i in range(count)}
     with pytest.raises(ConfigError, match=f"{count + 2} processes"):
-        make_plan(config(tmp_path, count), layouts, config_file=tmp_path / "s.toml")
+        make_plan(config(tmp_path, count), layouts, PLAYED, config_file=tmp_path / "s.toml")
 
 
 def test_every_kind_has_its_module_and_its_place() -> None:

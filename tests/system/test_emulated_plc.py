@@ -1,0 +1,96 @@
+"""The page on emulated controllers, done as it says: its files written, its commands run, its output compared."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+import shmio
+from shmio.segment import Quality
+from shmio.testing.cell import BIN, PATIENCE_S, until
+from shmio.testing.ports import reserved_port
+
+PAGE = Path(__file__).parents[2] / "docs/how-to/emulate-an-s7-plc.md"
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+
+
+class Reader:
+    """Somebody who follows the page, with another port and other names of instances."""
+
+    def __init__(self, folder: Path, instance: str, port: int) -> None:
+        text = PAGE.read_text().replace("127.0.0.1:1102", f"127.0.0.1:{port}").replace(" 1102", f" {port}")
+        text = re.sub('^name = "press(-plc)?"\n(?!connector)', rf'name = "{instance}\1"\n', text, flags=re.MULTILINE)
+        self.blocks = [(match[1], match[2]) for match in BLOCK.finditer(text)]
+        self.folder, self.instance = folder, instance
+        self.source, (self.configuration, self.apart) = self._all("scl")[0], self._all("toml")
+
+    def _all(self, kind: str) -> list[str]:
+        return [text for found, text in self.blocks if found == kind]
+
+    def write(self, name: str, text: str) -> None:
+        (self.folder / name).write_text(text)
+
+    def steps(self) -> Iterator[tuple[str, str]]:
+        """Each block of commands, with what the page shows it to print, if it does."""
+        for at, (kind, text) in enumerate(self.blocks):
+            if kind == "sh":
+                following, shown = self.blocks[at + 1] if at + 1 < len(self.blocks) else ("", "")
+                yield text, shown if following == "text" else ""
+
+    def run(self, commands: str) -> subprocess.CompletedProcess[str]:
+        environment = {**os.environ, "PATH": f"{BIN}:{os.environ['PATH']}"}
+        return subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", commands],
+            cwd=self.folder,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+        )
+
+    def follow(self, commands: str, shown: str) -> None:
+        """Run commands; those that only look, until they print what is shown."""
+        if shown:
+            until(lambda: self.run(commands).stdout == shown, f"{commands}{shown}", 2 * PATIENCE_S)
+            return
+        done = self.run(commands)
+        assert done.returncode == 0, f"{commands}\n{done.stdout}\n{done.stderr}"
+
+
+@pytest.fixture
+def reader(tmp_path: Path, instance: str) -> Iterator[Reader]:
+    with ExitStack() as stack:
+        address = stack.enter_context(reserved_port())
+        reader = Reader(tmp_path, instance, address.port)
+        yield reader
+        for file in tmp_path.glob("*.toml"):
+            reader.run(f"shmio-supervisor down -c {file.name}")
+
+
+def test_the_page_on_emulated_controllers(reader: Reader) -> None:
+    reader.write("my.db", reader.source)
+    reader.write("supervisor.toml", reader.configuration)
+    *steps, (unplug, nothing) = reader.steps()
+    assert len(steps) > 10
+    assert "kill -STOP" in unplug
+    assert not nothing
+    for commands, shown in steps:
+        if commands.startswith("shmio-supervisor reload"):
+            before, _, emulator = reader.configuration.partition("[[emulator]]")
+            assert re.sub(" *#.*", "", emulator) == reader.apart.partition("[[emulator]]")[2]
+            reader.write("supervisor.toml", before)
+            reader.write("plc.toml", reader.apart)
+        reader.follow(commands, shown)
+    with shmio.attach(reader.instance) as press:
+        reader.follow(unplug, "")
+        until(lambda: press.read("press/Fault").reason.startswith("no answer within 1000 ms"), "the reason")
+        assert json.loads(reader.run("shmio-supervisor status --json").stdout)["state"] == "degraded"
+        until(lambda: press.read("press/Fault").quality is Quality.GOOD, "another process in its place")
