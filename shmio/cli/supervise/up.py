@@ -17,11 +17,12 @@ from typing import TextIO
 
 from shmio import logs
 from shmio.cli.supervise import logdir
+from shmio.cli.supervise.ports import check_ports
 from shmio.cli.supervise.prepare import Prepared, peer, prepare
 from shmio.cli.target import config_file
 from shmio.errors import ConfigError, ControlError, ShmioError
 from shmio.logs import printable
-from shmio.segment import PREFIX, State
+from shmio.segment import PREFIX, State, instances
 from shmio.segment.segment import refuse_second
 from shmio.supervisor.main import Supervisor
 from shmio.supervisor.plan import MODES, Job, Plan
@@ -46,7 +47,7 @@ def execute(arguments: argparse.Namespace) -> int:
 
 
 def _foreground(prepared: Prepared) -> int:
-    refuse_second(prepared.plan.instance)
+    _refuse(prepared.plan)
     _announce(prepared)
     _say("Ctrl-C stops it, and so does closing the terminal")
     console = logging.StreamHandler(sys.stderr)
@@ -57,6 +58,13 @@ def _foreground(prepared: Prepared) -> int:
         logging.getLogger("shmio.supervisor").addHandler(console)
         Supervisor(plan, replan=_replan(plan)).run()
     return 0
+
+
+def _refuse(plan: Plan) -> None:
+    """AlreadyRunningError; EndpointError when a port is taken, which those that a dead supervisor left may well be."""
+    refuse_second(plan.instance)
+    if plan.instance not in instances():
+        check_ports(plan)
 
 
 def _replan(plan: Plan) -> Callable[[], Plan]:
@@ -120,7 +128,7 @@ def _detached(file: Path, mode: str, report: int) -> int:
 
 def _detach(prepared: Prepared) -> int:
     plan = prepared.plan
-    refuse_second(plan.instance)
+    _refuse(plan)
     log_file = plan.log_dir / "supervisor.log"
     with logdir.held(plan.log_dir, plan.instance):
         logs.setup(log_file, "supervisor")

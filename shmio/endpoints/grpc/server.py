@@ -52,7 +52,8 @@ class Server:
                     ports.append(self._server.add_insecure_port(str(address)))
             except RuntimeError:
                 raise EndpointError(
-                    f"grpc.listen: cannot listen on {address}: another program has it, or this host has no such address"
+                    f"grpc.listen: cannot listen on {address}: another program has it (ss -ltnp shows which), or this "
+                    "host has no such address"
                 ) from None
         await self._server.start()
         for service in (health.OVERALL_HEALTH, simlog_v1.SERVICE):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import select
 import signal
 import socket
@@ -163,7 +164,8 @@ def test_down_tells_what_it_clears_of_a_killed_supervisor(cell: Cell) -> None:
 def test_the_logs_of_another_instance_are_left_alone(cell: Cell) -> None:
     cell.run("up", "--detach", status=0)
     other = cell.folder / "other.toml"
-    other.write_text((cell.folder / "supervisor.toml").read_text().replace(f'"{cell.instance}"', '"other"'))
+    text = (cell.folder / "supervisor.toml").read_text().replace(f'"{cell.instance}"', '"other"')
+    other.write_text(text.replace('listen = "127.0.0.1:', 'listen = "127.0.0.1:0" #'))
     refused = cell.run("up", "-c", "other.toml", status=1).stderr
     assert refused.startswith(f"instance.log_dir: instance {cell.instance!r} writes its logs to ")
     cell.run("down", status=0)
@@ -187,17 +189,52 @@ def test_a_device_that_is_not_there_is_told_but_does_not_hold_up_the_start(cell:
     cell.run("down", status=0)
 
 
+def serve_on(cell: Cell, address: str) -> None:
+    file = cell.folder / "supervisor.toml"
+    file.write_text(file.read_text().replace('["127.0.0.1:0", "127.0.0.1:0"]', f'["{address}"]\ninsecure = true'))
+
+
 def test_a_start_that_fails_tells_why_and_leaves_nothing(cell: Cell) -> None:
+    serve_on(cell, "192.0.2.1:8089")  # RFC 5737: nobody's address
+    error = cell.run("up", "--detach", status=1).stderr
+    assert error.startswith("grpc: ")
+    assert "192.0.2.1:8089" in error
+    assert cell.instance not in instances()
+
+
+@pytest.mark.parametrize("arguments", [["up"], ["up", "--detach"]])
+def test_a_port_that_another_program_has_is_found_before_the_start(cell: Cell, arguments: list[str]) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        file = cell.folder / "supervisor.toml"
-        file.write_text(file.read_text().replace('["127.0.0.1:0", "127.0.0.1:0"]', f'["127.0.0.1:{port}"]'))
-        error = cell.run("up", "--detach", status=1).stderr
-    assert error.startswith("grpc: ")
-    assert str(port) in error
-    assert cell.instance not in instances()
+        serve_on(cell, f"0.0.0.0:{port}")
+        error = cell.run(*arguments, status=1).stderr
+    assert error == (
+        f"grpc: cannot listen on 0.0.0.0:{port}: another program listens there; choose another port, or see which: "
+        f"ss -ltnp sport = :{port}\n"
+    )
+    assert not (cell.folder / "logs").exists()
+
+
+@pytest.mark.parametrize("name", ["plc", "grpc"])
+def test_a_port_that_another_instance_has_is_said_to_be_its(cell: Cell, name: str) -> None:
+    serve_on(cell, f"127.0.0.1:{free_port()}")
+    cell.run("up", "--detach", status=0)
+    pid = cell.of(name)["pid"]
+    file = cell.folder / "supervisor.toml"
+    text = file.read_text().replace(f'"{cell.instance}"', f'"{cell.instance}-2"\nlog_dir = "logs-2"')
+    port = re.search(r'listen = "127.0.0.1:(\d+)"' if name == "plc" else r'listen = \["127.0.0.1:(\d+)"\]', text)
+    assert port is not None
+    if name == "grpc":
+        text = text.replace('listen = "127.0.0.1:', f'listen = "127.0.0.1:{free_port()}" #')
+    (cell.folder / "second.toml").write_text(text)
+    error = cell.run("up", "-c", "second.toml", status=1).stderr
+    assert error == (
+        f"{name}: cannot listen on 127.0.0.1:{port[1]}: process {name} of instance {cell.instance}, pid {pid}, listens "
+        f"there; choose another port, or stop that instance: shmio-supervisor down --instance {cell.instance}\n"
+    )
+    cell.run("down", status=0)
 
 
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
