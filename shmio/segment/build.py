@@ -6,7 +6,8 @@ import os
 import secrets
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import msgspec
@@ -91,6 +92,16 @@ def write_blocks(memory: memoryview, at: int, first: int, blocks: Sequence[Block
             entries.append(SectionEntry(kind, False, at, size, of, block.source, digest))
             at += align(size, 64)
     return entries
+
+
+def wake(memory: memoryview, entries: Iterable[SectionEntry]) -> None:
+    """Have those look who wait at these sections; once more does no harm."""
+    for entry in entries:
+        with suppress(ValueError):  # one that contradicts itself has nobody who waits
+            if entry.kind in (SectionKind.FRAMES, SectionKind.EVENTS):
+                _atomics.Ring(memory, entry.offset, entry.size).wake()
+            elif entry.kind == SectionKind.COMMANDS:
+                commands.CommandQueues(memory, entry.offset, entry.size).wake()
 
 
 def segment_size(blocks: Sequence[BlockSpec], processes: int) -> int:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 if TYPE_CHECKING:
     from shmio.segment._atomics import FrameTuple, Ring
 
 Entry = TypeVar("Entry")
+
+TURN_NS: Final = 1_000_000_000
+"""How often who waits looks by itself: the bell of a block's end is lost if the supervisor dies before it."""
 
 
 class Cursor(Generic[Entry]):
@@ -67,8 +70,8 @@ class Cursor(Generic[Entry]):
             entry = self.poll()
             if entry is not None or retired:
                 return entry
-            rest_ns = -1 if deadline_ns is None else deadline_ns - time.monotonic_ns()
-            if deadline_ns is not None and rest_ns <= 0:
+            rest_ns = TURN_NS if deadline_ns is None else min(TURN_NS, deadline_ns - time.monotonic_ns())
+            if rest_ns <= 0:
                 return None
             ring.wait(seen, rest_ns)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import suppress
 
 import msgspec
@@ -12,7 +12,7 @@ from shmio.errors import AlreadyRunningError, FormatError, LayoutError, NotRunni
 from shmio.layout.model import Layout
 from shmio.segment import _atomics, header, shm
 from shmio.segment.block import Attributes, Block, BlockWriter
-from shmio.segment.build import SECTIONS_PER_BLOCK, BlockSpec, align, build_segment, write_blocks
+from shmio.segment.build import SECTIONS_PER_BLOCK, BlockSpec, align, build_segment, wake, write_blocks
 from shmio.segment.commands import CommandQueues
 from shmio.segment.events import EVENT_SIZE
 from shmio.segment.header import HEADER_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
@@ -187,23 +187,22 @@ class Segment:
         """
         at = self.reserve(add)
         first = len(self._sections())  # which maps what has been added, too
-        self._change(write_blocks(self.memory, at, first, add), [self.blocks[name] for name in retire])
+        self._change(write_blocks(self.memory, at, first, add), {self.blocks[name].section for name in retire})
 
     def end_replaced(self) -> None:
-        """End what a supervisor that died within :meth:`change` has replaced and not ended; its successor's alone."""
-        replaced = [block for block in self._known.values() if block not in self.blocks.values()]
-        self._change((), replaced)  # even if there is none: the generation may not have been told
-
-    def _change(self, add: Sequence[SectionEntry], ending: Sequence[Block]) -> None:
-        layouts = {block.section for block in ending}
+        """End what a supervisor that died within :meth:`change` has not, and wake who waits at what has ended."""
+        replaced = {block.section for block in self._known.values() if block not in self.blocks.values()}
         parts = enumerate(self._sections())
-        indices = [i for i, part in parts if (i if part.kind == SectionKind.LAYOUT else part.layout) in layouts]
-        header.change_sections(self.memory, self.header, add, indices)
+        ended = {index for index, part in parts if part.kind == SectionKind.LAYOUT and part.retired}
+        self._change((), replaced | ended)  # even if there is none: the generation may not have been told
+
+    def _change(self, add: Sequence[SectionEntry], ending: Collection[int]) -> None:
+        """Append entries, and end the blocks of these layouts' sections."""
+        parts = list(enumerate(self._sections()))
+        ended = {i: part for i, part in parts if (i if part.kind == SectionKind.LAYOUT else part.layout) in ending}
+        header.change_sections(self.memory, self.header, add, list(ended))
         self.refresh()
-        for block in ending:  # who waits there is to look
-            block.ring.wake()
-            block.events.ring.wake()
-            block.commands.wake()
+        wake(self.memory, ended.values())
 
     def clock_ns(self, now_ns: int) -> int:
         """The instance's clock, ns since its start, at a time of CLOCK_MONOTONIC."""

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import struct
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 
 import shmio
 from shmio.errors import NotRunningError, PathError, SegmentError
 from shmio.layout.model import Layout, Register
-from shmio.segment import BlockSpec, ProcessSpec, Quality, Segment, header, shm
+from shmio.segment import BlockSpec, ProcessSpec, Quality, Segment, _atomics, build, header, shm
 from shmio.segment.view import View
 
 OLD = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))
@@ -102,6 +102,84 @@ def test_a_change_cut_off_by_the_supervisors_death_is_completed(
         assert not waiter.is_alive()
         assert (held.retired, other.retired, reader.block("cell").retired) == (True, False, False)
         assert reader.block("cell").layout == NEW
+
+
+@pytest.mark.parametrize("calls", [1, 2, 3])
+def test_who_waits_is_woken_by_the_successor_wherever_the_supervisor_died(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch, calls: int
+) -> None:
+    """After the new block's entry; after the old one's end; before its first bell. All waits are without a time-out."""
+    steps = 0
+
+    def dying(step: Callable[..., None], *, before: bool = False) -> Callable[..., None]:
+        def take(*arguments: object) -> None:
+            nonlocal steps
+            steps += 1
+            if not (before and steps == calls):
+                step(*arguments)
+            if steps == calls:
+                raise SystemExit
+
+        return take
+
+    with shmio.attach(segment.instance) as reader:
+        held = reader.block("cell")
+        seen = held.ring.doorbell(), held.events.ring.doorbell(), held.commands.bell()
+        waits = [
+            lambda: held.ring.wait(seen[0], -1),
+            lambda: held.events.ring.wait(seen[1], -1),
+            lambda: held.commands.wait(seen[2]),
+        ]
+        waiters = [threading.Thread(target=wait, daemon=True) for wait in waits]
+        for waiter in waiters:
+            waiter.start()
+        with monkeypatch.context() as patched:
+            patched.setattr(header, "_set_table_state", dying(header._set_table_state))
+            patched.setattr("shmio.segment.segment.wake", dying(build.wake, before=True))
+            with pytest.raises(SystemExit):
+                segment.change(add=[spec("cell", NEW)], retire=["cell"])
+        assert all(waiter.is_alive() for waiter in waiters)
+        with Segment.open(segment.instance, writable=True) as successor:
+            successor.end_replaced()
+            successor.end_replaced()
+        for waiter in waiters:
+            waiter.join(20)
+            assert not waiter.is_alive()
+        assert held.retired
+
+
+def test_a_block_ended_only_in_part_is_ended_by_the_successor(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """For readers that look at their own section's flag alone."""
+    store = _atomics.store64
+
+    def die(memory: memoryview, offset: int, value: int) -> None:
+        store(memory, offset, value)
+        if value & header._RETIRED:
+            raise SystemExit
+
+    with monkeypatch.context() as patched:
+        patched.setattr(_atomics, "store64", die)
+        with pytest.raises(SystemExit):
+            segment.change(retire=["cell"])
+    assert [entry.retired for entry in segment._sections() if entry.name == "cell"].count(True) == 1
+    with Segment.open(segment.instance, writable=True) as successor:
+        successor.end_replaced()
+        assert list(successor.blocks) == ["press"]
+        assert all(entry.retired for entry in successor._sections() if entry.name == "cell")
+
+
+def test_a_lost_bell_leaves_nobody_waiting(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who waits without a time-out looks by itself, too."""
+    monkeypatch.setattr("shmio.segment.segment.wake", lambda *_: None)
+    with shmio.attach(segment.instance) as reader:
+        held = reader.block("cell")
+        waiter = threading.Thread(target=held.cursor().next, daemon=True)
+        waiter.start()
+        segment.change(retire=["cell"])
+        waiter.join(20)
+        assert not waiter.is_alive()
 
 
 def test_a_held_block_says_that_it_is_over_and_keeps_its_last_frame(segment: Segment) -> None:
