@@ -13,7 +13,7 @@ import msgspec
 from shmio.config.address import Address
 from shmio.config.model import Config, Emulator, Grpc, Instance, Recorder, Section, Source, Tls
 from shmio.config.properties import read_properties
-from shmio.config.wording import explain, named
+from shmio.config.wording import explain, explain_toml, named
 from shmio.errors import ConfigError
 
 RESERVED_SOURCES = frozenset({"simlog", "model", "shmio"})
@@ -58,11 +58,12 @@ def read_tables(file: Path) -> dict[str, Any]:
     if len(data) > MAX_FILE_BYTES:
         raise ConfigError(f"{file}: larger than {MAX_FILE_BYTES} bytes")
     try:
-        return tomllib.loads(data.decode("utf-8"))
+        text = data.decode("utf-8")
+        return tomllib.loads(text)
     except UnicodeDecodeError as error:
         raise ConfigError(f"{file}: not UTF-8 at byte {error.start}") from None
     except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ConfigError(f"{file}: not TOML: {error}") from None
+        raise ConfigError(f"{file}: not TOML: {explain_toml(error, text)}") from None
     except ValueError:  # more digits than int() takes
         raise ConfigError(f"{file}: a number in it has too many digits") from None
 

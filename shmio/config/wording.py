@@ -1,4 +1,4 @@
-"""What msgspec finds wrong, in the words of the file's user."""
+"""What msgspec and tomllib find wrong, in the words of the file's user."""
 
 from __future__ import annotations
 
@@ -10,6 +10,10 @@ from msgspec import ValidationError
 
 from shmio.config.model import NAME_PATTERN, NAME_RULE
 
+MAX_LINE = 80
+_PLACE = re.compile(r"\(at line (\d+), column (\d+)\)\Z")
+_BARE = re.compile(r"[^\s,=#\[\]{}\"']+")
+_TEXT = re.compile(r"[^\W\d].*|.*[:/].*|\d+(?:\.\d+){2,}")  # a name, a path, an address
 _TYPES = {
     "int": "a whole number",
     "float": "a number",
@@ -38,6 +42,28 @@ def explain(error: ValidationError, key: str = "") -> str:
 
 def _types(match: re.Match[str]) -> str:
     return " or ".join(_TYPES.get(name, name) for name in match[1].split(" | ") if name != "null")
+
+
+def explain_toml(error: Exception, text: str) -> str:
+    """The parser's message, the line it is about, and what to write instead where that is a frequent slip."""
+    place = _PLACE.search(str(error))
+    if place is None:
+        return str(error)
+    lines = text.replace("\r\n", "\n").split("\n")
+    line, column = lines[int(place[1]) - 1], int(place[2]) - 1
+    shown = line.strip()[:MAX_LINE]
+    return f"{error}: {shown}{_slip(str(error), line, column)}" if shown else str(error)
+
+
+def _slip(message: str, line: str, column: int) -> str:
+    if message.startswith("Illegal character '\\n'"):
+        return "; a quote is missing at its end"
+    word = next((word[0] for word in _BARE.finditer(line) if word.start() <= column < word.end()), "").strip("“”")
+    if message.startswith("Expected '='") or not _TEXT.fullmatch(word):
+        return ""
+    if word.lower() in ("true", "false"):
+        return f"; write {word.lower()}"
+    return f'; text is written in quotes: "{word[:MAX_LINE]}"'
 
 
 def named(message: str, tables: Mapping[str, Any]) -> str:

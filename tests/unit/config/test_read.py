@@ -170,6 +170,32 @@ def test_what_is_wrong_is_refused_by_its_full_key(folder: Path, old: str, new: s
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('name = "a50"', "name = a50", 'name = a50; text is written in quotes: "a50"'),
+        ('name = "a50"', "name = “a50”", 'name = “a50”; text is written in quotes: "a50"'),
+        ('name = "a50"', 'name = "a50', 'name = "a50; a quote is missing at its end'),
+        ("armed = false", "armed = False  # yet", "armed = False  # yet; write false"),
+        ("slot = 2", "host = 10.76.0.12", 'host = 10.76.0.12; text is written in quotes: "10.76.0.12"'),
+        ('"127.0.0.1:1102"', "127.0.0.1:1102", 'listen = 127.0.0.1:1102; text is written in quotes: "127.0.0.1:1102"'),
+        ('"[::1]:8090"', "localhost:8090", '; text is written in quotes: "localhost:8090"'),
+        ('["Outputs", "Robot_*/*"]', "[\n  Outputs\n]", 'Outputs; text is written in quotes: "Outputs"'),
+        ('"var/log"', "/var/log", '= /var/log; text is written in quotes: "/var/log"'),
+        ("period_ms = 20", "period_ms = 020", "period_ms = 020"),
+        ("period_ms = 20", "period_ms: 20", "period_ms: 20"),
+    ],
+)
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_a_slip_in_toml_is_shown_with_what_to_write(folder: Path, old: str, new: str, said: str, end: str) -> None:
+    assert old in WHOLE
+    (folder / "supervisor.toml").write_text(WHOLE.replace(old, new, 1), newline=end)
+    with pytest.raises(ConfigError, match=r"not TOML: .* \(at line \d+, column \d+\): ") as caught:
+        load(folder / "supervisor.toml")
+    assert str(caught.value).endswith(said)
+    assert "\n" not in str(caught.value)
+
+
 def test_plain_text_off_host_must_be_written_down(folder: Path) -> None:
     text = WHOLE.replace('"127.0.0.1:8089"', '"0.0.0.0:8089"')
     with pytest.raises(ConfigError, match="insecure"):
