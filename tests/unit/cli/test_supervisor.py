@@ -390,6 +390,31 @@ def test_status_of_nothing_is_an_object(instance: str, capsys: pytest.CaptureFix
     assert output.err == ""
 
 
+def documented(page: str, heading: str) -> list[str]:
+    """The names that the table under a line of the reference page has in its first column, in their order."""
+    table = page.partition(f"\n{heading}\n\n")[2].partition("\n\n")[0]
+    return [name for row in table.splitlines()[2:] for name in re.findall(r"`(\w+)`", row.split(" | ")[0])]
+
+
+def test_status_has_the_keys_of_the_reference_in_its_order(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+    page = (ROOT / "docs/reference/cli-supervisor.md").read_text()
+    layout = Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
+    blocks = [BlockSpec("cell", layout, 20_000_000, 3600 * 10**9, 1 << 16)]
+    kinds = {"source": "cell", "emulator": "plc", "grpc": "grpc", "recorder": "recorder"}
+    with Segment.create(instance, blocks, [ProcessSpec(name, kind) for kind, name in kinds.items()]) as segment:
+        assert main(["status", "--json", "--instance", instance]) == 0
+        segment.unlink()
+    told = json.loads(capsys.readouterr().out)
+    assert list(told) == documented(page, "One object, with all of these keys, in this order:")
+    of_process, of_source = documented(page, "Each process:"), documented(page, "A source also:")
+    counters = page.partition("| kind | counters |\n")[2].partition("\n\n")[0].splitlines()[1:]
+    for process, row in zip(told["processes"], counters, strict=True):
+        kind, *names = re.findall(r"`(\w+)`", row)
+        assert process["kind"] == kind
+        assert list(process) == of_process + of_source * (kind == "source")
+        assert list(process["counters"]) == names
+
+
 class TestTarget:
     """Which instance a verb acts on."""
 
