@@ -9,10 +9,13 @@ import re
 import sys
 from collections.abc import Sequence
 from importlib import resources
+from itertools import islice
 from pathlib import Path
 
 from shmio.cli.supervise.layouts import compile_files, summarize
+from shmio.cli.supervise.ports import in_use
 from shmio.cli.target import config_file
+from shmio.config import Address
 from shmio.config.properties import read_properties
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout
@@ -20,6 +23,7 @@ from shmio.logs import printable
 
 EXAMPLE = ("supervisor.toml", "db201.db")
 SOURCES = (".db", ".udt", ".scl", ".awl")
+FIRST_PORTS = range(8089, 8189)
 _NAME = re.compile(r"[^A-Za-z0-9_-]+")
 
 
@@ -90,8 +94,11 @@ def _own(file: Path, files: Sequence[Path]) -> tuple[str, list[str]]:
         "armed = false                         # whether an injection may reach the device",
         "",
         "[grpc]",
-        'listen = ["127.0.0.1:8089", "127.0.0.1:8090"]',
+        f"listen = {_toml([str(address) for address in _free()])}",
         'default_source = "cell"',
+        "",
+        "# [recorder]                          # without the first #: everything, to files that shmio-dump reads",
+        '# directory = "dumps"',
         "",
     ]
     return "\n".join(lines), missing
@@ -105,6 +112,12 @@ def _first(layouts: Sequence[Layout], number: str | None) -> Layout:
 def _instance(block: Layout) -> str:
     """A name for the instance, after its block."""
     return _NAME.sub("-", block.name.lower()).strip("-_")[:40] or "cell"
+
+
+def _free() -> list[Address]:
+    """Two addresses for the endpoint: the usual ones, else the next two on which nobody listens now."""
+    free = (address for port in FIRST_PORTS if not in_use(address := Address("127.0.0.1", port)))
+    return list(islice(free, 2)) or [Address("127.0.0.1", 0)]
 
 
 def _relative(path: Path, file: Path) -> str:

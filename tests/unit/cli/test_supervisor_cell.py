@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import os
 import re
@@ -12,6 +13,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -187,6 +189,36 @@ def test_a_device_that_is_not_there_is_told_but_does_not_hold_up_the_start(cell:
     assert "warning: source cell is bad: " in cell.run("up", "--detach", status=0).stderr
     assert cell.status()["state"] == "degraded"
     cell.run("down", status=0)
+
+
+def test_what_init_writes_for_a_block_runs_beside_a_running_cell(cell: Cell, instance: str) -> None:
+    own, name = cell.folder / "own", f"{instance}-own"
+    own.mkdir()
+    (own / "my.db").write_text((cell.folder / "db201.db").read_text().replace("DB201", f'"{name}"', 1))
+    (own / "plc.ini").write_text(f"host=127.0.0.1\nport={free_port()}\ndbNumber=201\n")
+    with ExitStack() as stack:
+        for port in (8089, 8090):  # what a demo has, unless it is running here
+            with suppress(OSError):
+                demo = stack.enter_context(socket.socket())
+                demo.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                demo.bind(("127.0.0.1", port))
+                demo.listen()
+        beside = copy.copy(cell)
+        beside.folder = own
+        beside.run("init", "plc.ini", "my.db", status=0)
+        assert "no faults found" in beside.run("check", status=0).stdout
+        file = own / "supervisor.toml"
+        assert not {"127.0.0.1:8089", "127.0.0.1:8090"} & set(re.findall(r'"([\d.:]+)"', file.read_text()))
+        beside.run("up", "--detach", status=0)
+        try:
+            assert beside.of("grpc")["state"] == "running"
+            file.write_text(
+                file.read_text().replace("# [recorder] ", "[recorder] ").replace("# directory", "directory")
+            )
+            assert "recorder: started" in beside.run("reload", status=0).stdout
+            assert list((own / "dumps").glob(f"{name}-*.mem"))
+        finally:
+            beside.run("down", status=0)
 
 
 def serve_on(cell: Cell, address: str) -> None:
