@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import os
 import threading
+import time
 from contextlib import ExitStack
 from functools import partial
 
@@ -36,17 +37,17 @@ class Source:
 
     def polls_and_overruns(self, duration_s: float) -> tuple[float, float]:
         """Run for a while; both a second, the first 0.2 s left out."""
-        stopping = threading.Event()
+        clock = WallClock()
         block = self._segment.blocks[self._name]
         schedule = Schedule(self._segment.header.started_ns, block.period_ns)
-        loop = SourceLoop(self._connector, self._segment.writer(self._name), schedule, WallClock(stopping))
+        loop = SourceLoop(self._connector, self._segment.writer(self._name), schedule, clock)
         thread = threading.Thread(target=loop.run)
         thread.start()
-        stopping.wait(0.2)
+        time.sleep(0.2)
         before = loop.counters.polls, loop.counters.overruns
-        stopping.wait(duration_s)
+        time.sleep(duration_s)
         after = loop.counters.polls, loop.counters.overruns
-        stopping.set()
+        clock.stop()
         thread.join()
         return (after[0] - before[0]) / duration_s, (after[1] - before[1]) / duration_s
 

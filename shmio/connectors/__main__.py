@@ -30,7 +30,8 @@ def run(worker: Worker) -> None:
     options = registry.convert_options(worker.config["connector"], worker.config["options"])
     connector = connector_class(options, block.layout)
     schedule = Schedule(segment.header.started_ns, block.period_ns)
-    loop = SourceLoop(connector, writer, schedule, WallClock(worker.stopping), worker.config["writable"])
+    clock = WallClock()
+    loop = SourceLoop(connector, writer, schedule, clock, worker.config["writable"])
     thread = threading.Thread(target=_guarded, args=(loop.run,), name="poll", daemon=True)
     desk = threading.Thread(target=_guarded, args=(loop.desk.run,), name="commands", daemon=True)
     thread.start()
@@ -55,6 +56,7 @@ def run(worker: Worker) -> None:
             ),
             note=loop.note,
         )
+    clock.stop()
     thread.join(timeout=min(connector.timeout_s + 0.5, LAST_WORDS_S))
     desk.join(timeout=1.0)
 

@@ -12,6 +12,7 @@ import msgspec
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout
 from shmio.layout.write import Write
+from shmio.segment import Provenance
 
 
 class Lost(Enum):
@@ -49,6 +50,12 @@ class Connector(ABC):
     can_write: ClassVar[bool] = False
     """Whether :meth:`write` is implemented."""
 
+    prompt: ClassVar[bool] = False
+    """Whether writes need not wait for the next cycle: they are carried out and shown at once."""
+
+    provenance: ClassVar[Provenance] = Provenance.LIVE
+    """Where its values come from."""
+
     @abstractmethod
     def __init__(self, options: Any, layout: Layout) -> None:
         """``options`` is an instance of ``Options``. ConfigError when layout and options do not go together."""
@@ -69,6 +76,9 @@ class Connector(ABC):
     @abstractmethod
     def close(self) -> None:
         """Drop the connection; allowed at any time, more than once."""
+
+    def resume(self, image: bytes) -> None:  # noqa: B027  a device has its values itself
+        """The last image that the source's process before this one published; before the first :meth:`connect`."""
 
     def describe(self) -> str:
         """What was agreed with the device, for the log."""

@@ -32,10 +32,17 @@ log = logging.getLogger("shmio.source")
 class CommandDesk:
     """Judges the commands of one block. :meth:`run` is for a thread of its own, all else for the loop's."""
 
-    def __init__(self, writer: BlockWriter, writable: Iterable[str] | None, now_ns: Callable[[], int]) -> None:
-        """``writable``: patterns; None: the device cannot be written at all."""
+    def __init__(
+        self,
+        writer: BlockWriter,
+        writable: Iterable[str] | None,
+        now_ns: Callable[[], int],
+        accepted: Callable[[], None] | None = None,
+    ) -> None:
+        """``writable``: patterns; None: the device cannot be written at all. ``accepted``: called when items wait."""
         self._writer = writer
         self._now_ns = now_ns
+        self._accepted = accepted
         self._cannot = "this source's connector cannot write" if writable is None else ""
         self._writable = cover(writer.block.layout, writable or ())
         self._most_bytes = MAX_WAITING_BLOCKS * writer.block.layout.size
@@ -178,6 +185,8 @@ class CommandDesk:
                 self._items += items
         if closed:
             self._end(items, [(EventKind.EXPIRED, closed)] * len(items))
+        elif self._accepted is not None:
+            self._accepted()
         return True
 
     def _has_room(self, command: Command) -> bool:

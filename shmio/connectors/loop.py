@@ -17,7 +17,7 @@ from typing import NamedTuple, Protocol, TypeVar
 
 from shmio.connectors.base import Connector
 from shmio.connectors.desk import CommandDesk
-from shmio.connectors.schedule import Backoff, Schedule
+from shmio.connectors.schedule import Backoff, Due, Schedule
 from shmio.errors import ConnectorError
 from shmio.logs import fields
 from shmio.segment import BlockWriter, EventKind, Quality, Record
@@ -38,22 +38,38 @@ class Clock(Protocol):
         """CLOCK_MONOTONIC."""
 
     def wait_ns(self, duration_ns: int) -> bool:
-        """Wait; True as soon as the loop is to stop."""
+        """Wait, or shorter after :meth:`nudge`; True as soon as the loop is to stop."""
+
+    def nudge(self) -> None:
+        """End a wait, the present or the next one; from any thread."""
 
 
 class WallClock:
     """The loop's clock in a live instance."""
 
-    def __init__(self, stopping: threading.Event) -> None:
-        self._stopping = stopping
+    def __init__(self) -> None:
+        self._stopped = False
+        self._nudged = threading.Event()
 
     def now_ns(self) -> int:
         """CLOCK_MONOTONIC."""
         return time.monotonic_ns()
 
     def wait_ns(self, duration_ns: int) -> bool:
-        """Wait; True as soon as the process is to stop."""
-        return self._stopping.wait(duration_ns / 1e9) if duration_ns > 0 else self._stopping.is_set()
+        """Wait, or shorter after :meth:`nudge`; True as soon as the loop is to stop."""
+        if duration_ns > 0 and not self._stopped:
+            self._nudged.wait(duration_ns / 1e9)
+            self._nudged.clear()
+        return self._stopped
+
+    def nudge(self) -> None:
+        """End a wait."""
+        self._nudged.set()
+
+    def stop(self) -> None:
+        """Make the loop stop; from any thread."""
+        self._stopped = True
+        self.nudge()
 
 
 @dataclass(slots=True)
@@ -96,7 +112,8 @@ class SourceLoop:
         self._writer = writer
         self._schedule = schedule
         self._clock = clock
-        self.desk = CommandDesk(writer, writable if connector.can_write else None, clock.now_ns)
+        accepted = clock.nudge if connector.prompt else None
+        self.desk = CommandDesk(writer, writable if connector.can_write else None, clock.now_ns, accepted)
         self._backoff = Backoff()
         self._connected_ns: int | None = None
         self._accepting = False
@@ -105,6 +122,8 @@ class SourceLoop:
         last = writer.block.latest()
         self._raw = last.raw if last else bytes(writer.block.layout.size)
         self._read_ns = last.source_ns if last else 0  # UTC of the last good image; 0: there was none
+        if self._read_ns:
+            connector.resume(self._raw)
         self.counters = Counters()
         self.note = ""
 
@@ -114,7 +133,7 @@ class SourceLoop:
             while True:
                 due = self._schedule.next(self._clock.now_ns())
                 self.counters.overruns += due.skipped
-                if self._clock.wait_ns(due.due_ns - self._clock.now_ns()):
+                if self._stops_before(due):
                     break
                 if self._clock.now_ns() >= self._schedule.due_ns(due.cycle + 1):  # held up while it waited
                     self.counters.overruns += 1
@@ -126,6 +145,15 @@ class SourceLoop:
             cycle = self._schedule.next(self._clock.now_ns()).cycle
             self._disconnected(cycle, "the source was stopped")
             self._writer.event(Record(EventKind.STOPPED))
+
+    def _stops_before(self, due: Due) -> bool:
+        """Wait until a cycle is due, and carry out before then what need not wait for it; True: told to stop."""
+        while not self._clock.wait_ns(due.due_ns - self._clock.now_ns()):
+            if self._clock.now_ns() >= due.due_ns:
+                return False
+            if self.desk.waiting and not self.poll(max(0, due.cycle - 1)):
+                return True
+        return True
 
     def poll(self, cycle: int) -> bool:
         """One cycle: connect if need be, write, ask, publish what comes. False: told to stop while backing off."""
@@ -179,6 +207,7 @@ class SourceLoop:
             cycle=asked.cycle,
             source_ns=asked.utc_ns,
             quality=quality,
+            provenance=self._connector.provenance,
             reason=doubt,
             asked_ns=asked.monotonic_ns,
         )

@@ -16,6 +16,7 @@ from shmio.errors import ConfigError
 GROUP = "shmio.connectors"
 
 BUILT_IN = {
+    "memory": "shmio.connectors.memory:MemoryConnector",
     "s7": "shmio.connectors.s7.connector:S7Connector",
 }
 

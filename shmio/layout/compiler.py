@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal, TypeVar
 
-from shmio.layout import emit, lexer, parser
+from shmio.layout import emit, lexer, parser, tags
 from shmio.layout.constants import Constants
 from shmio.layout.encoding import decode
 from shmio.layout.model import MAX_BLOCK_BYTES, MAX_STANDARD_BYTES, Diagnostic, Layout
@@ -46,11 +46,17 @@ class Compiled:
 
 
 def compile_sources(sources: Sequence[Source]) -> Compiled:
-    """Compile the data blocks of one or several files that may use each other's types.
+    """Compile the data blocks of one or several files that may use each other's types, or a tag table (``.toml``).
 
     Raises LayoutError: ``diagnostics`` has everything found, errors first.
     """
     report = Report([source.file for source in sources])
+    for source in sources:
+        if source.file.endswith(tags.SUFFIX):
+            if len(sources) == 1:
+                return Compiled((tags.compile_tags(source.file, source.text),), ())
+            report.add(Diagnostic(source.file, 1, 1, "a tag table stands alone, not together with other files"))
+            report.raise_errors()
     layouts: list[Layout] = []
     with suppress(TooManyErrors):
         units = [_read(source, report) for source in sources]

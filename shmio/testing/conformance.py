@@ -46,10 +46,9 @@ class Run:
         self.frames: list[Frame] = []
         self._rig = rig
         self._cursor = block.cursor()
-        self._stopping = threading.Event()
         schedule = Schedule(segment.header.started_ns, block.period_ns)
-        clock = WallClock(self._stopping)
-        self.loop = SourceLoop(rig.connector(), segment.writer("device"), schedule, clock, writable)
+        self._clock = WallClock()
+        self.loop = SourceLoop(rig.connector(), segment.writer("device"), schedule, self._clock, writable)
         self._threads = [threading.Thread(target=run, daemon=True) for run in (self.loop.run, self.loop.desk.run)]
         for thread in self._threads:
             thread.start()
@@ -75,7 +74,7 @@ class Run:
 
     def stop(self) -> None:
         """End the loop, then hold all frames to what holds always."""
-        self._stopping.set()
+        self._clock.stop()
         self.loop.desk.stop()
         for thread in self._threads:
             thread.join(PATIENCE_S)

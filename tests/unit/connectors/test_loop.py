@@ -30,6 +30,9 @@ class VirtualClock:
     def now_ns(self) -> int:
         return self.time_ns
 
+    def nudge(self) -> None:
+        """No wait of this clock is under way when another thread runs."""
+
     def wait_ns(self, duration_ns: int) -> bool:
         self.time_ns += max(0, duration_ns)
         return self.time_ns >= self.end_ns

@@ -1,0 +1,59 @@
+"""A source without a device: its registers hold what was last written to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+
+from shmio.connectors.base import Connector
+from shmio.layout.image import initial_frame
+from shmio.layout.model import Layout
+from shmio.layout.write import Write
+from shmio.segment import Provenance
+
+
+class MemoryConnector(Connector):
+    """``connector = "memory"``: begins with the initial values; what is written to ``/in`` is ``/out`` at once.
+
+    A process that takes the place of another goes on with its values. For programs that publish signals of their own:
+    a remote simulator, an operator's panel, a test.
+    """
+
+    class Options(msgspec.Struct, forbid_unknown_fields=True):
+        """It has no keys of its own."""
+
+    can_write = True
+    prompt = True
+    provenance = Provenance.SIMULATED
+
+    def __init__(self, options: Options, layout: Layout) -> None:  # noqa: ARG002  it has none
+        self._image, _ = initial_frame(layout)
+
+    @property
+    def timeout_s(self) -> float:
+        """Nothing here waits."""
+        return 1.0
+
+    def resume(self, image: bytes) -> None:
+        """Go on with the values of the process before this one."""
+        self._image[:] = image
+
+    def connect(self) -> None:
+        """There is nobody to reach."""
+
+    def read(self) -> bytes:
+        """All registers."""
+        return bytes(self._image)
+
+    def write(self, writes: Sequence[Write]) -> list[str]:
+        """Change them; nothing refuses."""
+        for offset, mask, data in writes:
+            if mask:
+                self._image[offset] = self._image[offset] & ~mask | data[0] & mask
+            else:
+                self._image[offset : offset + len(data)] = data
+        return [""] * len(writes)
+
+    def close(self) -> None:
+        """Nothing to drop."""

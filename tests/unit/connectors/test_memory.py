@@ -1,0 +1,108 @@
+"""The memory connector behind the source's loop: what is written is there at once, and stays."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from shmio.connectors import registry
+from shmio.connectors.loop import SourceLoop, WallClock
+from shmio.connectors.schedule import Schedule
+from shmio.errors import CommandError, ConfigError
+from shmio.layout.compiler import Source, compile_sources
+from shmio.segment import Attributes, BlockSpec, EventKind, Frame, ProcessSpec, Provenance, Quality, Segment
+from shmio.segment.commander import Commander
+from shmio.segment.view import reading
+
+TABLE = b"""
+[registers]
+position = { type = "LREAL", initial = 0.5 }
+lamps = "ARRAY[1..12] OF BOOL"
+name = { type = "STRING[8]", initial = "R3200" }
+locked = "INT"
+"""
+LAYOUT = compile_sources([Source("cell.toml", TABLE)]).layouts[0]
+PERIOD_NS = 1_000_000_000
+WRITABLE = ("position", "lamps", "name")
+
+
+@pytest.fixture
+def segment(instance: str) -> Iterator[Segment]:
+    spec = BlockSpec("cell", LAYOUT, PERIOD_NS, 10 * PERIOD_NS, 1 << 20, Attributes("memory", WRITABLE))
+    with Segment.create(instance, [spec], [ProcessSpec("cell", "source")]) as segment:
+        yield segment
+        segment.unlink()
+
+
+@contextmanager
+def running(segment: Segment) -> Iterator[Commander]:
+    """A process of the source, and a writer toward it."""
+    options = registry.convert_options("memory", {})
+    connector = registry.load("memory")(options, LAYOUT)
+    clock = WallClock()
+    schedule = Schedule(segment.header.started_ns, PERIOD_NS)
+    cursor = segment.blocks["cell"].cursor()
+    loop = SourceLoop(connector, segment.writer("cell"), schedule, clock, WRITABLE)
+    threads = [threading.Thread(target=run) for run in (loop.run, loop.desk.run)]
+    for thread in threads:
+        thread.start()
+    try:
+        while (frame := cursor.next(20)) is None or frame.quality is not Quality.GOOD:
+            assert frame is not None, "no frame"
+        yield Commander(segment.blocks["cell"], 4)
+    finally:
+        clock.stop()
+        for thread in threads:
+            thread.join()
+
+
+def values(segment: Segment, frame: Frame | None = None) -> dict[str, object]:
+    block = segment.blocks["cell"]
+    return {r.path: reading(block, r, frame or block.latest()).value for r in LAYOUT.registers}
+
+
+def test_it_begins_with_the_initial_values(segment: Segment) -> None:
+    with running(segment):
+        frame = segment.blocks["cell"].latest()
+        assert frame is not None
+        assert frame.provenance is Provenance.SIMULATED
+        assert values(segment) == {"position": 0.5, "lamps": [False] * 12, "name": "R3200", "locked": 0}
+
+
+def test_what_is_written_is_there_at_once_and_stays(segment: Segment) -> None:
+    cursor = segment.blocks["cell"].cursor()
+    cycles: list[int] = []
+
+    def until(path: str, value: object) -> None:
+        while (frame := cursor.next(20)) is None or values(segment, frame)[path] != value:
+            assert frame is not None, f"{path} was not seen as {value}"
+        cycles.append(frame.cycle)
+
+    with running(segment) as commander:
+        for number in range(20):
+            (outcome,) = commander.write({"position": number + 0.25})
+            assert outcome.kind is EventKind.WRITTEN
+            until("position", number + 0.25)
+        commander.write({"lamps/3": True, "name": "R800"})
+        until("name", "R800")
+        assert cursor.missed == 0
+        assert cycles == sorted(cycles)
+        assert cycles[-1] - cycles[0] < 20, "each waited for its cycle"
+    with running(segment):  # another process
+        lamps = [place == 3 for place in range(1, 13)]
+        assert values(segment) == {"position": 19.25, "lamps": lamps, "name": "R800", "locked": 0}
+
+
+def test_what_is_not_named_writable_is_not_written(segment: Segment) -> None:
+    with running(segment) as commander:
+        with pytest.raises(CommandError, match="not writable"):
+            commander.write({"locked": 1})
+        assert values(segment)["locked"] == 0
+
+
+def test_it_has_no_keys_of_its_own() -> None:
+    with pytest.raises(ConfigError, match="host"):
+        registry.convert_options("memory", {"host": "10.0.0.1"})
