@@ -51,6 +51,9 @@ def _parser() -> argparse.ArgumentParser:
 
     info = verb("info", "tell what is in recordings")
     info.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    info.add_argument(
+        "--check", action="store_true", help="read all of each file, and tell what is damaged; exit status 1 if any is"
+    )
     info.add_argument("--json", action="store_true", help="print JSON: one object, or a list for several files")
 
     cat = verb("cat", "print values as they changed, events, and what was missed")

@@ -16,8 +16,9 @@ from mcap.records import Metadata
 
 from shmio.errors import LayoutError, RecordingError
 from shmio.layout.model import Layout
+from shmio.recording.damage import Damage, DamageLog
 from shmio.recording.encoding import EVENT, FRAME, GAP, Gap, decode_event, decode_frame, decode_gap
-from shmio.recording.records import Record, Records, stream
+from shmio.recording.records import BROKEN, Record, Records, stream
 from shmio.recording.writer import ABOUT, GAPS_TOPIC
 from shmio.segment import Event, Frame
 
@@ -82,45 +83,96 @@ class Reader:
         self.attachments: dict[str, AttachmentEntry] = {}
         self._layouts: dict[str, Layout] = {}
         self._layout_bytes = 0
+        self._summarized = False
 
     def messages(
         self,
         wanted: Callable[[Channel], bool] = lambda _: True,
         from_ns: int = 0,
         to_ns: int = (1 << 64) - 1,
+        damaged: Callable[[Damage], object] | None = None,
     ) -> Iterator[Message]:
         """Messages of the wanted channels whose log times are in this range, as the file has them.
 
-        Ends where the file does; then :attr:`Records.closed` and :attr:`Records.damage` say how. RecordingError: a part
-        that is there is damaged.
+        Ends where the file does; then :attr:`Records.closed` and :attr:`Records.damage` say how. What is damaged before
+        that, in this range, ``damaged`` is told of where it is, and the next whole chunk follows; without it
+        RecordingError is raised. Chunks outside of the range are not looked into.
         """
+
+        def tell(damage: Damage) -> None:
+            if damaged and damage.after_ns <= to_ns and not 0 < damage.before_ns < from_ns:
+                damaged(damage)
+
+        log = DamageLog(tell)
         for record in self.records.walk():
-            if record.opcode == Opcode.CHUNK:
-                first_ns, last_ns = self.records.chunk_times(record)
-                if (first_ns <= to_ns and last_ns >= from_ns) or not self.complete:
-                    for channel, log_ns, data in self.raw(record):
-                        if from_ns <= log_ns <= to_ns and wanted(channel):
-                            yield Message(channel, log_ns, self.decode(channel, data))
-            else:
-                self.note(record)
+            try:
+                if record.opcode == Opcode.CHUNK:
+                    first_ns, last_ns = self.records.chunk_times(record)
+                    if (first_ns <= to_ns and last_ns >= from_ns) or not self.complete:
+                        contents = self.raw(record)
+                        log.end(first_ns)
+                        yield from self._decoded(contents, wanted, from_ns, to_ns)
+                    log.after(last_ns)
+                else:
+                    self.note(record)
+            except RecordingError as error:
+                if damaged is None:
+                    raise
+                log.add(record, error)
+        log.end()
+
+    def _decoded(
+        self,
+        contents: Iterator[tuple[Channel, int, memoryview]],
+        wanted: Callable[[Channel], bool],
+        from_ns: int,
+        to_ns: int,
+    ) -> Iterator[Message]:
+        """A chunk's messages; what cannot be decoded is passed over, and RecordingError raised at the end."""
+        problem: RecordingError | None = None
+        for channel, log_ns, data in contents:
+            if from_ns <= log_ns <= to_ns and wanted(channel):
+                try:
+                    item = self.decode(channel, data)
+                except RecordingError as error:
+                    problem = error
+                else:
+                    yield Message(channel, log_ns, item)
+        if problem:
+            raise problem
 
     def raw(self, record: Record) -> Iterator[tuple[Channel, int, memoryview]]:
         """(channel, log time, data) of a chunk's messages, those of others passed over; its channels are noted.
 
-        RecordingError.
+        RecordingError: at once if the chunk as a whole is damaged; at its end if messages had to be left out.
         """
-        for opcode, content in self.records.chunk(record):
+        return self._raw(self.records.chunk(record))
+
+    def _raw(self, contents: Iterator[tuple[int, memoryview]]) -> Iterator[tuple[Channel, int, memoryview]]:
+        unknown: int | None = None
+        for opcode, content in contents:
             if opcode == Opcode.CHANNEL:
                 self._channel(content)
             elif opcode == Opcode.MESSAGE:
                 if len(content) < _MESSAGE.size:
                     raise RecordingError(f"{self.file}: a message is shorter than its header")
                 number, _, log_ns, _ = _MESSAGE.unpack_from(content)
-                channel = self.channels.get(number)
+                channel = self.channel(number)
                 if channel is None:
-                    raise RecordingError(f"{self.file}: a message of channel {number}, which is not described")
-                if channel.encoding:
+                    unknown = number
+                elif channel.encoding:
                     yield channel, log_ns, content[_MESSAGE.size :]
+        if unknown is not None:
+            raise RecordingError(f"{self.file}: messages of channel {unknown}, which is not described")
+
+    def channel(self, number: int) -> Channel | None:
+        """A channel by its number; if the chunk that describes it is damaged, from the summary of a closed file."""
+        if number not in self.channels and not self._summarized:
+            self._summarized = True
+            for record in self.records.summary():
+                if record.opcode == Opcode.CHANNEL:
+                    self._channel(memoryview(self.records.read(record.at, record.size)))
+        return self.channels.get(number)
 
     def decode(self, channel: Channel, data: memoryview) -> Frame | Event | Gap:
         """What a message holds; RecordingError."""
@@ -152,7 +204,11 @@ class Reader:
         return self._layouts[digest]
 
     def note(self, record: Record) -> None:
-        """Take in a record that is not of a chunk: what it tells about the instance, or an attachment."""
+        """Take in a record that is not of a chunk: what it tells of the instance, or an attachment. RecordingError."""
+        if record.opcode == BROKEN:
+            raise RecordingError(
+                f"{self.file}: bytes {record.at} to {record.at + record.size - 1} make no sense: they were changed"
+            )
         try:
             if record.opcode == Opcode.METADATA:
                 metadata = Metadata.read(stream(self.records.read(record.at, record.size)))
@@ -200,6 +256,11 @@ class Reader:
         except (ValueError, KeyError, struct.error, McapError):
             raise RecordingError(f"{self.file}: the description of a channel is damaged") from None
         self.channels[found.id] = channel
+
+    def require_ours(self) -> None:
+        """RecordingError if nothing in what was read is of a recorder of shmio."""
+        if not self.about and not any(channel.encoding for channel in self.channels.values()):
+            raise RecordingError(f"{self.file} is an MCAP file, but no recording of shmio")
 
     def close(self) -> None:
         """Close the file."""

@@ -1,15 +1,18 @@
 """The records of an MCAP file, walked from front to back without an index, so that a file that ends anywhere is read.
 
-Nothing is trusted: lengths are checked against the file and against limits, chunks against their CRC; no more than one
-chunk is in memory at a time.
+Nothing is trusted: lengths are checked against the file, against each other and against limits, chunks against their
+CRC; no more than one chunk is in memory at a time. Behind a place that makes no sense the walk goes on with the next
+chunk or attachment that is whole.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -19,15 +22,25 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
+from shmio.recording.framing import CHUNK, FOOTER, MAX_CHUNK_BYTES, U32, framed, unpack
 
 MAGIC: Final = b"\x89MCAP0\r\n"
-MAX_CHUNK_BYTES: Final = 32 << 20
-"""Far more than a recorder makes: 1 MiB and one message of at most 2 MiB."""
 MAX_RECORD_BYTES: Final = 1 << 20
 """Any other record that is read as a whole."""
 
+BROKEN: Final = 0
+"""The opcode, which no record of MCAP has, of bytes that make no sense."""
+LOOK_BYTES: Final = 4096
+"""So much at a record's beginning tells how long it is: names of attachments and metadata fit in."""
+
 _HEAD: Final = struct.Struct("<BQ")
-_CHUNK: Final = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC; then the compression's name, size, data
+_MARK: Final = re.compile(  # how each chunk and each attachment of ours begins
+    rb"\x06(?=.{36}\x04\x00\x00\x00zstd)|\x09(?=.{24}.\x00\x00\x00(?:layouts|config|sources)/)", re.DOTALL
+)
+_MARK_BYTES: Final = 64
+_SEARCH_BYTES: Final = 1 << 20
+_MAX_SEARCHED: Final = 100
+"""So many places that look like a chunk or an attachment and are none: then it is not searched any further."""
 
 
 class Record(NamedTuple):
@@ -36,6 +49,11 @@ class Record(NamedTuple):
     opcode: int
     at: int
     size: int
+
+    @property
+    def start(self) -> int:
+        """Where the record itself begins."""
+        return self.at - _HEAD.size
 
 
 class Records:
@@ -63,27 +81,98 @@ class Records:
             raise RecordingError(f"{file} {empty}")
 
     def walk(self) -> Iterator[Record]:
-        """All records up to the footer; ends where the file ends, or makes no sense any more."""
-        self.closed, self.damage = False, ""
+        """All records up to the footer; ends where the file ends.
+
+        Bytes that make no sense are one record of opcode BROKEN, up to the next chunk or attachment that is whole, or
+        the footer.
+        """
+        self.closed, self.damage, self._searched = False, "", 0
         at = len(MAGIC)
         while at < self.size:
-            head = os.pread(self._fd, _HEAD.size, at)
-            if len(head) < _HEAD.size:
-                break
-            opcode, size = _HEAD.unpack(head)
-            if opcode == 0:
-                self.damage = f"no record at byte {at}"
-                return
-            content = at + _HEAD.size
-            if size > self.size - content:
-                break
-            yield Record(opcode, content, size)
-            at = content + size
-            if opcode == Opcode.FOOTER:
-                self.closed = os.pread(self._fd, len(MAGIC), at) == MAGIC
+            record = self._record(at)
+            if record is None:
+                goes_on = self._whole(at + 1) or self._footer(at + 1)
+                if not goes_on:
+                    break
+                yield Record(BROKEN, at, goes_on - at)
+                at = goes_on
+                continue
+            yield record
+            at = record.at + record.size
+            if record.opcode == Opcode.FOOTER:
+                self.closed = self._peek(at, len(MAGIC)) == MAGIC
                 self.damage = "" if self.closed else f"it ends within its footer at byte {at}"
                 return
-        self.damage = f"it ends within a record at byte {at} of {self.size}" if at < self.size else "it has no footer"
+        if self._peek(at, 1) == b"\0":
+            self.damage = f"no record at byte {at}"
+        else:
+            self.damage = (
+                f"it ends within a record at byte {at} of {self.size}" if at < self.size else "it has no footer"
+            )
+
+    def summary(self) -> Iterator[Record]:
+        """The records between data and footer of a file that was closed, which tell of channels once more."""
+        footer = self._footer(len(MAGIC))
+        if not footer:
+            return
+        at, _, _ = FOOTER.unpack(self.read(footer + _HEAD.size, FOOTER.size))
+        while at >= len(MAGIC) and at < footer and (record := self._record(at)) is not None:
+            yield record
+            at = record.at + record.size
+
+    def summary_damage(self) -> str:
+        """What the footer's CRC tells of the summary of a file that was closed; empty: it is whole, or has no CRC."""
+        footer = self._footer(len(MAGIC))
+        start, _, crc = FOOTER.unpack(self.read(footer + _HEAD.size, FOOTER.size))
+        end = footer + _HEAD.size + FOOTER.size - U32.size
+        whole = not crc or (start <= end and self.crc(start, end) == crc)
+        return "" if whole else f"the index between byte {start} and byte {footer} is damaged: its checksum is wrong"
+
+    def crc(self, at: int, end: int) -> int:
+        """CRC-32 of some bytes, however many; RecordingError: the file became shorter."""
+        found = 0
+        for begin in range(at, end, _SEARCH_BYTES):
+            found = zlib.crc32(self.read(begin, min(_SEARCH_BYTES, end - begin)), found)
+        return found
+
+    def _peek(self, at: int, size: int) -> bytes:
+        """Some bytes, or as many as there are before the end that the file had when it was opened."""
+        return os.pread(self._fd, max(0, min(size, self.size - at)), at)
+
+    def _record(self, at: int) -> Record | None:
+        """The record there; None if what is there makes no sense."""
+        head = self._peek(at, _HEAD.size + LOOK_BYTES)
+        if len(head) < _HEAD.size:
+            return None
+        opcode, size = _HEAD.unpack_from(head)
+        content = at + _HEAD.size
+        if opcode == BROKEN or size > self.size - content or not framed(opcode, size, head[_HEAD.size :]):
+            return None
+        if opcode == Opcode.FOOTER and not MAGIC.startswith(self._peek(content + size, len(MAGIC))):
+            return None
+        return Record(opcode, content, size)
+
+    def _whole(self, at: int) -> int:
+        """Where the next chunk or attachment begins of which all is there, by its CRC; 0: there is none."""
+        for begin in range(at, self.size, _SEARCH_BYTES):
+            for found in _MARK.finditer(self._peek(begin, _SEARCH_BYTES + _MARK_BYTES - 1)):
+                record = self._record(begin + found.start())
+                if record is not None and record.start < begin + _SEARCH_BYTES:
+                    with suppress(RecordingError):
+                        self.check_crc(record)
+                        return record.start
+                    self._searched += 1
+                    if self._searched >= _MAX_SEARCHED:
+                        return 0
+        return 0
+
+    def _footer(self, at: int) -> int:
+        """Where the footer is that ends the file, if not before here; 0: there is none."""
+        start = self.size - len(MAGIC) - FOOTER.size - _HEAD.size
+        record = self._record(start) if start >= at else None
+        if record is None or record.opcode != Opcode.FOOTER or record.at + record.size + len(MAGIC) != self.size:
+            return 0
+        return start
 
     def read(self, at: int, size: int, limit: int = MAX_RECORD_BYTES) -> bytes:
         """Some bytes; RecordingError: more than the limit, or the file became shorter."""
@@ -96,15 +185,28 @@ class Records:
 
     def chunk_times(self, record: Record) -> tuple[int, int]:
         """Log times of a chunk's first and last message."""
-        start_ns, end_ns, _, _ = _CHUNK.unpack(self.read(record.at, min(record.size, _CHUNK.size)).ljust(_CHUNK.size))
+        start_ns, end_ns, _, _ = CHUNK.unpack(self.read(record.at, min(record.size, CHUNK.size)).ljust(CHUNK.size))
         return start_ns, end_ns
 
     def chunk(self, record: Record) -> Iterator[tuple[int, memoryview]]:
-        """(opcode, content) of the records in a chunk; RecordingError."""
+        """(opcode, content) of the records in a chunk. RecordingError: at once if the chunk as a whole is damaged."""
         try:
-            data = memoryview(_unpack(self.read(record.at, record.size, MAX_CHUNK_BYTES)))
+            data = memoryview(unpack(self.read(record.at, record.size, MAX_CHUNK_BYTES)))
         except (ValueError, struct.error, zstandard.ZstdError) as error:
             raise RecordingError(f"{self.file}: the chunk at byte {record.at} is damaged: {error}") from None
+        return self._split(record, data)
+
+    def check_crc(self, record: Record) -> None:
+        """RecordingError if a chunk's or an attachment's own CRC is wrong."""
+        if record.opcode == Opcode.CHUNK:
+            self.chunk(record)
+        elif record.opcode == Opcode.ATTACHMENT:
+            end = record.at + record.size - U32.size
+            (crc,) = U32.unpack(self.read(end, U32.size))
+            if crc and self.crc(record.at, end) != crc:
+                raise RecordingError(f"{self.file}: the attachment at byte {record.at} is damaged")
+
+    def _split(self, record: Record, data: memoryview) -> Iterator[tuple[int, memoryview]]:
         at = 0
         while at < len(data):
             if len(data) - at < _HEAD.size:
@@ -126,30 +228,3 @@ class Records:
 def stream(data: bytes | memoryview) -> ReadDataStream:
     """What the mcap library's records are read from; a bounded copy."""
     return ReadDataStream(BytesIO(data))
-
-
-def _unpack(content: bytes) -> bytes:
-    """The records of a chunk, uncompressed; ValueError, struct.error, ZstdError."""
-    _, _, size, crc = _CHUNK.unpack_from(content)
-    (name_size,) = struct.unpack_from("<I", content, _CHUNK.size)
-    at = _CHUNK.size + 4 + name_size
-    compression = content[_CHUNK.size + 4 : at].decode()
-    (packed_size,) = struct.unpack_from("<Q", content, at)
-    packed = content[at + 8 :]
-    if packed_size != len(packed):
-        raise ValueError("its sizes contradict each other")
-    if size > MAX_CHUNK_BYTES:
-        raise ValueError(f"{size} bytes, more than {MAX_CHUNK_BYTES}")
-    if compression == "zstd":
-        if zstandard.get_frame_parameters(packed).content_size not in (size, zstandard.CONTENTSIZE_UNKNOWN):
-            raise ValueError("its sizes contradict each other")
-        data = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK_BYTES).decompress(packed, max_output_size=size)
-    elif not compression:
-        data = packed
-    else:
-        raise ValueError(f"its compression {compression[:20]!r} is none that is known here")
-    if len(data) != size:
-        raise ValueError("its sizes contradict each other")
-    if crc and zlib.crc32(data) != crc:
-        raise ValueError("its checksum is wrong")
-    return data

@@ -12,7 +12,7 @@ from mcap.opcode import Opcode
 from shmio.errors import RecordingError
 from shmio.recording.encoding import GAP, Gap
 from shmio.recording.reader import Channel, Reader
-from shmio.recording.records import MAX_RECORD_BYTES, Record
+from shmio.recording.records import BROKEN, MAX_RECORD_BYTES, Record
 
 MAX_GAPS: Final = 1000
 """Gaps that are kept one by one; all are counted."""
@@ -26,8 +26,8 @@ _ENTRY: Final = struct.Struct("<QQ")  # log time, offset
 _NUMBER: Final = struct.Struct("<Q")  # how frames and events begin
 
 
-class _Count(NamedTuple):
-    """Messages of one channel in one chunk."""
+class Count(NamedTuple):
+    """Messages of one channel in one chunk: how many, log times of the first and the last."""
 
     channel: int
     messages: int
@@ -48,7 +48,10 @@ class Track:
 
     def numbers(self, reader: Reader) -> tuple[int, int]:
         """Numbers of its first and its last frame or event; RecordingError."""
-        return next(self._in(reader, self.first_in)), list(self._in(reader, self.last_in))[-1]
+        first, last = list(self._in(reader, self.first_in)), list(self._in(reader, self.last_in))
+        if not first or not last:
+            raise RecordingError(f"{reader.file}: {self.channel.topic}: an index names messages that are not there")
+        return first[0], last[-1]
 
     def _in(self, reader: Reader, chunk: Record) -> Iterator[int]:
         for channel, _, data in reader.raw(chunk):
@@ -81,13 +84,15 @@ def survey(reader: Reader, beat: Callable[[], object] = lambda: None) -> Survey:
     found = Survey()
     chunks = 0
     chunk: Record | None = None
-    counts: list[_Count] | None = []
+    counts: list[Count] | None = []
     for record in reader.records.walk():
         if record.opcode == Opcode.MESSAGE_INDEX:
-            count = _read_index(reader, record) if counts is not None else None
+            count = read_index(reader, record) if counts is not None else None
             counts = None if counts is None or count is None else [*counts, count]
             continue
         if chunk is not None:
+            if record.opcode == BROKEN:  # which may be the rest of its indexes
+                counts = None
             _settle(reader, found, chunk, counts)
             chunk = None
         if record.opcode == Opcode.CHUNK:
@@ -95,20 +100,19 @@ def survey(reader: Reader, beat: Callable[[], object] = lambda: None) -> Survey:
             chunks += 1
             if chunks % BEAT_CHUNKS == 0:
                 beat()
-        elif record.opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
+        else:
             try:
                 reader.note(record)
             except RecordingError as error:
                 _damaged(found, error)
     if chunk is not None:  # the last of a file that ends here: its indexes may be missing
         _settle(reader, found, chunk, None)
-    if not reader.about:
-        raise RecordingError(f"{reader.file} is an MCAP file, but no recording of shmio")
+    reader.require_ours()
     reader.complete = True
     return found
 
 
-def _read_index(reader: Reader, record: Record) -> _Count | None:
+def read_index(reader: Reader, record: Record) -> Count | None:
     """What a message index says; None if it is of no use."""
     if not _INDEX.size < record.size <= MAX_RECORD_BYTES or (record.size - _INDEX.size) % _ENTRY.size:
         return None
@@ -116,17 +120,13 @@ def _read_index(reader: Reader, record: Record) -> _Count | None:
     channel, _ = _INDEX.unpack_from(data)
     first_ns, _ = _ENTRY.unpack_from(data, _INDEX.size)
     last_ns, _ = _ENTRY.unpack_from(data, record.size - _ENTRY.size)
-    return _Count(channel, (record.size - _INDEX.size) // _ENTRY.size, first_ns, last_ns)
+    return Count(channel, (record.size - _INDEX.size) // _ENTRY.size, first_ns, last_ns)
 
 
-def _settle(reader: Reader, found: Survey, chunk: Record, counts: list[_Count] | None) -> None:
+def _settle(reader: Reader, found: Survey, chunk: Record, counts: list[Count] | None) -> None:
     """Count a chunk's messages: by its indexes, unless something in it must be read."""
-    try:
-        if not counts or any(_must_read(reader, count.channel) for count in counts):
-            counts = _read(reader, found, chunk)
-    except RecordingError as error:
-        _damaged(found, error)
-        return
+    if not counts or any(_must_read(reader, count.channel) for count in counts):
+        counts = _read(reader, found, chunk)
     for count in counts:
         channel = reader.channels[count.channel]
         track = found.tracks.get(count.channel)
@@ -143,19 +143,23 @@ def _damaged(found: Survey, error: RecordingError) -> None:
 
 
 def _must_read(reader: Reader, number: int) -> bool:
-    channel = reader.channels.get(number)
+    channel = reader.channel(number)
     return channel is None or channel.encoding == GAP
 
 
-def _read(reader: Reader, found: Survey, chunk: Record) -> list[_Count]:
-    counts: dict[int, _Count] = {}
-    for channel, log_ns, data in reader.raw(chunk):
-        old = counts.get(channel.number, _Count(channel.number, 0, log_ns, log_ns))
-        counts[channel.number] = old._replace(messages=old.messages + 1, last_ns=log_ns)
-        if channel.encoding == GAP:
-            item = reader.decode(channel, data)
-            if isinstance(item, Gap):
-                _add_gap(found, item)
+def _read(reader: Reader, found: Survey, chunk: Record) -> list[Count]:
+    """Count what can be read of a chunk."""
+    counts: dict[int, Count] = {}
+    try:
+        for channel, log_ns, data in reader.raw(chunk):
+            old = counts.get(channel.number, Count(channel.number, 0, log_ns, log_ns))
+            counts[channel.number] = old._replace(messages=old.messages + 1, last_ns=log_ns)
+            if channel.encoding == GAP:
+                item = reader.decode(channel, data)
+                if isinstance(item, Gap):
+                    _add_gap(found, item)
+    except RecordingError as error:
+        _damaged(found, error)
     return list(counts.values())
 
 

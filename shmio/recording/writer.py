@@ -49,7 +49,7 @@ class Writer:
     def __init__(self, output: Output, about: Mapping[str, str]) -> None:
         """``about``: what the reader is told of the instance."""
         self._output = output
-        self._mcap = mcap.writer.Writer(cast("IO[bytes]", output), chunk_size=CHUNK_BYTES)
+        self._mcap = mcap.writer.Writer(cast("IO[bytes]", output), chunk_size=CHUNK_BYTES, enable_data_crcs=True)
         self._mcap.start(PROFILE, f"shmio {__version__}")
         self._mcap.add_metadata(ABOUT, dict(about))
         self._schemas: dict[str, int] = {}

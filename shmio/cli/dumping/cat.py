@@ -5,17 +5,19 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, Protocol
 
-from shmio.cli.dumping.moments import MAX_NS, iso, local, parse_time
+from shmio.cli.dumping.moments import MAX_NS, iso, local, lost, parse_time
 from shmio.cli.readings import SHOWN_CHARACTERS, registers_at
 from shmio.cli.run import dumps
-from shmio.errors import PathError
+from shmio.errors import PathError, RecordingError
 from shmio.layout.codec import codec
 from shmio.layout.model import Layout, Register
 from shmio.layout.text import json_value, to_text
 from shmio.layout.topic import parse_topic
 from shmio.logs import printable
+from shmio.recording.damage import Damage
 from shmio.recording.encoding import EVENT, FRAME, GAP, Gap
 from shmio.recording.reader import Channel, Message, Reader
 from shmio.recording.survey import survey
@@ -24,26 +26,49 @@ from shmio.segment.scan import ChangeScan
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Print a line for each frame in which a chosen value or the quality changed, and for events and gaps."""
+    """Print a line for each frame in which a chosen value or the quality changed, and for events and gaps.
+
+    1 if something was damaged: all the rest is printed, and where something is lost is told.
+    """
+    complaints = Complaints(arguments.file)
     with Reader(arguments.file) as reader:
         found = survey(reader)
         start_ns = min((track.first_ns for track in found.tracks.values() if track.channel.source), default=0)
         from_ns = parse_time("--from", arguments.begin, start_ns, 0)
         to_ns = parse_time("--to", arguments.end, start_ns, MAX_NS)
         channels = [track.channel for track in found.tracks.values()]
-        views = _views(reader, channels, arguments.patterns)
+        views = _views(reader, channels, arguments.patterns, complaints)
         sources = {view.source for view in views.values()} if arguments.patterns else {c.source for c in channels}
         printer: Printer = JsonLines() if arguments.json else Table()
         wanted = {c.number for c in channels if c.number in views or (c.encoding == EVENT and c.source in sources)}
         wanted |= {c.number for c in channels if c.encoding == GAP}
-        for message in reader.messages(lambda channel: channel.number in wanted, from_ns, to_ns):
+        damaged = complaints.damage
+        for message in reader.messages(lambda channel: channel.number in wanted, from_ns, to_ns, damaged):
             for line in _lines(message, views, sources, printer):
                 print(line)
         sys.stdout.flush()
         if not reader.records.closed:
             end = printable(f"{reader.file} was not closed: {reader.records.damage}")
             print(end, file=sys.stderr)
-    return 0
+    return int(complaints.any)
+
+
+class Complaints:
+    """Tells on standard error what cannot be printed, where the rest of the output has come to."""
+
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self.any = False
+
+    def damage(self, damage: Damage) -> None:
+        """A part of the file is lost."""
+        self.say(f"{self._file}: {lost(damage)}")
+
+    def say(self, text: str) -> None:
+        """One line; the exit status will be 1."""
+        self.any = True
+        sys.stdout.flush()
+        print(printable(text), file=sys.stderr, flush=True)
 
 
 class View:
@@ -79,9 +104,20 @@ class Printer(Protocol):
         """What was missed."""
 
 
-def _views(reader: Reader, channels: Sequence[Channel], patterns: Sequence[str]) -> dict[int, View]:
-    """By their frames' channels the blocks of which something is to be shown. PathError: a pattern names nothing."""
-    blocks = {channel.number: (channel, reader.layout(channel)) for channel in channels if channel.encoding == FRAME}
+def _views(
+    reader: Reader, channels: Sequence[Channel], patterns: Sequence[str], complaints: Complaints
+) -> dict[int, View]:
+    """By their frames' channels the blocks of which something is to be shown. PathError: a pattern names nothing.
+
+    Of a block whose layout is damaged nothing can be.
+    """
+    blocks = {}
+    for channel in channels:
+        if channel.encoding == FRAME:
+            try:
+                blocks[channel.number] = channel, reader.layout(channel)
+            except RecordingError as error:
+                complaints.say(str(error))
     if not patterns:
         return {number: View(*block, block[1].registers) for number, block in blocks.items()}
     sources = list(dict.fromkeys(channel.source for channel, _ in blocks.values()))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime
 
 from shmio.errors import RecordingError
+from shmio.recording.damage import Damage
 
 MAX_NS = (1 << 63) - 1
 
@@ -36,6 +37,13 @@ def iso(time_ns: int) -> str:
 def local(time_ns: int) -> str:
     """Local date and time with ms, for people."""
     return _datetime(time_ns).astimezone().isoformat(" ", timespec="milliseconds")[:23]
+
+
+def lost(damage: Damage) -> str:
+    """Where something is lost, in time and in the file, and why."""
+    begin = f"after {local(damage.after_ns)}" if damage.after_ns else "from the beginning"
+    end = f"before {local(damage.before_ns)}" if damage.before_ns else "to the end"
+    return f"lost {begin}, {end} (bytes {damage.first} to {damage.last}): {damage.why}"
 
 
 def _datetime(time_ns: int) -> datetime:

@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from mcap.opcode import Opcode
 
 from shmio.cli.dump import main
 from shmio.recording.reader import Reader
+from shmio.recording.recorder import Start
 from shmio.segment import EventKind, Quality, Record, Segment
 from shmio.testing.cell import until
 from tests.unit.recording.harness import OTHER, RING, numbers, publish, recorder, spec
@@ -189,19 +191,65 @@ def test_a_recording_that_was_not_closed_is_read_and_that_is_told(file: str, sai
     assert line.startswith("cut.mem was not closed: ")
 
 
-def test_a_damaged_recording_is_read_up_to_there(file: str, said: Output) -> None:
-    data = bytearray(Path(file).read_bytes())
-    at = data.rindex(b"zstd", 0, data.index(b"layouts/", data.index(b"zstd"))) + 100
-    data[at] ^= 0xFF
-    Path("bad.mem").write_bytes(data)
-    assert main(["info", "bad.mem", file]) == 1
+@pytest.fixture
+def damaged(segment: Segment, tmp_path: Path, file: str) -> tuple[str, str]:
+    """A recording of 30 frames of cell in three chunks, and the same with a byte changed within the second."""
+    work = recorder(segment, tmp_path / "steady", sources=["press"], start=Start(first=False))
+    for turn in range(3):
+        publish(segment.writer("press"), 10, first=10 * turn)
+        work.turn()
+        work._writer.flush()
+    assert work.close()
+    content = bytearray(work.output.path.read_bytes())
+    with Reader(work.output.path) as reader:
+        chunk = [record for record in reader.records.walk() if record.opcode == Opcode.CHUNK][1]
+    content[chunk.at + chunk.size // 2] ^= 0xFF
+    Path("bad.mem").write_bytes(content)
+    return str(work.output.path), "bad.mem"
+
+
+TIME = r"[-\d]+ [:\d]+\.\d{3}"
+WHERE = rf"lost after {TIME}, before {TIME} \(bytes \d+ to \d+\): bad\.mem: the chunk at byte \d+ is damaged: .*"
+
+
+def test_info_check_tells_what_is_damaged_and_where(damaged: tuple[str, str], said: Output) -> None:
+    file, bad = damaged
+    assert main(["info", "--check", file]) == 0
+    assert any(line == "  all of it was read: 3 chunks, 33 messages, no damage" for line in said()[0])
+    assert main(["info", "--check", bad, file]) == 1
     out, err = said()
-    assert any(line.startswith("  damage: bad.mem: the chunk at byte") for line in out)
-    assert out[-1] != out[0], "the other is told too"
+    [place, events, frames] = [line for line in out if line.startswith("  damage: ")]
+    assert re.fullmatch(f"  damage: {WHERE}", place)
+    first = 3 * RING + 11
+    assert frames == f"  damage: press, block 1: frames {first} to {first + 9} are neither there nor in a gap"
+    assert events.startswith("  damage: press, block 1: events ")
+    assert any(line.startswith("  all of it was read: ") for line in out), "the other is told too"
     assert err == []
-    assert main(["cat", "bad.mem"]) == 1
-    out, err = said()
-    assert len(err) == 1
+    assert main(["info", "--check", "--json", bad]) == 1
+    found = json.loads("\n".join(said()[0]))
+    assert (found["checked"], found["messages"], len(found["damage"])) == (True, 22, 3)
+    assert main(["info", "--json", file]) == 0
+    assert json.loads("\n".join(said()[0]))["checked"] is False
+
+
+def test_cat_goes_on_behind_a_damaged_chunk_and_says_what_is_lost(damaged: tuple[str, str], said: Output) -> None:
+    file, bad = damaged
+    assert main(["cat", "--json", file]) == 0
+    whole = objects(said()[0])
+    assert main(["cat", "--json", bad]) == 1
+    out, [line] = said()
+    assert objects(out) == whole[:11] + whole[-11:]
+    assert re.fullmatch(rf"bad\.mem: {WHERE}", line)
+
+
+def test_a_block_without_its_layout_is_told_and_the_others_are_printed(file: str, said: Output) -> None:
+    data = Path(file).read_bytes()
+    assert data.count(b'"path":"speed"') == 1
+    Path("bad.mem").write_bytes(data.replace(b'"path":"speed"', b'"path":"spred"'))
+    assert main(["cat", "--json", "bad.mem", "cell/count"]) == 1
+    out, [line] = said()
+    assert [entry["frame"] for entry in objects(out) if "frame" in entry] == [1, 3, 4]
+    assert line == "bad.mem: the layout of cell/frames is damaged"
 
 
 @pytest.mark.parametrize("verb", ["info", "cat"])

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
-from shmio.segment import ProcessSpec, Segment
-from tests.unit.recording.harness import spec
+from shmio.segment import EventKind, ProcessSpec, Record, Segment
+from tests.unit.recording.harness import publish, recorder, spec
 
 
 @pytest.fixture
@@ -17,3 +18,19 @@ def segment(instance: str) -> Iterator[Segment]:
     with Segment.create(instance, [spec("cell"), spec("press")], processes) as segment:
         yield segment
         segment.unlink()
+
+
+@pytest.fixture
+def recording(segment: Segment, tmp_path: Path) -> bytes:
+    """The bytes of a file with several chunks."""
+    work = recorder(segment, tmp_path / "whole")
+    writer = segment.writer("cell")
+    for turn in range(4):
+        publish(writer, 10, first=turn * 10)
+        writer.event(Record(EventKind.QUALITY, "so so"))
+        if turn == 1:
+            publish(writer, 1200)
+        work.turn()
+        work._writer.flush()
+    assert work.close()
+    return work.output.path.read_bytes()

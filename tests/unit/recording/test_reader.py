@@ -15,31 +15,14 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
 from shmio.errors import RecordingError
+from shmio.recording.framing import MAX_CHUNK_BYTES
 from shmio.recording.reader import Message, Reader
-from shmio.recording.records import MAGIC, MAX_CHUNK_BYTES
+from shmio.recording.records import MAGIC
 from shmio.recording.survey import survey
-from shmio.segment import EventKind, Record, Segment
-from tests.unit.recording.harness import publish, recorder
 
 CHUNK = 6  # opcode
 
 any_input = settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
-
-
-@pytest.fixture
-def recording(segment: Segment, tmp_path: Path) -> bytes:
-    """The bytes of a file with several chunks."""
-    work = recorder(segment, tmp_path / "whole")
-    writer = segment.writer("cell")
-    for turn in range(4):
-        publish(writer, 10, first=turn * 10)
-        writer.event(Record(EventKind.QUALITY, "so so"))
-        if turn == 1:
-            publish(writer, 1200)
-        work.turn()
-        work._writer.flush()
-    assert work.close()
-    return work.output.path.read_bytes()
 
 
 def look(file: Path) -> tuple[list[Message], bool]:
@@ -154,7 +137,7 @@ def chunk(size: int, packed: bytes, compression: bytes = b"zstd", crc: int = 0) 
         (chunk(4, b"1234", b"", crc=77), "checksum is wrong"),
         (chunk(4, b"1234", b"lz5"), "compression 'lz5' is none that is known"),
         (chunk(9, struct.pack("<BQ", 5, 1 << 60), b""), "ends within a record"),
-        (chunk(31, struct.pack("<BQ", 5, 22) + bytes(22), b""), "message of channel 0, which is not described"),
+        (chunk(31, struct.pack("<BQ", 5, 22) + bytes(22), b""), "messages of channel 0, which is not described"),
     ],
 )
 def test_hostile_chunks_cost_no_memory_and_no_traceback(content: bytes, message: str, tmp_path: Path) -> None:
@@ -168,8 +151,9 @@ def test_hostile_chunks_cost_no_memory_and_no_traceback(content: bytes, message:
 
 def test_a_chunk_larger_than_any_of_ours_is_not_read(tmp_path: Path) -> None:
     file = tmp_path / "x.mem"
+    size = MAX_CHUNK_BYTES + 1
     with file.open("wb") as stream:
-        stream.write(MAGIC + struct.pack("<BQ", CHUNK, MAX_CHUNK_BYTES + 1))
+        stream.write(MAGIC + struct.pack("<BQ", CHUNK, size) + struct.pack("<QQQIIQ", 0, 1, size, 0, 0, size - 40))
         stream.truncate(MAX_CHUNK_BYTES + 100)
     with Reader(file) as reader, pytest.raises(RecordingError, match="is larger than"):
         list(reader.messages())

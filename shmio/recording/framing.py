@@ -1,0 +1,73 @@
+"""What the bytes of a record of MCAP say: how long it must be, and what is in a chunk. Nothing is trusted."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from typing import Final
+
+import zstandard
+from mcap.opcode import Opcode
+
+MAX_CHUNK_BYTES: Final = 32 << 20
+"""Far more than a recorder makes: 1 MiB and one message of at most 2 MiB."""
+
+CHUNK: Final = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC; then the compression's name, size, data
+FOOTER: Final = struct.Struct("<QQI")  # start of the summary, start of its offsets, CRC of the summary up to here
+U32: Final = struct.Struct("<I")
+U64: Final = struct.Struct("<Q")
+SIZES: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: FOOTER.size}
+
+
+def framed(opcode: int, size: int, look: bytes) -> bool:
+    """Whether the lengths in a record's content, of which this is the beginning, agree with that of the whole.
+
+    A length that is damaged must not lead the walk past what is whole.
+    """
+    try:
+        if opcode == Opcode.CHUNK:
+            (name,) = U32.unpack_from(look, CHUNK.size)
+            (data,) = U64.unpack_from(look, CHUNK.size + 4 + name)
+            return bool(size == CHUNK.size + 12 + name + data)
+        if opcode == Opcode.MESSAGE_INDEX:
+            (data,) = U32.unpack_from(look, 2)
+            return bool(size == 6 + data)
+        if opcode == Opcode.ATTACHMENT:
+            (name,) = U32.unpack_from(look, 16)
+            (media_type,) = U32.unpack_from(look, 20 + name)
+            (data,) = U64.unpack_from(look, 24 + name + media_type)
+            return bool(size == 36 + name + media_type + data)
+        if opcode == Opcode.METADATA:
+            (name,) = U32.unpack_from(look)
+            (data,) = U32.unpack_from(look, 4 + name)
+            return bool(size == 8 + name + data)
+    except struct.error:
+        return False
+    return size == SIZES.get(opcode, size)
+
+
+def unpack(content: bytes) -> bytes:
+    """The records of a chunk, uncompressed; ValueError, struct.error, ZstdError."""
+    _, _, size, crc = CHUNK.unpack_from(content)
+    (name_size,) = struct.unpack_from("<I", content, CHUNK.size)
+    at = CHUNK.size + 4 + name_size
+    compression = content[CHUNK.size + 4 : at].decode()
+    (packed_size,) = struct.unpack_from("<Q", content, at)
+    packed = content[at + 8 :]
+    if packed_size != len(packed):
+        raise ValueError("its sizes contradict each other")
+    if size > MAX_CHUNK_BYTES:
+        raise ValueError(f"{size} bytes, more than {MAX_CHUNK_BYTES}")
+    if compression == "zstd":
+        if zstandard.get_frame_parameters(packed).content_size not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+            raise ValueError("its sizes contradict each other")
+        data = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK_BYTES).decompress(packed, max_output_size=size)
+    elif not compression:
+        data = packed
+    else:
+        raise ValueError(f"its compression {compression[:20]!r} is none that is known here")
+    if len(data) != size:
+        raise ValueError("its sizes contradict each other")
+    if crc and zlib.crc32(data) != crc:
+        raise ValueError("its checksum is wrong")
+    return data
