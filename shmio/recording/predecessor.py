@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
+import stat
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -32,7 +35,7 @@ def places(directory: Path, segment: Segment, by: str, beat: Callable[[], object
     found: dict[str, Place] = {}
     for file in _of_this_run(directory, segment, by):
         try:
-            with Reader(file) as reader:
+            with Reader(file, own=True) as reader:
                 found = _places(reader, segment.blocks, beat) | found
         except (OSError, RecordingError) as error:
             log.warning("it is not known where the recording before ended: %s", error)
@@ -48,15 +51,30 @@ def _of_this_run(directory: Path, segment: Segment, by: str) -> list[Path]:
     found: list[tuple[int, Path]] = []
     name = re.compile(rf"{re.escape(segment.instance)}-\d{{8}}T\d{{6}}Z(_\d+)?{re.escape(SUFFIX)}")  # not of a50-test
     files = [file for file in directory.glob(f"{segment.instance}-*{SUFFIX}") if name.fullmatch(file.name)]
-    for file in sorted(files, reverse=True)[:MAX_FILES]:
+    for file in sorted(_own(files), reverse=True)[:MAX_FILES]:
         try:
-            with Reader(file) as reader:
+            with Reader(file, own=True) as reader:
                 about = _about(reader)
             if about.items() >= run.items():
                 found.append((int(about["recording_ns"]), file))
         except (OSError, RecordingError, KeyError, ValueError) as error:
             log.warning("%s is passed over: %s", file, error)
     return [file for _, file in sorted(found, reverse=True)]
+
+
+def _own(files: list[Path]) -> list[Path]:
+    """Regular files of this user: what others may have put into the folder says nothing of where a recorder ended."""
+    found: list[Path] = []
+    strange: list[Path] = []
+    for file in files:
+        with suppress(OSError):  # removed just now
+            status = file.lstat()
+            own = stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid()
+            (found if own else strange).append(file)
+    if strange:
+        more = f", and {len(strange) - 1} others," if len(strange) > 1 else ""
+        log.warning("%s%s passed over: no regular file of this user", strange[0], more)
+    return found
 
 
 def _about(reader: Reader) -> dict[str, str]:

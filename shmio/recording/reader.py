@@ -72,9 +72,10 @@ class Reader:
     OSError, RecordingError: it cannot be opened, or is no recording.
     """
 
-    def __init__(self, file: Path) -> None:
+    def __init__(self, file: Path, *, own: bool = False) -> None:
+        """``own``: refuse what is no regular file of this user."""
         self.file = file
-        self.records = Records(file)
+        self.records = Records(file, own=own)
         self.about: dict[str, str] = {}
         """What the recorder said of the instance."""
         self.complete = False

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 import struct
 import zlib
 from collections.abc import Iterator
@@ -59,18 +60,27 @@ class Record(NamedTuple):
 class Records:
     """A file's records. ``closed`` and ``damage`` are known when :meth:`walk` has ended."""
 
-    def __init__(self, file: Path) -> None:
-        """Open; RecordingError for what is no MCAP file. OSError."""
+    def __init__(self, file: Path, *, own: bool = False) -> None:
+        """Open; RecordingError for what is no MCAP file. OSError.
+
+        ``own``: refuse what is no regular file of this user, a link to one too: nobody else may have made it.
+        """
         self.file = file
         self.closed = False
         """Whether the recorder closed it: index and footer are there."""
         self.damage = ""
         """Where and why the walk ended before the footer."""
-        self._fd = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a FIFO would wait for its writer
+        flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC  # a FIFO would wait for its writer
+        self._fd = os.open(file, flags | os.O_NOFOLLOW if own else flags)
         try:
-            self.size = os.fstat(self._fd).st_size
+            found = os.fstat(self._fd)
+            if own and not stat.S_ISREG(found.st_mode):
+                raise RecordingError(f"{file} is no regular file")
+            if own and found.st_uid != os.geteuid():
+                raise RecordingError(f"{file} is another user's, of id {found.st_uid}")
+            self.size = found.st_size
             start = os.pread(self._fd, len(MAGIC), 0)
-        except OSError:
+        except (OSError, RecordingError):
             os.close(self._fd)
             raise
         if start != MAGIC:

@@ -11,8 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from shmio.errors import RecordingError
 from shmio.recording.encoding import Reason
 from shmio.recording.reader import Reader
+from shmio.recording.records import MAGIC
 from shmio.segment import Activity, BlockSpec, Event, Segment
 from shmio.testing.cell import kill, until
 from tests.unit.recording.harness import RING, Process, gaps, numbers, publish
@@ -158,6 +160,54 @@ def test_a_recording_of_another_run_or_by_another_is_no_predecessor(segment: Seg
         until(lambda: process.counts("frames") == 3, "all frames")
         process.stop()
     assert "is no recording" in process.log.read_text()
+
+
+def test_what_others_put_into_its_folder_is_no_predecessor(segment: Segment, tmp_path: Path) -> None:
+    """A recording that says of itself that it has all frames up to the tenth, but is not this user's file."""
+    if os.geteuid() != 0:
+        pytest.skip("only root can give a file away")
+    writer = segment.writer("cell")
+    with Process(segment, tmp_path) as process:
+        publish(writer, 10)
+        until(lambda: process.counts("frames") == 10, "frames")
+        process.stop()
+    folder = process.folder
+    strange = process.file.rename(folder / f"{segment.instance}-20980101T000000Z.mem")
+    os.chown(strange, 65534, 65534)
+    content, before = strange.read_bytes(), strange.stat()
+    (folder / f"{segment.instance}-20980101T000001Z.mem").symlink_to(strange)
+    os.mkfifo(folder / f"{segment.instance}-20980101T000002Z.mem")
+    (folder / f"{segment.instance}-20980101T000003Z.mem").mkdir()
+    for number in range(300):  # more than are looked at
+        os.link(strange, folder / f"{segment.instance}-20990101T{number:06}Z.mem")
+    with Process(segment, tmp_path) as process:
+        until(lambda: process.counts("frames") == 10, "the frames from the first on")
+        process.stop()
+        own = process.file
+        assert "passed over: no regular file of this user" in process.log.read_text()
+    after = strange.stat()
+    assert (strange.read_bytes(), after.st_mtime_ns, after.st_ino) == (content, before.st_mtime_ns, before.st_ino)
+    with Process(segment, tmp_path) as process:
+        publish(writer, 1, first=10)
+        until(lambda: process.counts("frames") == 1, "what came since its own predecessor")
+        process.stop()
+    assert numbers(own) + numbers(process.file) == list(range(1, 12))
+
+
+def test_a_file_that_is_another_users_by_the_time_it_is_opened(tmp_path: Path) -> None:
+    file = tmp_path / "x.mem"
+    file.write_bytes(MAGIC)
+    Reader(file, own=True).close()
+    (tmp_path / "link.mem").symlink_to(file)
+    os.mkfifo(tmp_path / "pipe.mem")
+    with pytest.raises(OSError, match="symbolic link"):
+        Reader(tmp_path / "link.mem", own=True)
+    with pytest.raises(RecordingError, match="is no regular file"):
+        Reader(tmp_path / "pipe.mem", own=True)
+    if os.geteuid() == 0:
+        os.chown(file, 65534, 65534)
+        with pytest.raises(RecordingError, match="is another user's, of id 65534"):
+            Reader(file, own=True)
 
 
 def test_without_room_it_says_so_and_goes_on_by_itself(segment: Segment, tmp_path: Path) -> None:
