@@ -6,7 +6,7 @@ import os
 import select
 import signal
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
@@ -69,8 +69,8 @@ def clear(instance: str, forget_control: Callable[[str], object] = lambda _: Non
     """Stop the orphans of a dead supervisor and unlink its segment; what was done, a line each.
 
     ``forget_control`` is called with the path of the dead one's control socket while nobody can have made a new one.
-    AlreadyRunningError: a supervisor is alive. SegmentError: a process cannot be identified. Nothing to clear is no
-    error.
+    AlreadyRunningError: a supervisor is alive. SegmentError: a process cannot be identified, or does not end; the
+    segment stays. Nothing to clear is no error.
     """
     shared = claim(instance)
     if shared is None:
@@ -93,7 +93,7 @@ def clear_claimed(
     except UnfinishedError:
         done = []
     except FormatError:
-        done = [f"segment {shared.name} is of another version of shmio", *_stop_mapping(shared)]
+        done = [f"segment {shared.name} is of another version of shmio", *_stop_mapping(shared, instance)]
     shm.unlink(shared.name)
     return [*done, f"removed the left-over segment {shared.name}"]
 
@@ -112,7 +112,7 @@ def _stop_orphans(segment: Segment, shared: SharedObject) -> list[str]:
                 if worker is not None or shared.try_lock(index + 1):
                     del held[index]
             time.sleep(0.01 if held else 0)
-        end(found)
+        end(segment.instance, found)
     finally:
         for worker in found:
             os.close(worker.pidfd)
@@ -124,10 +124,10 @@ def _stop_orphans(segment: Segment, shared: SharedObject) -> list[str]:
     return [f"stopped {worker.name}, pid {worker.pid}, which had lost its supervisor" for worker in found]
 
 
-def _stop_mapping(shared: SharedObject) -> list[str]:
+def _stop_mapping(shared: SharedObject, instance: str) -> list[str]:
     """End the processes of a segment whose format is not known: this user's workers that may write to it."""
     with _opened(_workers(shared)) as found:
-        end(found)
+        end(instance, found)
         return [f"stopped {worker.name}, pid {worker.pid}, which had lost its supervisor" for worker in found]
 
 
@@ -195,20 +195,37 @@ def _maps(pid: int, inode: int, right: str = "") -> bool:
     return False
 
 
-def end(workers: Iterable[Worker]) -> None:
-    """Have processes end, by SIGTERM, then SIGKILL; returns when they have, or after ``GRACE_S`` for each signal."""
-    alive = {worker.pidfd for worker in workers}
+def end(instance: str, workers: Iterable[Worker]) -> None:
+    """Have processes end, by SIGTERM, then SIGKILL, with ``GRACE_S`` for each; returns when they have.
+
+    SegmentError: some have not, by name and pid.
+    """
+    alive = {worker.pidfd: worker for worker in workers}
     for sign in (signal.SIGTERM, signal.SIGKILL):
-        alive -= _ended(alive, 0)
+        for fd in _ended(alive, 0):
+            del alive[fd]
         for fd in alive:
-            with suppress(ProcessLookupError):
+            with suppress(ProcessLookupError, PermissionError):
                 signal.pidfd_send_signal(fd, sign)
         deadline = time.monotonic() + GRACE_S
         while alive and (rest_s := deadline - time.monotonic()) > 0:
-            alive -= _ended(alive, rest_s)
+            for fd in _ended(alive, rest_s):
+                del alive[fd]
+    if alive:
+        stuck = "; ".join(f"{worker.name}: {survivor(worker.pid)}" for worker in alive.values())
+        raise SegmentError(f"instance {instance!r} has processes that do not end: {stuck}; then try again")
 
 
-def _ended(pidfds: set[int], timeout_s: float) -> set[int]:
+def survivor(pid: int) -> str:
+    """What to say of a process that SIGKILL has not ended, with the remedy."""
+    state = ""
+    with suppress(OSError, IndexError):  # "pid (name) state …", where the name may be anything: proc_pid_stat(5)
+        state = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()[0]
+    held = "waits in the kernel (state D), as for a disk or a device that hangs" if state == "D" else "lives on"
+    return f"pid {pid} was killed and {held}: free what it waits for, or restart the host"
+
+
+def _ended(pidfds: Collection[int], timeout_s: float) -> set[int]:
     """Which of these processes have ended, waited for until one does."""
     poll = select.poll()
     for fd in pidfds:

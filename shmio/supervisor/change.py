@@ -54,6 +54,12 @@ class Change:
         life = self._fleet.named(name).life
         return life.starts > 0 and life.state in SETTLED
 
+    @property
+    def stuck(self) -> str:
+        """Which processes must end and do not, if that is what is waited for."""
+        leaving = [] if self._stopped else [self._fleet.named(name) for name in self._leaving]
+        return "; ".join(f"{managed.name}: {managed.life.note}" for managed in leaving if managed.life.stuck)
+
     def _stop(self) -> bool:
         """Have all end that must, rank by rank, so that a recorder has the last of a source; whether they have."""
         leaving = [self._fleet.named(name) for name in self._leaving]

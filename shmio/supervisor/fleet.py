@@ -104,7 +104,8 @@ class Fleet:
                 self._evict(managed)
             event = policy.due(managed.life, now_ns, ready=managed.ready, quiet_ns=quiet_ns, limits=self._limits)
             if event is not None:
-                self.apply(managed, event)
+                dying = managed.child if managed.life.killed else None
+                self.apply(managed, event, leftover.survivor(dying.pid) if dying else "")
 
     def _evict(self, managed: Managed) -> None:
         """Kill a process that holds the role and is not ours.

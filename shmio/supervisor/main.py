@@ -1,4 +1,4 @@
-"""The supervisor: one thread, one selector; ``fleet`` has the processes, ``change`` brings them to a plan."""
+"""The supervisor: one thread, one selector; ``fleet`` has the processes, ``changer`` brings them to a plan."""
 
 from __future__ import annotations
 
@@ -15,14 +15,13 @@ from shmio.logs import fields
 from shmio.segment import Quality, Segment
 from shmio.segment import State as InstanceState
 from shmio.supervisor import policy
-from shmio.supervisor.change import Change
+from shmio.supervisor.changer import Changer
 from shmio.supervisor.control import Answer, ControlServer, Reload, Request, Restart, Stop
 from shmio.supervisor.fleet import TICK_S, Fleet
 from shmio.supervisor.managed import brief, log
 from shmio.supervisor.notify import Notifier
 from shmio.supervisor.plan import MODULES, Plan
 from shmio.supervisor.policy import Limits
-from shmio.supervisor.reconcile import refusal
 from shmio.supervisor.signals import wake_on_signals
 from shmio.supervisor.socketpath import socket_path
 from shmio.supervisor.states import Event, State
@@ -54,7 +53,6 @@ class Supervisor:
         """
         self._plan = plan
         self._replan = replan
-        self._read_ns = time.time_ns()
         self._limits = limits or Limits()
         self._modules = modules
         self._on_state = on_state
@@ -65,8 +63,6 @@ class Supervisor:
         self._started = False
         self._failure: str | None = None
         self._stop_answers: list[Answer] = []
-        self._change: Change | None = None
-        self._change_answer: Answer | None = None
         self._qualities: list[Quality | None] = []
         self._qualities_ns = 0
         self._found_ns = 0
@@ -94,10 +90,11 @@ class Supervisor:
             self._control = ControlServer(path, self._selector, self._handle)
             stack.callback(self._control.close)
             self._fleet = Fleet(self._segment, self._selector, self._limits, self._modules)
+            self._changer = Changer(self._fleet, self._segment, self._notifier, self._plan, self._replan)
             if found:  # until all of it is ours, a failure leaves it for the next attempt
                 for slot, child in found.children:
                     self._fleet.adopt(self._fleet.named(slot.name), child)
-                self._change = Change(self._fleet, self._segment, self._plan)
+                self._changer.follow()
             else:
                 for job in self._plan.jobs:
                     self._fleet.assign(job)
@@ -139,9 +136,7 @@ class Supervisor:
         if not self._stopping:
             self._notifier.stopping()
         self._stopping = True
-        if self._change_answer is not None:
-            self._change_answer.error("the instance is stopping")
-        self._change = self._change_answer = None
+        self._changer.drop()
 
     def _hasten(self) -> None:
         """Asked a second time: no more grace."""
@@ -159,14 +154,12 @@ class Supervisor:
         elif isinstance(request, Reload):
             self._reload(answer)
         else:
-            plan = self._plan
-            answer.ok(config=str(plan.config_file), read_ns=self._read_ns, log_dir=str(plan.log_dir))
+            plan, read_ns = self._changer.plan, self._changer.read_ns
+            answer.ok(config=str(plan.config_file), read_ns=read_ns, log_dir=str(plan.log_dir))
 
     def _busy(self) -> str | None:
         """Why no request that changes something can be taken at present."""
-        if self._stopping:
-            return "the instance is stopping"
-        return "the instance is just being changed: ask again when that is over" if self._change else None
+        return "the instance is stopping" if self._stopping else self._changer.busy()
 
     def _restart(self, name: str, answer: Answer) -> None:
         if name not in self._fleet.names:
@@ -178,46 +171,19 @@ class Supervisor:
             managed = self._fleet.named(name)
             managed.waiting.append(answer)
             self._fleet.apply(managed, Event.RESTART)
+            managed.answer()  # one that is stuck is so before anything is done
 
     def _reload(self, answer: Answer) -> None:
-        log.info("asked to reload %s", self._plan.config_file)
+        log.info("asked to reload %s", self._changer.plan.config_file)
         reason = self._busy() or (None if self._started else "the instance is just starting: ask again when it runs")
         if reason:
             answer.error(reason)
-            return
-        self._notifier.reloading()
-        read_ns = time.time_ns()
-        try:
-            plan = self._replan()
-            if reason := refusal(plan, self._plan):
-                raise ShmioError(f"{plan.config_file}: {reason}")
-            self._change = Change(self._fleet, self._segment, plan)
-        except Exception as error:  # noqa: BLE001 - whatever a connector's own check raises, what runs goes on
-            expected = isinstance(error, ShmioError)
-            reason = str(error) if expected else f"the reload failed: {brief(error)}"
-            log.error("nothing is changed: %s", reason, exc_info=not expected)
-            self._notifier.ready()
-            answer.error(reason)
-            return
-        self._plan, self._change_answer, self._read_ns = plan, answer, read_ns
-
-    def _follow_change(self, change: Change) -> None:
-        if not change.step():
-            return
-        done, problems = change.outcome()
-        for line in done:
-            log.info("%s", line)
-        for line in problems:
-            log.error("%s", line)
-        log.info("the change is over", extra=fields(kept=len(change.changes.kept)))
-        if self._change_answer is not None:
-            self._notifier.ready()
-            told = {"done": done, "problems": problems, "kept": list(change.changes.kept)}
-            self._change_answer.ok(warnings=change.warnings(), **told)
-        self._change = self._change_answer = None
+        else:
+            self._changer.reload(answer)
 
     def _pause_s(self) -> float:
-        return START_TICK_S if any(m.life.state is State.STARTING for m in self._fleet) else TICK_S
+        starting = any(m.life.state is State.STARTING for m in self._fleet)
+        return START_TICK_S if starting or self._changer.planning else TICK_S
 
     def _tick(self) -> bool:
         """Look at everything once; True when all is stopped."""
@@ -227,15 +193,26 @@ class Supervisor:
         if not self._stopping and now_ns - self._found_ns >= NAME_S * 1e9:
             self._found_ns = now_ns
             self._follow_name()
-        if self._change:
-            self._follow_change(self._change)
-            self._started = self._started or self._change is None
+        taking_over = self._changer.under_way
+        self._changer.step()
+        if taking_over:
+            self._started = self._started or not self._changer.under_way
         elif not self._stopping and not self._started:
             self._follow_start(now_ns)
         if self._stopping:
             self._fleet.stop_due()
+            self._follow_stop()
         self._tell(now_ns)
         return self._stopping and policy.all_gone(self._fleet.ranked)
+
+    def _follow_stop(self) -> None:
+        """Tell those who wait for the end when it does not come, and why."""
+        there = [managed for managed in self._fleet if managed.life.state is not State.STOPPED]
+        if there and all(managed.life.stuck for managed in there):
+            stuck = "; ".join(f"{managed.name}: {managed.life.note}" for managed in there)
+            for answer in self._stop_answers:
+                answer.error(f"all else is stopped, but {stuck}; the stop goes on as soon as it has ended")
+            self._stop_answers.clear()
 
     def _follow_name(self) -> None:
         """Without its name nobody finds the segment: the instance could not even be stopped."""

@@ -90,6 +90,10 @@ class Managed:
     def answer(self) -> None:
         """Tell those who asked for a restart how it went, if it is over."""
         state = self.life.state
+        if self.life.stuck:
+            for answer in self.waiting:
+                answer.error(f"{self.name}: {self.life.note}; it starts again as soon as it has ended")
+            self.waiting.clear()
         if state not in (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED):
             return
         for answer in self.waiting:
@@ -103,7 +107,10 @@ class Managed:
 def log_step(managed: Managed, before: Life, action: Action | None, limits: Limits) -> None:
     """Tell about one edge of the graph, unless it says nothing."""
     name, life = managed.name, managed.life
-    if life.state is State.RUNNING:
+    if life.stuck:
+        if not before.stuck:
+            log.error("%s: %s", name, life.note)
+    elif life.state is State.RUNNING:
         log.info("%s running", name, extra=fields(pid=managed.child.pid) if managed.child else None)
     elif life.state is State.HUNG:
         log.warning("%s hangs, %s: killed", name, life.note)

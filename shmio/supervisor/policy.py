@@ -23,6 +23,8 @@ class Limits:
     """Without a heartbeat while running."""
     grace_s: float = 5.0
     """From SIGTERM to SIGKILL."""
+    kill_s: float = 5.0
+    """From SIGKILL until a process that still is there counts as stuck."""
     stable_s: float = 5.0
     """Running this long, it has put its crashes behind it."""
     backoff_first_s: float = 0.5
@@ -50,6 +52,10 @@ class Life:
     """Whether it has been running at any time."""
     note: str = ""
     """Why it is not running."""
+    killed: bool = False
+    """Whether it was sent SIGKILL, and has not ended yet."""
+    stuck: bool = False
+    """Whether it should have ended by then: it waits in the kernel."""
 
     @property
     def restarts(self) -> int:
@@ -63,12 +69,16 @@ def step(life: Life, event: Event, now_ns: int, limits: Limits, note: str = "") 
     if edge is None:
         return life, None
     state, action = edge
-    life = replace(life, crashes=_crashes(life, event, state, now_ns, limits), note=_note(life, state, limits, note))
+    killed = action is Action.KILL or (life.killed and event not in (Event.EXIT, Event.REFUSAL))
+    stuck = killed and (life.stuck or (life.killed and event is Event.ELAPSED))
+    told = (note or life.note) if stuck else _note(life, state, limits, note)
+    crashes = _crashes(life, event, state, now_ns, limits)
+    life = replace(life, crashes=crashes, note=told, killed=killed, stuck=stuck)
     if action is Action.SPAWN:
         life = replace(life, starts=life.starts + 1, spawned_ns=now_ns, ready_ns=None)
     elif event is Event.READY:
         life = replace(life, ran=True, ready_ns=now_ns)
-    allowed_s = _allowed_s(state, action, life.crashes, limits)
+    allowed_s = None if stuck else _allowed_s(state, action, life.crashes, limits)
     due_ns = None if allowed_s is None else now_ns + round(allowed_s * 1e9)
     return replace(life, state=state, due_ns=due_ns), action
 
@@ -98,7 +108,7 @@ def _allowed_s(state: State, action: Action | None, crashes: int, limits: Limits
         return limits.start_s
     if state is State.BACKOFF:
         return backoff_s(crashes, limits)
-    return limits.grace_s if action is Action.TERMINATE else None
+    return {Action.TERMINATE: limits.grace_s, Action.KILL: limits.kill_s}.get(action) if action else None
 
 
 def backoff_s(crashes: int, limits: Limits) -> float:
@@ -150,10 +160,18 @@ def to_start(processes: Ranked) -> list[int]:
 
 
 def to_stop(processes: Ranked) -> list[int]:
-    """Indices of the processes whose turn to stop has come: those of the highest rank that is not gone yet."""
-    turn = max((rank for rank, life in processes if life.state is not State.STOPPED), default=None)
+    """Indices of the processes whose turn to stop has come: those of the highest rank that is not gone yet.
+
+    One that is stuck is not waited for.
+    """
+    there = [rank for rank, life in processes if not (life.state is State.STOPPED or _past_stopping(life))]
+    turn = max(there, default=None)
     settled = (State.STOPPED, State.STOPPING)
     return [index for index, (rank, life) in enumerate(processes) if rank == turn and life.state not in settled]
+
+
+def _past_stopping(life: Life) -> bool:
+    return life.stuck and life.state is State.STOPPING
 
 
 def all_gone(processes: Ranked) -> bool:
@@ -165,7 +183,7 @@ def start_failure(life: Life, limits: Limits) -> str | None:
     """Why the start of the instance has failed at this process; None when it has not."""
     if life.ran:
         return None
-    if life.state is State.FATAL:
+    if life.state is State.FATAL or life.stuck:
         return life.note
     if life.state is State.BACKOFF and life.crashes >= limits.start_attempts:
         return f"failed to start {life.crashes} times; {life.note}"

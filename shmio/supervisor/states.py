@@ -84,6 +84,7 @@ GRAPH: Final[Mapping[State, Mapping[Event, Edge]]] = {
     State.HUNG: {
         Event.EXIT: (State.BACKOFF, None),
         Event.REFUSAL: (State.BACKOFF, None),
+        Event.ELAPSED: (State.HUNG, Action.KILL),
         Event.RESTART: (State.RESTARTING, Action.KILL),
         Event.STOP: (State.STOPPING, Action.KILL),
         Event.HASTEN: (State.STOPPING, Action.KILL),

@@ -29,7 +29,8 @@ def take_over(plan: Plan, control: str, limits: Limits) -> tuple[Found | None, l
     """What can be taken over for this plan, if anything; all else is stopped and removed. What was done, a line each.
 
     ``control``: path of the new control socket, to which the segment leads from now on.
-    AlreadyRunningError: a supervisor is alive. SegmentError: no permission, or a process cannot be identified.
+    AlreadyRunningError: a supervisor is alive. SegmentError: no permission, or a process cannot be identified or
+    does not end.
     """
     shared = leftover.claim(plan.instance)
     if shared is None:
@@ -74,7 +75,10 @@ def _fitting(shared: SharedObject, plan: Plan) -> tuple[Segment | None, list[str
 def _sort(
     segment: Segment, shared: SharedObject, limits: Limits
 ) -> tuple[list[tuple[ProcessSlot, Adopted]], list[str]]:
-    """The processes that run well; the others are ended. SegmentError: one cannot be told from a stranger's."""
+    """The processes that run well; the others are ended.
+
+    SegmentError: one cannot be told from a stranger's, or does not end.
+    """
     living = {slot.name: slot for slot in segment.processes if slot.alive()}
     fit: list[tuple[ProcessSlot, Adopted]] = []
     done, unfit = [], []
@@ -98,9 +102,15 @@ def _sort(
                 f"{', '.join(living)}; end them first"
             )
         time.sleep(0.01 if living else 0)
-    leftover.end(unfit)
-    for worker in unfit:
-        os.close(worker.pidfd)
+    try:
+        leftover.end(segment.instance, unfit)
+    except SegmentError:
+        for _, child in fit:
+            os.close(child.pidfd)
+        raise
+    finally:
+        for worker in unfit:
+            os.close(worker.pidfd)
     return fit, done
 
 

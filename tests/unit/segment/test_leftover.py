@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.errors import AlreadyRunningError, NotRunningError
+from shmio.errors import AlreadyRunningError, NotRunningError, SegmentError
 from shmio.segment import ProcessSpec, Segment, instances
 from shmio.segment.leftover import clear
 
@@ -82,6 +82,28 @@ def test_another_versions_processes_are_found_without_its_format(instance: str, 
         ]
         assert running["workers"].wait(10) == -signal.SIGTERM
         assert running["others"].poll() is None
+    assert instance not in instances()
+
+
+def test_what_does_not_end_is_named_and_keeps_the_segment(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a process that waits in the kernel, which not even SIGKILL ends."""
+    monkeypatch.setattr("shmio.segment.leftover.GRACE_S", 0.2)
+    command = [sys.executable, "-c", SUPERVISOR, instance, ORPHAN.format(stubborn=False)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as supervisor:
+        assert supervisor.stdout is not None
+        orphan = int(supervisor.stdout.readline())
+        supervisor.kill()
+        supervisor.wait()
+        with monkeypatch.context() as held:
+            held.setattr("shmio.segment.leftover.signal.pidfd_send_signal", lambda *_: None)
+            with pytest.raises(SegmentError) as caught:
+                clear(instance)
+        assert str(caught.value) == (
+            f"instance {instance!r} has processes that do not end: cell: pid {orphan} was killed and lives on: "
+            "free what it waits for, or restart the host; then try again"
+        )
+        assert instance in instances()
+        assert clear(instance)[0].startswith(f"stopped cell, pid {orphan}")
     assert instance not in instances()
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from shmio.segment import BlockSpec, State
 from shmio.supervisor.main import Supervisor
 from shmio.supervisor.plan import Job, Plan
 from shmio.supervisor.policy import Limits
+from shmio.supervisor.process import Child
 
 instance, folder, jobs, limits = sys.argv[1], Path(sys.argv[2]), json.loads(sys.argv[3]), json.loads(sys.argv[4])
 LAYOUTS = {
@@ -51,13 +54,29 @@ def make(settings: dict[str, Any]) -> Plan:
 
 
 def replan() -> Plan:
-    """As the file has it by now."""
+    """As the file has it by now; it takes until somebody writes to the pipe, if there is one."""
+    if (pipe := folder / "slow").exists():
+        pipe.read_bytes()
     try:
         return make(json.loads((folder / "plan.json").read_text()))
     except ValueError:
         raise ConfigError("plan.json: no JSON") from None
 
 
+def kill(child: Child, end: Callable[[Child], None] = Child.kill) -> None:
+    """As a process takes it that waits in the kernel, as long as there is the file."""
+    if not (folder / "held").exists():
+        end(child)
+
+
+def send(pidfd: int, sign: int, really: Callable[[int, int], None] = signal.pidfd_send_signal) -> None:
+    """The same for one that is no child."""
+    if not (folder / "held").exists():
+        really(pidfd, sign)
+
+
+Child.kill = kill  # type: ignore[method-assign,assignment]
+signal.pidfd_send_signal = send  # type: ignore[assignment]
 logs.setup(folder / "supervisor.log", "supervisor")
 modules = dict.fromkeys(("source", "emulator", "grpc"), "fake_worker")
 

@@ -137,7 +137,7 @@ def test_silence_while_running_is_a_crash(world: World) -> None:
     assert world.passes(100, quiet_s=LIMITS.hang_s - 0.001) is None, "only silence counts, not time"
     assert world.passes(0, quiet_s=LIMITS.hang_s) is Event.HANG
     assert (world.state(), world.last_action()) == (State.HUNG, Action.KILL)
-    assert world.passes(100, quiet_s=200) is None, "killed once"
+    assert world.passes(LIMITS.kill_s - 0.001, quiet_s=200) is None, "killed once"
     world.happens(Event.EXIT, "killed by SIGKILL")
     assert world.life.note == "no heartbeat for 5 s, killed by SIGKILL"
 
@@ -168,9 +168,35 @@ def test_a_process_that_does_not_stop_is_killed_after_its_grace(world: World) ->
     assert world.passes(LIMITS.grace_s - 0.001, quiet_s=60) is None
     assert world.passes(0.001) is Event.ELAPSED
     assert world.last_action() is Action.KILL
-    assert world.passes(100) is None, "killed once"
+    assert world.passes(LIMITS.kill_s - 0.001) is None, "killed once"
     world.happens(Event.EXIT)
     assert (world.state(), world.life.due_ns) == (State.STOPPED, None)
+
+
+@pytest.mark.parametrize(
+    ("asked", "after"), [(Event.STOP, State.STOPPED), (Event.RESTART, State.STARTING), (Event.HANG, State.BACKOFF)]
+)
+def test_a_process_that_sigkill_does_not_end_is_stuck_until_it_ends(world: World, asked: Event, after: State) -> None:
+    started(world)
+    world.happens(asked)
+    if asked is not Event.HANG:
+        assert world.passes(LIMITS.grace_s) is Event.ELAPSED
+    assert (world.life.killed, world.life.stuck) == (True, False)
+    world.now_ns += round(LIMITS.kill_s * S)
+    world.happens(Event.ELAPSED, "pid 7 lives on")
+    assert (world.life.stuck, world.life.note, world.last_action()) == (True, "pid 7 lives on", Action.KILL)
+    assert world.passes(10_000) is None, "killed twice"
+    world.happens(Event.EXIT)
+    assert (world.state(), world.life.killed, world.life.stuck) == (after, False, False)
+
+
+def test_what_is_stuck_holds_up_no_stop_of_others() -> None:
+    stuck = Life(State.STOPPING, starts=1, killed=True, stuck=True)
+    processes = [(1, Life(State.RUNNING, starts=1)), (2, stuck)]
+    assert policy.to_stop(processes) == [0]
+    assert policy.to_stop([(1, Life(State.STOPPED)), (2, stuck)]) == []
+    assert not policy.all_gone([(1, Life(State.STOPPED)), (2, stuck)])
+    assert policy.to_stop([(1, Life(State.RUNNING, starts=1)), (2, replace(stuck, state=State.HUNG))]) == [1]
 
 
 def test_a_restart_asked_for_is_not_held_against_the_process(world: World) -> None:

@@ -204,6 +204,51 @@ def test_what_does_not_run_is_told_and_the_rest_goes_on(launch: Launch) -> None:
     assert cell.of("press").state == "running"
 
 
+def test_while_a_reload_is_planned_the_supervisor_looks_after_all(launch: Launch) -> None:
+    """To compile a big layout takes seconds."""
+    cell = launch()
+    cell.wait_state("running")
+    os.mkfifo(cell.folder / "slow")
+    cell.plan([*CELL, PRESS])
+    answers: list[dict[str, Any]] = []
+    asking = threading.Thread(target=lambda: answers.append(cell.request(Reload())))
+    asking.start()
+    with (cell.folder / "slow").open("w"):  # it is being planned, and will not be done before this is closed
+        with pytest.raises(ControlError, match="another reload is just being planned: ask again when it is over"):
+            cell.request(Reload())
+        os.kill(cell.pid("cell"), signal.SIGKILL)
+        until(lambda: cell.of("cell").restarts == 1 and cell.of("cell").state == "running")
+        assert cell.request(Restart("grpc")) == {"ok": True}
+        with Segment.open(cell.instance) as segment:
+            beat_ns = segment.supervisor_heartbeat_ns
+            until(lambda: segment.supervisor_heartbeat_ns > beat_ns)
+        assert "press" not in cell.pids()
+        (cell.folder / "slow").unlink()
+    asking.join()
+    assert answers[0]["done"] == ["press: started"]
+    assert cell.of("press").state == "running"
+
+
+def test_a_stop_does_not_wait_for_a_plan(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    os.mkfifo(cell.folder / "slow")
+    outcomes: list[str] = []
+
+    def reload() -> None:
+        try:
+            cell.reload(CELL)
+        except ControlError as error:
+            outcomes.append(str(error))
+
+    asking = threading.Thread(target=reload)
+    asking.start()
+    with (cell.folder / "slow").open("w"):
+        assert cell.stop() == 0
+    asking.join()
+    assert outcomes == ["the instance is stopping"]
+
+
 def test_a_stop_ends_a_change_under_way(launch: Launch) -> None:
     cell = launch([*CELL, ("press", "source", ["stubborn"])], grace_s=3600)
     cell.wait_state("running")
