@@ -28,7 +28,7 @@ from snap7.server import CPUState, Server, ServerISOConnection, ServerState
 from snap7.type import SrvArea
 
 from shmio.config.address import Address
-from shmio.emulators.s7_jobs import MAX_PDU_SIZE, NOT_AVAILABLE, Jobs, Memory, Traits, refusal
+from shmio.emulators.s7_jobs import MAX_PDU_SIZE, NOT_AVAILABLE, PROTOCOL, Jobs, Memory, Traits, refusal
 from shmio.errors import ConfigError, EndpointError, ShmioError
 
 logger = logging.getLogger(__name__)
@@ -40,6 +40,9 @@ _LONGEST_FRAME = MAX_PDU_SIZE + _FRAME_OVERHEAD
 _INBOX_SIZE = 8 * _LONGEST_FRAME
 _ANSWERS_AT_ONCE = 8  # then they are sent, whether or not more requests have come
 _SEND_TIMEOUT_S = 5
+_KEEPALIVE = {socket.TCP_KEEPIDLE: 30, socket.TCP_KEEPINTVL: 10, socket.TCP_KEEPCNT: 3}
+"""In s: a client whose host is gone gives its place back within a minute."""
+_SERVICES = (b"P_PROGRAM", b"_MODU", b"_GARB")  # start; and what a block that lives in memory alone has done already
 _MODE_LIST = 0x0424
 _RUN, _STOP = 0x08, 0x04  # operating modes in that list
 _JOIN_TIMEOUT_S = 10
@@ -95,7 +98,7 @@ class S7Server(Server):
         try:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(place)
-            listener.listen(self.max_clients)
+            listener.listen()  # as many as may be: who is one too many is told so at once
         except OSError as error:
             listener.close()
             taken = ": another program, maybe a running instance, has it" if error.errno == errno.EADDRINUSE else ""
@@ -186,7 +189,8 @@ class S7Server(Server):
         """Answer one client until it leaves or breaks the protocol. Uses a fixed amount of memory, whatever comes."""
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        client.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 30)
+        for option, value in _KEEPALIVE.items():
+            client.setsockopt(socket.IPPROTO_TCP, option, value)
         if not ServerISOConnection(client).accept_connection():  # has a deadline of its own
             return
         client.setblocking(True)  # a quiet client may stay, but one that takes no answers may not
@@ -224,9 +228,16 @@ class S7Server(Server):
 
     def _process_request(self, request_data: bytes, client_address: tuple[str, int]) -> bytes | None:
         """Let python-snap7 answer what it may of what is no read, write or set-up; refuse the rest."""
-        kind, function = request_data[1], request_data[10] if len(request_data) > 10 else 0
-        if kind == S7PDUType.USERDATA or (
-            kind == S7PDUType.REQUEST and function in {S7Function.PLC_CONTROL, S7Function.PLC_STOP}
+        protocol, kind, function = request_data[0], request_data[1], request_data[10] if len(request_data) > 10 else 0
+        if protocol != PROTOCOL:  # S7comm-plus, say
+            return None
+        if (
+            kind == S7PDUType.USERDATA
+            or (kind, function) == (S7PDUType.REQUEST, S7Function.PLC_STOP)
+            or (
+                (kind, function) == (S7PDUType.REQUEST, S7Function.PLC_CONTROL)
+                and any(service in request_data for service in _SERVICES)  # python-snap7 takes any other for a start
+            )
         ):
             return super()._process_request(request_data, client_address)
         if kind == S7PDUType.REQUEST:

@@ -19,6 +19,7 @@ from snap7.datatypes import S7Area, S7WordLen
 MAX_JOBS = 32
 MAX_PDU_SIZE = 960
 
+PROTOCOL = 0x32
 JOB = 1
 READ, WRITE, SETUP = 0x04, 0x05, 0xF0
 NOT_AVAILABLE, BAD_JOB = 0x8104, 0x8500  # header errors: function not available, PDU of a wrong size
@@ -102,17 +103,18 @@ class Jobs:
     def __init__(self, memory: Memory, traits: Traits) -> None:
         self._memory = memory
         self._traits = traits
-        self.pdu_size = 0  # until set up, no answer fits
+        self.pdu_size = 0  # until set up, no job fits
 
     def answer(self, pdu: memoryview) -> bytes | None:
         """Answer one S7 PDU of ten or more bytes; None if it is not a job known here."""
-        _, kind, reference, parameter_size, data_size = _JOB.unpack_from(pdu)
-        if kind != JOB or len(pdu) < 12:
+        protocol, kind, reference, parameter_size, data_size = _JOB.unpack_from(pdu)
+        if protocol != PROTOCOL or kind != JOB or len(pdu) < 12:
             return None
         function = pdu[10]
         if function not in {READ, WRITE, SETUP}:
             return None
-        if len(pdu) != 10 + parameter_size + data_size or parameter_size < 2:
+        longest = MAX_PDU_SIZE if function == SETUP else self.pdu_size
+        if len(pdu) != 10 + parameter_size + data_size or parameter_size < 2 or len(pdu) > longest:
             return refusal(reference, BAD_JOB)
         if function != SETUP and self._traits.fault is Fault.PUT_GET_OFF:
             return refusal(reference, NOT_AVAILABLE)
@@ -193,11 +195,11 @@ class Jobs:
 
 def refusal(reference: int, error: int) -> bytes:
     """Build an answer that holds only a header error: ROSCTR 2, as S7-1200 and S7-1500 send it."""
-    return _ANSWER.pack(0x32, 2, 0, reference, 0, 0, error)
+    return _ANSWER.pack(PROTOCOL, 2, 0, reference, 0, 0, error)
 
 
 def _ack(reference: int, parameters: bytes, data: bytes | bytearray = b"") -> bytes:
-    return _ANSWER.pack(0x32, 3, 0, reference, len(parameters), len(data), 0) + parameters + data
+    return _ANSWER.pack(PROTOCOL, 3, 0, reference, len(parameters), len(data), 0) + parameters + data
 
 
 def _read_item(item: _Item) -> bytes:

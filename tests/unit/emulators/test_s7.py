@@ -95,6 +95,21 @@ def test_answers_while_stopped(client: snap7.Client, server: S7Server, block: by
     assert server.get_status()[1] == "Run"
 
 
+def test_only_a_start_starts(client: snap7.Client, server: S7Server) -> None:
+    client.plc_stop()
+    client.compress(1000)
+    client.copy_ram_to_rom(1000)
+    delete = bytes.fromhex("0300002c 02f080 32 01 0000 0001 001b 0000 28 00000000000000fd 000a 01003042303030303541 05")
+    with socket.create_connection(tuple_of(server)) as peer, peer.makefile("rb") as stream:
+        peer.settimeout(10)
+        peer.sendall(SESSION + delete + b"_DELE")
+        stream.read(22)
+        assert stream.read(19)[-2:] == b"\x81\x04"
+    assert server.get_status()[1] == "Stop"
+    client.plc_cold_start()
+    assert server.get_status()[1] == "Run"
+
+
 def test_tells_its_operating_mode(client: snap7.Client) -> None:
     """SZL 0x0424: one record of 20 bytes, in its fourth byte the mode now and before."""
 
@@ -199,6 +214,7 @@ SESSION = bytes.fromhex("0300001611e00000000100c1020100c2020101c0010a")
         SESSION + b"\x03\x00\x00\x11\x02\xf0\x00" + bytes(10),
         SESSION + b"\x03\x00\x00\x11\x02\xf0\x80\x32\x03" + bytes(8),
         SESSION + b"\x03\x00\x00\x19\x02\xf0\x80\x32\x07" + b"\xff" * 16,
+        SESSION + bytes.fromhex("03000019 02f080 72 01 0000 0001 0008 0000 f0 00 0008 0008 03c0"),
     ],
 )
 def test_garbage_ends_only_its_own_connection(server: S7Server, block: bytearray, noise: bytes) -> None:

@@ -125,6 +125,26 @@ def test_answer_must_fit_the_pdu(block: bytearray) -> None:
     assert error(jobs.answer(read(item(BYTE, 40, 0), item(BYTE, 39, 0)))) == 0x8500
 
 
+def test_a_job_must_fit_the_pdu_too(block: bytearray) -> None:
+    before = bytes(block)
+    jobs = Jobs(Memory({(S7Area.DB, 1): block}), Traits())
+    assert error(jobs.answer(write((item(BYTE, 1, 0), 4, b"x")))) == 0x8500  # before set-up
+    jobs.answer(job(struct.pack(">BxHHH", 0xF0, 1, 1, 100)))
+    assert error(jobs.answer(write((item(BYTE, 73, 0), 4, bytes(73))))) == 0x8500
+    assert block == before
+    assert payload(jobs.answer(write((item(BYTE, 72, 0), 4, bytes(72))))) == b"\xff"
+    assert block == bytes(72) + before[72:]
+
+
+@pytest.mark.parametrize("size", [0, 65535])
+def test_any_pdu_size_may_be_asked_for(block: bytearray, size: int) -> None:
+    jobs = Jobs(Memory({(S7Area.DB, 1): block}), Traits())
+    answer = jobs.answer(job(struct.pack(">BxHHH", 0xF0, 0, 65535, size)))
+    assert answer is not None
+    assert answer[14:] == struct.pack(">HHH", 0, 8, min(size, 960))
+    assert len(jobs.answer(read(item(BYTE, 1, 0))) or b"") == (19 if size else 12)
+
+
 def test_writes_each_type(jobs: Jobs, block: bytearray) -> None:
     before = bytes(block)
     for kind, transport in ((BYTE, 4), (CHAR, 9), (WORD, 4), (INT, 5), (DWORD, 4), (DINT, 5), (REAL, 7)):
@@ -185,6 +205,7 @@ def test_other_address_forms_are_not_known(jobs: Jobs, syntax: bytes) -> None:
 def test_leaves_other_functions_to_others(jobs: Jobs) -> None:
     assert jobs.answer(job(b"\x28\x00")) is None
     assert jobs.answer(memoryview(bytes.fromhex("32 07 0000 0001 0004 0000 04 01 12 00"))) is None
+    assert jobs.answer(memoryview(b"\x72" + bytes(SETUP)[1:])) is None
 
 
 # -- traits ------------------------------------------------------------------------------------------------------------
