@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from enum import StrEnum
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -65,6 +65,14 @@ class Gap(msgspec.Struct, frozen=True):
     reason: Reason
     after_ns: int = 0
     before_ns: int = 0
+
+
+class Place(NamedTuple):
+    """Where a recording begins, or ends: behind these numbers of a block, which were recorded at ``log_ns``."""
+
+    frame: int = 0
+    event: int = 0
+    log_ns: int = 0
 
 
 def encode_frame(frame: Frame) -> bytes:
@@ -138,3 +146,16 @@ def decode_gap(data: bytes) -> Gap:
     if gap.what not in ("frames", "events") or not 0 < gap.first <= gap.last or gap.count != gap.last - gap.first + 1:
         raise ValueError("a gap contradicts itself")
     return gap
+
+
+def encode_place(place: Place) -> str:
+    """A place as text."""
+    return " ".join(map(str, place))
+
+
+def decode_place(text: str) -> Place:
+    """The place that a text tells; ValueError."""
+    frame, event, log_ns = (int(number) for number in text.split(" ") if len(number) <= 20)
+    if min(frame, event, log_ns) < 0:
+        raise ValueError("a place is negative")
+    return Place(frame, event, log_ns)

@@ -5,18 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Generic, NamedTuple, TypeVar
 
-from shmio.recording.encoding import Gap, Reason
+from shmio.recording.encoding import Gap, Place, Reason
 from shmio.segment import Block, Cursor, Event, Frame
 
 Item = TypeVar("Item", bound=Frame | Event)
-
-
-class Place(NamedTuple):
-    """Where a follower begins: behind these numbers, which were recorded at ``log_ns``."""
-
-    frame: int = 0
-    event: int = 0
-    log_ns: int = 0
 
 
 class Entry(NamedTuple):

@@ -14,8 +14,7 @@ from typing import Final
 from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
-from shmio.recording.encoding import EVENT, FRAME
-from shmio.recording.follower import Place
+from shmio.recording.encoding import EVENT, FRAME, Place
 from shmio.recording.output import SUFFIX
 from shmio.recording.reader import Reader
 from shmio.recording.survey import survey
@@ -27,20 +26,21 @@ MAX_FILES: Final = 256
 log = logging.getLogger("shmio.recorder")
 
 
-def places(directory: Path, segment: Segment, by: str, beat: Callable[[], object] = lambda: None) -> dict[str, Place]:
-    """For each source the last frame and event that recorders of this kind (``by``) have of this run of the instance.
+def places(directory: Path, segment: Segment, by: str, beat: Callable[[], object] = lambda: None) -> dict[int, Place]:
+    """By section the last frame and event of each block that recorders of this kind (``by``) have of this run.
 
-    Sources that were not recorded, or had another block then, are left out. ``beat`` is called now and then.
+    Blocks that were not recorded are left out. ``beat`` is called now and then.
     """
-    found: dict[str, Place] = {}
+    found: dict[int, Place] = {}
+    blocks = {block.section: block for block in (*segment.ended, *segment.blocks.values())}
     for file in _of_this_run(directory, segment, by):
         try:
             with Reader(file, own=True) as reader:
-                found = _places(reader, segment.blocks, beat) | found
+                found = _places(reader, blocks, beat) | found
         except (OSError, RecordingError) as error:
             log.warning("it is not known where the recording before ended: %s", error)
             continue
-        if found.keys() >= segment.blocks.keys():
+        if found.keys() >= blocks.keys():
             break
     return found
 
@@ -87,27 +87,26 @@ def _about(reader: Reader) -> dict[str, str]:
     return reader.about
 
 
-def _places(reader: Reader, blocks: dict[str, Block], beat: Callable[[], object]) -> dict[str, Place]:
+def _places(reader: Reader, blocks: dict[int, Block], beat: Callable[[], object]) -> dict[int, Place]:
+    """Where a file ends: where it began, if nothing came of a block."""
     found = survey(reader, beat)
-    frames: dict[str, tuple[int, int]] = {}  # by source: number, log time
-    events: dict[str, tuple[int, int]] = {}
+    places = {section: place for section, place in reader.places.items() if section in blocks}
     for channel in reader.channels.values():
-        block = blocks.get(channel.source)
-        # The section, for a block that a reload has made anew counts from 1 again.
-        if block is None or channel.section != block.section or channel.encoding not in (FRAME, EVENT):
+        block = blocks.get(channel.section)
+        if block is None or channel.source != block.source or channel.encoding not in (FRAME, EVENT):
             continue
         what = "frames" if channel.encoding == FRAME else "events"
         track = found.tracks.get(channel.number)
         number = track.numbers(reader)[1] if track else channel.after
         number = max(number, found.missed_to.get((channel.source, channel.block, what), 0))
-        (frames if channel.encoding == FRAME else events)[channel.source] = number, track.last_ns if track else 0
-    places = {
-        source: Place(number, events[source][0], max(log_ns, events[source][1]))
-        for source, (number, log_ns) in frames.items()
-        if source in events
-    }
+        frame, event, log_ns = places.get(channel.section, Place())
+        log_ns = max(log_ns, track.last_ns if track else 0)
+        if channel.encoding == FRAME:
+            places[channel.section] = Place(number, event, log_ns)
+        else:
+            places[channel.section] = Place(frame, number, log_ns)
     return {
-        source: place
-        for source, place in places.items()
-        if place.frame <= blocks[source].ring.head() and place.event <= blocks[source].events.head()
+        section: place
+        for section, place in places.items()
+        if place.frame <= blocks[section].ring.head() and place.event <= blocks[section].events.head()
     }

@@ -17,9 +17,9 @@ from mcap.records import Metadata
 from shmio.errors import LayoutError, RecordingError
 from shmio.layout.model import Layout
 from shmio.recording.damage import Damage, DamageLog
-from shmio.recording.encoding import EVENT, FRAME, GAP, Gap, decode_event, decode_frame, decode_gap
+from shmio.recording.encoding import EVENT, FRAME, GAP, Gap, Place, decode_event, decode_frame, decode_gap, decode_place
 from shmio.recording.records import BROKEN, Record, Records, stream
-from shmio.recording.writer import ABOUT, GAPS_TOPIC
+from shmio.recording.writer import ABOUT, GAPS_TOPIC, PLACES
 from shmio.segment import Event, Frame
 
 MAX_LAYOUT_BYTES: Final = 64 << 20
@@ -78,6 +78,8 @@ class Reader:
         self.records = Records(file, own=own)
         self.about: dict[str, str] = {}
         """What the recorder said of the instance."""
+        self.places: dict[int, Place] = {}
+        """By section where the recorder before had come to, as far as it was known."""
         self.complete = False
         """Whether all channels are known, from a walk through the whole file."""
         self.channels: dict[int, Channel] = {}
@@ -215,6 +217,8 @@ class Reader:
                 metadata = Metadata.read(stream(self.records.read(record.at, record.size)))
                 if metadata.name == ABOUT:
                     self.about = metadata.metadata
+                elif metadata.name == PLACES:
+                    self.places = {int(section): decode_place(place) for section, place in metadata.metadata.items()}
             elif record.opcode == Opcode.ATTACHMENT and len(self.attachments) < MAX_ATTACHMENTS:
                 self._attachment(record)
         except (ValueError, struct.error, McapError):

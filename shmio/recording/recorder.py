@@ -11,8 +11,8 @@ from itertools import chain
 from typing import Final, NamedTuple
 
 from shmio import __version__
-from shmio.recording.encoding import Gap, Reason
-from shmio.recording.follower import Entry, Follower, Place
+from shmio.recording.encoding import Gap, Place, Reason
+from shmio.recording.follower import Entry, Follower
 from shmio.recording.output import Output
 from shmio.recording.writer import JSON, Channels, Writer
 from shmio.segment import Frame, Segment
@@ -48,9 +48,9 @@ def no_attachments(_source: str | None, _block: int) -> list[Attachment]:
 
 
 class Start(NamedTuple):
-    """Where to begin: behind these places by source; blocks without one at their first frame, or at the present."""
+    """Where to begin: behind these places, by section; blocks without one at their first frame, or at the present."""
 
-    places: Mapping[str, Place] = {}
+    places: Mapping[int, Place] = {}
     first: bool = True
 
 
@@ -110,9 +110,13 @@ class Recorder:
         self._writer = Writer(output, self._about(by))
         self._followed: list[_Followed] = []
         self._blocks = 0
+        self._seen: set[int] = set()
+        """Sections whose blocks are followed, were, or need not be."""
         self._attached: set[bytes] = set()
         self._attach(attachments(None, 0))
-        self._follow(start or Start())
+        start = start or Start()
+        self._writer.places(start.places)
+        self._follow(start)
         self._lively = False
         self._flushed_s = self._checked_s = time.monotonic()
 
@@ -193,23 +197,29 @@ class Recorder:
     # ---- blocks ------------------------------------------------------------------------------------------------------
 
     def _follow(self, start: Start) -> None:
-        followed = {id(known.follower.block) for known in self._followed}
+        """Follow what is not followed yet: blocks that a reload has ended, too, unless all they have is recorded."""
         self._known = self._segment.blocks
-        for source, block in self._known.items():
-            if id(block) in followed or (self._sources is not None and source not in self._sources):
+        ended = self._segment.ended
+        for block in (*ended, *self._known.values()):
+            if block.section in self._seen or (self._sources is not None and block.source not in self._sources):
                 continue
-            self._blocks += 1
-            place = start.places.get(source)
+            self._seen.add(block.section)
+            place = start.places.get(block.section)
             reason = Reason.NOT_RUNNING if place or start.first else Reason.OVERTAKEN
             if place is None:
                 place = Place() if start.first else Place(block.ring.head(), block.events.head())
+            over = block in ended
+            if over and (place.frame, place.event) == (block.ring.head(), block.events.head()):
+                continue
+            self._blocks += 1
             follower = Follower(block, self._blocks, place, reason, self.log_time)
             self._followed.append(_Followed(follower, log_ns=place.log_ns))
             if block.layout.hash not in self._attached:
                 self._attached.add(block.layout.hash)
                 name = f"layouts/{block.layout.hash.hex()}.json"
                 self._attach([Attachment(name, JSON, block.layout.to_json())])
-            self._attach(self._attachments(source, self._blocks))
+            if not over:  # the files on the disk are of its successor
+                self._attach(self._attachments(block.source, self._blocks))
 
     def _attach(self, attachments: list[Attachment]) -> None:
         now_ns = self.log_time(time.monotonic_ns())

@@ -17,9 +17,11 @@ from shmio.recording.encoding import (
     GAP,
     GAP_SCHEMA,
     Gap,
+    Place,
     encode_event,
     encode_frame,
     encode_gap,
+    encode_place,
 )
 from shmio.recording.output import Output
 from shmio.segment import Block, Event, Frame
@@ -27,6 +29,8 @@ from shmio.segment import Block, Event, Frame
 PROFILE: Final = "shmio"
 ABOUT: Final = "shmio"
 """Name of the metadata that tell about the instance."""
+PLACES: Final = "places"
+"""Name of the metadata that tell behind which numbers the recording begins."""
 CHUNK_BYTES: Final = 1 << 20
 GAPS_TOPIC: Final = "gaps"
 
@@ -55,6 +59,11 @@ class Writer:
         self._schemas: dict[str, int] = {}
         self._gaps: int | None = None
         self.flush()
+
+    def places(self, places: Mapping[int, Place]) -> None:
+        """Tell where the recorder before had come to, by section: it may be all that there is of a block."""
+        if places:
+            self._mcap.add_metadata(PLACES, {str(section): encode_place(place) for section, place in places.items()})
 
     def attach(self, name: str, media_type: str, data: bytes, now_ns: int, changed_ns: int = 0) -> None:
         """Attach a file."""

@@ -95,17 +95,26 @@ class Segment:
             raise
 
     def _find_blocks(self) -> dict[str, Block]:
-        entries = self._sections()
-        blocks = {}
-        for layout, described in enumerate(entries):
-            if described.kind != SectionKind.LAYOUT or described.retired:
-                continue
-            parts = {
-                entry.kind: index for index, entry in enumerate(entries) if entry.layout == layout and index != layout
-            }
-            known = self._known.get(layout)
-            self._known[layout] = blocks[described.name] = known or self._block(entries, layout, parts)
-        return blocks
+        self._entries = entries = self._sections()
+        layouts = [index for index, entry in enumerate(entries) if entry.kind == SectionKind.LAYOUT]
+        return {entries[index].name: self._found(index) for index in layouts if not entries[index].retired}
+
+    def _found(self, layout: int) -> Block:
+        """The block whose layout is in this section; always the same object."""
+        if layout not in self._known:
+            entries = enumerate(self._entries)
+            parts = {entry.kind: index for index, entry in entries if entry.layout == layout and index != layout}
+            self._known[layout] = self._block(self._entries, layout, parts)
+        return self._known[layout]
+
+    @property
+    def ended(self) -> list[Block]:
+        """The blocks that reloads have ended, the oldest first: what their rings held then can still be read.
+
+        As of :meth:`refresh`. FormatError.
+        """
+        entries = enumerate(self._entries)
+        return [self._found(index) for index, entry in entries if entry.kind == SectionKind.LAYOUT and entry.retired]
 
     def _sections(self) -> list[SectionEntry]:
         """The section table of one generation."""

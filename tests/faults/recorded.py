@@ -13,6 +13,7 @@ from typing import Final
 
 from shmio.recording.encoding import FRAME, Gap
 from shmio.recording.reader import Channel, Reader
+from shmio.recording.survey import survey
 from shmio.segment import Event, Frame
 from tests.faults.checker import Checker
 from tests.faults.checks import Complain, Counts, FrameCheck, Source
@@ -102,6 +103,7 @@ def check(file: Path, away_ns: int, checks: Mapping[str, BlockCheck]) -> None:
 
     begun = False
     with Reader(file) as reader:
+        survey(reader)  # a gap at the beginning comes before its block is described
         for message in reader.messages(wanted):
             if not begun:
                 begun = True

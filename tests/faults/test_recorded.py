@@ -8,8 +8,11 @@ from typing import Any
 
 import pytest
 
+from shmio.layout.model import Layout, Register
 from shmio.recording.encoding import Gap, Reason
-from shmio.segment import Event, EventKind, Frame, Quality
+from shmio.recording.output import Output, create
+from shmio.recording.recorder import Recorder
+from shmio.segment import BlockSpec, Event, EventKind, Frame, Quality, Segment
 from shmio.segment.events import NO_WRITER
 from tests.faults import recorded
 from tests.faults.checks import Source
@@ -83,6 +86,19 @@ def test_bad_recordings_are_found(name: str, check: BlockCheck, found: list[str]
     for items in files:
         feed(check, *items)
     assert problem in found[0]
+
+
+def test_a_file_that_begins_with_a_gap(instance: str, tmp_path: Path, check: BlockCheck, found: list[str]) -> None:
+    layout = Layout("DB1", 1, SIZE, False, (Register("raw", "BYTE", ((1, SIZE),), 0, None, SIZE, SIZE),))
+    with Segment.create(instance, [BlockSpec("cell", layout, PERIOD_NS, STALE_NS, 1 << 16)], []) as segment:
+        writer = segment.writer("cell")
+        for number in range(1, 3000):
+            writer.publish(image(FIRST + 2 * number, places(SIZE)), cycle=number)
+        file, fd = create(tmp_path, instance)
+        assert Recorder(segment, Output(file, fd, limit_bytes=1 << 26), by="test").close()
+        segment.unlink()
+    recorded.check(file, 1 << 62, {"cell": check})
+    assert check.counts.missed > 0, found
 
 
 def test_files_are_checked_in_their_order_and_removed(tmp_path: Path) -> None:

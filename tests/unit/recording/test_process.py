@@ -12,12 +12,13 @@ from pathlib import Path
 import pytest
 
 from shmio.errors import RecordingError
+from shmio.recording.check import check
 from shmio.recording.encoding import Reason
 from shmio.recording.reader import Reader
 from shmio.recording.records import MAGIC
-from shmio.segment import Activity, BlockSpec, Event, Segment
+from shmio.segment import Activity, BlockSpec, Event, Frame, Segment
 from shmio.testing.cell import kill, until
-from tests.unit.recording.harness import RING, Process, gaps, numbers, publish
+from tests.unit.recording.harness import OTHER, RING, Process, gaps, numbers, publish, read, spec
 
 
 def written(process: Process) -> list[int]:
@@ -136,6 +137,50 @@ def test_a_block_made_anew_is_not_taken_for_the_one_before(segment: Segment, tmp
         until(lambda: process.counts("frames") == 30, "all of the new block's")
         process.stop()
     assert numbers(process.file) == list(range(1, 31))
+
+
+def by_section(file: Path) -> dict[int, list[int]]:
+    """Numbers of the frames of cell in a file, block by block."""
+    found: dict[int, list[int]] = {}
+    for channel, _, item in read(file):
+        if isinstance(item, Frame) and channel.source == "cell":
+            found.setdefault(channel.section, []).append(item.number)
+    return found
+
+
+def test_what_a_reload_ended_while_no_recorder_ran_is_recorded_by_the_next(segment: Segment, tmp_path: Path) -> None:
+    sections = [segment.blocks["cell"].section]
+    with Process(segment, tmp_path) as process:
+        publish(segment.writer("cell"), 10)
+        until(lambda: process.counts("frames") == 10, "frames")
+        process.stop()
+        files = [process.file]
+    publish(segment.writer("cell"), 3, first=10)
+    segment.change(add=[spec("cell", OTHER)], retire=["cell"])
+    sections.append(segment.blocks["cell"].section)
+    publish(segment.writer("cell"), 3 * RING)
+    segment.change(add=[spec("cell")], retire=["cell"])
+    sections.append(segment.blocks["cell"].section)
+    publish(segment.writer("cell"), 5)
+    for published in (0, 2):  # the second one finds in the first one's file what is over
+        publish(segment.writer("cell"), published, first=5)
+        with Process(segment, tmp_path) as process:
+            until(lambda: ready(process), "its file")  # at its end it takes what is there
+            process.stop()
+            files.append(process.file)
+    first, second, third = map(by_section, files)
+    [gap] = gaps(files[1])
+    assert (gap.what, gap.first, gap.reason) == ("frames", 1, Reason.NOT_RUNNING)
+    assert first == {sections[0]: list(range(1, 11))}
+    assert second == {
+        sections[0]: [11, 12, 13],
+        sections[1]: list(range(gap.last + 1, 3 * RING + 1)),
+        sections[2]: [1, 2, 3, 4, 5],
+    }
+    assert (third, gaps(files[2])) == ({sections[2]: [6, 7]}, [])
+    for file in files:
+        with Reader(file) as reader:
+            assert check(reader).whole
 
 
 def test_the_recordings_of_an_instance_with_a_longer_name_are_not_its_own(segment: Segment, tmp_path: Path) -> None:

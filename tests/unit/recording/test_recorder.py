@@ -140,6 +140,30 @@ def test_a_changed_layout_and_a_new_source_are_recorded_as_blocks_of_their_own(
     assert len(layouts) == 2
 
 
+def test_a_block_that_came_and_went_between_two_looks_is_recorded(segment: Segment, tmp_path: Path) -> None:
+    recording = recorder(segment, tmp_path)
+    publish(segment.writer("cell"), 3)
+    with Segment.open(segment.instance, writable=True) as other:
+        for layout in (OTHER, spec("cell").layout):
+            other.change(add=[spec("cell", layout)], retire=["cell"])
+            publish(other.writer("cell"), 4)
+    assert recording.close()
+    found: dict[int, list[int]] = {}
+    for channel, _, item in read(recording.output.path):
+        if isinstance(item, Frame):
+            found.setdefault(channel.section, []).append(item.number)
+    assert list(found.values()) == [[1, 2, 3], [1, 2, 3, 4], [1, 2, 3, 4]]
+
+
+def test_from_outside_what_was_over_before_is_not_recorded(segment: Segment, tmp_path: Path) -> None:
+    publish(segment.writer("cell"), 3)
+    segment.change(add=[spec("cell", OTHER)], retire=["cell"])
+    recording = recorder(segment, tmp_path, start=Start(first=False))
+    publish(segment.writer("cell"), 1)
+    assert recording.close()
+    assert numbers(recording.output.path) == [1]
+
+
 def test_a_chunk_is_in_the_file_within_the_second(
     segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

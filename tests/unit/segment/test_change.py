@@ -41,6 +41,23 @@ def test_a_new_source_is_seen_by_who_is_attached(segment: Segment) -> None:
         assert reader.block("cell") is before, "what goes on stays the same object"
 
 
+def test_what_ended_blocks_held_can_still_be_read(segment: Segment) -> None:
+    for layout, cycle in ((NEW, 1), (OLD, 2)):
+        segment.writer("cell").publish(bytes(segment.blocks["cell"].layout.size), cycle=cycle)
+        segment.change(add=[spec("cell", layout)], retire=["cell"])
+    with Segment.open(segment.instance) as reader:
+        first, second = reader.ended
+        assert (first.source, first.layout, first.section) == ("cell", OLD, segment.ended[0].section)
+        assert [block.ring.head() for block in (first, second, reader.blocks["cell"])] == [1, 1, 0]
+        frames = [block.latest() for block in (first, second)]
+        assert [frame.cycle for frame in frames if frame] == [1, 2]
+        assert first.retired
+        segment.change(retire=["press"])
+        assert reader.ended == [first, second], "as of the last refresh"
+        assert reader.refresh()
+        assert [block.source for block in reader.ended] == ["cell", "press", "cell"]
+
+
 def test_a_stream_goes_on_with_the_new_layout(segment: Segment) -> None:
     old = segment.writer("cell")
     with shmio.attach(segment.instance) as reader:
