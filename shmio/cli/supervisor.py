@@ -62,7 +62,10 @@ def _parser() -> argparse.ArgumentParser:
     logs.add_argument("-f", "--follow", action="store_true", help="go on with what is added")
     logs.add_argument("-n", "--lines", type=at_least(0), default=20, metavar="LINES", help="default: 20")
     init = verb("init", "write a configuration: the A50 example, or one for the files given", file)
-    init.usage = f"{PROGRAM} init [-h] [-c FILE] [plc.ini] [FILE.db [FILE.udt ...]]"
+    init.usage = f"{PROGRAM} init [-h] [-c FILE] [--emulated] [plc.ini] [FILE.db [FILE.udt ...]]"
+    init.add_argument(
+        "--emulated", action="store_true", help="with an emulated PLC that holds the block, in place of the real one"
+    )
     init.add_argument(
         "files", metavar="FILE", nargs="*", type=Path, help="the block's sources (.db, .udt, .scl), and a plc.ini"
     )

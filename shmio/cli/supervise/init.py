@@ -7,7 +7,7 @@ import json
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from itertools import islice
 from pathlib import Path
@@ -23,7 +23,9 @@ from shmio.logs import printable
 
 EXAMPLE = ("supervisor.toml", "db201.db")
 SOURCES = (".db", ".udt", ".scl", ".awl")
-FIRST_PORTS = range(8089, 8189)
+GRPC_PORTS = range(8089, 8189)
+S7_PORTS = range(1102, 1202)
+_DB_NUMBER = re.compile(r"[0-9]{1,5}", re.ASCII)
 _NAME = re.compile(r"[^A-Za-z0-9_-]+")
 
 
@@ -31,7 +33,7 @@ def execute(arguments: argparse.Namespace) -> int:
     """Write the files, or none of them when one is there already."""
     file = config_file(arguments)
     _refuse_present(file)
-    text, missing = _own(file, arguments.files) if arguments.files else (None, [])
+    text, missing = _own(file, arguments.files, emulated=arguments.emulated) if arguments.files else (None, [])
     written = _example(file) if text is None else {file: text}
     _write(written)
     for path in written:
@@ -52,8 +54,11 @@ def _example(file: Path) -> dict[Path, str]:
     return {file: config, file.parent / EXAMPLE[1]: layout}
 
 
-def _own(file: Path, files: Sequence[Path]) -> tuple[str, list[str]]:
-    """A configuration for the controller's files (D6.5, section 4.2), and the keys that are left to fill in."""
+def _own(file: Path, files: Sequence[Path], *, emulated: bool) -> tuple[str, list[str]]:
+    """A configuration for the controller's files (D6.5, section 4.2), and the keys that are left to fill in.
+
+    ``emulated``: with a process in the controller's place, which holds the block.
+    """
     sources = [path for path in files if path.suffix.lower() in SOURCES]
     others = [path for path in files if path not in sources]
     if not sources or len(others) > 1:
@@ -67,6 +72,17 @@ def _own(file: Path, files: Sequence[Path]) -> tuple[str, list[str]]:
         print(printable(line), file=sys.stderr)
     block = _first(compiled.layouts, properties.get("dbNumber"))
     paths = [_relative(path, file) for path in sources]
+    what = [f"layout = {_toml(paths if len(paths) > 1 else paths[0])}"]
+    if len(compiled.layouts) > 1:
+        held = ", ".join(layout.name for layout in compiled.layouts)
+        what.append(f"block = {_toml(block.name)}  # of {printable(held)}")
+    missing: list[str] = []
+    if emulated:
+        device, emulator = _emulated(what, block, properties.get("dbNumber", ""))
+        writable = '["**"]                     # all of it'
+    else:
+        (device, missing), emulator = _real(block, properties), []
+        writable = "[]                         # nothing is writable unless named"
     lines = [
         "[instance]",
         f"name = {_toml(_instance(block))}",
@@ -74,27 +90,16 @@ def _own(file: Path, files: Sequence[Path]) -> tuple[str, list[str]]:
         "[[source]]",
         'name = "cell"',
         'connector = "s7"',
-        f"layout = {_toml(paths if len(paths) > 1 else paths[0])}",
-    ]
-    if len(compiled.layouts) > 1:
-        held = ", ".join(layout.name for layout in compiled.layouts)
-        lines.append(f"block = {_toml(block.name)}  # of {printable(held)}")
-    if others:
-        lines.append(f"properties = {_toml(_relative(others[0], file))}")
-    missing = []
-    if "host" not in properties:
-        missing.append("host")
-        lines.append('# host = ""                           # needed: the address of your controller')
-    if block.number is None and "dbNumber" not in properties:
-        missing.append("dbNumber")
-        lines.append("# dbNumber =                          # needed: the number of the data block")
-    lines += [
+        *what,
+        *([f"properties = {_toml(_relative(others[0], file))}"] if others else []),
+        *device,
         "period_ms = 20",
-        "writable = []                         # nothing is writable unless named",
+        f"writable = {writable}",
         "armed = false                         # whether an injection may reach the device",
         "",
+        *emulator,
         "[grpc]",
-        f"listen = {_toml([str(address) for address in _free()])}",
+        f"listen = {_toml([str(address) for address in _free(GRPC_PORTS, 2)])}",
         'default_source = "cell"',
         "",
         "# [recorder]                          # without the first #: everything, to files that shmio-dump reads",
@@ -102,6 +107,39 @@ def _own(file: Path, files: Sequence[Path]) -> tuple[str, list[str]]:
         "",
     ]
     return "\n".join(lines), missing
+
+
+def _real(block: Layout, properties: Mapping[str, str]) -> tuple[list[str], list[str]]:
+    """The source's lines that name its controller as far as that is not known, and the keys that are left."""
+    lines, missing = [], []
+    if "host" not in properties:
+        missing.append("host")
+        lines.append('# host = ""                           # needed: the address of your controller')
+    if block.number is None and "dbNumber" not in properties:
+        missing.append("dbNumber")
+        lines.append("# dbNumber =                          # needed: the number of the data block")
+    return lines, missing
+
+
+def _emulated(what: Sequence[str], block: Layout, number: str) -> tuple[list[str], list[str]]:
+    """The source's lines that name an emulated controller, and the section of that, which serves ``what``."""
+    (address,) = _free(S7_PORTS, 1)
+    key = f"dbNumber = {int(number) if _DB_NUMBER.fullmatch(number) else block.number or 1}"
+    lines = [
+        f"host = {_toml(address.host):<31}# the emulator below; for a real controller: its address",
+        f"port = {address.port:<31}# for a real controller: without this line",
+        f"{key:<38}# for a real controller: the number of its data block",
+    ]
+    section = [
+        "[[emulator]]                          # a process that plays the controller; for a real one: without it",
+        'name = "plc"',
+        'kind = "s7"',
+        *what,
+        key,
+        f"listen = {_toml(str(address))}",
+        "",
+    ]
+    return lines, section
 
 
 def _first(layouts: Sequence[Layout], number: str | None) -> Layout:
@@ -114,10 +152,10 @@ def _instance(block: Layout) -> str:
     return _NAME.sub("-", block.name.lower()).strip("-_")[:40] or "cell"
 
 
-def _free() -> list[Address]:
-    """Two addresses for the endpoint: the usual ones, else the next two on which nobody listens now."""
-    free = (address for port in FIRST_PORTS if not in_use(address := Address("127.0.0.1", port)))
-    return list(islice(free, 2)) or [Address("127.0.0.1", 0)]
+def _free(ports: range, count: int) -> list[Address]:
+    """Addresses to listen on: the usual ones, else the next on which nobody listens now."""
+    free = (address for port in ports if not in_use(address := Address("127.0.0.1", port)))
+    return list(islice(free, count)) or [Address("127.0.0.1", 0)]
 
 
 def _relative(path: Path, file: Path) -> str:

@@ -144,6 +144,35 @@ def test_a_block_without_a_number_in_its_name(capsys: pytest.CaptureFixture[str]
     assert main(["check"]) == 0
 
 
+@pytest.mark.parametrize(
+    ("files", "number"),
+    [
+        (["cell.db"], 1),
+        (["two.db"], 7),
+        (["two.db", "plc.ini"], 9),
+        (["cell.db", "plc.ini"], 9),
+        (["by.ini", "two.db"], 7),
+    ],
+)
+def test_init_with_an_emulated_controller_can_be_started_as_it_is(
+    files: list[str], number: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("cell.db").write_text(block('"Cell"', "Int"))
+    Path("two.db").write_text(block("DB7", "Int") + block("DB9", "DInt"))
+    Path("plc.ini").write_text("host=10.76.0.12\nport=102\nslot=2\ndbNumber=9\n")
+    Path("by.ini").write_text("host=10.76.0.12\n")
+    assert main(["init", "--emulated", *files]) == 0
+    assert "next: shmio-supervisor check, then" in capsys.readouterr().out
+    assert main(["check"]) == 0
+    assert "no faults found" in capsys.readouterr().out
+    prepared = prepare(Path("supervisor.toml"))
+    [source], [emulator] = prepared.config.source, prepared.config.emulator
+    assert (source.options["dbNumber"], emulator.dbNumber, emulator.program) == (number, number, "idle")
+    assert emulator.listen == f"127.0.0.1:{source.options['port']}"
+    assert prepared.emulated["plc"] == (prepared.layouts["cell"],)
+    assert source.writable == ["**"]
+
+
 def test_an_emulator_plays_a_block_without_a_number(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
     Path("db201.db").write_text(Path("db201.db").read_text().replace("DATA_BLOCK DB201", 'DATA_BLOCK "Cell"'))
     example("port = 1102", "port = 1102\ndbNumber = 7")
@@ -283,7 +312,7 @@ def test_a_block_is_chosen_by_its_number_or_name(example: Edit, key: str, capsys
 
 def test_help_tells_what_init_takes_and_which_modes_there_are(capsys: pytest.CaptureFixture[str]) -> None:
     for verb, said in (
-        ("init", "init [-h] [-c FILE] [plc.ini] [FILE.db [FILE.udt ...]]"),
+        ("init", "init [-h] [-c FILE] [--emulated] [plc.ini] [FILE.db [FILE.udt ...]]"),
         ("up", "not in this version"),
     ):
         with pytest.raises(SystemExit):
