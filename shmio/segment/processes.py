@@ -203,7 +203,7 @@ class ProcessTable(Sequence[ProcessSlot]):
         if count > vacant:
             raise SegmentError(
                 f"segment {self._shared.name} has room for {vacant} more processes, not for {count}: "
-                "stop the instance and start it anew"
+                "restart the instance: shmio-supervisor down, up"
             )
 
     def add(self, spec: ProcessSpec) -> ProcessSlot:

@@ -175,9 +175,10 @@ class Segment:
         SegmentError: no room in shared memory or in the section table.
         """
         entries = self._sections()
-        if len(entries) + len(add) * SECTIONS_PER_BLOCK > self.header.section_capacity:
+        if len(add) > (vacant := (self.header.section_capacity - len(entries)) // SECTIONS_PER_BLOCK):
             raise SegmentError(
-                f"segment {self.shared.name} has no room for more changes: stop the instance and start it anew"
+                f"segment {self.shared.name} has room for {vacant} more blocks, not for {len(add)} (each new or "
+                "changed source takes one, until the instance ends): restart the instance: shmio-supervisor down, up"
             )
         head = self.header
         tables = head.processes_offset + head.process_capacity * SLOT_SIZE

@@ -26,8 +26,8 @@ class Change:
         self._segment = segment
         self._jobs = {job.name: job for job in plan.jobs}
         self._stopped = False
-        segment.reserve(self.changes.add)
         segment.processes.require(len(self.changes.started) - len(self.changes.stopped))
+        segment.reserve(self.changes.add)  # the last to fail: what it takes is not given back
         for name in self.changes.kept:
             self._fleet.named(name).keep(self._jobs[name])
 

@@ -50,7 +50,7 @@ async def _serve(worker: Worker) -> None:
     worker.log.info("serving %s", served)
     worker.running()
     while not stopping.is_set():
-        if over := feeds.follow():
+        if over := await feeds.follow():
             worker.log.info("a reload changed or ended %s", ", ".join(over))
             service.move(over)
         if not feeds.alive:

@@ -21,6 +21,7 @@ class Feeds(Mapping[str, Feed]):
     ) -> None:
         """``writer``: the command queue of this process. ``on_quality``: told whether a source is good by now."""
         self._segment = segment
+        self._generation = -1  # of the segment when it was last read
         self._writer = writer
         self._loop = loop
         self._on_quality = on_quality
@@ -55,14 +56,15 @@ class Feeds(Mapping[str, Feed]):
                 self._on_quality(source, False)
                 feed.start()
 
-    def follow(self) -> list[str]:
+    async def follow(self) -> list[str]:
         """Take up what a reload has changed; the sources whose feed is another by now, or none.
 
         FormatError: the segment makes no sense any more.
         """
         self._prune()
-        if not self._segment.refresh():
+        if self._segment.generation == self._generation:
             return []
+        await asyncio.to_thread(self._read)
         over = [name for name, feed in self._feeds.items() if self._segment.blocks.get(name) is not feed.block]
         for name in over:
             feed = self._feeds.pop(name)
@@ -70,6 +72,13 @@ class Feeds(Mapping[str, Feed]):
             self._on_quality(name, False)
         self.start()
         return over
+
+    def _read(self) -> None:
+        """Read what there is by now: for a big layout it takes a second, in which streams of others must not stand."""
+        self._generation = self._segment.generation  # before looking: what changes meanwhile is read the next time
+        self._segment.refresh()
+        for block in self._segment.blocks.values():
+            block.layout.members(""), block.layout.by_path
 
     def _prune(self) -> None:
         """Forget the feeds of which nothing is left, and with them what they hold of the segment."""

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import threading
 import weakref
+
+import pytest
 
 from shmio.endpoints.grpc.feeds import Feeds
 from shmio.segment import Attributes, BlockSpec, Segment
@@ -30,17 +33,17 @@ def test_what_a_reload_ended_is_forgotten_when_its_streams_are_gone(segment: Seg
         segment.change(retire=["cell"], add=[spec])
         async with asyncio.timeout(TIMEOUT_S):
             while feeds["cell"] is old:
-                feeds.follow()
+                await feeds.follow()
                 await asyncio.sleep(0)
         old.join()
-        feeds.follow()
+        await feeds.follow()
         assert old in feeds._ended  # a stream has not gone over yet
         old.leave(step, stream)
         gone = weakref.ref(old)
         del old
         async with asyncio.timeout(TIMEOUT_S):
             while gone() is not None:
-                feeds.follow()
+                await feeds.follow()
                 await asyncio.sleep(0)
                 gc.collect()
         assert feeds.messages == counted
@@ -50,3 +53,35 @@ def test_what_a_reload_ended_is_forgotten_when_its_streams_are_gone(segment: Seg
 
     with Segment.open(instance, writable=True) as opened:
         asyncio.run(run(opened))
+
+
+def test_the_loop_goes_on_while_a_new_layout_is_read(segment: Segment, instance: str) -> None:
+    """Whatever is read of the segment is read by another thread than that of the streams."""
+
+    async def run(opened: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+        feeds = Feeds(opened, WRITER, asyncio.get_running_loop(), lambda source, good: None)
+        feeds.start()
+        await feeds.follow()
+        going_on, begun, refresh = threading.Event(), asyncio.Event(), opened.refresh
+        loop = asyncio.get_running_loop()
+
+        def slow() -> bool:
+            loop.call_soon_threadsafe(begun.set)
+            assert going_on.wait(TIMEOUT_S)
+            return refresh()
+
+        monkeypatch.setattr(opened, "refresh", slow)
+        spec = BlockSpec("second", LAYOUT, 10_000_000, STALE_NS, 1 << 20, Attributes("test", WRITABLE))
+        segment.change(add=[spec])
+        following = asyncio.create_task(feeds.follow())
+        async with asyncio.timeout(TIMEOUT_S):
+            await begun.wait()
+            assert list(feeds) == ["cell"]
+            going_on.set()
+            assert await following == []
+        assert list(feeds) == ["cell", "second"]
+        feeds.stop()
+        feeds.join()
+
+    with Segment.open(instance, writable=True) as opened, pytest.MonkeyPatch.context() as monkeypatch:
+        asyncio.run(run(opened, monkeypatch))

@@ -180,7 +180,7 @@ def test_no_room_changes_nothing(launch: Launch) -> None:
     cell.wait_state("running")
     before = cell.pids()
     many = [(f"more-{i}", "source", ["good"]) for i in range(41)]
-    with pytest.raises(ControlError, match="no room for more changes"):
+    with pytest.raises(ControlError, match="has room for 16 more processes, not for 40: restart the instance"):
         cell.reload([*CELL[1:], *many])
     emulators = [(f"more-{i}", "emulator", ["good"]) for i in range(17)]
     with pytest.raises(ControlError, match="room for 16 more processes, not for 17"):
@@ -188,6 +188,54 @@ def test_no_room_changes_nothing(launch: Launch) -> None:
     assert cell.pids() == before
     with Segment.open(cell.instance) as segment:
         assert list(segment.blocks) == ["cell"]
+
+
+def test_when_the_blocks_are_used_up_the_instance_goes_on_as_it_is(launch: Launch) -> None:
+    """Ten sources of which each reload changes the layout: four of these are all that an instance has room for."""
+    names = [f"cell-{i}" for i in range(10)]
+
+    def jobs(layout: str) -> list[Any]:
+        return [(name, "source", ["good"], layout) for name in names]
+
+    cell = launch([(name, "source", ["good"]) for name in names])
+    cell.wait_state("running")
+    for layout in ("new", "old", "new", "old"):
+        assert len(cell.reload(jobs(layout))["done"]) == 10
+    before = cell.pids()
+    with Segment.open(cell.instance) as segment:
+        size, generation = segment.shared.size, segment.generation
+        with pytest.raises(ControlError, match=r"has room for 0 more blocks, not for 10 .*: restart the instance"):
+            cell.reload(jobs("new"))
+        assert (segment.shared.size, segment.generation) == (size, generation)
+        cursor = segment.blocks[names[0]].cursor()
+        assert cursor.next(20) is not None, "frames go on"
+    assert cell.pids() == before
+    assert cell.status().state == "running"
+    assert cell.request(Restart(names[0])) == {"ok": True}
+    assert cell.reload(jobs("old")[1:])["done"] == [f"{names[0]}: stopped"], "what needs no block is done"
+
+
+def test_another_size_of_rings_replaces_the_blocks_that_it_changes(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    before = cell.pids()
+    assert cell.reload(CELL, ring=1 << 24)["kept"] == ["plc", "cell", "grpc"], "the ring had its 8 s already"
+    with shmio.attach(cell.instance) as reader:
+        old = reader.block("cell")
+        stream = reader.stream("cell", timeout_s=20)
+        next(stream)
+        answer = cell.reload(CELL, ring=1 << 14)
+        assert (answer["done"], answer["kept"]) == (
+            ["cell: restarted, as its configuration has changed"],
+            ["plc", "grpc"],
+        )
+        new = reader.block("cell")
+        assert new.ring.slot_count < old.ring.slot_count
+        while next(stream).section != new.section:
+            pass
+    after = cell.pids()
+    assert after.pop("cell") != before.pop("cell")
+    assert after == before
 
 
 def test_what_does_not_run_is_told_and_the_rest_goes_on(launch: Launch) -> None:
