@@ -12,7 +12,7 @@ from shmio.layout.model import Layout, Register
 from shmio.recording.encoding import Gap, Reason
 from shmio.recording.output import Output, create
 from shmio.recording.recorder import Recorder
-from shmio.segment import BlockSpec, Event, EventKind, Frame, Quality, Segment
+from shmio.segment import BlockSpec, Event, EventKind, Frame, Quality, Record, Segment
 from shmio.segment.events import NO_WRITER
 from tests.faults import recorded
 from tests.faults.checks import Source
@@ -92,6 +92,8 @@ def test_a_file_that_begins_with_a_gap(instance: str, tmp_path: Path, check: Blo
     layout = Layout("DB1", 1, SIZE, False, (Register("raw", "BYTE", ((1, SIZE),), 0, None, SIZE, SIZE),))
     with Segment.create(instance, [BlockSpec("cell", layout, PERIOD_NS, STALE_NS, 1 << 16)], []) as segment:
         writer = segment.writer("cell")
+        for item in range(3000):
+            writer.event(Record(EventKind.WRITTEN, item=item))
         for number in range(1, 3000):
             writer.publish(image(FIRST + 2 * number, places(SIZE)), cycle=number)
         file, fd = create(tmp_path, instance)
