@@ -10,9 +10,9 @@ import msgspec
 from shmio import worker
 from shmio.config import Recorder as Settings
 from shmio.recording.attach import ConfigFiles
-from shmio.recording.output import Output, create
 from shmio.recording.predecessor import places
-from shmio.recording.recorder import Recorder, Start
+from shmio.recording.recorder import Recorder
+from shmio.recording.series import Series
 from shmio.worker import BEAT_S, Worker
 
 BY = "supervised"
@@ -24,27 +24,29 @@ def run(worker: Worker) -> None:
     directory, segment = Path(settings.directory), worker.segment
     worker.running()  # its search for what its predecessor has may take a while
     known = places(directory, segment, BY, worker.slot.beat)
-    path, fd = create(directory, segment.instance)
-    output = Output(path, fd, limit_bytes=settings.buffer_bytes, fsync_s=settings.fsync_s)
-    files = ConfigFiles(Path(worker.config["config_file"]))
-    recorder = Recorder(segment, output, by=BY, start=Start(known), attachments=files)
-    worker.log.info("recording to %s%s", path, ", going on where its predecessor ended" if known else "")
-    _record(worker, recorder)
+    series = Series(segment, settings, BY, known, ConfigFiles(Path(worker.config["config_file"])))
+    goes_on = ", going on where its predecessor ended" if known else ""
+    worker.log.info("recording to %s%s", series.recorder.output.path, goes_on)
+    _record(worker, series)
+    recorder = series.recorder
     if not recorder.close():
-        worker.log.error("%s; it was not closed", output.problem or path)
+        output = recorder.output
+        worker.log.error("%s%s", output.problem or output.path, "" if output.doubt else "; it was not closed")
     _report(worker, recorder, "")
     counters = recorder.counters
     worker.log.info("%d frames, %d events, %d missed", counters.frames, counters.events, counters.missed)
 
 
-def _record(worker: Worker, recorder: Recorder) -> None:
+def _record(worker: Worker, series: Series) -> None:
     more, problem, told_s = False, "", 0.0
-    while not worker.stopping.wait(0 if more else recorder.pause_s):
-        more = recorder.turn()
+    while not worker.stopping.wait(0 if more else series.recorder.pause_s):
+        more = series.recorder.turn()
         if time.monotonic() - told_s < BEAT_S:
             continue
         told_s = time.monotonic()
-        before, problem = problem, recorder.problem
+        renewed = series.renew()
+        recorder = series.recorder
+        before, problem = "" if renewed else problem, recorder.problem
         if problem and not before:
             worker.log.error("%s", problem)
         elif before and not problem:

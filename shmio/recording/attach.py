@@ -3,17 +3,35 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from shmio.config import load
 from shmio.errors import ConfigError
-from shmio.recording.recorder import Attachment
 from shmio.recording.writer import TEXT, TOML
 
 MAX_FILE_BYTES: Final = 16 << 20
 
 log = logging.getLogger("shmio.recorder")
+
+
+class Attachment(NamedTuple):
+    """A file that goes with a recording."""
+
+    name: str
+    media_type: str
+    data: bytes
+    changed_ns: int = 0
+
+
+Attachments = Callable[[str | None, int], list[Attachment]]
+"""Gives the files to attach: those of the instance for None, those of a source for its name and its block's number."""
+
+
+def no_attachments(_source: str | None, _block: int) -> list[Attachment]:
+    """None at all."""
+    return []
 
 
 class ConfigFiles:

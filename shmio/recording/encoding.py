@@ -35,7 +35,8 @@ u32 item, u32 items, u32 offset, u32 size, u16 kind, u8 quality, u8 mask, u16 da
 text (UTF-8)."""
 GAP_SCHEMA: Final = b"""{"type": "object", "properties": {"source": {"type": "string"}, "block": {"type": "integer"}, \
 "what": {"enum": ["frames", "events"]}, "first": {"type": "integer"}, "last": {"type": "integer"}, \
-"count": {"type": "integer"}, "reason": {"enum": ["overtaken", "not running", "no room"]}, \
+"count": {"type": "integer"}, "reason": {"enum": ["overtaken", "not running", "no room", \
+"unsure"]}, \
 "after_ns": {"type": "integer"}, "before_ns": {"type": "integer"}}}"""
 
 
@@ -48,6 +49,8 @@ class Reason(StrEnum):
     """It was overwritten while no recorder ran."""
     NO_ROOM = "no room"
     """The disk was full or too slow, and so was the memory set aside for that."""
+    UNSURE = "unsure"
+    """It is in the file before, at whose fsync the disk failed: it may be lost."""
 
 
 class Gap(msgspec.Struct, frozen=True):

@@ -50,8 +50,13 @@ class Output:
         self.path = path
         self.error = ""
         """Why the disk does not take what waits; empty while it does."""
+        self.doubt = ""
+        """Whether an fsync has failed, and what that may cost. It stays: the kernel takes for written what it could not
+        write, so that no later fsync of this file tells of it again."""
         self.written = 0
         """Bytes in the file."""
+        self.synced = 0
+        """Bytes that are on the disk for certain: an fsync has confirmed them, and none before it has failed."""
         self._fd = fd
         self._limit = limit_bytes
         self._fsync_s = fsync_s
@@ -99,6 +104,8 @@ class Output:
         since_s = self._busy_since_s
         if self.error:
             return f"{self.path}: {self.error}"
+        if self.doubt:
+            return f"{self.path}: {self.doubt}"
         if since_s is not None and time.monotonic() - since_s > SLOW_S:
             return f"{self.path}: the disk has not answered for {time.monotonic() - since_s:.0f} s"
         return ""
@@ -109,7 +116,7 @@ class Output:
             raise RecordingError(f"{self.path} was removed while it was being written")
 
     def close(self, patience_s: float) -> bool:
-        """Write what waits, as far as the disk takes it in this time; whether all of it is in the file."""
+        """Write what waits, as far as the disk takes it in this time; whether all of it is there, for certain."""
         self.flush()
         with self._news:
             self._closing = True
@@ -118,7 +125,7 @@ class Output:
         if self._thread.is_alive():
             self.error = self.error or "the disk does not answer"
             return False
-        whole = self.written == self._given and not self.error
+        whole = self.written == self._given and not self.error and not self.doubt
         os.close(self._fd)
         return whole
 
@@ -172,6 +179,10 @@ class Output:
         try:
             os.fsync(self._fd)
         except OSError as error:
-            self.error = error.strerror or str(error)
+            reason = error.strerror or str(error)
+            self.doubt = self.doubt or f"fsync: {reason}: what was written behind byte {self.synced} may be lost"
+        else:
+            if not self.doubt:
+                self.synced = self.written
         self._busy_since_s = None
         self._synced_s = time.monotonic()

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import socket
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from itertools import chain
 from typing import Final, NamedTuple
 
 from shmio import __version__
+from shmio.recording.attach import Attachment, Attachments, no_attachments
 from shmio.recording.encoding import Gap, Place, Reason
 from shmio.recording.follower import Entry, Follower
 from shmio.recording.output import Output
@@ -29,31 +30,6 @@ CLOSE_S: Final = 3.0
 CHECK_S: Final = 1.0
 
 
-class Attachment(NamedTuple):
-    """A file that goes with a recording."""
-
-    name: str
-    media_type: str
-    data: bytes
-    changed_ns: int = 0
-
-
-Attachments = Callable[[str | None, int], list[Attachment]]
-"""Gives the files to attach: those of the instance for None, those of a source for its name and its block's number."""
-
-
-def no_attachments(_source: str | None, _block: int) -> list[Attachment]:
-    """None at all."""
-    return []
-
-
-class Start(NamedTuple):
-    """Where to begin: behind these places, by section; blocks without one at their first frame, or at the present."""
-
-    places: Mapping[int, Place] = {}
-    first: bool = True
-
-
 @dataclass(slots=True)
 class Counters:
     """What came of it so far. ``missed``: frames and events."""
@@ -61,6 +37,19 @@ class Counters:
     frames: int = 0
     events: int = 0
     missed: int = 0
+
+
+class Start(NamedTuple):
+    """Where to begin: behind these places, by section; blocks without one at their first frame, or at the present."""
+
+    places: Mapping[int, Place] = {}
+    first: bool = True
+    reason: Reason = Reason.NOT_RUNNING
+    """Why something may be missing at the beginning."""
+    about: Mapping[str, str] = {}
+    """What else is to be told of this recording."""
+    counters: Counters | None = None
+    """What came of the recordings before, if it goes on from there."""
 
 
 @dataclass(slots=True)
@@ -103,18 +92,22 @@ class Recorder:
     ) -> None:
         """``by``: who records. ``start``: default from the first frame. ``sources``: only these."""
         self.output = output
-        self.counters = Counters()
+        start = start or Start()
+        self.counters = start.counters or Counters()
+        self.confirmed: Mapping[int, Place] = start.places
+        """Where the recording had come to, by section, when what was written last that is on the disk for certain."""
         self._segment = segment
         self._sources = sources
         self._attachments = attachments
-        self._writer = Writer(output, self._about(by))
+        self._writer = Writer(output, {**self._about(by), **start.about})
         self._followed: list[_Followed] = []
         self._blocks = 0
         self._seen: set[int] = set()
         """Sections whose blocks are followed, were, or need not be."""
         self._attached: set[bytes] = set()
         self._attach(attachments(None, 0))
-        start = start or Start()
+        self._places = dict(start.places)
+        self._to_confirm: tuple[int, dict[int, Place]] | None = None
         self._writer.places(start.places)
         self._follow(start)
         self._lively = False
@@ -160,15 +153,26 @@ class Recorder:
                 self._lose(followed, entry)
             else:
                 self._write(followed, entry)
-        self._followed = [followed for followed in self._followed if not self._ended(followed)]
+        for followed in [followed for followed in self._followed if self._ended(followed)]:
+            self._places[followed.follower.block.section] = followed.follower.place
+            self._followed.remove(followed)
         now_s = time.monotonic()
         if now_s - self._flushed_s >= CHUNK_S - TURN_S / 2:
             self._flushed_s = now_s
             self._writer.flush()
+            self._confirm()
         if now_s - self._checked_s >= CHECK_S:
             self._checked_s = now_s
             self.output.check()
         return more
+
+    def _confirm(self) -> None:
+        """See what the disk has for certain; what was written by now is the next that it is to have."""
+        if self._to_confirm and self.output.synced >= self._to_confirm[0]:
+            self.confirmed, self._to_confirm = self._to_confirm[1], None
+        if not self._to_confirm and not any(followed.lost for followed in self._followed):
+            self._places |= {followed.follower.block.section: followed.follower.place for followed in self._followed}
+            self._to_confirm = self.output.tell(), dict(self._places)
 
     @property
     def pause_s(self) -> float:
@@ -205,7 +209,7 @@ class Recorder:
                 continue
             self._seen.add(block.section)
             place = start.places.get(block.section)
-            reason = Reason.NOT_RUNNING if place or start.first else Reason.OVERTAKEN
+            reason = start.reason if place or start.first else Reason.OVERTAKEN
             if place is None:
                 place = Place() if start.first else Place(block.ring.head(), block.events.head())
             over = block in ended

@@ -70,6 +70,8 @@ def _describe(reader: Reader, found: Survey) -> dict[str, Any]:
         "blocks": _blocks(reader, found),
         "missed_frames": _missed(found, "frames"),
         "missed_events": _missed(found, "events"),
+        "doubtful": about.get("doubtful"),
+        "doubtful_from": about.get("doubtful_from"),
         "gap_count": found.gap_count,
         "gaps": [msgspec.to_builtins(gap) for gap in found.gaps],
         "attachments": {name: entry.size for name, entry in reader.attachments.items()},
@@ -140,6 +142,9 @@ def _lines(found: dict[str, Any]) -> list[str]:
         f"  instance {found['instance']}, mode {found['mode']}, started {found['started']}; {by}",
         f"  {found['from']} to {found['to']}, {found['duration_s']:.1f} s{rate}",
     ]
+    if found["doubtful"]:
+        where = f"behind byte {found['doubtful_from']} of {found['doubtful']}"
+        lines.append(f"  what is {where} may be lost: the disk failed at its fsync")
     for block in found["blocks"]:
         hertz = f" at {block['rate_hz']:.1f} Hz" if block["rate_hz"] else ""
         lines.append(

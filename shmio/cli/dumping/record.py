@@ -16,9 +16,9 @@ from types import FrameType
 from shmio.cli.target import instance_name
 from shmio.errors import ControlError, PathError, RecordingError
 from shmio.logs import printable
-from shmio.recording.attach import ConfigFiles
+from shmio.recording.attach import Attachments, ConfigFiles, no_attachments
 from shmio.recording.output import Output, create
-from shmio.recording.recorder import Attachments, Recorder, Start, no_attachments
+from shmio.recording.recorder import Recorder, Start
 from shmio.segment import Segment
 from shmio.supervisor import control
 
@@ -53,7 +53,10 @@ def execute(arguments: argparse.Namespace) -> int:
             closed = recorder.close()
         _sum_up(recorder, path)
         if not closed:
-            raise RecordingError(f"{recorder.output.problem or path}; the file was not closed")
+            output = recorder.output
+            raise RecordingError(
+                output.problem if output.doubt else f"{output.problem or path}; the file was not closed"
+            )
         return 0 if whole else 1
 
 

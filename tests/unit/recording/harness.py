@@ -66,7 +66,8 @@ def gaps(file: Path) -> list[Gap]:
 class Process:
     """The recorder's process; killed at the end of the test, if it still runs."""
 
-    def __init__(self, segment: Segment, folder: Path, **config: object) -> None:
+    def __init__(self, segment: Segment, folder: Path, *, before: str = "", **config: object) -> None:
+        """``before``: Python that its interpreter runs first."""
         self.slot = segment.processes.find("recorder")
         self.folder = folder / "dumps"
         self.log = folder / "recorder.log"
@@ -81,7 +82,10 @@ class Process:
             "config": settings,
         }
         self.popen = subprocess.Popen(
-            [sys.executable, "-m", "shmio.recording"], stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            [sys.executable, "-c", f"import runpy\n{before}\nrunpy.run_module('shmio.recording', run_name='__main__')"],
+            stdin=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
         )
         assert self.popen.stdin is not None
         self.popen.stdin.write(json.dumps(description))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import queue
+import threading
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -71,3 +74,27 @@ def test_a_disk_that_never_takes_it_does_not_hold_up_the_end(tmp_path: Path, mon
     output.write(b"x")
     assert not output.close(30)
     assert output.problem == f"{output.path}: Input/output error"
+
+
+def test_a_failed_fsync_is_not_forgotten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The kernel has given up what it could not write: that the next fsync succeeds means nothing."""
+    calls = queue.SimpleQueue[bool]()
+    done = threading.Semaphore(0)
+
+    def fsync(_: int) -> None:
+        good = calls.get(timeout=30)
+        done.release()
+        if not good:
+            raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    output = Output(*create(tmp_path, "a50", NOW), limit_bytes=100, fsync_s=1e-9)
+    for good in (True, False, True):
+        output.write(b"x" * 10)
+        output.flush()
+        calls.put(good)
+        assert done.acquire(timeout=30)
+    doubt = f"{output.path}: fsync: Input/output error: what was written behind byte 10 may be lost"
+    calls.put(True)
+    assert not output.close(30)
+    assert (output.problem, output.written, output.synced) == (doubt, 30, 10)

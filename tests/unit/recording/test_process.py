@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from shmio.cli.dump import main
 from shmio.errors import RecordingError
 from shmio.recording.check import check
 from shmio.recording.encoding import Reason
@@ -283,6 +284,80 @@ def test_without_room_it_says_so_and_goes_on_by_itself(segment: Segment, tmp_pat
     assert {gap.reason for gap in missed} == {Reason.NO_ROOM}
     lost = [number for gap in missed for number in range(gap.first, gap.last + 1)]
     assert sorted(found + lost) == list(range(1, writer.block.ring.head() + 1))
+
+
+BROKEN_DISK = """
+import errno, os, pathlib
+fsync, folder = os.fsync, pathlib.Path({folder!r})
+def broken(fd):
+    if (folder / "broken").exists():
+        (folder / "broken").unlink()
+        raise OSError(errno.EIO, "Input/output error")
+    fsync(fd)
+    (folder / "synced").write_text(str(os.fstat(fd).st_size))
+os.fsync = broken
+"""
+
+
+@pytest.mark.parametrize("more", [5, 3 * RING])
+def test_after_a_failed_fsync_it_goes_on_in_a_new_file_from_what_the_disk_has(
+    segment: Segment, tmp_path: Path, capsys: pytest.CaptureFixture[str], more: int
+) -> None:
+    """The disk is the process's own fsync, which fails once."""
+    writer = segment.writer("cell")
+    synced = tmp_path / "synced"
+    with Process(segment, tmp_path, before=BROKEN_DISK.format(folder=str(tmp_path)), fsync_s=0.001) as process:
+        publish(writer, 20)
+        until(lambda: ready(process) and len(written(process)) == 20, "frames in the file")
+        synced.unlink(missing_ok=True)
+        publish(writer, 1, first=20)
+        until(synced.exists, "what came before on the disk")
+        (tmp_path / "broken").touch()
+        publish(writer, more, first=21)
+        old = process.file
+        until(lambda: process.file != old, "another file")
+        process.stop()
+    new = process.file
+    first, second = numbers(old), numbers(new)
+    assert (first[0], second[-1]) == (1, 21 + more)
+    assert "fsync: Input/output error: what was written behind byte" in process.log.read_text()
+    assert f"may be lost; going on in {new}" in process.log.read_text()
+    with Reader(new) as reader:
+        assert check(reader).whole
+        assert reader.about["doubtful"] == old.name
+        assert 0 < int(reader.about["doubtful_from"]) < old.stat().st_size
+    begin = second[0]
+    for gap in gaps(new):
+        assert gap.reason is Reason.UNSURE
+        assert (gap.what, gap.last) == ("frames", begin - 1)
+        begin = gap.first
+    assert 10 < begin <= 22, "from where the disk had it for certain"
+    assert (more > RING) == bool(gaps(new))
+    assert main(["info", str(new)]) == 0
+    assert f" of {old.name} may be lost: the disk failed at its fsync" in capsys.readouterr().out
+
+
+def test_until_there_is_a_new_file_the_status_says_that_an_fsync_failed(segment: Segment, tmp_path: Path) -> None:
+    writer = segment.writer("cell")
+    with Process(segment, tmp_path, before=BROKEN_DISK.format(folder=str(tmp_path)), fsync_s=0.001) as process:
+        publish(writer, 5)
+        until(lambda: ready(process) and len(written(process)) == 5, "frames in the file")
+        old = process.folder.rename(tmp_path / "moved") / process.file.name
+        process.folder.touch()  # no new file can be made in it
+        (tmp_path / "broken").touch()
+        publish(writer, 1, first=5)
+        until(lambda: "may be lost" in process.slot.report.note, "the doubt in the status")
+        (tmp_path / "synced").unlink()
+        publish(writer, 1, first=6)
+        until(lambda: len(numbers(old)) == 7, "a good write")
+        until((tmp_path / "synced").exists, "a good fsync")
+        until(lambda: process.counts("bytes") == old.stat().st_size, "a report of it")
+        assert "may be lost" in process.slot.report.note
+        assert "cannot make a recording" in process.log.read_text()
+        process.folder.unlink()
+        until(lambda: ready(process) and process.file.name != old.name, "a new file")
+        process.stop()
+    assert numbers(process.file)[-1] == 7
 
 
 @pytest.fixture
