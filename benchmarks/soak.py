@@ -2,20 +2,22 @@
 
 A reader of its own follows every frame: cycles must follow each other, quality must stay good. What the subscribers got
 is held against how often their registers changed; the recording against the frames. Memory and descriptors of each
-process are taken every few seconds; what the second half holds more than the second quarter is growth. A witness, a
-process that only sleeps at the same rate, tells when the machine itself made loops late.
+process are taken every few seconds; what the second half holds more than the second quarter is growth. Witnesses, a process
+on each core that only sleeps at the same rate, tell when the machine itself made loops late.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import statistics
 import subprocess
 import sys
 import tempfile
 import threading
 import time
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -115,7 +117,10 @@ def soak(running: Instance, duration_s: float) -> list[str]:
     thread = threading.Thread(target=follower.run)
     sizes: dict[str, list[Size]] = {name: [] for name in running.pids}
     paths = [f"cell/{path}" for path in REGISTERS]
-    with Child("witness.py", PERIOD_MS) as witness, Child("subscriber.py", running.grpc, *paths) as subscribers:
+    with ExitStack() as stack:
+        subscribers = stack.enter_context(Child("subscriber.py", running.grpc, *paths))
+        cores = sorted(os.sched_getaffinity(0))
+        witnesses = [stack.enter_context(Child("witness.py", PERIOD_MS, core)) for core in cores]
         thread.start()
         begun_s = time.monotonic()
         end_s = begun_s + duration_s
@@ -126,7 +131,7 @@ def soak(running: Instance, duration_s: float) -> list[str]:
         follower.stopping.set()
         thread.join()
         messages = int(subscribers.finish()["messages"])
-        delays = [(at_s, late_s) for at_s, late_s in witness.finish()]
+        delays = [(at_s, late_s) for witness in witnesses for at_s, late_s in witness.finish()]
     after = slots["cell"].counters
     rows, problems = [], []
     for name, taken in sizes.items():
@@ -148,9 +153,9 @@ def soak(running: Instance, duration_s: float) -> list[str]:
     )
     for at_s, count in follower.skips:
         near = [f"{late_s * 1000:.0f} ms late" for when_s, late_s in delays if abs(when_s - at_s) < NEAR_S + late_s]
-        print(f"at {at_s - begun_s:.1f} s: {count} cycles skipped; the witness was {', '.join(near) or 'in time'}")
+        print(f"at {at_s - begun_s:.1f} s: {count} cycles skipped; the witnesses were {', '.join(near) or 'in time'}")
     print(
-        f"the witness was late by {PERIOD_MS / 2:g} ms and more {len(delays)} times, "
+        f"the witnesses were late by {PERIOD_MS / 2:g} ms and more {len(delays)} times, "
         f"by {max((late_s for _, late_s in delays), default=0) * 1000:.0f} ms at most"
     )
     for name, value in (

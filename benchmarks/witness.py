@@ -1,12 +1,13 @@
-"""What the machine itself does to a loop: python witness.py PERIOD_MS.
+"""What the machine itself does to a loop: python witness.py PERIOD_MS CORE.
 
-A process that does nothing but sleep to an absolute schedule. It tells in the end when (CLOCK_MONOTONIC, s) it came
+A process that does nothing but sleep to an absolute schedule, on one core. It tells in the end when (CLOCK_MONOTONIC, s) it came
 late by half a period or more, and by how much: no loop of that rate fares better there and then.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import sys
 import threading
 import time
@@ -14,6 +15,7 @@ import time
 
 def main() -> None:
     period_s = float(sys.argv[1]) / 1000
+    os.sched_setaffinity(0, {int(sys.argv[2])})
     ended = threading.Event()
 
     def await_end() -> None:

@@ -41,7 +41,7 @@ class Inflictor:
             "kill": lambda f: kill(self._pid(f.target)),
             "pause": self._pause,
             "hang": self._hang,
-            "restart": self._restart,
+            "restart": lambda f: self._rig.ask("restart", f.target),
             "torn": self._torn,
             "relayout": lambda f: self._rig.reload(lambda configuration: configuration.relayout(f.target)),
             "reload": lambda _: self._rig.reload(Configuration.toggle_extra),
@@ -74,11 +74,6 @@ class Inflictor:
         pid = self._pid(fault.target)
         kill(pid, signal.SIGSTOP)
         until(lambda: self._rig.processes()[fault.target].pid != pid, f"{fault.target} replaced", GONE_S)
-
-    def _restart(self, fault: Fault) -> None:
-        done = self._rig.supervisor("restart", fault.target)
-        if done.returncode:
-            raise RuntimeError(f"restart {fault.target} failed: {done.stderr}")
 
     def _torn(self, fault: Fault) -> None:
         """The writer dies in the middle of a slot, for certain."""

@@ -147,13 +147,18 @@ class Rig:
         if done.returncode:
             raise RuntimeError(f"up failed: {done.stderr}")
 
+    def ask(self, verb: str, *arguments: str) -> None:
+        """Have the instance do something; again, when it is just being changed, as the supervisor says then."""
+        until_s = time.monotonic() + COMMAND_S
+        while (done := self.supervisor(verb, *arguments)).returncode:
+            if "ask again" not in done.stderr or time.monotonic() > until_s:
+                raise RuntimeError(f"{verb} {' '.join(arguments)} failed: {done.stderr}")
+
     def reload(self, change: Callable[[Configuration], None]) -> None:
         """Change the configuration and have the instance take it."""
         with self._turn:
             change(self.configuration)
-            done = self.supervisor("reload")
-        if done.returncode:
-            raise RuntimeError(f"reload failed: {done.stderr}")
+            self.ask("reload")
 
     def down(self) -> None:
         """Stop the instance."""
