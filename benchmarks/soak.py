@@ -2,8 +2,8 @@
 
 A reader of its own follows every frame: cycles must follow each other, quality must stay good. What the subscribers got
 is held against how often their registers changed; the recording against the frames. Memory and descriptors of each
-process are taken every few seconds; what the second half holds more than the second quarter is growth. Witnesses, a process
-on each core that only sleeps at the same rate, tell when the machine itself made loops late.
+process are taken every few seconds; what the second half holds more than the second quarter is growth. Witnesses, a
+process on each core that only sleeps at the same rate, tell when the machine itself made loops late.
 """
 
 from __future__ import annotations

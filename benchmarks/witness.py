@@ -1,7 +1,7 @@
 """What the machine itself does to a loop: python witness.py PERIOD_MS CORE.
 
-A process that does nothing but sleep to an absolute schedule, on one core. It tells in the end when (CLOCK_MONOTONIC, s) it came
-late by half a period or more, and by how much: no loop of that rate fares better there and then.
+A process that does nothing but sleep to an absolute schedule, on one core. It tells in the end when
+(CLOCK_MONOTONIC, s) it came late by half a period or more, and by how much: no loop of that rate fares better there.
 """
 
 from __future__ import annotations
