@@ -63,6 +63,12 @@ class Commander:
         """Find out what is writable, which takes seconds for a big layout; else the first :meth:`submit` does it."""
         _ = self._writable
 
+    def is_writable(self, register: Register) -> bool:
+        """Whether the configuration lets a register, or an array's element, be written as a whole."""
+        own = bits_of(register)
+        allowed = self._writable[register.offset : register.offset + register.size]
+        return not any(bits & ~covered for bits, covered in zip(own, allowed, strict=True))
+
     @property
     def timeout_s(self) -> float:
         """How long a command may wait, unless told otherwise."""
@@ -112,9 +118,7 @@ class Commander:
     def _register(self, path: str) -> Register:
         source = self.block.source
         register = find(self.block.layout, path)
-        own = bits_of(register)
-        allowed = self._writable[register.offset : register.offset + register.size]
-        if any(bits & ~covered for bits, covered in zip(own, allowed, strict=True)):
+        if not self.is_writable(register):
             raise CommandError(
                 f"{source}/{path} is not writable; the configuration has to name it in the source's `writable`"
             )

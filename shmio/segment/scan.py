@@ -7,7 +7,7 @@ bit alone; padding belongs to nobody.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from shmio.layout.model import Register
 from shmio.segment import _atomics
@@ -19,9 +19,14 @@ class ChangeScan:
     """Compares two images over the given registers, in C; immutable."""
 
     def __init__(self, registers: Sequence[Register]) -> None:
-        self._table = b"".join(
-            _ENTRY.pack(*run, index) for index, register in enumerate(registers) for run in _runs(register)
-        )
+        self._table = b"".join(entries([register], index) for index, register in enumerate(registers))
+
+    @classmethod
+    def joined(cls, parts: Iterable[bytes]) -> ChangeScan:
+        """One over what :func:`entries` made; their indices in this order."""
+        scan = cls(())
+        scan._table = b"".join(parts)
+        return scan
 
     def changed(self, old: bytes, new: bytes) -> list[int]:
         """Indices, ascending, of the registers whose bytes differ.
@@ -29,6 +34,11 @@ class ChangeScan:
         Both images have one size and hold all registers; ValueError otherwise.
         """
         return _atomics.changed(old, new, self._table)
+
+
+def entries(registers: Iterable[Register], index: int) -> bytes:
+    """The part of a scan that reports a change of any of the registers as ``index``."""
+    return b"".join(_ENTRY.pack(*run, index) for register in registers for run in _runs(register))
 
 
 def _runs(register: Register) -> Iterator[tuple[int, int, int]]:

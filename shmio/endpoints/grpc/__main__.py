@@ -10,7 +10,7 @@ from shmio import worker
 from shmio.config import Address, Grpc
 from shmio.endpoints.grpc.feeds import Feeds
 from shmio.endpoints.grpc.server import Server
-from shmio.endpoints.grpc.simlog_v1 import SimlogV1
+from shmio.endpoints.grpc.services import Services
 from shmio.errors import SegmentError
 from shmio.logs import fields
 from shmio.worker import BEAT_S, Worker
@@ -41,8 +41,8 @@ async def _serve(worker: Worker) -> None:
         task.add_done_callback(tasks.discard)
 
     feeds = Feeds(worker.segment, writer, loop, on_quality)
-    service = SimlogV1(feeds, config.default_source)
-    server = Server(service)
+    services = Services(feeds, config.default_source)
+    server = Server(services)
     feeds.start()
     addresses = [Address.parse(text) for text in config.listen]
     ports = await server.start(addresses, config.tls)
@@ -50,12 +50,12 @@ async def _serve(worker: Worker) -> None:
     worker.log.info("serving %s", served)
     worker.running()
     while not stopping.is_set():
-        if over := await feeds.follow():
-            worker.log.info("a reload changed or ended %s", ", ".join(over))
-            service.move(over)
+        if changed := await feeds.follow():
+            worker.log.info("a reload added, changed or ended %s", ", ".join(changed))
+            services.move(changed)
         if not feeds.alive:
             raise RuntimeError("a feed ended; the endpoint starts anew")
-        streams, dropped, published, refused = service.counters
+        streams, dropped, published, refused = services.counters
         worker.report((streams, feeds.messages, dropped, published, refused))
         try:
             await asyncio.wait_for(stopping.wait(), BEAT_S)

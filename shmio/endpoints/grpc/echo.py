@@ -2,37 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterable, Sized
 from typing import Final, NamedTuple, Protocol
 
+from shmio.endpoints.grpc.subject import Subject
 from shmio.layout.model import Register
 from shmio.layout.write import bits_of
 from shmio.segment import Block, Event, EventKind
 
 
-class Picture(Protocol):
-    """An image of a block and its time: a frame, or what is to become one."""
-
-    @property
-    def number(self) -> int:
-        """Number of the frame."""
-
-    @property
-    def clock_ns(self) -> int:
-        """The instance's clock."""
-
-    @property
-    def image(self) -> bytes:
-        """The block's bytes."""
-
-
-Encode = Callable[[Picture], bytes | None]
-
-
 class Listener(Protocol):
     """One stream; called in the event loop's thread."""
 
-    def deliver(self, message: bytes) -> None:
+    def deliver(self, message: Sized) -> None:
         """Take one message for this stream."""
 
     def fail(self, reason: str) -> None:
@@ -40,16 +22,17 @@ class Listener(Protocol):
 
 
 class InChannel:
-    """One register as somebody listens to its ``/in``."""
+    """A subject as somebody listens to its ``/in``."""
 
-    def __init__(self, register: Register, encode: Encode) -> None:
-        self.encode = encode
+    def __init__(self, subject: Subject) -> None:
+        self.encode = subject.encode
         self.listeners: set[Listener] = set()
-        self.start, self.stop = register.offset, register.offset + register.size
-        self.bits = int.from_bytes(bits_of(register), "big")
+        self.start = min(register.offset for register in subject.registers)
+        self.stop = max(register.offset + register.size for register in subject.registers)
+        self.bits = _bits(subject.registers, self.stop)
 
 
-Message = tuple[InChannel, bytes]
+Message = tuple[InChannel, Sized]
 
 
 class _Written(NamedTuple):
@@ -66,7 +49,7 @@ _NOBODY: Final = (0, 0, 0)
 class Echo:
     """Turns accepted writes of all writers into messages, in the order in which the source accepted them.
 
-    A register is shown when a command has written all of it. One of which only a part is written, as an array's
+    A subject is shown when a command has written all of it. One of which only a part is written, as an array's
     element, is shown when that is known to be all, with the rest as of the frame before the command. A command whose
     first events nobody followed is passed over: it could only be shown in part. ``listen``, ``leave`` and ``fail``
     belong to the event loop's thread, ``follow`` and ``skip`` to that of the events.
@@ -74,7 +57,7 @@ class Echo:
 
     def __init__(self, block: Block) -> None:
         self._block = block
-        self._channels: dict[Register, InChannel] = {}
+        self._channels: dict[Subject, InChannel] = {}
         self._table: tuple[InChannel, ...] = ()
         self._frame = -1  # the image is this frame, and what was accepted since
         self._image = bytearray(block.layout.size)
@@ -83,20 +66,20 @@ class Echo:
         self._mask = bytearray(block.layout.size)  # what the command has written
         self._partly: dict[InChannel, Event] = {}  # channels it has written a part of
 
-    def listen(self, register: Register, encode: Encode, listener: Listener) -> None:
+    def listen(self, subject: Subject, listener: Listener) -> None:
         """Join: what is accepted from now on is delivered."""
-        channel = self._channels.get(register)
+        channel = self._channels.get(subject)
         if channel is None:
-            channel = self._channels[register] = InChannel(register, encode)
+            channel = self._channels[subject] = InChannel(subject)
             self._table = tuple(self._channels.values())
         channel.listeners.add(listener)
 
-    def leave(self, register: Register, listener: Listener) -> None:
+    def leave(self, subject: Subject, listener: Listener) -> None:
         """Leave; the last listener takes the channel with it."""
-        channel = self._channels[register]
+        channel = self._channels[subject]
         channel.listeners.discard(listener)
         if not channel.listeners:
-            del self._channels[register]
+            del self._channels[subject]
             self._table = tuple(self._channels.values())
 
     @property
@@ -194,3 +177,11 @@ class Echo:
 
 def _command(event: Event) -> tuple[int, int, int]:
     return event.incarnation, event.writer, event.command
+
+
+def _bits(registers: Iterable[Register], stop: int) -> int:
+    """The bits of all these registers, as those of one number whose last byte is the one before ``stop``."""
+    bits = 0
+    for register in registers:
+        bits |= int.from_bytes(bits_of(register), "big") << 8 * (stop - register.offset - register.size)
+    return bits

@@ -6,13 +6,13 @@ import asyncio
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sized
 from typing import NamedTuple, Protocol
 
 from shmio.endpoints.grpc.inlet import Inlet
-from shmio.layout.model import Register
+from shmio.endpoints.grpc.subject import Subject
 from shmio.segment import Block, Frame, Quality
-from shmio.segment.scan import ChangeScan
+from shmio.segment.scan import ChangeScan, entries
 
 log = logging.getLogger("shmio.grpc")
 
@@ -29,7 +29,7 @@ class Listener(Protocol):
     since: int
     """Frame whose value the stream already has."""
 
-    def deliver(self, message: bytes) -> None:
+    def deliver(self, message: Sized) -> None:
         """Take one message for this stream."""
 
     def lose(self) -> None:
@@ -37,16 +37,18 @@ class Listener(Protocol):
 
 
 class Channel:
-    """One register as somebody listens to it: how a frame becomes a message, and who gets it."""
+    """A subject as somebody listens to it: how a frame becomes a message, and who gets it."""
 
-    def __init__(self, register: Register, encode: Callable[[Frame], bytes | None]) -> None:
-        self.register = register
-        self.encode = encode
+    def __init__(self, subject: Subject, slot: int) -> None:
+        """``slot``: its place in the feed's table."""
+        self.encode = subject.encode
         self.listeners: set[Listener] = set()
+        self.slot = slot
+        self.entries = entries(subject.registers, slot)
 
 
 class _Table(NamedTuple):
-    channels: tuple[Channel, ...]
+    slots: tuple[Channel | None, ...]
     scan: ChangeScan
 
 
@@ -71,8 +73,10 @@ class Feed:
         self.messages = 0
         self._loop = loop
         self._on_quality = on_quality
-        self._channels: dict[Register, Channel] = {}
+        self._channels: dict[Subject, Channel] = {}
+        self._free: list[int] = []  # slots
         self._table = _Table((), ChangeScan([]))
+        self._outdated = False
         self._owed: dict[Listener, Channel] = {}  # joined while there was no good value
         _ = block.layout.members("")  # builds what paths are looked up in, before the first client waits for it
         self._stopping = threading.Event()
@@ -103,25 +107,29 @@ class Feed:
         self._thread.join()
         self.inlet.join()
 
-    def listen(self, register: Register, encode: Callable[[Frame], bytes | None], listener: Listener) -> None:
-        """Join a register's listeners; the current value is delivered at once, or as soon as it is good."""
-        channel = self._channels.get(register)
+    def listen(self, subject: Subject, listener: Listener) -> None:
+        """Join a subject's listeners; the current value is delivered at once, or as soon as it is good."""
+        channel = self._channels.get(subject)
         if channel is None:
-            channel = self._channels[register] = Channel(register, encode)
+            slot = self._free.pop() if self._free else len(self._channels)
+            channel = self._channels[subject] = Channel(subject, slot)
             self._rebuild()
         channel.listeners.add(listener)
         listener.since = 0
         self._owed[listener] = channel
         self._settle()
 
-    def leave(self, register: Register, listener: Listener) -> None:
+    def leave(self, subject: Subject, listener: Listener) -> None:
         """Leave; the last listener takes the channel with it."""
         self._owed.pop(listener, None)
-        channel = self._channels[register]
+        channel = self._channels[subject]
         channel.listeners.discard(listener)
         if not channel.listeners:
-            del self._channels[register]
-            self._rebuild()
+            del self._channels[subject]
+            self._free.append(channel.slot)
+            if not self._outdated:  # once for all who leave together
+                self._outdated = True
+                self._loop.call_soon(self._rebuild)
 
     def _settle(self) -> None:
         """Give those who are owed a value the newest one, if it is good."""
@@ -135,7 +143,7 @@ class Feed:
                 listener.deliver(message)
         self._owed.clear()
 
-    def _deliver(self, frame: int, batch: list[tuple[Channel, bytes]]) -> None:
+    def _deliver(self, frame: int, batch: list[tuple[Channel, Sized]]) -> None:
         """Hand a frame's messages to all who have not seen that frame yet."""
         for channel, message in batch:
             for listener in channel.listeners:
@@ -154,8 +162,11 @@ class Feed:
         self._on_quality(self.block.source, False)
 
     def _rebuild(self) -> None:
-        channels = tuple(self._channels.values())
-        self._table = _Table(channels, ChangeScan([channel.register for channel in channels]))
+        slots: list[Channel | None] = [None] * (len(self._channels) + len(self._free))
+        for channel in self._channels.values():
+            slots[channel.slot] = channel
+        self._table = _Table(tuple(slots), ChangeScan.joined(channel.entries for channel in self._channels.values()))
+        self._outdated = False
 
     # ---- the feed's own thread ---------------------------------------------------------------------------------
 
@@ -191,13 +202,13 @@ class Feed:
 
     def _show(self, shown: Frame | None, frame: Frame) -> None:
         """Encode what has changed since the frame shown before; everything, if there is none."""
-        table = self._table
+        slots, scan = self._table
         if shown is None:
             self._loop.call_soon_threadsafe(self._on_quality, self.block.source, True)
-            news: Sequence[Channel] = table.channels
+            news: Iterable[Channel | None] = slots
         else:
-            news = [table.channels[i] for i in table.scan.changed(shown.image, frame.image)]
-        batch = [(channel, message) for channel in news if (message := channel.encode(frame)) is not None]
+            news = [slots[i] for i in scan.changed(shown.image, frame.image)]
+        batch = [(channel, message) for channel in news if channel and (message := channel.encode(frame)) is not None]
         if batch or self._owed:
             self.messages += len(batch)
             self._loop.call_soon_threadsafe(self._deliver, frame.number, batch)

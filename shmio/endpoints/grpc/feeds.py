@@ -57,7 +57,7 @@ class Feeds(Mapping[str, Feed]):
                 feed.start()
 
     async def follow(self) -> list[str]:
-        """Take up what a reload has changed; the sources whose feed is another by now, or none.
+        """Take up what a reload has changed; the sources whose feed is another by now, those that came or went too.
 
         FormatError: the segment makes no sense any more.
         """
@@ -65,13 +65,14 @@ class Feeds(Mapping[str, Feed]):
         if self._segment.generation == self._generation:
             return []
         await asyncio.to_thread(self._read)
+        before = dict(self._feeds)
         over = [name for name, feed in self._feeds.items() if self._segment.blocks.get(name) is not feed.block]
         for name in over:
             feed = self._feeds.pop(name)
             self._ended.append(feed)  # its threads end by themselves, when all is read
             self._on_quality(name, False)
         self.start()
-        return over
+        return [name for name in before | self._feeds if before.get(name) is not self._feeds.get(name)]
 
     def _read(self) -> None:
         """Read what there is by now: for a big layout it takes a second, in which streams of others must not stand."""

@@ -27,8 +27,8 @@ WAIT_S: Final = 0.2
 
 _RETIRED: Final = "the source was changed or removed by a reload"
 
-Done = Callable[[str], None]
-"""Called once with what became of a value: empty if the device has it, else the reason."""
+Done = Callable[[EventKind, str], None]
+"""Called once with what became of a value, one of ``ENDS``, and the reason if the device does not have it."""
 
 
 @dataclass(slots=True)
@@ -40,6 +40,7 @@ class _Pending:
     record_bytes: int
     events: int
     done: Done
+    accepted: Callable[[], None] | None
     taken: bool = False
 
 
@@ -57,6 +58,7 @@ class Inlet:
         self._loop = loop
         self._commander = Commander(block, writer)
         self._prepared = False
+        self._preparing = asyncio.Lock()
         self._pending: dict[int, _Pending] = {}
         self._untaken_bytes = 0  # of records that may still lie in the queue
         self._open_events = 0
@@ -96,16 +98,21 @@ class Inlet:
         """Whether :meth:`send` would not have to wait."""
         return self._prepared and not self._turn.locked() and self._has_room(register)
 
-    async def send(self, register: Register, value: object, done: Done) -> None:
+    async def writable(self, register: Register) -> bool:
+        """Whether the configuration lets it be written."""
+        await self._prepare()
+        return self._commander.is_writable(register)
+
+    async def send(
+        self, register: Register, value: object, done: Done, accepted: Callable[[], None] | None = None
+    ) -> None:
         """Send a value as soon as there is room; ``done`` is called when its end is known, a bounded time later.
 
-        CommandError: it is not writable, or the source takes nothing at present; ValueRangeError. ``done`` is not
-        called then.
+        ``accepted``: called before, if the source accepts it. CommandError: it is not writable, or the source takes
+        nothing at present; ValueRangeError. Neither is called then.
         """
         async with self._turn:
-            if not self._prepared:  # not on the loop: for a big layout it takes seconds
-                await asyncio.to_thread(self._commander.prepare)
-                self._prepared = True
+            await self._prepare()
             while not self._has_room(register):
                 self._freed = self._loop.create_future()
                 await self._freed
@@ -117,11 +124,19 @@ class Inlet:
                 )
             ticket = self._commander.submit({register.path: value})
             record_bytes, events = _cost(register)
-            self._pending[ticket.number] = _Pending(ticket.incarnation, ticket.until_ns, record_bytes, events, done)
+            self._pending[ticket.number] = _Pending(
+                ticket.incarnation, ticket.until_ns, record_bytes, events, done, accepted
+            )
             self._untaken_bytes += record_bytes
             self._open_events += events
             if self._timer is None:
                 self._set_timer()
+
+    async def _prepare(self) -> None:
+        if not self._prepared:
+            async with self._preparing:  # not on the loop: for a big layout it takes seconds
+                await asyncio.to_thread(self._commander.prepare)
+                self._prepared = True
 
     def _has_room(self, register: Register) -> bool:
         if self._silent or not self._pending:
@@ -148,9 +163,11 @@ class Inlet:
         if not pending.taken:
             pending.taken = True
             self._untaken_bytes -= pending.record_bytes
+            if event.kind == EventKind.ACCEPTED and pending.accepted is not None:
+                pending.accepted()
         if event.kind in ENDS:  # of the one item there is
-            written = event.kind == EventKind.WRITTEN
-            self._end(event.command, "" if written else f"{EventKind(event.kind)}: {event.text}")
+            kind = EventKind(event.kind)
+            self._end(event.command, kind, "" if kind is EventKind.WRITTEN else f"{kind}: {event.text}")
 
     def _restarted(self, event: Event) -> None:
         """A successor rejects what its predecessor had not taken; of what it had taken nobody knows."""
@@ -160,22 +177,23 @@ class Inlet:
             if pending.incarnation == event.incarnation:
                 continue
             if pending.taken:
-                self._end(number, "the source was restarted meanwhile; it is not known whether the value was written")
+                reason = "the source was restarted meanwhile; it is not known whether the value was written"
+                self._end(number, EventKind.UNKNOWN, reason)
             else:
                 pending.until_ns = min(pending.until_ns, soon_ns)
         self._set_timer()
 
     def _retired(self) -> None:
         for number in list(self._pending):
-            self._end(number, _RETIRED)
+            self._end(number, EventKind.UNKNOWN, _RETIRED)
         self._free()
 
-    def _end(self, number: int, reason: str) -> None:
+    def _end(self, number: int, kind: EventKind, reason: str) -> None:
         pending = self._pending.pop(number)
         self._open_events -= pending.events
         if not pending.taken:
             self._untaken_bytes -= pending.record_bytes
-        pending.done(reason)
+        pending.done(kind, reason)
 
     def _free(self) -> None:
         if self._freed is not None and not self._freed.done():
@@ -197,7 +215,8 @@ class Inlet:
         for number, pending in list(self._pending.items()):
             if pending.until_ns <= now_ns:
                 self._silent |= not pending.taken
-                self._end(number, "the source gave no answer in time; it is not known whether the value was written")
+                reason = "the source gave no answer in time; it is not known whether the value was written"
+                self._end(number, EventKind.UNKNOWN, reason)
         self._free()
         self._set_timer()
 

@@ -1,25 +1,33 @@
-"""SimlogAPI version 1, Publish: values that clients send toward sources."""
+"""Values that clients send toward sources, whichever wire they come by."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine
 from functools import partial
+from typing import NamedTuple
 
 from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError
 
 from shmio.endpoints.grpc.inlet import Done, Inlet
 from shmio.endpoints.grpc.refusals import Refusals
-from shmio.errors import PathError, ShmioError, ValueRangeError
-from shmio.layout.codec import Value
+from shmio.endpoints.grpc.topics import Topics
+from shmio.errors import CommandError, ShmioError
 from shmio.layout.model import Register
-from shmio.layout.text import from_text
-from shmio.layout.topic import Topic, shorten
-from shmio.wire import simlog_v1_pb2 as wire
+from shmio.layout.topic import shorten
+from shmio.segment import EventKind
 
-Locate = Callable[[str], tuple[Topic, Inlet, Register]]
-"""What a path names; PathError."""
+
+class Request(NamedTuple):
+    """One value for one topic; ``read`` makes it a register's, or raises ValueRangeError."""
+
+    path: str
+    read: Callable[[Register], object]
+
+
+Parse = Callable[[bytes], Request]
+"""What a message asks for; DecodeError: it is none."""
 
 
 class _Stream:
@@ -36,9 +44,9 @@ class Publisher:
     Every message is in the end one of ``published``, the device has it, or ``refused``.
     """
 
-    def __init__(self, locate: Locate) -> None:
+    def __init__(self, topics: Topics) -> None:
         self.published = 0
-        self._locate = locate
+        self._topics = topics
         self._refusals = Refusals()
         self._waiting: set[asyncio.Task[None]] = set()
 
@@ -47,7 +55,7 @@ class Publisher:
         """Messages that were not carried out, or of which it is not known."""
         return self._refusals.count
 
-    async def publish(self, messages: AsyncIterator[bytes], peer: str) -> Empty:
+    async def publish(self, messages: AsyncIterator[bytes], parse: Parse, peer: str) -> Empty:
         """Take a stream's messages in order; return when the end of each is known, after the stream's.
 
         What was taken is carried out even if the client is gone meanwhile.
@@ -56,8 +64,8 @@ class Publisher:
         async for message in messages:
             path = ""
             try:
-                request = wire.PubRequest.FromString(message)
-                path = request.topic.path
+                request = parse(message)
+                path = request.path
                 inlet, register, value = self._read(request)
             except DecodeError:
                 self._refusals.add(f"{len(message)} bytes are no PubRequest", path, peer)
@@ -76,22 +84,48 @@ class Publisher:
             await stream.settled
         return Empty()
 
-    def _read(self, request: wire.PubRequest) -> tuple[Inlet, Register, Value]:
-        """What a message asks for; PathError, ValueRangeError."""
-        path = request.topic.path
-        topic, inlet, register = self._locate(path)
-        if topic.direction == "out":
-            raise PathError(f"{shorten(path)}: what comes out of a source is not published to; use /in")
-        content = request.data.WhichOneof("content")
-        if content not in (None, "timeStamp"):
-            raise ValueRangeError(f"a {content}; no register takes a structure")
-        return inlet, register, from_text(request.data.value, register)
+    async def write(self, request: Request, peer: str) -> tuple[EventKind, str]:
+        """Write one value: (ACCEPTED, "") as soon as its source has accepted it, else how it ended before, and why.
 
-    async def _send(self, inlet: Inlet, register: Register, value: Value, done: Done) -> None:
+        PathError, ValueRangeError, CommandError: it was not sent. Of one that was accepted the log says if the device
+        does not take it after all.
+        """
+        answer: asyncio.Future[tuple[EventKind, str]] = asyncio.get_running_loop().create_future()
+
+        def accepted() -> None:
+            if not answer.done():
+                answer.set_result((EventKind.ACCEPTED, ""))
+
+        def ended(kind: EventKind, reason: str) -> None:
+            if kind is EventKind.WRITTEN:
+                self.published += 1
+            elif answer.done():
+                self._refusals.add(reason, request.path, peer)
+            else:
+                self._refusals.count += 1
+                answer.set_result((kind, reason))
+
+        try:
+            inlet, register, value = self._read(request)
+            await inlet.send(register, value, ended, accepted)
+        except ShmioError:
+            self._refusals.count += 1
+            raise
+        return await answer
+
+    def _read(self, request: Request) -> tuple[Inlet, Register, object]:
+        """What is to be written where; PathError, ValueRangeError, CommandError."""
+        topic = self._topics.topic(request.path)
+        register = self._topics.register(topic)
+        if topic.direction == "out":
+            raise CommandError(f"{shorten(request.path)}: what comes out of a source is not published to; use /in")
+        return self._topics.feed(topic.source).inlet, register, request.read(register)
+
+    async def _send(self, inlet: Inlet, register: Register, value: object, done: Done) -> None:
         try:
             await inlet.send(register, value, done)
         except ShmioError as error:
-            done(str(error))
+            done(EventKind.REJECTED, str(error))
 
     def _keep(self, sending: Coroutine[None, None, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(sending)
@@ -99,11 +133,11 @@ class Publisher:
         task.add_done_callback(self._waiting.discard)
         return task
 
-    def _ended(self, stream: _Stream, path: str, peer: str, reason: str) -> None:
-        if reason:
-            self._refusals.add(reason, path, peer)
-        else:
+    def _ended(self, stream: _Stream, path: str, peer: str, kind: EventKind, reason: str) -> None:
+        if kind is EventKind.WRITTEN:
             self.published += 1
+        else:
+            self._refusals.add(reason, path, peer)
         stream.open -= 1
         if stream.open == 0 and stream.settled is not None and not stream.settled.done():
             stream.settled.set_result(None)

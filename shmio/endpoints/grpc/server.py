@@ -8,7 +8,7 @@ from grpc_reflection.v1alpha import reflection
 
 from shmio.config import Address, Tls
 from shmio.config.tls import read_tls
-from shmio.endpoints.grpc import simlog_v1
+from shmio.endpoints.grpc.services import Services
 from shmio.errors import EndpointError
 
 MAX_REQUEST_BYTES = 1 << 20
@@ -29,12 +29,13 @@ _OPTIONS = [
 class Server:
     """All services on each of the addresses."""
 
-    def __init__(self, simlog: simlog_v1.SimlogV1) -> None:
+    def __init__(self, services: Services) -> None:
         self._health = health.aio.HealthServicer()
         self._server = grpc.aio.server(options=_OPTIONS, maximum_concurrent_rpcs=MAX_CALLS)
-        self._server.add_generic_rpc_handlers((simlog.handlers(),))
+        self._server.add_generic_rpc_handlers(services.handlers())
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
-        names = [simlog_v1.SERVICE, health.SERVICE_NAME, reflection.SERVICE_NAME]
+        self._names = services.names
+        names = [*self._names, health.SERVICE_NAME, reflection.SERVICE_NAME]
         reflection.enable_server_reflection(names, self._server)
 
     async def start(self, addresses: list[Address], tls: Tls | None) -> list[int]:
@@ -56,7 +57,7 @@ class Server:
                     "host has no such address"
                 ) from None
         await self._server.start()
-        for service in (health.OVERALL_HEALTH, simlog_v1.SERVICE):
+        for service in (health.OVERALL_HEALTH, *self._names):
             await self._health.set(service, _SERVING)
         return ports
 

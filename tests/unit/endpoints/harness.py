@@ -15,7 +15,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from shmio.config import Address
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.server import Server
-from shmio.endpoints.grpc.simlog_v1 import SimlogV1
+from shmio.endpoints.grpc.services import Services
 from shmio.layout.model import Layout, Register
 from shmio.segment import Quality, Segment
 from shmio.wire import simlog_v1_pb2 as wire
@@ -56,7 +56,7 @@ def image(
 class Endpoint:
     """A served segment, and a client of it."""
 
-    def __init__(self, segment: Segment, feeds: dict[str, Feed], service: SimlogV1, port: int) -> None:
+    def __init__(self, segment: Segment, feeds: dict[str, Feed], service: Services, port: int) -> None:
         self.segment = segment
         self.writer = segment.writer("cell")
         self.feeds = feeds
@@ -94,7 +94,7 @@ async def endpoint(segment: Segment) -> AsyncIterator[Endpoint]:
 
     loop = asyncio.get_running_loop()
     feeds = {name: Feed(block, WRITER, loop, on_quality) for name, block in segment.blocks.items()}
-    service = SimlogV1(feeds, "cell")
+    service = Services(feeds, "cell")
     server = Server(service)
     await server.set_source("cell", False)
     ports = await server.start([Address("127.0.0.1", 0)], None)

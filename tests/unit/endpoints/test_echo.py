@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sized
 from typing import Any
 
 import grpc
 import pytest
 
 import shmio
-from shmio.endpoints.grpc.echo import Picture
+from shmio.endpoints.grpc.subject import Picture, Subject
 from shmio.segment import CommandSender, EventKind, Record, Segment, Write
 from shmio.segment.events import EVENT_SLOTS
 from tests.unit.endpoints.harness import LAYOUT, TIMEOUT_S, Endpoint, endpoint, image, listening, serve, value
@@ -154,7 +154,8 @@ class Gate:
     def __init__(self, served: Endpoint) -> None:
         self._reached, self._open = threading.Event(), threading.Event()
         self._echo = served.feeds["cell"].inlet.echo
-        self._echo.listen(LAYOUT.registers[2], self._encode, self)
+        self._subject = Subject("gate", "running", (LAYOUT.registers[2],), self._encode)
+        self._echo.listen(self._subject, self)
         served.writer.event(Record(EventKind.ACCEPTED, "", 7, 1, 0, 1, 8, 8, 1, b"\x08"))
         assert self._reached.wait(TIMEOUT_S)
 
@@ -164,9 +165,9 @@ class Gate:
 
     def open(self) -> None:
         self._open.set()
-        self._echo.leave(LAYOUT.registers[2], self)
+        self._echo.leave(self._subject, self)
 
-    def deliver(self, message: bytes) -> None:
+    def deliver(self, message: Sized) -> None:
         raise AssertionError
 
     def fail(self, reason: str) -> None:
@@ -209,7 +210,7 @@ def test_events_that_were_missed_end_the_stream(segment: Segment) -> None:
 
 
 def test_a_listener_that_is_too_slow_is_told_so(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shmio.endpoints.grpc.simlog_v1.EVENT_BOUND", 8)
+    monkeypatch.setattr("shmio.endpoints.grpc.outbox.EVENT_BOUND", 8)
 
     async def test(served: Endpoint) -> None:
         served.publish(image())

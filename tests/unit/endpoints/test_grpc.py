@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sized
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,8 @@ from grpc_health.v1 import health_pb2
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from shmio.config import Address, Tls
-from shmio.endpoints.grpc.queue import ConflatingQueue, UnbrokenQueue
 from shmio.endpoints.grpc.server import Server
+from shmio.endpoints.grpc.subject import Subject
 from shmio.errors import ConfigError, EndpointError
 from shmio.segment import Quality, Segment
 from shmio.wire import simlog_v1_pb2 as wire
@@ -278,46 +279,7 @@ def test_tls_serves_those_who_trust_it(segment: Segment, tmp_path: Path) -> None
     serve(segment, test)
 
 
-def test_a_slow_reader_gets_the_newest_value_and_the_loss_is_counted() -> None:
-    async def test() -> None:
-        waiting = ConflatingQueue(bound=3)
-        for number in range(3):
-            waiting.push(bytes([number]))
-        assert [await waiting.pop() for _ in range(3)] == [b"\x00", b"\x01", b"\x02"]
-        for number in range(10):
-            waiting.push(bytes([number]))
-        assert await waiting.pop() == b"\x09"
-        assert waiting.dropped == 9
-        popped = asyncio.ensure_future(waiting.pop())
-        await asyncio.sleep(0)
-        waiting.push(b"x")
-        assert await popped == b"x"
-
-    asyncio.run(test())
-
-
-def test_events_wait_all_or_the_queue_ends() -> None:
-    async def test() -> None:
-        waiting = UnbrokenQueue(bound=3, bound_bytes=10)
-        for text in (b"much longer than that", b""):
-            waiting.push(text)
-            assert await waiting.pop() == text
-        for number in range(3):
-            waiting.push(bytes([number]))
-        assert [await waiting.pop() for _ in range(3)] == [b"\x00", b"\x01", b"\x02"]
-        assert (waiting.failure, waiting.dropped) == ("", 0)
-        waiting.push(b"123456")
-        waiting.push(b"12345")
-        assert await waiting.pop() is None
-        assert waiting.failure.startswith("1 messages wait to be read")
-        assert waiting.dropped == 2
-        many = UnbrokenQueue(bound=3, bound_bytes=10)
-        for _ in range(5):
-            many.push(b"")
-        assert await many.pop() is None
-        assert many.dropped == 5
-
-    asyncio.run(test())
+STEP = Subject("raw", "step", (LAYOUT.registers[4],), lambda picture: picture.image[12:14])
 
 
 class Recorder:
@@ -325,10 +287,10 @@ class Recorder:
 
     def __init__(self) -> None:
         self.since = 0
-        self.got: list[bytes] = []
+        self.got: list[Any] = []
         self.lost = 0
 
-    def deliver(self, message: bytes) -> None:
+    def deliver(self, message: Sized) -> None:
         self.got.append(message)
 
     def lose(self) -> None:
@@ -337,7 +299,6 @@ class Recorder:
 
 def test_who_joins_while_the_source_stalls_gets_the_value_of_a_register_that_never_changes(soon_stale: Segment) -> None:
     async def test(served: Endpoint) -> None:
-        step = LAYOUT.registers[4]
         feed = served.feeds["cell"]
         served.publish(image(step=7))
         frame = feed.block.latest()
@@ -345,7 +306,7 @@ def test_who_joins_while_the_source_stalls_gets_the_value_of_a_register_that_nev
         while not frame.age_ns() > SOON_STALE_NS:  # noqa: ASYNC110  age is what is waited for
             await asyncio.sleep(0.01)
         late = Recorder()
-        feed.listen(step, lambda f: f.image[12:14], late)
+        feed.listen(STEP, late)
         assert late.got == []
 
         async def value_came() -> bool:
@@ -354,18 +315,17 @@ def test_who_joins_while_the_source_stalls_gets_the_value_of_a_register_that_nev
 
         await served.until(value_came)
         assert set(late.got) == {b"\0\x07"}
-        feed.leave(step, late)
+        feed.leave(STEP, late)
 
     serve(soon_stale, test)
 
 
 def test_what_waits_is_dropped_when_the_source_turns_bad(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
-        step = LAYOUT.registers[4]
         feed = served.feeds["cell"]
         served.publish(image(step=1))
         listener = Recorder()
-        feed.listen(step, lambda f: f.image[12:14], listener)
+        feed.listen(STEP, listener)
         served.publish(image(step=2), Quality.BAD)
 
         async def told() -> bool:
@@ -379,18 +339,17 @@ def test_what_waits_is_dropped_when_the_source_turns_bad(segment: Segment) -> No
 
         await served.until(again)
         assert listener.got == [b"\0\x01"] * len(listener.got)
-        feed.leave(step, listener)
+        feed.leave(STEP, listener)
 
     serve(segment, test)
 
 
 def test_who_joins_around_a_change_of_quality_is_shown_no_past(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
-        step = LAYOUT.registers[4]
         feed = served.feeds["cell"]
         first = Recorder()
         served.publish(image(step=1))
-        feed.listen(step, lambda f: f.image[12:14], first)
+        feed.listen(STEP, first)
         for step_now in (2, 3):
             served.publish(image(step=step_now))
         served.publish(image(step=3), Quality.BAD)
@@ -398,7 +357,7 @@ def test_who_joins_around_a_change_of_quality_is_shown_no_past(segment: Segment)
             served.publish(image(step=step_now))
         published = served.writer.block.ring.head()
         joiner = Recorder()
-        feed.listen(step, lambda f: f.image[12:14], joiner)
+        feed.listen(STEP, joiner)
         assert joiner.since == published
         served.publish(image(step=7))
 
@@ -409,6 +368,6 @@ def test_who_joins_around_a_change_of_quality_is_shown_no_past(segment: Segment)
         assert joiner.got == [b"\0\x06", b"\0\x07"]
         assert first.got == sorted(first.got)
         for listener in (first, joiner):
-            feed.leave(step, listener)
+            feed.leave(STEP, listener)
 
     serve(segment, test)

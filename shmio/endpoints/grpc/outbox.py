@@ -1,0 +1,219 @@
+"""What waits between sources and one client's stream, of one topic or of many."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterator, Sized
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, Final
+
+from shmio.endpoints.grpc.feed import CATCH_UP_FRAMES, Feed
+from shmio.endpoints.grpc.subject import Subject
+from shmio.segment.events import EVENT_SLOTS
+
+TOPIC_BOUND: Final = 2 * CATCH_UP_FRAMES
+"""Values of one topic that may wait; a feed that catches up delivers half as many at once."""
+STATE_BOUND: Final = 4096
+"""When so many values of all topics of a stream wait, it is given only the newest of each."""
+EVENT_BOUND: Final = 2 * EVENT_SLOTS
+"""Events that may wait in a stream; an inlet that catches up delivers half of it at once."""
+BOUND_BYTES: Final = 8 << 20
+"""Of values, and of events, that wait in a stream."""
+
+Finish = Callable[[Any], bytes]
+
+
+class _Load:
+    """Messages of one kind that wait."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self.size = 0
+
+    def full(self, message: Sized, bound: int) -> bool:
+        """Whether one more would be too much. A single one never is, however long."""
+        return self.count > 0 and (self.count >= bound or self.size + len(message) > BOUND_BYTES)
+
+    def add(self, message: Sized) -> None:
+        self.count += 1
+        self.size += len(message)
+
+    def remove(self, message: Sized) -> None:
+        self.count -= 1
+        self.size -= len(message)
+
+
+class Outbox:
+    """Messages of its lanes in the order in which they came; for the event loop's thread alone, with one reader."""
+
+    def __init__(self) -> None:
+        self.states, self.events = _Load(), _Load()
+        self.dropped = 0
+        self.failure = ""
+        """Why it ended; empty: it did not fail."""
+        self._waiting: OrderedDict[int, tuple[_Lane, Sized]] = OrderedDict()
+        self._next = 0
+        self._waiter: asyncio.Future[None] | None = None
+        self._ended = False
+
+    def add(self, lane: _Lane, message: Sized) -> int:
+        """Take a message; its number."""
+        number, self._next = self._next, self._next + 1
+        self._waiting[number] = lane, message
+        lane.load.add(message)
+        self._wake()
+        return number
+
+    def drop(self, number: int) -> None:
+        """Drop one that waits."""
+        lane, message = self._waiting.pop(number)
+        lane.load.remove(message)
+        self.dropped += 1
+
+    def clear(self) -> None:
+        """Drop all that waits."""
+        for lane, _ in list(self._waiting.values()):
+            lane.drop()
+
+    def end(self) -> None:
+        """Have the reader end once it has read what waits."""
+        self._ended = True
+        self._wake()
+
+    def fail(self, reason: str) -> None:
+        """End at once; what waits is dropped, and all that comes."""
+        self.failure = self.failure or reason
+        self.clear()
+        self.end()
+
+    async def pop(self) -> bytes | None:
+        """The oldest message, waited for; None at the end, from where it begins anew."""
+        while not self._waiting:
+            if self._ended:
+                self._ended = False
+                return None
+            self._waiter = asyncio.get_running_loop().create_future()
+            try:
+                await self._waiter
+            finally:
+                self._waiter = None
+        _, (lane, message) = self._waiting.popitem(last=False)
+        return lane.take(message)
+
+    def _wake(self) -> None:
+        if self._waiter is not None and not self._waiter.done():
+            self._waiter.set_result(None)
+
+
+class _Lane:
+    """One topic's part of an outbox."""
+
+    def __init__(self, outbox: Outbox, load: _Load, finish: Finish) -> None:
+        self.load = load
+        self._outbox = outbox
+        self._finish = finish
+        self._numbers: deque[int] = deque()
+
+    def take(self, message: Sized) -> bytes:
+        """Its oldest message, which has left the outbox, as it is sent."""
+        self._numbers.popleft()
+        self.load.remove(message)
+        return self._finish(message)
+
+    def drop(self) -> None:
+        """Drop what waits of it."""
+        while self._numbers:
+            self._outbox.drop(self._numbers.popleft())
+
+    def _add(self, message: Sized) -> None:
+        if self._outbox.failure:
+            self._outbox.dropped += 1
+        else:
+            self._numbers.append(self._outbox.add(self, message))
+
+
+class StateLane(_Lane):
+    """For states: every change for a client that keeps up; for one that does not the newest value, the loss is counted.
+
+    A client that has fallen behind is not shown the past. It is a feed's listener.
+    """
+
+    def __init__(self, outbox: Outbox, finish: Finish = bytes) -> None:
+        """``finish``: what a message still lacks when it is sent."""
+        super().__init__(outbox, outbox.states, finish)
+        self.since = 0
+
+    def deliver(self, message: Sized) -> None:
+        """Add a message, in place of the topic's that wait if they are too many."""
+        if len(self._numbers) >= TOPIC_BOUND or self.load.full(message, STATE_BOUND):
+            self.drop()
+        self._add(message)
+
+    def lose(self) -> None:
+        """What waits must not be sent any more."""
+        self.drop()
+
+    def join(self, feed: Feed, subject: Subject) -> Callable[[], None]:
+        """Listen to what comes out of a feed's source; how to leave again."""
+        feed.listen(subject, self)
+        return partial(feed.leave, subject, self)
+
+
+class EventLane(_Lane):
+    """For events, of which none replaces another: all of them up to the one that did not fit, and then the end.
+
+    It is an echo's listener.
+    """
+
+    def __init__(self, outbox: Outbox, path: str, finish: Finish = bytes) -> None:
+        """``path``: named when the outbox fails. ``finish``: what a message still lacks when it is sent."""
+        super().__init__(outbox, outbox.events, finish)
+        self._path = path
+
+    def deliver(self, message: Sized) -> None:
+        """Add a message, or fail if there is no room."""
+        if self.load.full(message, EVENT_BOUND):
+            self.fail(f"{self.load.count} messages wait to be read: the client is too slow for what is written")
+        self._add(message)
+
+    def fail(self, reason: str) -> None:
+        """End the whole outbox: what comes next is not all there was."""
+        self._outbox.fail(f"{self._path}: {reason}")
+
+    def join(self, feed: Feed, subject: Subject) -> Callable[[], None]:
+        """Listen to what is written to a feed's source; how to leave again."""
+        echo = feed.inlet.echo
+        echo.listen(subject, self)
+        return partial(echo.leave, subject, self)
+
+
+Lane = StateLane | EventLane
+
+
+class Outboxes:
+    """Those of all open streams, counted."""
+
+    def __init__(self) -> None:
+        self._open: set[Outbox] = set()
+        self._dropped = 0
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+    @property
+    def dropped(self) -> int:
+        """Messages dropped on streams too slow for them, since the start."""
+        return self._dropped + sum(outbox.dropped for outbox in self._open)
+
+    @contextmanager
+    def opened(self) -> Iterator[Outbox]:
+        """One for a stream as long as that is open."""
+        outbox = Outbox()
+        self._open.add(outbox)
+        try:
+            yield outbox
+        finally:
+            self._open.discard(outbox)
+            self._dropped += outbox.dropped

@@ -1,0 +1,47 @@
+"""All services of the endpoint, over the same feeds."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import grpc
+
+from shmio.endpoints.grpc.feed import Feed
+from shmio.endpoints.grpc.outbox import Outboxes
+from shmio.endpoints.grpc.publish import Publisher
+from shmio.endpoints.grpc.simlog_v1 import SimlogV1
+from shmio.endpoints.grpc.simlog_v2 import SimlogV2
+from shmio.endpoints.grpc.topics import Topics
+
+
+class Services:
+    """What a server offers on each of its addresses."""
+
+    def __init__(self, feeds: Mapping[str, Feed], default_source: str | None) -> None:
+        """``default_source``: that of paths which name none; default: the only one."""
+        topics = Topics(feeds, default_source)
+        self._outboxes = Outboxes()
+        self._publisher = Publisher(topics)
+        self._services = (
+            SimlogV1(topics, self._publisher, self._outboxes),
+            SimlogV2(topics, self._publisher, self._outboxes),
+        )
+
+    @property
+    def names(self) -> list[str]:
+        """Full names of the services."""
+        return [service.name for service in self._services]
+
+    @property
+    def counters(self) -> tuple[int, int, int, int]:
+        """Streams of subscribers open, messages dropped on slow ones, messages published, and refused."""
+        return len(self._outboxes), self._outboxes.dropped, self._publisher.published, self._publisher.refused
+
+    def handlers(self) -> list[grpc.GenericRpcHandler]:
+        """The services' calls, for a server."""
+        return [service.handlers() for service in self._services]
+
+    def move(self, sources: Collection[str]) -> None:
+        """Have the streams of these sources go over to the feeds that there are by now."""
+        for service in self._services:
+            service.move(sources)

@@ -1,0 +1,206 @@
+"""SimlogAPI version 2, package ``simlog.server``; without injection and stepping for now."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Collection, Iterable
+from functools import partial
+from typing import Any, Final, NoReturn
+
+import grpc
+from google.protobuf.empty_pb2 import Empty
+
+from shmio.endpoints.grpc.outbox import Outboxes
+from shmio.endpoints.grpc.publish import Publisher, Request
+from shmio.endpoints.grpc.subscribers import Subscribers
+from shmio.endpoints.grpc.topics import Topics
+from shmio.endpoints.grpc.values import (
+    MAX_ELEMENTS,
+    MAX_MEMBERS,
+    Shape,
+    encoder,
+    from_wire,
+    nothing,
+    path_field,
+    repeated,
+    shape,
+    time_stamp,
+)
+from shmio.errors import CommandError, EndpointError, PathError, ShmioError, ValueRangeError
+from shmio.layout.topic import Topic, shorten
+from shmio.segment import EventKind, Frame, Quality
+from shmio.wire import simlog_v2_pb2 as wire
+
+SERVICE: Final = wire.DESCRIPTOR.services_by_name["SimlogAPI"].full_name
+
+Context = grpc.aio.ServicerContext[Any, Any]
+
+_STATUS: Final = {
+    PathError: grpc.StatusCode.NOT_FOUND,
+    ValueRangeError: grpc.StatusCode.INVALID_ARGUMENT,
+    CommandError: grpc.StatusCode.FAILED_PRECONDITION,
+    EndpointError: grpc.StatusCode.RESOURCE_EXHAUSTED,
+}
+
+
+class SimlogV2:
+    """Serves the registers and structures of all sources as ``google.protobuf.Value``."""
+
+    name = SERVICE
+
+    def __init__(self, topics: Topics, publisher: Publisher, outboxes: Outboxes) -> None:
+        self._topics = topics
+        self._publisher = publisher
+        self._outboxes = outboxes
+        self._subscribers = Subscribers(topics)
+
+    def handlers(self) -> grpc.GenericRpcHandler:
+        """The service's calls, for a server. Values are serialised where they are made, and once."""
+        unary = grpc.unary_unary_rpc_method_handler
+        empty = Empty.SerializeToString
+        write = unary(self.write, wire.PubRequest.FromString, empty)
+        calls: dict[str, grpc.RpcMethodHandler[Any, Any]] = {
+            "GetTopicInfo": unary(
+                self.get_topic_info, wire.TopicInfoRequest.FromString, wire.TopicInfo.SerializeToString
+            ),
+            "CreateSubscriber": grpc.unary_stream_rpc_method_handler(
+                self.create_subscriber, wire.Subscriber.FromString
+            ),
+            "Subscribe": unary(self.subscribe, wire.SubscriptionRequest.FromString, empty),
+            "Inject": unary(self.inject),
+            "Publish": grpc.stream_unary_rpc_method_handler(self.publish, None, empty),
+            "Write": write,
+            "PublishSynch": write,
+            "Read": unary(self.read, wire.ReadRequest.FromString),
+        }
+        return grpc.method_handlers_generic_handler(SERVICE, calls)
+
+    async def get_topic_info(self, request: wire.TopicInfoRequest, _: Context) -> wire.TopicInfo:
+        """Tell what a topic is; ``exists`` is false, and no more said, for what does not exist."""
+        try:
+            topic, found = self._find(request.path)
+            direction = await self._direction(topic, found)
+        except PathError:
+            return wire.TopicInfo(path=request.path)
+        return wire.TopicInfo(path=request.path, type=found.type, direction=direction, exists=True)
+
+    async def create_subscriber(self, request: wire.Subscriber, context: Context) -> AsyncIterator[bytes]:
+        """Stream the values of all topics that are subscribed for this uuid, in the order of the frames.
+
+        INVALID_ARGUMENT: no uuid; RESOURCE_EXHAUSTED: too many subscribers, or this one does not read what is written
+        to ``/in``; ABORTED: another one came with its uuid.
+        """
+        with self._outboxes.opened() as outbox:
+            try:
+                subscriber = self._subscribers.enter(request.uuid, request.name, outbox)
+            except ShmioError as error:
+                await _refuse(context, error)
+            try:
+                await context.send_initial_metadata(())  # who waits for it may subscribe from then on
+                while (message := await outbox.pop()) is not None:
+                    yield message
+            finally:
+                self._subscribers.leave(request.uuid, subscriber)
+            if subscriber.replaced:
+                await context.abort(grpc.StatusCode.ABORTED, "CreateSubscriber was called again with this uuid")
+            await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, outbox.failure)
+
+    async def subscribe(self, request: wire.SubscriptionRequest, context: Context) -> Empty:
+        """Add a topic to a subscriber's stream: the current value if it is good, then every change.
+
+        Of ``/in``, what is written to it. NOT_FOUND: no such topic, or subscriber; INVALID_ARGUMENT: a structure too
+        large for a message; RESOURCE_EXHAUSTED: too many.
+        """
+        try:
+            await self._subscribers.subscribe(request.subscriberUUID, request.path)
+        except ShmioError as error:
+            await _refuse(context, error)
+        return Empty()
+
+    async def inject(self, _: bytes, context: Context) -> bytes:
+        """Not built yet: UNIMPLEMENTED."""
+        await context.abort(grpc.StatusCode.UNIMPLEMENTED, "Inject: this version of shmio has no injection yet")
+        raise AssertionError  # abort never returns
+
+    async def publish(self, messages: AsyncIterator[bytes], context: Context) -> Empty:
+        """Write the values of a stream, in its order, and answer when it has ended and all of them have."""
+        return await self._publisher.publish(messages, _parse, context.peer())
+
+    async def write(self, request: wire.PubRequest, context: Context) -> Empty:
+        """Write one value; return when its source has accepted it.
+
+        NOT_FOUND: no such topic; INVALID_ARGUMENT: no value of its type; FAILED_PRECONDITION: not writable, or the
+        source takes nothing; DEADLINE_EXCEEDED: the source did not say, it is not known whether it was written.
+        """
+        try:
+            kind, reason = await self._publisher.write(_request(request), context.peer())
+        except ShmioError as error:
+            await _refuse(context, error)
+        if kind is EventKind.UNKNOWN:
+            await context.abort(grpc.StatusCode.DEADLINE_EXCEEDED, f"{shorten(request.topic)}: {reason}")
+        if kind is not EventKind.ACCEPTED:
+            await context.abort(grpc.StatusCode.FAILED_PRECONDITION, f"{shorten(request.topic)}: {reason}")
+        return Empty()
+
+    async def read(self, request: wire.ReadRequest, context: Context) -> bytes:
+        """The values of topics, in the order of the paths, those of one source from one frame; NULL while it is bad.
+
+        NOT_FOUND: no such topic; INVALID_ARGUMENT: too much for a message.
+        """
+        try:
+            return repeated(self._read(request.path))
+        except ShmioError as error:
+            await _refuse(context, error)
+
+    def move(self, sources: Collection[str]) -> None:
+        """Have the subscriptions of these sources go over to the feeds that there are by now."""
+        self._subscribers.move(sources)
+
+    def _find(self, path: str) -> tuple[Topic, Shape]:
+        """What a path names; PathError."""
+        topic = self._topics.topic(path)
+        return topic, shape(self._topics.layout(topic), topic)
+
+    async def _direction(self, topic: Topic, found: Shape) -> wire.DirectionType:
+        if topic.direction is not None:
+            return wire.IN if topic.direction == "in" else wire.OUT
+        inlet = self._topics.feed(topic.source).inlet
+        return wire.INOUT if found.whole and await inlet.writable(found.registers[0]) else wire.OUT
+
+    def _read(self, paths: Iterable[str]) -> list[bytes]:
+        """Serialised messages; PathError, ValueRangeError."""
+        wanted: list[tuple[str, str, Shape]] = []
+        members = elements = 0
+        for path in paths:
+            topic, found = self._find(path)
+            members, elements = members + len(found.registers), elements + found.elements
+            if members > MAX_MEMBERS or elements > MAX_ELEMENTS:
+                raise ValueRangeError(
+                    f"{shorten(path)}: too much for one Read: {MAX_MEMBERS} registers with {MAX_ELEMENTS} elements are "
+                    "the most"
+                )
+            wanted.append((path, topic.source, found))
+        frames = {source: self._topics.feed(source).block.latest() for source in {source for _, source, _ in wanted}}
+        return [self._message(path, source, found, frames[source]) for path, source, found in wanted]
+
+    def _message(self, path: str, source: str, found: Shape, frame: Frame | None) -> bytes:
+        block = self._topics.feed(source).block
+        message = None
+        if frame is not None and frame.assess(block.stale_ns)[0] is not Quality.BAD:
+            message = encoder(found, block.layout)(frame)
+        if message is None:
+            message = nothing(time_stamp(frame.clock_ns) if frame else b"")
+        return message.under(path_field(path))
+
+
+def _parse(message: bytes) -> Request:
+    return _request(wire.PubRequest.FromString(message))
+
+
+def _request(request: wire.PubRequest) -> Request:
+    return Request(request.topic, partial(from_wire, request.data.value))
+
+
+async def _refuse(context: Context, error: ShmioError) -> NoReturn:
+    """End a call with what its error means to the client."""
+    await context.abort(_STATUS.get(type(error), grpc.StatusCode.INTERNAL), str(error))
+    raise error  # abort never returns

@@ -1,0 +1,42 @@
+"""What somebody may listen to: registers of one block, and how an image of them becomes a message."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sized
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from shmio.layout.model import Register
+
+
+class Picture(Protocol):
+    """An image of a block and its time: a frame, or what is to become one."""
+
+    @property
+    def number(self) -> int:
+        """Number of the frame."""
+
+    @property
+    def clock_ns(self) -> int:
+        """The instance's clock."""
+
+    @property
+    def image(self) -> bytes:
+        """The block's bytes."""
+
+
+Encode = Callable[[Picture], Sized | None]
+"""The message, whose length is in bytes; None where the bytes hold no value."""
+
+
+@dataclass(frozen=True, slots=True)
+class Subject:
+    """A register, an array's element or a structure as one wire shows it; equal ones are encoded once for all.
+
+    ``wire``: which one. ``path``: canonical, in the block. ``registers``: what it shows.
+    """
+
+    wire: str
+    path: str
+    registers: tuple[Register, ...] = field(compare=False)
+    encode: Encode = field(compare=False)

@@ -1,0 +1,158 @@
+"""Version 2's subscribers: a stream each, for all of their topics."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Collection
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+from shmio.endpoints.grpc.outbox import EventLane, Lane, Outbox, StateLane
+from shmio.endpoints.grpc.topics import Topics
+from shmio.endpoints.grpc.values import Encoded, path_field, shape, subject
+from shmio.errors import EndpointError, PathError, ShmioError, ValueRangeError
+from shmio.layout.topic import Topic, shorten
+from shmio.logs import fields
+
+MAX_SUBSCRIBERS: Final = 256
+MAX_TOPICS: Final = 10_000
+"""Of one subscriber."""
+MAX_ALL_TOPICS: Final = 100_000
+"""Of all subscribers."""
+MAX_NAME: Final = 256
+"""Characters of a subscriber's name, and of its uuid."""
+PATIENCE_S: Final = 1.0
+"""So long Subscribe waits for its subscriber: the two calls may arrive in any order."""
+
+log = logging.getLogger("shmio.grpc")
+
+
+@dataclass(slots=True)
+class _Subscription:
+    """``leave``: None while no source has such a topic."""
+
+    topic: Topic
+    lane: Lane
+    leave: Callable[[], None] | None = None
+
+
+class Subscriber:
+    """One CreateSubscriber call."""
+
+    def __init__(self, topics: Topics, name: str, outbox: Outbox) -> None:
+        self.name = name
+        self.outbox = outbox
+        self.replaced = False
+        """Whether another one of its uuid has taken its place."""
+        self._topics = topics
+        self._subscriptions: dict[str, _Subscription] = {}
+
+    def __len__(self) -> int:
+        return len(self._subscriptions)
+
+    def add(self, path: str) -> None:
+        """Subscribe to a topic; again, if it is already: nothing. PathError, ValueRangeError, EndpointError."""
+        if path in self._subscriptions:
+            return
+        topic = self._topics.topic(path)
+        finish = partial(Encoded.under, path=path_field(path))
+        lane: Lane = StateLane(self.outbox, finish)
+        if topic.direction == "in":
+            lane = EventLane(self.outbox, shorten(path), finish)
+        subscription = _Subscription(topic, lane)
+        self._join(subscription)
+        self._subscriptions[path] = subscription
+
+    def move(self, sources: Collection[str]) -> None:
+        """Go over to the feeds that these sources have by now; a topic that is gone waits until it is back."""
+        for path, subscription in self._subscriptions.items():
+            if subscription.topic.source in sources:
+                self._leave(subscription)
+                try:
+                    self._join(subscription)
+                except ShmioError as error:
+                    log.info("a subscribed topic is gone: %s", error, extra=fields(topic=shorten(path)))
+
+    def close(self) -> None:
+        """Leave all topics."""
+        for subscription in self._subscriptions.values():
+            self._leave(subscription)
+        self._subscriptions.clear()
+
+    def _join(self, subscription: _Subscription) -> None:
+        topic = subscription.topic
+        feed = self._topics.feed(topic.source)
+        layout = feed.block.layout
+        subscription.leave = subscription.lane.join(feed, subject(shape(layout, topic), layout))
+
+    def _leave(self, subscription: _Subscription) -> None:
+        if subscription.leave is not None:
+            subscription.leave()
+            subscription.leave = None
+
+
+class Subscribers:
+    """Those whose stream is open, by their uuid."""
+
+    def __init__(self, topics: Topics) -> None:
+        self._topics = topics
+        self._open: dict[str, Subscriber] = {}
+        self._arrived = asyncio.Event()
+
+    def enter(self, uuid: str, name: str, outbox: Outbox) -> Subscriber:
+        """A stream opens. One that has the uuid already ends: it may be what a broken connection has left.
+
+        ValueRangeError: no uuid, or too long; EndpointError: too many.
+        """
+        if not uuid:
+            raise ValueRangeError("uuid: it is needed, to say in Subscribe whose stream the topic is for")
+        if max(len(uuid), len(name)) > MAX_NAME:
+            raise ValueRangeError(f"name and uuid have at most {MAX_NAME} characters")
+        before = self._open.pop(uuid, None)
+        if before is not None:
+            before.replaced = True
+            before.close()
+            before.outbox.clear()
+            before.outbox.end()
+            log.info("subscriber %s came again; its stream before ends", shorten(name), extra=fields(uuid=uuid))
+        elif len(self._open) >= MAX_SUBSCRIBERS:
+            raise EndpointError(f"there are {MAX_SUBSCRIBERS} subscribers already; one stream serves many topics")
+        subscriber = self._open[uuid] = Subscriber(self._topics, name, outbox)
+        self._arrived.set()
+        self._arrived = asyncio.Event()
+        return subscriber
+
+    def leave(self, uuid: str, subscriber: Subscriber) -> None:
+        """Its stream has ended."""
+        subscriber.close()
+        if self._open.get(uuid) is subscriber:
+            del self._open[uuid]
+
+    async def subscribe(self, uuid: str, path: str) -> None:
+        """Add a topic to a subscriber's stream, which may still be about to open.
+
+        PathError: no such topic, or subscriber; ValueRangeError: too much for a message; EndpointError: too many.
+        """
+        with suppress(TimeoutError):
+            async with asyncio.timeout(PATIENCE_S):
+                while uuid not in self._open:
+                    await self._arrived.wait()
+        subscriber = self._open.get(uuid)
+        if subscriber is None:
+            raise PathError(
+                f"subscriberUUID {shorten(uuid)!r}: no such subscriber; keep the stream of CreateSubscriber open"
+            )
+        if len(subscriber) >= MAX_TOPICS or sum(map(len, self._open.values())) >= MAX_ALL_TOPICS:
+            raise EndpointError(
+                f"{shorten(path)}: too many subscriptions: {MAX_TOPICS} a subscriber and {MAX_ALL_TOPICS} in all are "
+                "the most"
+            )
+        subscriber.add(path)
+
+    def move(self, sources: Collection[str]) -> None:
+        """Have all go over to the feeds that these sources have by now."""
+        for subscriber in self._open.values():
+            subscriber.move(sources)

@@ -1,0 +1,221 @@
+"""Registers and structures as version 2 shows them: values of ``google.protobuf.Value``.
+
+Their bytes are put together here, as fields of protobuf messages are, and not through message objects, which would take
+more than ten times as long for each change. Reading goes through the objects.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable
+from functools import lru_cache
+from typing import Final, NamedTuple
+
+from google.protobuf.struct_pb2 import Value as WireValue
+from google.protobuf.timestamp_pb2 import Timestamp
+
+from shmio.endpoints.grpc.subject import Picture, Subject
+from shmio.errors import ValueRangeError
+from shmio.layout.codec import Value, codec
+from shmio.layout.model import Layout, Register
+from shmio.layout.text import from_text, wire_type
+from shmio.layout.topic import Topic, decode_segment, look_up, shorten
+from shmio.wire import simlog_v2_pb2 as wire
+
+MAX_ELEMENTS: Final = 1 << 16
+"""Numbers, bits or texts in one value."""
+MAX_MEMBERS: Final = 4096
+"""Registers in one structure."""
+MAX_LEVELS: Final = 24
+"""Structures within each other: the messages that hold them are three times as deep, and readers stop at 100."""
+
+_NULL: Final = b"\x08\x00"
+_TRUE: Final = b"\x20\x01"
+_FALSE: Final = b"\x20\x00"
+_NUMBER: Final = struct.Struct("<cd")
+_TYPES: Final = {"bool": wire.BOOL, "double": wire.NUMBER, "int": wire.NUMBER, "string": wire.STRING}
+
+
+class Shape(NamedTuple):
+    """What a path names: one register, or all below a structure."""
+
+    path: str
+    registers: tuple[Register, ...]
+    whole: bool
+    """Whether it is a register, or an array's element, as a whole; else a structure."""
+
+    @property
+    def type(self) -> wire.ValueType:
+        """The type of its values."""
+        if not self.whole:
+            return wire.STRUCT
+        (register,) = self.registers
+        return wire.LIST if register.dims else _TYPES[wire_type(register)]
+
+    @property
+    def elements(self) -> int:
+        """Numbers, bits and texts in it."""
+        return sum(register.count for register in self.registers)
+
+
+class Encoded:
+    """A SimlogMessage without its path: the time stamp of its header, and the fields after that."""
+
+    __slots__ = ("rest", "stamp")
+
+    def __init__(self, stamp: bytes, rest: bytes) -> None:
+        self.stamp = stamp
+        self.rest = rest
+
+    def __len__(self) -> int:
+        return len(self.stamp) + len(self.rest)
+
+    def under(self, path: bytes) -> bytes:
+        """The whole message; ``path``: as :func:`path_field` has it."""
+        header = self.stamp + path
+        return b"\x0a" + _varint(len(header)) + header + self.rest
+
+
+def shape(layout: Layout, topic: Topic) -> Shape:
+    """What a topic names in a layout; PathError."""
+    below = layout.members(topic.path)
+    if below:
+        return Shape(topic.path, tuple(layout.registers[index] for index in below), whole=False)
+    return Shape(topic.path, (look_up(layout, topic),), whole=True)
+
+
+def subject(found: Shape, layout: Layout) -> Subject:
+    """What to listen to for it; ValueRangeError as of :func:`encoder`."""
+    return Subject("v2", found.path, found.registers, encoder(found, layout))
+
+
+def encoder(found: Shape, layout: Layout) -> Callable[[Picture], Encoded | None]:
+    """A function from a frame to the message; None where the bytes hold no value.
+
+    ValueRangeError: it is too large, or too deep, for a message.
+    """
+    encode = _encoder(found, layout)
+    head = b"\x10" + _varint(found.type) + b"\x1a"
+
+    def message(picture: Picture) -> Encoded | None:
+        value = encode(picture.image)
+        return None if value is None else Encoded(time_stamp(picture.clock_ns), head + _delimited(value))
+
+    return message
+
+
+def path_field(path: str) -> bytes:
+    """The path in a header."""
+    return b"\x12" + _delimited(path.encode())
+
+
+@lru_cache(maxsize=64)  # a frame or two for each feed
+def time_stamp(clock_ns: int) -> bytes:
+    """The time in a header, from ns of the instance's clock."""
+    seconds, nanos = divmod(clock_ns, 1_000_000_000)
+    return b"\x0a" + _delimited(Timestamp(seconds=seconds, nanos=nanos).SerializeToString())
+
+
+def nothing(stamp: bytes) -> Encoded:
+    """The message of a value that there is none of."""
+    return Encoded(stamp, b"\x10" + _varint(wire.NULL) + b"\x1a" + _delimited(_NULL))
+
+
+def repeated(messages: Iterable[bytes]) -> bytes:
+    """A message whose field 1 is repeated."""
+    return b"".join(b"\x0a" + _delimited(message) for message in messages)
+
+
+def to_wire(value: Value) -> bytes:
+    """A decoded value as a serialised Value: numbers are doubles, and what has no value is null."""
+    if value is None:
+        return _NULL
+    if isinstance(value, bool):
+        return _TRUE if value else _FALSE
+    if isinstance(value, int | float):
+        return _NUMBER.pack(b"\x11", value)
+    if isinstance(value, str):
+        return b"\x1a" + _delimited(value.encode())
+    return b"\x32" + _delimited(repeated(map(to_wire, value)))
+
+
+def from_wire(value: WireValue, register: Register) -> object:
+    """What a client sent for a register; ValueRangeError.
+
+    A text for what is none is read as in version 1: so all digits of a number of 64 bits arrive.
+    """
+    kind = value.WhichOneof("kind")
+    if kind == "string_value" and (register.dims or wire_type(register) != "string"):
+        return from_text(value.string_value, register)
+    return _plain(value, register.path)
+
+
+def _plain(value: WireValue, name: str) -> object:
+    kind = value.WhichOneof("kind")
+    if kind == "list_value":
+        return [_plain(item, name) for item in value.list_value.values]
+    if kind in ("number_value", "bool_value", "string_value"):
+        plain: object = getattr(value, kind)
+        return plain
+    raise ValueRangeError(f"{name}: expected a value, found {'a structure' if kind == 'struct_value' else 'none'}")
+
+
+def _encoder(found: Shape, layout: Layout) -> Callable[[bytes], bytes | None]:
+    """A function from an image of the block to a serialised Value."""
+    members, elements = len(found.registers), found.elements
+    if members > MAX_MEMBERS or elements > MAX_ELEMENTS:
+        raise ValueRangeError(
+            f"{shorten(found.path)}: {members} registers with {elements} elements are too much for one value, "
+            f"{MAX_MEMBERS} with {MAX_ELEMENTS} are the most; its members are topics, too"
+        )
+    if not found.whole:
+        start = len(found.path) + 1
+        parts = [(register.path[start:].split("/"), register) for register in found.registers]
+        return _structure(found.path, parts, layout, MAX_LEVELS)
+    decode = codec(found.registers[0], layout.byte_order).decode
+
+    def encode(image: bytes) -> bytes | None:
+        value = decode(image)
+        return None if value is None else to_wire(value)
+
+    return encode
+
+
+def _structure(
+    path: str, parts: list[tuple[list[str], Register]], layout: Layout, levels: int
+) -> Callable[[bytes], bytes]:
+    """``parts``: the names that lead to each register from here."""
+    if not levels:
+        raise ValueRangeError(f"{shorten(path)}: more than {MAX_LEVELS} structures within each other")
+    groups: dict[str, list[tuple[list[str], Register]]] = {}
+    for (name, *rest), register in parts:
+        groups.setdefault(name, []).append((rest, register))
+    members: list[tuple[bytes, Callable[[bytes], bytes]]] = []
+    for name, inner in groups.items():
+        rest, register = inner[0]
+        encode = _structure(f"{path}/{name}", inner, layout, levels - 1) if rest else _member(register, layout)
+        members.append((b"\x0a" + _delimited(decode_segment(name).encode()) + b"\x12", encode))
+    return lambda image: b"\x2a" + _delimited(repeated(key + _delimited(encode(image)) for key, encode in members))
+
+
+def _member(register: Register, layout: Layout) -> Callable[[bytes], bytes]:
+    decode = codec(register, layout.byte_order).decode
+    return lambda image: to_wire(decode(image))
+
+
+def _delimited(data: bytes) -> bytes:
+    return _varint(len(data)) + data
+
+
+def _varint(number: int) -> bytes:
+    if number < 0x80:
+        return _SMALL[number]
+    data = bytearray()
+    while number > 0x7F:
+        data.append(number & 0x7F | 0x80)
+        number >>= 7
+    data.append(number)
+    return bytes(data)
+
+
+_SMALL: Final = [bytes([number]) for number in range(0x80)]
