@@ -10,6 +10,7 @@ from typing import Any
 
 import grpc
 import pytest
+from google.protobuf.json_format import MessageToDict
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from shmio.config import Address
@@ -19,7 +20,9 @@ from shmio.endpoints.grpc.services import Services
 from shmio.layout.model import Layout, Register
 from shmio.segment import Quality, Segment
 from shmio.wire import simlog_v1_pb2 as wire
+from shmio.wire import simlog_v2_pb2 as v2
 from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
+from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as SimlogV2Stub
 
 WRITER = 4
 LAYOUT = Layout(
@@ -64,6 +67,7 @@ class Endpoint:
         self.port = port
         self.channel = grpc.aio.insecure_channel(f"127.0.0.1:{port}")
         self.stub: Any = SimlogAPIStub(self.channel)  # type: ignore[no-untyped-call]
+        self.v2: Any = SimlogV2Stub(self.channel)  # type: ignore[no-untyped-call]
         self.cycle = 0
 
     def publish(self, raw: bytes, quality: Quality = Quality.GOOD) -> None:
@@ -72,6 +76,17 @@ class Endpoint:
 
     def subscribe(self, path: str) -> Any:
         return self.stub.Subscribe(wire.TopicDescriptor(path=path), timeout=TIMEOUT_S)
+
+    async def subscriber(self, uuid: str, *paths: str) -> Any:
+        """A stream of version 2 that has subscribed to these."""
+        stream = self.v2.CreateSubscriber(v2.Subscriber(name="test", uuid=uuid), timeout=TIMEOUT_S)
+        await stream.initial_metadata()
+        for path in paths:
+            await self.add(uuid, path)
+        return stream
+
+    async def add(self, uuid: str, path: str) -> None:
+        await self.v2.Subscribe(v2.SubscriptionRequest(path=path, subscriberUUID=uuid), timeout=TIMEOUT_S)
 
     async def health(self, service: str) -> int:
         stub: Any = health_pb2_grpc.HealthStub(self.channel)
@@ -125,11 +140,26 @@ async def value(stream: Any) -> str:
     return str(message.value)
 
 
-async def code(call: Any) -> grpc.StatusCode:
+async def message(stream: Any) -> tuple[str, Any]:
+    """Path and value of version 2's next message; lists and structures as Python's."""
+    got = await asyncio.wait_for(stream.read(), TIMEOUT_S)
+    assert got is not grpc.aio.EOF
+    return got.header.path, plain(got.value)
+
+
+def plain(value: Any) -> Any:
+    return MessageToDict(value)
+
+
+async def refusal(call: Any) -> tuple[grpc.StatusCode, str]:
+    """Status and message with which a call ends."""
     with pytest.raises(grpc.aio.AioRpcError) as caught:
         await call
-    found: grpc.StatusCode = caught.value.code()
-    return found
+    return caught.value.code(), str(caught.value.details())
+
+
+async def code(call: Any) -> grpc.StatusCode:
+    return (await refusal(call))[0]
 
 
 async def listening(served: Endpoint, streams: int) -> bool:
