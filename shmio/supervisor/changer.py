@@ -15,14 +15,17 @@ from shmio.supervisor.fleet import Fleet
 from shmio.supervisor.managed import brief, log
 from shmio.supervisor.notify import Notifier
 from shmio.supervisor.plan import Plan
+from shmio.supervisor.policy import Limits
 from shmio.supervisor.reconcile import refusal
 
 
 class _Planning:
-    """A plan in the making: to compile a big layout takes seconds."""
+    """A plan in the making: to compile a big layout takes seconds, and a file system may hang."""
 
-    def __init__(self, replan: Callable[[], Plan]) -> None:
+    def __init__(self, replan: Callable[[], Plan], limit_s: float) -> None:
         self.read_ns = time.time_ns()
+        self.limit_s = limit_s
+        self._deadline = time.monotonic() + limit_s
         self._plan: Plan | None = None
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, args=(replan,), name="plan", daemon=True)
@@ -38,8 +41,18 @@ class _Planning:
     def over(self) -> bool:
         return not self._thread.is_alive()
 
+    @property
+    def late(self) -> bool:
+        """Whether it has had its time. A thread cannot be ended: its result, if there ever is one, is lost."""
+        return not self.over and time.monotonic() >= self._deadline
+
     def result(self) -> Plan:
         """The plan, or what went wrong."""
+        if not self.over:
+            raise ShmioError(
+                f"what the configuration names could not be read within {self.limit_s:g} s, and nothing is changed: "
+                "see whether a file system hangs, and reload again"
+            )
         if self._plan is None:
             raise self._error or RuntimeError("there is no plan")
         return self._plan
@@ -49,7 +62,13 @@ class Changer:
     """The change of an instance that is under way, if any, and the plan that it follows by now."""
 
     def __init__(
-        self, fleet: Fleet, segment: Segment, notifier: Notifier, plan: Plan, replan: Callable[[], Plan]
+        self,
+        fleet: Fleet,
+        segment: Segment,
+        notifier: Notifier,
+        plan: Plan,
+        replan: Callable[[], Plan],
+        limits: Limits,
     ) -> None:
         self.plan = plan
         self.read_ns = time.time_ns()
@@ -58,6 +77,7 @@ class Changer:
         self._segment = segment
         self._notifier = notifier
         self._replan = replan
+        self._limits = limits
         self._planning: _Planning | None = None
         self._change: Change | None = None
         self._answer: Answer | None = None
@@ -66,11 +86,6 @@ class Changer:
     def under_way(self) -> bool:
         """Whether processes and blocks are being changed."""
         return self._change is not None
-
-    @property
-    def planning(self) -> bool:
-        """Whether a reload is being planned; nothing has changed yet."""
-        return self._planning is not None
 
     def busy(self) -> str | None:
         """Why nothing else can be changed at present."""
@@ -91,7 +106,7 @@ class Changer:
             answer.error(reason)
             return
         self._notifier.reloading()
-        self._planning, self._answer = _Planning(self._replan), answer
+        self._planning, self._answer = _Planning(self._replan, self._limits.plan_s), answer
 
     def drop(self) -> None:
         """Give up what is under way, for all is to stop."""
@@ -101,7 +116,7 @@ class Changer:
 
     def step(self) -> None:
         """Do what can be done now."""
-        if self._planning is not None and self._planning.over:
+        if self._planning is not None and (self._planning.over or self._planning.late):
             planning, self._planning = self._planning, None
             self._begin(planning)
         if self._change is not None:

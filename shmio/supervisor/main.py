@@ -90,7 +90,7 @@ class Supervisor:
             self._control = ControlServer(path, self._selector, self._handle)
             stack.callback(self._control.close)
             self._fleet = Fleet(self._segment, self._selector, self._limits, self._modules)
-            self._changer = Changer(self._fleet, self._segment, self._notifier, self._plan, self._replan)
+            self._changer = Changer(self._fleet, self._segment, self._notifier, self._plan, self._replan, self._limits)
             if found:  # until all of it is ours, a failure leaves it for the next attempt
                 for slot, child in found.children:
                     self._fleet.adopt(self._fleet.named(slot.name), child)
@@ -183,7 +183,7 @@ class Supervisor:
 
     def _pause_s(self) -> float:
         starting = any(m.life.state is State.STARTING for m in self._fleet)
-        return START_TICK_S if starting or self._changer.planning else TICK_S
+        return START_TICK_S if starting else TICK_S
 
     def _tick(self) -> bool:
         """Look at everything once; True when all is stopped."""

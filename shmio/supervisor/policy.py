@@ -33,6 +33,8 @@ class Limits:
     """Crashes of a process that never ran, after which the start of the instance has failed."""
     settle_s: float = 3.0
     """Time for the sources' first frames before the instance's start counts as over."""
+    plan_s: float = 60.0
+    """For a reload to read the configuration and all that it names."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import stat
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -67,10 +69,17 @@ def compile_files(paths: Iterable[Path], key: str = "") -> compiler.Compiled:
 def _read(path: Path, key: str) -> compiler.Source:
     """Read a source; a little more than allowed is enough for the compiler to refuse it."""
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", opener=_open_at_once) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise ConfigError(f"{key}{path}: no regular file; name the file of a data block")
             return compiler.Source(str(path), file.read(MAX_SOURCE_BYTES + 4))
     except OSError as error:
         raise ConfigError(f"{key}{path}: {error.strerror}") from None
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    """Open without waiting for a writer, as a FIFO would have it."""
+    return os.open(path, flags | os.O_NONBLOCK)
 
 
 def summarize(warnings: Iterable[Diagnostic]) -> list[str]:

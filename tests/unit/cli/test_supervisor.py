@@ -281,6 +281,9 @@ def test_faults_of_a_layout_have_their_place(example: Edit, capsys: pytest.Captu
     Path("db201.db").unlink()
     assert main(["check"]) == 1
     assert "db201.db: No such file or directory" in capsys.readouterr().err
+    os.mkfifo("db201.db")
+    assert main(["check"]) == 1
+    assert "db201.db: no regular file; name the file of a data block" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

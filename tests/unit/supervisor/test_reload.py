@@ -297,6 +297,20 @@ def test_a_stop_does_not_wait_for_a_plan(launch: Launch) -> None:
     assert outcomes == ["the instance is stopping"]
 
 
+def test_a_plan_that_does_not_come_is_given_up_and_another_one_made(launch: Launch) -> None:
+    cell = launch(plan_s=2)
+    cell.wait_state("running")
+    before = cell.pids()
+    os.mkfifo(cell.folder / "slow")
+    why = "what the configuration names could not be read within 2 s, and nothing is changed"
+    with pytest.raises(ControlError, match=f"^{why}: see whether a file system hangs, and reload again$"):
+        cell.reload([*CELL, PRESS])
+    assert cell.pids() == before
+    (cell.folder / "slow").unlink()
+    assert cell.reload([*CELL, ("robot", "source", ["good"])])["done"] == ["robot: started"]
+    assert cell.stop() == 0
+
+
 def test_a_stop_ends_a_change_under_way(launch: Launch) -> None:
     cell = launch([*CELL, ("press", "source", ["stubborn"])], grace_s=3600)
     cell.wait_state("running")
