@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -40,13 +41,31 @@ def instance_name(arguments: argparse.Namespace) -> str:
     return running[0]
 
 
+def config_option(arguments: argparse.Namespace) -> str | None:
+    """What names the same configuration on another command line: ``-c FILE``, empty for the one that is taken anyway.
+
+    None: the instance was named, or found running, and its configuration is not known.
+    """
+    if getattr(arguments, "instance", None) is not None:
+        return None
+    if arguments.config is not None:
+        return option_for(arguments.config)
+    return "" if DEFAULT_CONFIG.exists() else None
+
+
+def option_for(file: Path) -> str:
+    """What names this configuration on a command line; empty for the one that is taken anyway."""
+    return "" if file == DEFAULT_CONFIG else f"-c {shlex.quote(str(file))}"
+
+
 def open_supervised(name: str) -> Segment:
     """Open the segment of an instance that has a living supervisor; NotRunningError otherwise."""
     segment = Segment.open(name)
     if not segment.supervised:
         segment.close()
         raise NotRunningError(
-            f"the supervisor of instance {name!r} is dead: shmio-supervisor up takes over what it left, down clears it"
+            f"the supervisor of instance {name!r} is dead: shmio-supervisor up takes over what it left, "
+            f"shmio-supervisor down --instance {name} clears it"
         )
     return segment
 

@@ -84,7 +84,8 @@ class Segment:
         except FileNotFoundError:
             running = ", ".join(running_instances()) or "none"
             raise NotRunningError(
-                f"no instance {instance!r} is running (running: {running}); start it with shmio-supervisor up"
+                f"no instance {instance!r} is running (running: {running}); start it with shmio-supervisor up, "
+                "and -c FILE if its configuration is not ./supervisor.toml"
             ) from None
         try:
             if shared.size < HEADER_SIZE:

@@ -7,7 +7,7 @@ import time
 import msgspec
 
 from shmio.errors import NotRunningError, SegmentError
-from shmio.segment import Phase, ProcessSlot, Quality, Segment
+from shmio.segment import Phase, ProcessSlot, Quality, Segment, running_instances
 from shmio.segment import State as InstanceState
 from shmio.supervisor.policy import assess
 
@@ -63,17 +63,24 @@ class InstanceStatus(msgspec.Struct):
         return self.state != str(InstanceState.STOPPED)
 
 
-def read_status(instance: str) -> InstanceStatus:
-    """The status of an instance, running or not. SegmentError: a segment that may not be read."""
+def read_status(instance: str, config: str | None = None) -> InstanceStatus:
+    """The status of an instance, running or not. SegmentError: a segment that may not be read.
+
+    ``config``: what a command line has to say to name its configuration, such as ``-c plc.toml``; empty if nothing,
+    None if that is not known.
+    """
+    up = " ".join(("shmio-supervisor up", "-c FILE" if config is None else config)).rstrip()
+    down = " ".join(("shmio-supervisor down", f"--instance {instance}" if config is None else config)).rstrip()
     try:
         segment = Segment.open(instance)
-    except NotRunningError as error:
-        return InstanceStatus(instance, note=str(error))
+    except NotRunningError:
+        running = ", ".join(running_instances()) or "none"
+        return InstanceStatus(instance, note=f"it is not running (running: {running}); start it with {up}")
     with segment:
-        return _read(segment)
+        return _read(segment, f"{up} takes them over, {down} stops them")
 
 
-def _read(segment: Segment) -> InstanceStatus:
+def _read(segment: Segment, remedy: str) -> InstanceStatus:
     supervised = segment.supervised
     pid, state = segment.supervisor
     now_ns = time.monotonic_ns()
@@ -88,7 +95,7 @@ def _read(segment: Segment) -> InstanceStatus:
         if not any(process.pid for process in processes):
             status.note = "its supervisor died and left the segment; the next up or down clears it"
             return status
-        status.note = "its supervisor is dead, nothing watches the processes; up takes them over, down stops them"
+        status.note = f"its supervisor is dead, nothing watches the processes; {remedy}"
         status.state = str(InstanceState.DEGRADED)
     else:
         status.supervisor = SupervisorStatus(pid, _seconds(now_ns - segment.supervised_since_ns))
@@ -107,7 +114,8 @@ def supervisor_silence(segment: Segment) -> str | None:
     pid = segment.supervisor[0]
     return (
         f"supervisor pid {pid} has shown no sign of life for {silent_s:.0f} s: if it was stopped, kill -CONT {pid} "
-        f"lets it go on; else kill -KILL {pid}, then shmio-supervisor down clears what is left"
+        f"lets it go on; else kill -KILL {pid}, then shmio-supervisor down --instance "
+        f"{segment.instance} clears what is left"
     )
 
 

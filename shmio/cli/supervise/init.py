@@ -14,7 +14,7 @@ from pathlib import Path
 
 from shmio.cli.supervise.layouts import compile_files, summarize
 from shmio.cli.supervise.ports import in_use
-from shmio.cli.target import config_file
+from shmio.cli.target import config_file, option_for
 from shmio.config import Address
 from shmio.config.properties import read_properties
 from shmio.errors import ConfigError
@@ -39,12 +39,9 @@ def execute(arguments: argparse.Namespace) -> int:
     for path in written:
         print(printable(f"wrote {path}"))
     first = f"fill in {' and '.join(missing)} in {file}, then " if missing else ""
-    print(printable(f"next: {first}shmio-supervisor check{_option(file)}, then shmio-supervisor up{_option(file)}"))
+    check, up = (f"shmio-supervisor {verb} {option_for(file)}".rstrip() for verb in ("check", "up"))
+    print(printable(f"next: {first}{check}, then {up}"))
     return 0
-
-
-def _option(file: Path) -> str:
-    return "" if file == Path("supervisor.toml") else f" -c {file}"
 
 
 def _example(file: Path) -> dict[Path, str]:

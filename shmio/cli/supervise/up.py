@@ -19,7 +19,7 @@ from shmio import logs
 from shmio.cli.supervise import logdir
 from shmio.cli.supervise.ports import check_ports
 from shmio.cli.supervise.prepare import Prepared, peer, prepare
-from shmio.cli.target import config_file
+from shmio.cli.target import config_file, option_for
 from shmio.errors import ConfigError, ControlError, ShmioError
 from shmio.logs import printable
 from shmio.segment import PREFIX, State, instances
@@ -43,7 +43,7 @@ def execute(arguments: argparse.Namespace) -> int:
     prepared = prepare(file, arguments.mode)
     for warning in prepared.plan.warnings:
         _say(warning, sys.stderr)
-    return _detach(prepared) if arguments.detach else _foreground(prepared)
+    return _detach(prepared, option_for(file)) if arguments.detach else _foreground(prepared)
 
 
 def _foreground(prepared: Prepared) -> int:
@@ -126,7 +126,7 @@ def _detached(file: Path, mode: str, report: int) -> int:
     return 0
 
 
-def _detach(prepared: Prepared) -> int:
+def _detach(prepared: Prepared, option: str) -> int:
     plan = prepared.plan
     _refuse(plan)
     log_file = plan.log_dir / "supervisor.log"
@@ -159,7 +159,7 @@ def _detach(prepared: Prepared) -> int:
     for line in history:
         _say(line)
     _announce(prepared)
-    _tell_how(plan.instance)
+    _tell_how(plan.instance, option)
     return 0
 
 
@@ -177,13 +177,14 @@ def _await(fd: int, timeout_s: float) -> str:
         answer += data
 
 
-def _tell_how(instance: str) -> None:
+def _tell_how(instance: str, option: str) -> None:
     status = read_status(instance)
     for process in status.processes:
         if isinstance(process, SourceStatus) and process.quality == "bad":
             _say(f"warning: source {process.name} is bad: {process.reason}", sys.stderr)
     pid = status.supervisor.pid if status.supervisor else None
-    _say(f"{status.state}, supervisor pid {pid}; shmio-supervisor down stops it")
+    down = f"shmio-supervisor down {option}".rstrip()
+    _say(f"{status.state}, supervisor pid {pid}; {down} stops it")
 
 
 class _Console(logging.Formatter):

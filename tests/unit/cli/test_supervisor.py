@@ -508,3 +508,12 @@ def test_down_clears_a_segment_that_was_never_finished(
     assert main(["down", "--instance", instance]) == 0
     assert f"removed the left-over segment shmio-{instance}" in capsys.readouterr().out
     assert not left.exists()
+
+
+def test_hints_name_the_configuration_as_it_has_to_be_typed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "my plc.toml"
+    file.write_text('[instance]\nname = "nobody-runs-this"\n')
+    assert main(["status", "-c", str(file)]) == 1
+    assert capsys.readouterr().err.endswith(f"start it with shmio-supervisor up -c '{file}'\n")
+    assert main(["status", "--instance", "nobody-runs-this"]) == 1
+    assert capsys.readouterr().err.endswith("start it with shmio-supervisor up -c FILE\n")

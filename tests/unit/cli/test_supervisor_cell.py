@@ -146,7 +146,10 @@ def test_up_tells_what_it_takes_over_of_a_killed_supervisor(cell: Cell) -> None:
     status = cell.status()
     os.kill(status["supervisor"]["pid"], signal.SIGKILL)
     cell.until(lambda: cell.status()["supervisor"] is None)
-    assert "up takes them over, down stops them" in cell.run("status", status=0).stdout
+    ours = "shmio-supervisor up takes them over, shmio-supervisor down stops them"
+    assert ours in cell.run("status", status=0).stdout
+    named = f"shmio-supervisor up -c FILE takes them over, shmio-supervisor down --instance {cell.instance} stops them"
+    assert named in cell.run("status", "--instance", cell.instance, status=0).stdout
     lines = cell.run("up", "--detach", status=0).stdout
     for process in status["processes"]:
         assert f"took over {process['name']}, pid {process['pid']}, which had lost its supervisor\n" in lines
