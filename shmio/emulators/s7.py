@@ -43,6 +43,7 @@ _SEND_TIMEOUT_S = 5
 _KEEPALIVE = {socket.TCP_KEEPIDLE: 30, socket.TCP_KEEPINTVL: 10, socket.TCP_KEEPCNT: 3}
 """In s: a client whose host is gone gives its place back within a minute."""
 _SERVICES = (b"P_PROGRAM", b"_MODU", b"_GARB")  # start; and what a block that lives in memory alone has done already
+_SERVICE_ARGUMENT = 8  # where, in the parameters, a job for a service has the length of what the service is given
 _MODE_LIST = 0x0424
 _RUN, _STOP = 0x08, 0x04  # operating modes in that list
 _JOIN_TIMEOUT_S = 10
@@ -234,10 +235,7 @@ class S7Server(Server):
         if (
             kind == S7PDUType.USERDATA
             or (kind, function) == (S7PDUType.REQUEST, S7Function.PLC_STOP)
-            or (
-                (kind, function) == (S7PDUType.REQUEST, S7Function.PLC_CONTROL)
-                and any(service in request_data for service in _SERVICES)  # python-snap7 takes any other for a start
-            )
+            or ((kind, function) == (S7PDUType.REQUEST, S7Function.PLC_CONTROL) and _is_served(request_data))
         ):
             return super()._process_request(request_data, client_address)
         if kind == S7PDUType.REQUEST:
@@ -252,3 +250,18 @@ class S7Server(Server):
         mode, before = (_RUN, _STOP) if self.cpu_state == CPUState.RUN else (_STOP, _RUN)
         record = struct.pack(">HBB16x", 0x4302 if mode == _RUN else 0x4303, 0xFF, before << 4 | mode)
         return struct.pack(">HH", len(record), 1) + record
+
+
+def _is_served(job: bytes) -> bool:
+    """Whether a PLC control job is for one of ``_SERVICES``.
+
+    Its parameters, as Wireshark's S7 dissector has them: function and 7 bytes; two bytes of length and the argument;
+    one of length and the service's name. Python-snap7 looks for names anywhere in them and takes what has none for a
+    start; so no other name may be there.
+    """
+    parameters = job[10 : 10 + int.from_bytes(job[6:8], "big")]
+    argument_size = int.from_bytes(parameters[_SERVICE_ARGUMENT : _SERVICE_ARGUMENT + 2], "big")
+    name = parameters[_SERVICE_ARGUMENT + 2 + argument_size :]
+    return any(name == bytes((len(service),)) + service for service in _SERVICES) and (
+        sum(service in parameters for service in _SERVICES) == 1
+    )

@@ -110,6 +110,30 @@ def test_only_a_start_starts(client: snap7.Client, server: S7Server) -> None:
     assert server.get_status()[1] == "Run"
 
 
+@pytest.mark.parametrize(
+    ("parameters", "data"),
+    [
+        (b"\x00\x00\x05_DELE", b"_MODU"),
+        (b"\x00\x05_MODU\x05_DELE", b""),
+        (b"\x00\x09P_PROGRAM\x05_MODU", b""),  # python-snap7 would start
+        (b"\x00\x00\x04_MODU", b""),
+        (b"\x00\x00\x09_MODU", b""),
+        (b"\xff\xff\x05_MODU", b""),
+    ],
+    ids=["in the data", "in the argument", "a second one", "too short", "too long", "beyond the end"],
+)
+def test_a_service_is_read_at_its_place(client: snap7.Client, server: S7Server, parameters: bytes, data: bytes) -> None:
+    client.plc_stop()
+    block = bytes.fromhex("28 000000000000fd") + parameters
+    job = bytes.fromhex("32 01 0000 0001") + len(block).to_bytes(2, "big") + len(data).to_bytes(2, "big") + block + data
+    with socket.create_connection(tuple_of(server)) as peer, peer.makefile("rb") as stream:
+        peer.settimeout(10)
+        peer.sendall(SESSION + b"\x03\x00" + (len(job) + 7).to_bytes(2, "big") + b"\x02\xf0\x80" + job)
+        stream.read(22)
+        assert stream.read(19)[-2:] == b"\x81\x04"
+    assert server.get_status()[1] == "Stop"
+
+
 def test_tells_its_operating_mode(client: snap7.Client) -> None:
     """SZL 0x0424: one record of 20 bytes, in its fourth byte the mode now and before."""
 
