@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from tomllib import TOMLDecodeError
 from typing import Any
 
 from msgspec import ValidationError
@@ -46,6 +47,8 @@ def _types(match: re.Match[str]) -> str:
 
 def explain_toml(error: Exception, text: str) -> str:
     """The parser's message, the line it is about, and what to write instead where that is a frequent slip."""
+    if isinstance(error, ValueError) and not isinstance(error, TOMLDecodeError):  # int() takes no more of them
+        return "a number in it has too many digits"
     place = _PLACE.search(str(error))
     if place is None:
         return str(error)

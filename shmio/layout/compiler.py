@@ -54,7 +54,7 @@ def compile_sources(sources: Sequence[Source]) -> Compiled:
     for source in sources:
         if source.file.endswith(tags.SUFFIX):
             if len(sources) == 1:
-                return Compiled((tags.compile_tags(source.file, source.text),), ())
+                return Compiled((tags.compile_tags(source.file, source.text, report),), tuple(report.warnings))
             report.add(Diagnostic(source.file, 1, 1, "a tag table stands alone, not together with other files"))
             report.raise_errors()
     layouts: list[Layout] = []

@@ -134,10 +134,10 @@ def _register(item: _Register) -> Register:
     if (item.bit is None) != (element.base != "BOOL") or (dims and item.bit):
         raise LayoutError(f"layout: {item.path!r} has a bit that is not its type's")
     try:
-        canonical = canonical_path(item.path) == item.path
-    except PathError:
-        canonical = False
-    if not canonical:
+        path = canonical_path(item.path)
+    except PathError as error:
+        raise LayoutError(f"layout: {error}") from None
+    if path != item.path:
         raise LayoutError(f"layout: {item.path!r} is not a path in its canonical form")
     return Register(
         item.path, item.type, dims, item.offset, item.bit, item.size, item.count, item.comment, item.initial

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
+from bisect import bisect_left
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -94,29 +95,30 @@ class Layout:
         return {register.path: index for index, register in enumerate(self.registers)}
 
     @cached_property
-    def in_any_case(self) -> Mapping[str, str]:
-        """Paths of registers and structures by themselves in lower case."""
-        return {path.lower(): path for path in (*self._below, *self.by_path)}
-
-    @cached_property
     def hash(self) -> bytes:
         """SHA-256 of the canonical JSON: equal for equal layouts."""
         return hashlib.sha256(self.to_json()).digest()
 
+    # Structures are ranges of sorted paths: a table of all structures' paths could be far larger than the layout.
     @cached_property
-    def _below(self) -> Mapping[str, tuple[int, ...]]:
-        below: dict[str, list[int]] = {}
-        for index, register in enumerate(self.registers):
-            path = register.path
-            slash = path.find("/")
-            while slash >= 0:
-                below.setdefault(path[:slash], []).append(index)
-                slash = path.find("/", slash + 1)
-        return {prefix: tuple(indices) for prefix, indices in below.items()}
+    def _sorted(self) -> _Sorted:
+        return _Sorted(register.path for register in self.registers)
+
+    @cached_property
+    def _sorted_in_lower_case(self) -> _Sorted:
+        return _Sorted(register.path.lower() for register in self.registers)
 
     def members(self, prefix: str) -> tuple[int, ...]:
         """Return the indices of the registers below a struct or an array of structs, ``()`` if none."""
-        return self._below.get(prefix, ())
+        return self._sorted.below(prefix)
+
+    def in_any_case(self, path: str) -> str | None:
+        """Return the path of a register or structure that is this one in some case, None if there is none."""
+        wanted = path.lower()
+        at = self._sorted_in_lower_case.first(wanted)
+        if at is None:
+            return None
+        return "/".join(self.registers[at].path.split("/")[: wanted.count("/") + 1])
 
     def element(self, register: Register, index: tuple[int, ...]) -> Register:
         """Return one element of an array register as a scalar register, its path ending in the index.
@@ -162,6 +164,28 @@ class Layout:
         from shmio.layout.document import load  # noqa: PLC0415
 
         return load(data)
+
+
+class _Sorted:
+    """Paths in order, with their places in the layout: all below a structure stand together."""
+
+    def __init__(self, paths: Iterable[str]) -> None:
+        ordered = sorted((path, index) for index, path in enumerate(paths))
+        self._paths = [path for path, _ in ordered]
+        self._indices = [index for _, index in ordered]
+
+    def below(self, prefix: str) -> tuple[int, ...]:
+        """The indices of the paths below the prefix, ascending."""
+        start = bisect_left(self._paths, f"{prefix}/")
+        stop = bisect_left(self._paths, f"{prefix}0", start)  # "0" follows "/" in Unicode
+        return tuple(sorted(self._indices[start:stop]))
+
+    def first(self, path: str) -> int | None:
+        """The index of the path, or else of the first one below it."""
+        for at in (bisect_left(self._paths, path), bisect_left(self._paths, f"{path}/")):
+            if at < len(self._paths) and f"{self._paths[at]}/".startswith(f"{path}/"):
+                return self._indices[at]
+        return None
 
 
 def element_position(element: ElementType, shape: tuple[int, ...], flat: int) -> tuple[int, int | None]:

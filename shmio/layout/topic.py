@@ -15,11 +15,12 @@ from typing import Literal, cast
 
 from shmio.config import RESERVED_SOURCES
 from shmio.errors import PathError
-from shmio.layout.model import Layout, Register
+from shmio.layout.model import MAX_DEPTH, MAX_DIMENSIONS, Layout, Register
 
 Direction = Literal["in", "out"]
 
 MAX_TOPIC = 16_384
+MAX_SEGMENTS = MAX_DEPTH * (1 + MAX_DIMENSIONS)  # names, each with its indices
 _NEAR_CANDIDATES = 500
 _NEAR_CHARACTERS = 200
 _SOURCES_SHOWN = 4
@@ -28,6 +29,7 @@ _SCHEME = re.compile(r"([^/:]+)://")
 _INDEX = re.compile(r"0|-?[1-9][0-9]{0,9}")
 _ESCAPE = re.compile(r"%([0-9A-Fa-f]{2})?")
 _RESERVED = re.compile(r"[/%+#]")
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,12 +81,18 @@ def decode_segment(segment: str) -> str:
 def canonical_path(path: str) -> str:
     """Return a path with each segment in its one canonical encoding.
 
-    Raises PathError: an empty segment or a wrong percent-encoding.
+    Raises PathError: an empty segment, a wrong percent-encoding, control characters, which no name has, or more
+    segments than the deepest layout has.
     """
-    segments = path.split("/")
+    segments = path.split("/", MAX_SEGMENTS)
+    if len(segments) > MAX_SEGMENTS:
+        raise PathError(f"{shorten(path)}: a path has at most {MAX_SEGMENTS} segments")
     if "" in segments:
         raise PathError(f"{shorten(path)}: empty segment in the path")
-    return "/".join(encode_segment(decode_segment(segment)) for segment in segments)
+    canonical = "/".join(encode_segment(decode_segment(segment)) for segment in segments)
+    if _CONTROL.search(canonical):
+        raise PathError(f"{shorten(path)!r}: a path must not hold control characters")
+    return canonical
 
 
 def parse_topic(text: str, sources: Collection[str], default: str | None) -> Topic:
@@ -186,14 +194,14 @@ def _unknown(layout: Layout, path: str) -> str:
 
 def _near(layout: Layout, path: str) -> list[str]:
     """Up to three paths of registers, elements or structures that are like this one, whatever the case."""
-    paths, wanted = layout.in_any_case, path[:_NEAR_CHARACTERS].lower()
+    wanted = path[:_NEAR_CHARACTERS].lower()
     head, indices = wanted, ""
-    while not (same := paths.get(head)) and _INDEX.fullmatch(last := head.rpartition("/")[2]):
+    while not (same := layout.in_any_case(head)) and _INDEX.fullmatch(last := head.rpartition("/")[2]):
         head, indices = head.removesuffix(last).removesuffix("/"), f"/{last}{indices}"
     if same and (not indices or (same in layout.by_path and layout.registers[layout.by_path[same]].dims)):
         return [f"{same}{indices}"]
     known = wanted
-    while known and not (below := layout.members(paths.get(known, ""))):
+    while known and not (below := layout.members(layout.in_any_case(known) or "")):
         known = known.rpartition("/")[0]
     names: dict[str, None] = {}
     for index in below if known else range(len(layout.registers)):
@@ -203,7 +211,8 @@ def _near(layout: Layout, path: str) -> list[str]:
             name = name.rpartition("/")[0]
         if len(names) >= _NEAR_CANDIDATES:
             break
-    return [paths[name] for name in difflib.get_close_matches(wanted, names, n=3)]
+    near = difflib.get_close_matches(wanted, names, n=3)
+    return [written for name in near if (written := layout.in_any_case(name))]
 
 
 def _where_it_ends(layout: Layout, path: str) -> tuple[str, str, list[str]]:

@@ -77,6 +77,8 @@ REGISTER_CHANGES: list[tuple[int, str, Any]] = [
     (0, "path", "in"),
     (0, "path", "a%2fb"),
     (0, "path", "x" * 20_000),
+    (0, "path", "/".join("a" * 225)),
+    (0, "path", "a\nb"),
     (1, "path", "a"),  # twice
     (0, "type", "Bool"),
     (0, "type", "TOD"),

@@ -85,13 +85,49 @@ WRONG = {
     "[registers]\n'a/b' = 'INT'\na = 'INT'": "a is a value itself",
     "[registers]\n'a.b' = 'INT'\n'a%2Eb' = 'INT'": "it is there twice",
     "[registers]\na = { type = 'INT', initial = 40000 }": "cell.toml:2:1: error: a: ",
-    "[registers]\na = { type = 'INT', start = 4 }": "start",
+    "[registers]\na = { type = 'INT', start = 4 }": "a: there is no 'start' here, only type, initial, comment",
+    "[registers]\nb = 'INT'\na = { initial = 4 }": "cell.toml:3:1: error: a: type: this key is needed",
+    f"[registers]\na = {'9' * 5000}": "cell.toml:2:1: error: a number in it has too many digits",
+    f"[registers]\na = {{ type = 'INT', initial = 0x{'f' * 5000} }}": "2:1: error: a: initial: expected a number of",
+    f"[registers]\n'{'/'.join('a' * 225)}' = 'INT'": "a path has at most 224 segments",
+    "[registers]\nb = 'INT'\na = { type = 'ARRAY[1..3] OF INT', initial = [1, 2, 3, 4] }": "3:1: error: a: initial: "
+    "expected at most 3 values, found more",
+    "[registers]\na = { type = 'ARRAY[1..3] OF INT', initial = '1, 3(2)' }": "expected at most 3 values, found more",
+    "[registers]\na = { type = 'ARRAY[0..1, 0..1] OF INT', initial = [1, 2, 3, 4, 5] }": "expected at most 4 values",
+    "[registers]\nb = 'INT'\na = { type = 'ARRAY[0..1, 0..1] OF INT', initial = [[1, 2], [3]] }": "3:1: error: a: "
+    "initial: expected one list",
+    '[registers]\nb = "INT"\n"a\\u0000b" = "INT"': r"3:1: error: a\x00b: 'a\x00b': a path must not hold control",
+    '[registers]\nb = "INT"\n"a\\nb" = "INT"': r"cell.toml:3:1: error: a\nb: 'a\nb': a path must not hold control",
+    "[registers]\n'a%0Ab' = 'INT'": "cell.toml:2:1: error: a%0Ab: 'a%0Ab': a path must not hold control",
+    "[registers]\na = 'INT'\nb = 'INT'\na = 'INT'": "cell.toml:4:1: error: a: it is there twice",
+    "[registers]\n'b/c' = 'INT'\n'b/c' = { type = 'ARRAY[1..2] OF INT', initial = [\n1,\n2] }\nd = 'INT'": "cell.toml"
+    ":3:1: error: 'b/c': it is there twice",
+    "[registers]\na = 'INT'\na.b = 'INT'\n": "3:1: error: a.b: it is there twice; a path with a dot is written in",
+    "[registers]\nab = 'INT'\na.b = 'INT'": "3:1: error: a: there is no 'b' here, only type, initial, comment; "
+    'a path with a dot is written in quotes, "a.b"',
+    "[registers]\na/b = 'INT'": "a path is written in quotes",
+    "name = 'a'\n[registers]\nb = 'INT'\n[registers.name]\ntype = 'INTEGER'": "4:1: error: name: there is no type",
 }
 
 
 @pytest.mark.parametrize("text", WRONG)
 def test_what_is_wrong_is_named(text: str) -> None:
     assert WRONG[text] in refusal(text)
+
+
+def test_an_array_of_several_dimensions_takes_one_list() -> None:
+    layout = compiled("[registers]\na = { type = 'ARRAY[0..1, 0..2] OF INT', initial = [1, 2, 3, 4, 5, 6] }")
+    frame, _ = initial_frame(layout)
+    assert codec(layout.registers[0], "little").decode(bytes(frame)) == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_paths_that_differ_in_case_only_are_warned_of() -> None:
+    text = "[registers]\n'a/Pos' = 'INT'\nb = 'INT'\n'A/pos' = 'INT'"
+    found = compile_sources([Source("cell.toml", text.encode())])
+    assert [register.path for register in found.layouts[0].registers] == ["a/Pos", "b", "A/pos"]
+    assert [str(warning) for warning in found.warnings] == [
+        "cell.toml:4:1: warning: A/pos: only the case of letters tells it from a/Pos"
+    ]
 
 
 def test_what_is_no_text_is_refused() -> None:
