@@ -22,6 +22,8 @@ from shmio.segment import Block, Segment
 
 MAX_FILES: Final = 256
 """How many recordings, the newest by their names first, are looked at."""
+ABOUT_BYTES: Final = 1 << 20
+"""What a recorder says of the instance is its file's second record: far before this byte."""
 
 log = logging.getLogger("shmio.recorder")
 
@@ -33,10 +35,11 @@ def places(directory: Path, segment: Segment, by: str, beat: Callable[[], object
     """
     found: dict[int, Place] = {}
     blocks = {block.section: block for block in (*segment.ended, *segment.blocks.values())}
-    for file in _of_this_run(directory, segment, by):
+    for file in _of_this_run(directory, segment, by, beat):
+        beat()
         try:
-            with Reader(file, own=True) as reader:
-                found = _places(reader, blocks, beat) | found
+            with Reader(file, own=True, beat=beat) as reader:
+                found = _places(reader, blocks) | found
         except (OSError, RecordingError) as error:
             log.warning("it is not known where the recording before ended: %s", error)
             continue
@@ -45,15 +48,16 @@ def places(directory: Path, segment: Segment, by: str, beat: Callable[[], object
     return found
 
 
-def _of_this_run(directory: Path, segment: Segment, by: str) -> list[Path]:
+def _of_this_run(directory: Path, segment: Segment, by: str, beat: Callable[[], object]) -> list[Path]:
     """The recordings of this run, the newest first; not by name, for the host's clock may go back."""
     run = {"instance": segment.instance, "epoch": f"{segment.header.epoch:016x}", "recorder": by}
     found: list[tuple[int, Path]] = []
     name = re.compile(rf"{re.escape(segment.instance)}-\d{{8}}T\d{{6}}Z(_\d+)?{re.escape(SUFFIX)}")  # not of a50-test
     files = [file for file in directory.glob(f"{segment.instance}-*{SUFFIX}") if name.fullmatch(file.name)]
     for file in sorted(_own(files), reverse=True)[:MAX_FILES]:
+        beat()
         try:
-            with Reader(file, own=True) as reader:
+            with Reader(file, own=True, beat=beat) as reader:
                 about = _about(reader)
             if about.items() >= run.items():
                 found.append((int(about["recording_ns"]), file))
@@ -79,7 +83,7 @@ def _own(files: list[Path]) -> list[Path]:
 
 def _about(reader: Reader) -> dict[str, str]:
     """What the recorder said of the instance, at the very beginning."""
-    for record in reader.records.walk():
+    for record in reader.records.walk(to=ABOUT_BYTES):
         if record.opcode == Opcode.METADATA:
             reader.note(record)
         if record.opcode == Opcode.CHUNK or reader.about:
@@ -87,9 +91,9 @@ def _about(reader: Reader) -> dict[str, str]:
     return reader.about
 
 
-def _places(reader: Reader, blocks: dict[int, Block], beat: Callable[[], object]) -> dict[int, Place]:
-    """Where a file ends: where it began, if nothing came of a block."""
-    found = survey(reader, beat)
+def _places(reader: Reader, blocks: dict[int, Block]) -> dict[int, Place]:
+    """Where a file ends: where it began, if nothing came of a block, or its last chunk is damaged."""
+    found = survey(reader)
     places = {section: place for section, place in reader.places.items() if section in blocks}
     for channel in reader.channels.values():
         block = blocks.get(channel.section)
@@ -97,7 +101,13 @@ def _places(reader: Reader, blocks: dict[int, Block], beat: Callable[[], object]
             continue
         what = "frames" if channel.encoding == FRAME else "events"
         track = found.tracks.get(channel.number)
-        number = track.numbers(reader)[1] if track else channel.after
+        number = channel.after
+        if track:
+            try:
+                number = track.last(reader)
+            except RecordingError as error:
+                log.warning("where the recording before ended is known from its beginning only: %s", error)
+                track = None
         number = max(number, found.missed_to.get((channel.source, channel.block, what), 0))
         frame, event, log_ns = places.get(channel.section, Place())
         log_ns = max(log_ns, track.last_ns if track else 0)

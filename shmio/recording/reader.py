@@ -72,10 +72,10 @@ class Reader:
     OSError, RecordingError: it cannot be opened, or is no recording.
     """
 
-    def __init__(self, file: Path, *, own: bool = False) -> None:
-        """``own``: refuse what is no regular file of this user."""
+    def __init__(self, file: Path, *, own: bool = False, beat: Callable[[], object] = lambda: None) -> None:
+        """``own``: refuse what is no regular file of this user. ``beat`` is called now and then while it is read."""
         self.file = file
-        self.records = Records(file, own=own)
+        self.records = Records(file, own=own, beat=beat)
         self.about: dict[str, str] = {}
         """What the recorder said of the instance."""
         self.places: dict[int, Place] = {}
@@ -83,6 +83,8 @@ class Reader:
         self.complete = False
         """Whether all channels are known, from a walk through the whole file."""
         self.channels: dict[int, Channel] = {}
+        self.summary_damage = ""
+        """The first record of the summary that was needed and could not be read."""
         self.attachments: dict[str, AttachmentEntry] = {}
         self._layouts: dict[str, Layout] = {}
         self._layout_bytes = 0
@@ -169,12 +171,18 @@ class Reader:
             raise RecordingError(f"{self.file}: messages of channel {unknown}, which is not described")
 
     def channel(self, number: int) -> Channel | None:
-        """A channel by its number; if the chunk that describes it is damaged, from the summary of a closed file."""
+        """A channel by its number; if the chunk that describes it is damaged, from the summary of a closed file.
+
+        What is damaged there costs no other channel: :attr:`summary_damage`.
+        """
         if number not in self.channels and not self._summarized:
             self._summarized = True
             for record in self.records.summary():
                 if record.opcode == Opcode.CHANNEL:
-                    self._channel(memoryview(self.records.read(record.at, record.size)))
+                    try:
+                        self._channel(memoryview(self.records.read(record.at, record.size)))
+                    except RecordingError as error:
+                        self.summary_damage = self.summary_damage or f"{error} (byte {record.at}, in the index)"
         return self.channels.get(number)
 
     def decode(self, channel: Channel, data: memoryview) -> Frame | Event | Gap:

@@ -12,7 +12,7 @@ import re
 import stat
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
@@ -33,6 +33,8 @@ BROKEN: Final = 0
 """The opcode, which no record of MCAP has, of bytes that make no sense."""
 LOOK_BYTES: Final = 4096
 """So much at a record's beginning tells how long it is: names of attachments and metadata fit in."""
+BEAT_BYTES: Final = 1 << 20
+"""After so much that was read or unpacked the reader's caller is told that it goes on."""
 
 _HEAD: Final = struct.Struct("<BQ")
 _MARK: Final = re.compile(  # how each chunk and each attachment of ours begins
@@ -60,12 +62,15 @@ class Record(NamedTuple):
 class Records:
     """A file's records. ``closed`` and ``damage`` are known when :meth:`walk` has ended."""
 
-    def __init__(self, file: Path, *, own: bool = False) -> None:
+    def __init__(self, file: Path, *, own: bool = False, beat: Callable[[], object] = lambda: None) -> None:
         """Open; RecordingError for what is no MCAP file. OSError.
 
         ``own``: refuse what is no regular file of this user, a link to one too: nobody else may have made it.
+        ``beat`` is called each BEAT_BYTES of work, whatever the work is: a large file takes a while.
         """
         self.file = file
+        self._beat = beat
+        self._worked_bytes = 0
         self.closed = False
         """Whether the recorder closed it: index and footer are there."""
         self.damage = ""
@@ -90,18 +95,20 @@ class Records:
             )
             raise RecordingError(f"{file} {empty}")
 
-    def walk(self) -> Iterator[Record]:
+    def walk(self, to: int | None = None) -> Iterator[Record]:
         """All records up to the footer; ends where the file ends.
 
+        ``to``: nothing is looked for from this byte on; how the file ends is then not known.
         Bytes that make no sense are one record of opcode BROKEN, up to the next chunk or attachment that is whole, or
         the footer.
         """
         self.closed, self.damage, self._searched = False, "", 0
         at = len(MAGIC)
-        while at < self.size:
+        end = self.size if to is None else min(to, self.size)
+        while at < end:
             record = self._record(at)
             if record is None:
-                goes_on = self._whole(at + 1) or self._footer(at + 1)
+                goes_on = self._whole(at + 1, end) or self._footer(at + 1)
                 if not goes_on:
                     break
                 yield Record(BROKEN, at, goes_on - at)
@@ -147,7 +154,17 @@ class Records:
 
     def _peek(self, at: int, size: int) -> bytes:
         """Some bytes, or as many as there are before the end that the file had when it was opened."""
-        return os.pread(self._fd, max(0, min(size, self.size - at)), at)
+        return self._pread(max(0, min(size, self.size - at)), at)
+
+    def _pread(self, size: int, at: int) -> bytes:
+        self._worked(size)
+        return os.pread(self._fd, size, at)
+
+    def _worked(self, size: int) -> None:
+        self._worked_bytes += size
+        if self._worked_bytes >= BEAT_BYTES:
+            self._worked_bytes = 0
+            self._beat()
 
     def _record(self, at: int) -> Record | None:
         """The record there; None if what is there makes no sense."""
@@ -162,9 +179,9 @@ class Records:
             return None
         return Record(opcode, content, size)
 
-    def _whole(self, at: int) -> int:
-        """Where the next chunk or attachment begins of which all is there, by its CRC; 0: there is none."""
-        for begin in range(at, self.size, _SEARCH_BYTES):
+    def _whole(self, at: int, end: int) -> int:
+        """Where, before ``end``, the next chunk or attachment begins of which all is there, by its CRC; 0: nowhere."""
+        for begin in range(at, end, _SEARCH_BYTES):
             for found in _MARK.finditer(self._peek(begin, _SEARCH_BYTES + _MARK_BYTES - 1)):
                 record = self._record(begin + found.start())
                 if record is not None and record.start < begin + _SEARCH_BYTES:
@@ -188,7 +205,7 @@ class Records:
         """Some bytes; RecordingError: more than the limit, or the file became shorter."""
         if size > limit:
             raise RecordingError(f"{self.file}: a record of {size} bytes at byte {at} is larger than {limit}")
-        data = os.pread(self._fd, size, at)
+        data = self._pread(size, at)
         if len(data) != size:
             raise RecordingError(f"{self.file}: it became shorter while it was read")
         return data
@@ -204,6 +221,7 @@ class Records:
             data = memoryview(unpack(self.read(record.at, record.size, MAX_CHUNK_BYTES)))
         except (ValueError, struct.error, zstandard.ZstdError) as error:
             raise RecordingError(f"{self.file}: the chunk at byte {record.at} is damaged: {error}") from None
+        self._worked(len(data))
         return self._split(record, data)
 
     def check_crc(self, record: Record) -> None:

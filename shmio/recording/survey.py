@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -19,7 +18,6 @@ MAX_GAPS: Final = 1000
 MAX_DAMAGE: Final = 20
 """Damaged places that are told."""
 MAX_BLOCKS: Final = 10_000
-BEAT_CHUNKS: Final = 500
 
 _INDEX: Final = struct.Struct("<HI")  # channel, bytes of the entries
 _ENTRY: Final = struct.Struct("<QQ")  # log time, offset
@@ -48,15 +46,25 @@ class Track:
 
     def numbers(self, reader: Reader) -> tuple[int, int]:
         """Numbers of its first and its last frame or event; RecordingError."""
-        first, last = list(self._in(reader, self.first_in)), list(self._in(reader, self.last_in))
-        if not first or not last:
-            raise RecordingError(f"{reader.file}: {self.channel.topic}: an index names messages that are not there")
-        return first[0], last[-1]
+        return self._in(reader, self.first_in)[0], self.last(reader)
 
-    def _in(self, reader: Reader, chunk: Record) -> Iterator[int]:
-        for channel, _, data in reader.raw(chunk):
-            if channel.number == self.channel.number and len(data) >= _NUMBER.size:
-                yield _NUMBER.unpack_from(data)[0]
+    def last(self, reader: Reader) -> int:
+        """Number of its last frame or event; RecordingError."""
+        return self._in(reader, self.last_in)[-1]
+
+    def _in(self, reader: Reader, chunk: Record) -> list[int]:
+        """Its numbers in a chunk: one at least."""
+        found: list[int] = []
+        try:
+            for channel, _, data in reader.raw(chunk):
+                if channel.number == self.channel.number and len(data) >= _NUMBER.size:
+                    found.append(_NUMBER.unpack_from(data)[0])
+        except RecordingError:
+            if not found:  # otherwise it is messages of other channels that are lost
+                raise
+        if not found:
+            raise RecordingError(f"{reader.file}: {self.channel.topic}: an index names messages that are not there")
+        return found
 
 
 @dataclass(slots=True)
@@ -76,13 +84,9 @@ class Survey:
     """What could not be read."""
 
 
-def survey(reader: Reader, beat: Callable[[], object] = lambda: None) -> Survey:
-    """Walk through the file. RecordingError: it is no recording of ours; damage within it is noted only.
-
-    ``beat`` is called now and then: a long recording takes a while.
-    """
+def survey(reader: Reader) -> Survey:
+    """Walk through the file. RecordingError: it is no recording of ours; damage within it is noted only."""
     found = Survey()
-    chunks = 0
     chunk: Record | None = None
     counts: list[Count] | None = []
     for record in reader.records.walk():
@@ -97,16 +101,15 @@ def survey(reader: Reader, beat: Callable[[], object] = lambda: None) -> Survey:
             chunk = None
         if record.opcode == Opcode.CHUNK:
             chunk, counts = record, []
-            chunks += 1
-            if chunks % BEAT_CHUNKS == 0:
-                beat()
         else:
             try:
                 reader.note(record)
             except RecordingError as error:
-                _damaged(found, error)
+                _damaged(found, str(error))
     if chunk is not None:  # the last of a file that ends here: its indexes may be missing
         _settle(reader, found, chunk, None)
+    if reader.summary_damage:
+        _damaged(found, reader.summary_damage)
     reader.require_ours()
     reader.complete = True
     return found
@@ -137,9 +140,9 @@ def _settle(reader: Reader, found: Survey, chunk: Record, counts: list[Count] | 
             track.last_ns, track.last_in = count.last_ns, chunk
 
 
-def _damaged(found: Survey, error: RecordingError) -> None:
+def _damaged(found: Survey, why: str) -> None:
     if len(found.damage) < MAX_DAMAGE:
-        found.damage.append(str(error))
+        found.damage.append(why)
 
 
 def _must_read(reader: Reader, number: int) -> bool:
@@ -159,7 +162,7 @@ def _read(reader: Reader, found: Survey, chunk: Record) -> list[Count]:
                 if isinstance(item, Gap):
                     _add_gap(found, item)
     except RecordingError as error:
-        _damaged(found, error)
+        _damaged(found, str(error))
     return list(counts.values())
 
 

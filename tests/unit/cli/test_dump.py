@@ -242,6 +242,53 @@ def test_cat_goes_on_behind_a_damaged_chunk_and_says_what_is_lost(damaged: tuple
     assert re.fullmatch(rf"bad\.mem: {WHERE}", line)
 
 
+def test_a_channel_whose_two_descriptions_are_damaged_costs_no_other(
+    segment: Segment, tmp_path: Path, said: Output
+) -> None:
+    """The chunks that describe channels, and of the index that repeats it the first of several."""
+    work = recorder(segment, tmp_path / "two")
+    for turn in range(3):
+        for source in ("cell", "press"):
+            publish(segment.writer(source), 10, first=10 * turn)
+        work.turn()
+        work._writer.flush()
+    assert work.close()
+    content = bytearray(work.output.path.read_bytes())
+    with Reader(work.output.path) as reader:
+        chunks = [record for record in reader.records.walk() if record.opcode == Opcode.CHUNK]
+        describing = {r for r in chunks if any(code == Opcode.CHANNEL for code, _ in reader.records.chunk(r))}
+        lost = next(record for record in reader.records.summary() if record.opcode == Opcode.CHANNEL)
+        list(reader.messages())
+    topic = reader.channels[int.from_bytes(content[lost.at : lost.at + 2], "little")].topic
+    for record in describing:
+        content[record.at + record.size - 1] ^= 1
+    content[lost.at + 7] = 0xFF  # the length of its topic
+    Path("bad.mem").write_bytes(content)
+
+    assert topic.startswith("cell/")
+    assert main(["info", "--json", "bad.mem"]) == 1
+    out, err = said()
+    found = json.loads("\n".join(out))
+    assert err == []
+    assert f"bad.mem: the description of a channel is damaged (byte {lost.at}, in the index)" in found["damage"]
+    assert {block["source"]: block["frames"] for block in found["blocks"]}["press"] > 0
+    assert main(["info", "--check", "bad.mem"]) == 1
+    out, err = said()
+    assert any("press: DB1" in line for line in out)
+    assert any("its checksum is wrong" in line for line in out)
+    assert err == []
+    assert main(["cat", "--json", str(work.output.path)]) == 0
+    whole = objects(said()[0])
+    assert main(["cat", "--json", "bad.mem"]) == 1
+    out, err = said()
+    kind = topic.removeprefix("cell/").removesuffix("s")
+    kept = [line for line in objects(out) if line["source"] == "press"]
+    assert kept == [line for line in whole if line["source"] == "press"][-len(kept) :]
+    assert [line["frame"] for line in kept if "frame" in line][-20:] == list(range(11, 31))
+    assert not any(line["source"] == "cell" and kind in line for line in objects(out))
+    assert any("which is not described" in line for line in err)
+
+
 def test_a_block_without_its_layout_is_told_and_the_others_are_printed(file: str, said: Output) -> None:
     data = Path(file).read_bytes()
     assert data.count(b'"path":"speed"') == 1

@@ -131,6 +131,18 @@ def test_a_wrong_length_costs_no_chunk_but_its_own(file: Path, recording: bytes,
             assert reader.records.closed
 
 
+@pytest.mark.parametrize("field", [0, 8])
+def test_times_of_a_chunk_that_are_not_its_messages_are_told(file: Path, recording: bytes, field: int) -> None:
+    """The start and the end that its header tells; no CRC of its own covers them."""
+    chunk = records(file, Opcode.CHUNK)[1]
+    changed = bytearray(recording)
+    changed[chunk.at + field] ^= 1
+    file.write_bytes(changed)
+    found = found_in(file)
+    assert found.problems == [f"the chunk at byte {chunk.at}: its times are not those of its messages"]
+    assert found.damage == []
+
+
 def test_without_its_layout_a_block_is_checked_as_far_as_can_be(file: Path, recording: bytes) -> None:
     record = records(file, Opcode.ATTACHMENT)[-1]
     changed = bytearray(recording)
