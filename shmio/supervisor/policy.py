@@ -54,6 +54,8 @@ class Life:
     """Whether it has been running at any time."""
     note: str = ""
     """Why it is not running."""
+    hang: str = ""
+    """Why it was last killed as one that hangs; its end is told together with this."""
     killed: bool = False
     """Whether it was sent SIGKILL, and has not ended yet."""
     stuck: bool = False
@@ -73,7 +75,9 @@ def step(life: Life, event: Event, now_ns: int, limits: Limits, note: str = "") 
     state, action = edge
     killed = action is Action.KILL or (life.killed and event not in (Event.EXIT, Event.REFUSAL))
     stuck = killed and (life.stuck or (life.killed and event is Event.ELAPSED))
-    told = (note or life.note) if stuck else _note(life, state, limits, note)
+    if state is State.HUNG and life.state is not State.HUNG:
+        life = replace(life, hang=_hang(life, limits))
+    told = (note or life.note) if stuck else _note(life, state, note)
     crashes = _crashes(life, event, state, now_ns, limits)
     life = replace(life, crashes=crashes, note=told, killed=killed, stuck=stuck)
     if action is Action.SPAWN:
@@ -94,12 +98,16 @@ def _crashes(life: Life, event: Event, to: State, now_ns: int, limits: Limits) -
     return 1 if stable else life.crashes + 1
 
 
-def _note(life: Life, to: State, limits: Limits, note: str) -> str:
+def _hang(life: Life, limits: Limits) -> str:
+    late = life.state is State.STARTING
+    return f"not running {limits.start_s:g} s after its start" if late else f"no heartbeat for {limits.hang_s:g} s"
+
+
+def _note(life: Life, to: State, note: str) -> str:
     if to is State.HUNG:
-        late = life.state is State.STARTING
-        return f"not running {limits.start_s:g} s after its start" if late else f"no heartbeat for {limits.hang_s:g} s"
+        return life.hang
     if to is State.BACKOFF and life.state is State.HUNG:
-        return f"{life.note}, {note}"
+        return f"{life.hang}, {note}"
     if to in (State.BACKOFF, State.FATAL):
         return note
     return {State.STOPPING: "stopping", State.RESTARTING: "restarting"}.get(to, "")

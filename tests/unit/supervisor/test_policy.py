@@ -190,6 +190,24 @@ def test_a_process_that_sigkill_does_not_end_is_stuck_until_it_ends(world: World
     assert (world.state(), world.life.killed, world.life.stuck) == (after, False, False)
 
 
+@pytest.mark.parametrize("late", [True, False])
+def test_what_was_stuck_and_has_ended_is_told_as_what_hung(world: World, late: bool) -> None:
+    for _ in range(2):  # at the second crash there is a wait before the start
+        if late:
+            world.happens(Event.START)
+            world.passes(LIMITS.start_s)
+        else:
+            started(world)
+            world.passes(0, quiet_s=LIMITS.hang_s)
+        why = "not running 20 s after its start" if late else "no heartbeat for 5 s"
+        assert (world.state(), world.life.note) == (State.HUNG, why)
+        world.now_ns += round(LIMITS.kill_s * S)
+        world.happens(Event.ELAPSED, "pid 7 lives on")
+        world.happens(Event.EXIT, "killed by SIGKILL")
+        assert (world.state(), world.life.note) == (State.BACKOFF, f"{why}, killed by SIGKILL")
+        world.starts_again_after()
+
+
 def test_what_is_stuck_holds_up_no_stop_of_others() -> None:
     stuck = Life(State.STOPPING, starts=1, killed=True, stuck=True)
     processes = [(1, Life(State.RUNNING, starts=1)), (2, stuck)]
