@@ -254,7 +254,10 @@ class Supervisor:
         elif self._started:
             if now_ns - self._qualities_ns >= QUALITY_S * 1e9 or len(self._qualities) != len(self._segment.blocks):
                 self._qualities, self._qualities_ns = self._look(), now_ns
-            state = policy.assess([m.life.state is State.RUNNING for m in self._fleet], self._qualities)
+                for managed in self._fleet:
+                    managed.listen()
+            well = [m.life.state is State.RUNNING and not m.complaint for m in self._fleet]
+            state = policy.assess(well, self._qualities)
         self._segment.set_state(os.getpid(), state)
         self._notifier.beat(now_ns)
         if state is not self._state:
@@ -270,5 +273,6 @@ class Supervisor:
     def _weak(self) -> list[str]:
         """What makes the instance degraded."""
         weak = [f"{m.name} is not running" for m in self._fleet if m.life.state is not State.RUNNING]
+        weak += [f"{m.name}: {m.complaint}" for m in self._fleet if m.complaint]
         named = zip(self._segment.blocks, self._qualities, strict=True)
         return weak + [f"source {name} is bad" for name, quality in named if quality in (None, Quality.BAD)]

@@ -26,6 +26,9 @@ class Managed:
         self.waiting: list[Answer] = []
         self.evicted_pid = 0
         """The process last killed for holding the role of this one."""
+        self.complaint = ""
+        """What it reports as wrong though it runs, as of :meth:`listen`; empty: nothing."""
+        self._missed = 0
         self._job: Job | None = None
         self._beat_ns = 0
         self._quiet_ns = 0
@@ -67,6 +70,17 @@ class Managed:
         """Whether the present process, not a predecessor, has reported that it runs."""
         report = self.slot.report
         return self.child is not None and report.pid == self.child.pid and report.activity is Activity.RUNNING
+
+    def listen(self) -> None:
+        """Take what it reports as wrong; the log tells the end of it, and what was lost by then."""
+        running = self.life.state is State.RUNNING
+        complaint = policy.complaint(self.slot.kind, self.slot.report.note) if running else ""
+        missed = self.slot.counters.get("missed", 0) if running else 0  # a process counts from its start
+        if self.complaint and running and not complaint:
+            log.info("%s is well again; %d frames and events were lost", self.name, max(0, missed - self._missed))
+        if not complaint:
+            self._missed = missed
+        self.complaint = complaint
 
     def quiet_ns(self, elapsed_ns: int) -> int:
         """Time without a heartbeat, as the supervisor has lived through it."""

@@ -9,7 +9,7 @@ import msgspec
 from shmio.errors import NotRunningError, SegmentError
 from shmio.segment import Phase, ProcessSlot, Quality, Segment, running_instances
 from shmio.segment import State as InstanceState
-from shmio.supervisor.policy import assess
+from shmio.supervisor.policy import assess, complaint
 
 SILENT_S = 5.0
 """A supervisor without a heartbeat for this long is stopped, or hangs."""
@@ -123,7 +123,7 @@ def _state(told: InstanceState, processes: list[SourceStatus | ProcessStatus]) -
     """The state as told while starting or stopping; else by what is read here, which is newer."""
     if told not in (InstanceState.RUNNING, InstanceState.DEGRADED):
         return told
-    running = [process.state == str(Phase.RUNNING) for process in processes]
+    running = [p.state == str(Phase.RUNNING) and not complaint(p.kind, p.note) for p in processes]
     return assess(running, [Quality[p.quality.upper()] for p in processes if isinstance(p, SourceStatus)])
 
 

@@ -213,3 +213,17 @@ def test_a_segment_that_was_never_finished_is_no_instance(instance: str, content
     status = read_status(instance)
     assert (status.state, status.processes) == ("stopped", [])
     assert status.note
+
+
+def test_a_recorder_that_cannot_write_degrades_the_instance(cell: Cell, instance: str) -> None:
+    cell.segment.processes.add(ProcessSpec("recorder", "recorder"))
+    for name in ("cell", "grpc", "recorder"):
+        cell.run(name)
+    cell.publish(5)
+    cell.segment.set_state(os.getpid(), State.RUNNING)
+    slot = cell.workers[-1].processes.find("recorder")
+    started_ns = cell.segment.header.started_ns
+    for note, state in (("to a.mem", "running"), ("a.mem: No space left on device", "degraded")):
+        slot.report = Report(os.getpid(), Activity.RUNNING, started_ns, (), note)
+        assert read_status(instance).state == state
+    assert read_status(instance).processes[2].note == "a.mem: No space left on device"
