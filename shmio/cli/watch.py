@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 
 from shmio.cli.readings import Selected, as_json, as_line, choose, topic_path
 from shmio.cli.run import at_least, dumps
-from shmio.errors import NotRunningError
+from shmio.errors import NotRunningError, PathError
 from shmio.layout.model import Register
 from shmio.segment import Block, Frame, Quality
 from shmio.segment.attach import Attachment
@@ -46,11 +46,12 @@ def execute(cell: Attachment, options: argparse.Namespace) -> int:
 def _news(cell: Attachment, patterns: list[str]) -> Iterator[tuple[Block, Register, Reading, int]]:
     """What all blocks report, with the width of their paths; a thread waits on each. Ends when the instance does.
 
-    PathError: after a reload, there is no such register any more.
+    NotRunningError: a reload has removed a source or a register.
     """
     news: queue.Queue[list[News]] = queue.Queue(WAITING_FRAMES)
     followed: set[int] = set()
-    width = _follow_new(choose(cell, patterns), followed, news)
+    chosen = choose(cell, patterns)
+    width = _follow_new(chosen, followed, news)
     while True:
         try:
             batch = news.get(timeout=IDLE_S)
@@ -61,8 +62,20 @@ def _news(cell: Attachment, patterns: list[str]) -> Iterator[tuple[Block, Regist
         if not batch:  # a reload has ended a block
             if not cell.current:
                 return
-            width = _follow_new(choose(cell, patterns), followed, news)
+            chosen = _choose_again(cell, patterns, {block.source for block, _ in chosen})
+            width = _follow_new(chosen, followed, news)
         yield from ((*item, width) for item in batch)
+
+
+def _choose_again(cell: Attachment, patterns: list[str], sources: set[str]) -> list[Selected]:
+    """What the patterns name after a reload; ``sources``: of what they named before. NotRunningError."""
+    try:
+        return choose(cell, patterns)
+    except PathError as error:
+        if gone := sorted(sources.difference(cell.sources)):
+            named = f"source {gone[0]!r} was" if len(gone) == 1 else f"sources {', '.join(gone)} were"
+            raise NotRunningError(f"{named} removed from instance {cell.instance!r} by a reload") from None
+        raise NotRunningError(f"{error}: a reload has taken it away") from None
 
 
 def _follow_new(chosen: list[Selected], followed: set[int], news: queue.Queue[list[News]]) -> int:

@@ -148,10 +148,12 @@ def _which(first: str, sources: Collection[str]) -> str:
 
 
 def look_up(layout: Layout, topic: Topic) -> Register:
-    """As :func:`find`; the PathError says which source was taken when the topic named none."""
+    """As :func:`find`; the PathError names the source, and says so if the topic did not."""
     try:
         return find(layout, topic.path)
     except PathError as error:
+        if topic.named and topic.path:
+            raise PathError(f"{topic.source}/{error}") from None
         if topic.named:
             raise
         raise PathError(f"{error}; looked for in source {topic.source}, as the path begins with no source") from None
@@ -188,11 +190,11 @@ def _unknown(layout: Layout, path: str) -> str:
     if names and all(map(_INDEX.fullmatch, names)):
         numbers = sorted(map(int, names))
         return f"{shorten(prefix + missing)}: the index is outside {numbers[0]}..{numbers[-1]}"
-    near = ", ".join(_near(layout, path))
-    return f"{shorten(path)}: no such register in {layout.name}{f'; near: {near}' if near else ''}"
+    like = ", ".join(near(layout, path))
+    return f"{shorten(path)}: no such register in {layout.name}{f'; near: {like}' if like else ''}"
 
 
-def _near(layout: Layout, path: str) -> list[str]:
+def near(layout: Layout, path: str) -> list[str]:
     """Up to three paths of registers, elements or structures that are like this one, whatever the case."""
     wanted = path[:_NEAR_CHARACTERS].lower()
     head, indices = wanted, ""

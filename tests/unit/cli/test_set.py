@@ -202,7 +202,7 @@ def test_json_is_an_object_by_path(device: Device, capsys: pytest.CaptureFixture
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["cell/nothing", "1"], "no such register in DB1"),
+        (["cell/nothing", "1"], "cell/nothing: no such register in DB1"),
         (["nothing/count", "1"], "there are 2 sources, and 'nothing' is none of them: write cell/… or other/…"),
         (["cell/COUNT", "1"], "near: count"),
         (["nope://count", "1"], "no source of this name; there are: cell, other"),

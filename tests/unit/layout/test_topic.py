@@ -94,7 +94,7 @@ def test_without_default_the_source_must_be_named() -> None:
 def test_a_path_without_a_source_says_where_it_was_looked_for(layout: Layout) -> None:
     with pytest.raises(PathError, match=r"^b: no such register in DB1; looked for in source cell, as the path begins"):
         look_up(layout, parse_topic("b/out", SOURCES, "cell"))
-    with pytest.raises(PathError, match=r"^b: no such register in DB1$"):
+    with pytest.raises(PathError, match=r"^cell/b: no such register in DB1$"):
         look_up(layout, parse_topic("cell/b", SOURCES, "cell"))
     assert look_up(layout, parse_topic("Inputs/3", SOURCES, "cell")).offset == 3
 
