@@ -12,14 +12,12 @@ from shmio.cli.run import dumps, run
 from shmio.errors import LayoutError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.document import describe
-from shmio.layout.image import unread
+from shmio.layout.image import complaints
 from shmio.layout.lexer import MAX_SOURCE_BYTES
-from shmio.layout.literal import default_text
 from shmio.layout.model import Layout, Register
 from shmio.logs import printable
 
 _HEADINGS = ("offset", "size", "type", "path", "initial", "comment")
-_MAX_UNREAD = 20
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -68,15 +66,8 @@ def _complain(lines: Iterable[object]) -> None:
 
 def _unread(layout: Layout) -> Iterator[str]:
     """Say which initial values mean nothing here; an emulated PLC would start without them."""
-    registers = unread(layout)
-    for register in registers[:_MAX_UNREAD]:
-        value = _short(register.initial or "")
-        yield (
-            f"{layout.name}: warning: the initial value {value} of {register.path} cannot be read as {register.type}; "
-            f"an emulated PLC starts it at {default_text(register.element)}"
-        )
-    if len(registers) > _MAX_UNREAD:
-        yield f"{layout.name}: warning: {len(registers) - _MAX_UNREAD} more initial values cannot be read"
+    for text in complaints(layout):
+        yield f"{layout.name}: warning: {text}"
 
 
 def _print(layouts: Sequence[Layout], *, as_json: bool) -> None:

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import Final
+
 from shmio.errors import ValueRangeError
 from shmio.layout.codec import Value, codec
 from shmio.layout.literal import default_text, parse_literal
 from shmio.layout.model import Layout, Register
+from shmio.layout.topic import shorten
+
+MAX_TOLD: Final = 20
+"""Of so many initial values that cannot be read each is named."""
 
 
 def initial_frame(layout: Layout) -> tuple[bytearray, tuple[str, ...]]:
@@ -27,6 +34,19 @@ def initial_frame(layout: Layout) -> tuple[bytearray, tuple[str, ...]]:
 def unread(layout: Layout) -> tuple[Register, ...]:
     """Return the registers whose initial value cannot be read."""
     return tuple(r for r in layout.registers if r.initial is not None and _given(r) is None)
+
+
+def complaints(layout: Layout) -> Iterator[str]:
+    """Say which initial values cannot be read, a line each, as far as they are not too many."""
+    registers = unread(layout)
+    for register in registers[:MAX_TOLD]:
+        value = " ".join((register.initial or "").split())
+        yield (
+            f"the initial value {shorten(value, 40)} of {register.path} cannot be read as {register.type}; "
+            f"an emulated PLC starts it at {default_text(register.element)}"
+        )
+    if len(registers) > MAX_TOLD:
+        yield f"{len(registers) - MAX_TOLD} more initial values cannot be read"
 
 
 def _given(register: Register) -> Value | None:

@@ -109,9 +109,8 @@ def scalar_literal(text: str, element: ElementType, byte_order: ByteOrder = "big
     text = text.strip()
     value = _read(text, element)
     if value is None:
-        raise ValueRangeError(
-            f"{element.name}: expected a literal such as {default_text(element)}, found {brief(text)}"
-        )
+        wanted = "TRUE, FALSE, 1 or 0" if element.base == "BOOL" else f"a literal such as {default_text(element)}"
+        raise ValueRangeError(f"{element.name}: expected {wanted}, found {brief(text)}")
     if element.base != "BOOL":
         scalar_codec(element, byte_order).encode(value)  # the range
     return value

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,8 +15,9 @@ from shmio.config.read import unknown_option
 from shmio.config.wording import named
 from shmio.errors import ConfigError, PathError
 from shmio.layout.glob import Glob
+from shmio.layout.image import complaints
 from shmio.layout.model import Layout
-from shmio.layout.topic import find
+from shmio.layout.topic import find, near
 from shmio.supervisor.plan import Plan, make_plan
 
 EMULATOR_KINDS = ("s7",)
@@ -48,7 +49,7 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
         _check_listening(config)
         layouts = {source.name: _check_source(i, source, files) for i, source in enumerate(config.source)}
         emulated = {emulator.name: _check_emulator(i, emulator, files) for i, emulator in enumerate(config.emulator)}
-        odd = _odd(config, layouts)
+        odd = [*_odd(config, layouts), *_not_served(config, layouts, emulated), *_unread(emulated)]
     except ConfigError as error:
         raise ConfigError(f"{file}: {named(str(error), msgspec.to_builtins(config))}") from None
     warnings = [*files.warnings, *(f"{file}: warning: {text}" for text in odd)]
@@ -140,7 +141,7 @@ def _odd(config: Config, layouts: dict[str, Layout]) -> list[str]:
         for pattern in source.writable:
             try:
                 if not _covers(pattern, layout):
-                    odd.append(f"{key}.writable: {pattern!r} names nothing in {layout.name}")
+                    odd.append(f"{key}.writable: {pattern!r} names nothing in {layout.name}{_near(pattern, layout)}")
             except PathError as error:
                 raise ConfigError(f"{key}.writable: {error}") from None
         number = source.options.get("dbNumber")
@@ -149,6 +150,31 @@ def _odd(config: Config, layouts: dict[str, Layout]) -> list[str]:
     if not config.source:
         odd.append("there is no [[source]]: the instance will hold no registers")
     return odd
+
+
+def _near(pattern: str, layout: Layout) -> str:
+    names = [] if "*" in pattern else near(layout, pattern)
+    return f"; did you mean {' or '.join(names)}?" if names else ""
+
+
+def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, tuple[Layout, ...]]) -> Iterator[str]:
+    """Sources of which an emulator of the same file is the device, and does not serve their block."""
+    for index, source in enumerate(config.source):
+        wanted = source.options.get("dbNumber") or layouts[source.name].number
+        for emulator in config.emulator:
+            if wanted is None or peer(source) != str(Address.parse(emulator.listen)):
+                continue
+            served = [emulator.dbNumber or layout.number for layout in emulated[emulator.name]]
+            if wanted not in served:
+                held = ", ".join(f"DB{number}" for number in served)
+                yield f"source[{index}]: it reads DB{wanted} of emulator {emulator.name!r}, which serves {held} alone"
+
+
+def _unread(emulated: dict[str, tuple[Layout, ...]]) -> Iterator[str]:
+    """Initial values that mean nothing to an emulator."""
+    for name, layouts in emulated.items():
+        for text in (text for layout in layouts for text in complaints(layout)):
+            yield f"emulator {name!r}: {text}"
 
 
 def _covers(pattern: str, layout: Layout) -> bool:

@@ -517,3 +517,18 @@ def test_hints_name_the_configuration_as_it_has_to_be_typed(tmp_path: Path, caps
     assert capsys.readouterr().err.endswith(f"start it with shmio-supervisor up -c '{file}'\n")
     assert main(["status", "--instance", "nobody-runs-this"]) == 1
     assert capsys.readouterr().err.endswith("start it with shmio-supervisor up -c FILE\n")
+
+
+def test_what_an_emulator_cannot_serve_is_odd(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (folder / "my.db").write_text(block("DB7", "Int").replace("x : Int", "Enable : Int := NOWHERE"))
+    (folder / "supervisor.toml").write_text(
+        '[instance]\nname = "press"\n'
+        '[[source]]\nname = "press"\nconnector = "s7"\nlayout = "my.db"\nhost = "127.0.0.1"\n'
+        'port = 1102\ndbNumber = 7\nwritable = ["Enabel"]\n'
+        '[[emulator]]\nname = "plc"\nkind = "s7"\nlayout = "my.db"\ndbNumber = 8\nlisten = "127.0.0.1:1102"\n'
+    )
+    assert main(["check"]) == 0
+    out = capsys.readouterr().out
+    assert "'Enabel' names nothing in DB7; did you mean Enable?\n" in out
+    assert "it reads DB7 of emulator 'plc', which serves DB8 alone\n" in out
+    assert "the initial value NOWHERE of Enable cannot be read as INT; an emulated PLC starts it at 0\n" in out

@@ -192,3 +192,8 @@ def test_every_type_has_a_default(type_: str) -> None:
     if type_ != "BOOL":
         codec = scalar_codec(element)
         assert codec.decode(codec.encode(value), 0) == value
+
+
+def test_a_bool_says_what_it_takes() -> None:
+    with pytest.raises(ValueRangeError, match="BOOL: expected TRUE, FALSE, 1 or 0, found"):
+        parse_literal("yes", Register("run", "BOOL", (), 0, 0, 1, 1))
