@@ -21,7 +21,9 @@ class Change:
     def __init__(self, fleet: Fleet, segment: Segment, plan: Plan) -> None:
         """Begin. SegmentError: no room for what is new; then nothing has changed."""
         self.plan = plan
-        self.changes = reconcile(plan, segment.header.epoch, fleet.present(), segment.blocks.values())
+        present = fleet.present()
+        self.changes = reconcile(plan, segment.header.epoch, present, segment.blocks.values())
+        self._unwell = {name for name, found in present.items() if not found.well}
         self._fleet = fleet
         self._segment = segment
         self._jobs = {job.name: job for job in plan.jobs}
@@ -93,6 +95,8 @@ class Change:
         for job in self._coming:
             managed = self._fleet.named(job.name)
             how = "restarted, as its configuration has changed" if job.name in self.changes.replaced else "started"
+            if job.name in self.changes.replaced and job.name in self._unwell:
+                how = "started again, as it was not running"
             if managed.life.state is State.RUNNING:
                 done.append(f"{job.name}: {how}")
             else:

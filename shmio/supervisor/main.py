@@ -66,6 +66,7 @@ class Supervisor:
         self._qualities: list[Quality | None] = []
         self._qualities_ns = 0
         self._found_ns = 0
+        self._adopted: dict[str, int] = {}
         self.history: list[str] = []
         """What was found of an earlier supervisor, and done about it, a line each."""
 
@@ -94,6 +95,7 @@ class Supervisor:
             if found:  # until all of it is ours, a failure leaves it for the next attempt
                 for slot, child in found.children:
                     self._fleet.adopt(self._fleet.named(slot.name), child)
+                    self._adopted[slot.name] = child.pid
                 self._changer.follow()
             else:
                 for job in self._plan.jobs:
@@ -181,6 +183,17 @@ class Supervisor:
         else:
             self._changer.reload(answer)
 
+    def _replaced(self) -> list[str]:
+        """What became of processes that were taken over and are configured otherwise by now, a line each."""
+        lines = []
+        for name, pid in self._adopted.items():
+            managed = self._fleet.named(name) if name in self._fleet.names else None
+            if managed is None:
+                lines.append(f"{name}, pid {pid}, was stopped at once: the configuration has it no more")
+            elif managed.child is None or managed.child.pid != pid:
+                lines.append(f"{name}, pid {pid}, was replaced at once: its configuration has changed")
+        return lines
+
     def _pause_s(self) -> float:
         starting = any(m.life.state is State.STARTING for m in self._fleet)
         return START_TICK_S if starting else TICK_S
@@ -196,7 +209,9 @@ class Supervisor:
         taking_over = self._changer.under_way
         self._changer.step()
         if taking_over:
-            self._started = self._started or not self._changer.under_way
+            if not self._changer.under_way and not self._started:
+                self._started = True
+                self.history += self._replaced()
         elif not self._stopping and not self._started:
             self._follow_start(now_ns)
         if self._stopping:

@@ -89,7 +89,7 @@ def _read(segment: Segment, remedy: str) -> InstanceStatus:
         instance=segment.instance,
         mode=segment.header.mode,
         segment=segment.shared.name,
-        segment_bytes=segment.header.size,
+        segment_bytes=segment.shared.size,
     )
     if not supervised:
         if not any(process.pid for process in processes):

@@ -19,16 +19,18 @@ from shmio import logs
 from shmio.cli.supervise import logdir
 from shmio.cli.supervise.ports import check_ports
 from shmio.cli.supervise.prepare import Prepared, peer, prepare
-from shmio.cli.target import config_file, option_for
-from shmio.errors import ConfigError, ControlError, ShmioError
+from shmio.cli.target import ask, config_file, option_for
+from shmio.errors import AlreadyRunningError, ConfigError, ControlError, ShmioError
 from shmio.logs import printable
-from shmio.segment import PREFIX, State, instances
+from shmio.segment import PREFIX, Segment, State, instances
 from shmio.segment.segment import refuse_second
+from shmio.supervisor import control
 from shmio.supervisor.main import Supervisor
 from shmio.supervisor.plan import MODES, Job, Plan
 from shmio.supervisor.process import child_environment
-from shmio.supervisor.status import SourceStatus, read_status
+from shmio.supervisor.status import InstanceStatus, SourceStatus, read_status
 
+WHERE_S = 5.0
 DETACH_S = 120.0
 """The longest time that the start of a detached instance is waited for."""
 
@@ -48,7 +50,8 @@ def execute(arguments: argparse.Namespace) -> int:
 
 def _foreground(prepared: Prepared) -> int:
     _refuse(prepared.plan)
-    _announce(prepared)
+    left_over = prepared.plan.instance in instances()
+    _announce(prepared, None if left_over else prepared.plan.segment_bytes)
     _say("Ctrl-C stops it, and so does closing the terminal")
     console = logging.StreamHandler(sys.stderr)
     console.setFormatter(_Console())
@@ -62,9 +65,22 @@ def _foreground(prepared: Prepared) -> int:
 
 def _refuse(plan: Plan) -> None:
     """AlreadyRunningError; EndpointError when a port is taken, which those that a dead supervisor left may well be."""
-    refuse_second(plan.instance)
+    try:
+        refuse_second(plan.instance)
+    except AlreadyRunningError as error:
+        raise AlreadyRunningError(f"{error}{_whose(plan)}") from None
     if plan.instance not in instances():
         check_ports(plan)
+
+
+def _whose(plan: Plan) -> str:
+    """From which file the running instance of this name was started, and what to do about it."""
+    down = f"shmio-supervisor down --instance {plan.instance} stops it"
+    with suppress(ShmioError), Segment.open(plan.instance) as segment:
+        file = ask(segment, control.Where(), WHERE_S)["config"]
+        if file != str(plan.config_file):
+            return f", started from {file}: {down}; or give this one another instance.name"
+    return f"; {down}"
 
 
 def _replan(plan: Plan) -> Callable[[], Plan]:
@@ -72,10 +88,11 @@ def _replan(plan: Plan) -> Callable[[], Plan]:
     return lambda: prepare(plan.config_file, plan.mode).plan
 
 
-def _announce(prepared: Prepared) -> None:
+def _announce(prepared: Prepared, segment_bytes: int | None) -> None:
+    """``segment_bytes``: None before a take-over, of which nobody knows yet what it will find."""
     plan = prepared.plan
-    size = f"{plan.segment_bytes / 1e6:.1f} MB"
-    _say(f"{plan.instance}: mode {plan.mode}, segment {PREFIX}{plan.instance} ({size}), logs in {plan.log_dir}")
+    size = "" if segment_bytes is None else f" ({segment_bytes / 1e6:.1f} MB)"
+    _say(f"{plan.instance}: mode {plan.mode}, segment {PREFIX}{plan.instance}{size}, logs in {plan.log_dir}")
     width = max((len(job.name) for job in plan.jobs), default=0)
     for job in sorted(plan.jobs, key=lambda job: job.rank):
         _say(f"  {job.name:<{width}}  {job.kind:<8}  {_describe(job, prepared)}")
@@ -158,8 +175,9 @@ def _detach(prepared: Prepared, option: str) -> int:
     child.returncode = 0  # it lives on, which Popen would complain about
     for line in history:
         _say(line)
-    _announce(prepared)
-    _tell_how(plan.instance, option)
+    status = read_status(plan.instance)
+    _announce(prepared, status.segment_bytes)
+    _tell_how(status, option)
     return 0
 
 
@@ -177,8 +195,7 @@ def _await(fd: int, timeout_s: float) -> str:
         answer += data
 
 
-def _tell_how(instance: str, option: str) -> None:
-    status = read_status(instance)
+def _tell_how(status: InstanceStatus, option: str) -> None:
     for process in status.processes:
         if isinstance(process, SourceStatus) and process.quality == "bad":
             _say(f"warning: source {process.name} is bad: {process.reason}", sys.stderr)

@@ -100,9 +100,14 @@ def test_a_day_in_the_life_of_the_cell(cell: Cell) -> None:
 
     refused = cell.run("up", status=1)
     assert refused.stderr == (
-        f"instance {cell.instance!r} is already running, supervisor pid {status['supervisor']['pid']}\n"
+        f"instance {cell.instance!r} is already running, supervisor pid {status['supervisor']['pid']}; "
+        f"shmio-supervisor down --instance {cell.instance} stops it\n"
     )
     assert refused.stdout == ""
+    file = cell.folder / "supervisor.toml"
+    (cell.folder / "other.toml").write_text(file.read_text())
+    refused = cell.run("up", "-c", "other.toml", status=1)
+    assert f", started from {file}: shmio-supervisor down --instance {cell.instance} stops it; " in refused.stderr
 
     pids = {process["name"]: process["pid"] for process in status["processes"]}
     os.kill(pids["plc"], signal.SIGKILL)
