@@ -38,11 +38,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "VALUE is JSON or an S7 literal: 5, -1.5e-3, true, 16#FF, T#1s, '\"text\"'."
     parser.add_argument(
         "--timeout",
-        type=_seconds,
+        type=seconds,
         metavar="S",
         help=f"give up when no cycle came to write in so many seconds (default {TIMEOUT_S:g}, or {MIN_PERIODS} cycles)",
     )
-    parser.add_argument("pairs", nargs="+", action=_Pairs, metavar="PATH VALUE", help="register or array element")
+    parser.add_argument("pairs", nargs="+", action=Pairs, metavar="PATH VALUE", help="register or array element")
 
 
 def shield(words: Sequence[str]) -> list[str]:
@@ -53,7 +53,7 @@ def shield(words: Sequence[str]) -> list[str]:
     return [f" {word}" if _NEGATIVE.match(word) else word for word in words]
 
 
-class _Pairs(argparse.Action):
+class Pairs(argparse.Action):
     """PATH VALUE, as often as wanted."""
 
     def __call__(
@@ -175,7 +175,8 @@ def _complaint(path: str, outcome: Outcome) -> str:
     return f"{path}: {outcome.text}; look with shmio get {shlex.quote(path)} before writing it again"
 
 
-def _seconds(text: str) -> float:
+def seconds(text: str) -> float:
+    """An argument's type: a time in s."""
     try:
         seconds = float(text)
     except ValueError:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from shmio import __version__
-from shmio.cli import get, registers, watch
+from shmio.cli import get, inject, registers, watch
 from shmio.cli import set as set_verb
 from shmio.cli.run import run
 from shmio.cli.target import instance_name
@@ -22,7 +22,7 @@ Verb = Callable[[Attachment, argparse.Namespace], int]
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of the console script; the exit status."""
     words = list(sys.argv[1:] if argv is None else argv)
-    arguments = _parser().parse_args(set_verb.shield(words) if words[:1] == ["set"] else words)
+    arguments = _parser().parse_args(set_verb.shield(words) if words[:1] in (["set"], ["inject"]) else words)
 
     def command() -> int:
         with attach(instance_name(arguments), writable=arguments.writable) as cell:
@@ -40,8 +40,8 @@ def _parser() -> argparse.ArgumentParser:
     common.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
     common.add_argument("--json", action="store_true", help="print JSON")
     verbs = parser.add_subparsers(required=True, metavar="VERB")
-    for name, module in (("list", registers), ("get", get), ("watch", watch), ("set", set_verb)):
+    for name, module in (("list", registers), ("get", get), ("watch", watch), ("set", set_verb), ("inject", inject)):
         sub = verbs.add_parser(name, parents=[common], help=module.HELP, description=module.HELP)
         module.arguments(sub)
-        sub.set_defaults(verb=module.execute, writable=module is set_verb)
+        sub.set_defaults(verb=module.execute, writable=module in (set_verb, inject))
     return parser

@@ -7,12 +7,15 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from functools import partial
 
 from shmio import worker
 from shmio.connectors import registry
+from shmio.connectors.injections import Owner
 from shmio.connectors.loop import SourceLoop, WallClock
 from shmio.connectors.schedule import Schedule
 from shmio.errors import ConnectorError
+from shmio.segment import Segment
 from shmio.worker import BEAT_S, Worker
 
 SWITCH_S = 0.0005  # the poll thread is not to wait Python's usual 5 ms for the others
@@ -31,7 +34,10 @@ def run(worker: Worker) -> None:
     connector = connector_class(options, block.layout)
     schedule = Schedule(segment.header.started_ns, block.period_ns)
     clock = WallClock()
-    loop = SourceLoop(connector, writer, schedule, clock, worker.config["writable"])
+    loop = SourceLoop(
+        connector, writer, schedule, clock, worker.config["writable"],
+        armed=block.attributes.armed, owner_of=partial(_owner_of, segment),
+    )  # fmt: skip
     thread = threading.Thread(target=_guarded, args=(loop.run,), name="poll", daemon=True)
     desk = threading.Thread(target=_guarded, args=(loop.desk.run,), name="commands", daemon=True)
     thread.start()
@@ -59,6 +65,15 @@ def run(worker: Worker) -> None:
     clock.stop()
     thread.join(timeout=min(connector.timeout_s + 0.5, LAST_WORDS_S))
     desk.join(timeout=1.0)
+
+
+def _owner_of(segment: Segment, writer: int) -> Owner | None:
+    """The process that has a command queue at present."""
+    segment.refresh()
+    for slot in (*segment.processes, *segment.processes.guests):
+        if slot.writer == writer and slot.alive():
+            return Owner(writer, slot.report.pid)
+    return None
 
 
 def _guarded(run: Callable[[], None]) -> None:

@@ -31,9 +31,6 @@ class WriteLostError(ConnectorError):
         super().__init__(message)
         self.outcomes = tuple(outcomes)
 
-    def __reduce__(self) -> tuple[type[WriteLostError], tuple[str, tuple[str | Lost, ...]]]:
-        return type(self), (str(self), self.outcomes)
-
 
 class Connector(ABC):
     """One device's protocol. All hooks run in one thread; none may block longer than ``timeout_s``.

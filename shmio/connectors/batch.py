@@ -21,11 +21,20 @@ class Item(NamedTuple):
 
     command: Command
     place: int
+    bits: bytes | None = None
+    """Which of the write's bits are for the device, if injections took others."""
 
     @property
     def write(self) -> Write:
         """The write itself."""
         return self.command.writes[self.place]
+
+    def parts(self) -> list[Write]:
+        """What of it is for the device."""
+        offset, _, data = self.write
+        if self.bits is None:
+            return [self.write]
+        return [part._replace(offset=offset + part.offset) for part in merge(data, self.bits, [(0, len(data))])]
 
 
 def coalesce(items: Sequence[Item], size: int) -> tuple[list[Write], set[int]]:
@@ -38,7 +47,8 @@ def coalesce(items: Sequence[Item], size: int) -> tuple[list[Write], set[int]]:
     superseded = set()
     for place in reversed(range(len(items))):
         offset, mask, data = items[place].write
-        own = bytes(~later & (mask or 0xFF) & 0xFF for later in taken[offset : offset + len(data)])
+        wanted = items[place].bits or bytes([mask or 0xFF]) * len(data)
+        own = bytes(~later & bits for later, bits in zip(taken[offset : offset + len(data)], wanted, strict=True))
         if not any(own):
             superseded.add(place)
             continue

@@ -11,13 +11,16 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import groupby
-from typing import Final
+from typing import Final, TypeVar
 
 from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.batch import End, Item, coalesce, ends
+from shmio.connectors.injections import Injection, uncovered
+from shmio.connectors.injector import Injector, OwnerOf, pieces
+from shmio.connectors.output import Output
+from shmio.errors import ConnectorError
 from shmio.layout.write import Write, cover
-from shmio.segment import BlockWriter, Command, EventKind, Record
-from shmio.segment.events import EVENT_DATA_SIZE
+from shmio.segment import Command, CommandKind, EventKind, Record
 
 MAX_WAITING: Final = 256
 """Items that wait for the next cycle; what comes beyond stays in its queue. A command alone may have more."""
@@ -25,6 +28,10 @@ MAX_WAITING_BLOCKS: Final = 4
 """The same in bytes, as a multiple of the block's."""
 TELL_NS: Final = 1_000_000_000
 """How often a writer that sends garbage is told."""
+
+_UNARMED: Final = "an injection toward a device needs `armed = true` in the source's configuration"
+
+_Outcome = TypeVar("_Outcome", str, str | Lost)
 
 log = logging.getLogger("shmio.source")
 
@@ -34,18 +41,27 @@ class CommandDesk:
 
     def __init__(
         self,
-        writer: BlockWriter,
+        output: Output,
         writable: Iterable[str] | None,
         now_ns: Callable[[], int],
-        accepted: Callable[[], None] | None = None,
+        *,
+        armed: bool = False,
+        owner_of: OwnerOf = lambda _: None,
+        accepted: Callable[[], None] = lambda: None,
     ) -> None:
-        """``writable``: patterns; None: the device cannot be written at all. ``accepted``: called when items wait."""
-        self._writer = writer
+        """``writable``: patterns; None: the device cannot be written at all. ``armed``: injections may reach it.
+
+        ``owner_of``: which process has a command queue. ``accepted``: called when items wait.
+        """
+        self._writer = output.writer
+        self._output = output
         self._now_ns = now_ns
         self._accepted = accepted
         self._cannot = "this source's connector cannot write" if writable is None else ""
-        self._writable = cover(writer.block.layout, writable or ())
-        self._most_bytes = MAX_WAITING_BLOCKS * writer.block.layout.size
+        layout = self._writer.block.layout
+        self._writable = cover(layout, writable or ())
+        self._most_bytes = MAX_WAITING_BLOCKS * layout.size
+        self._injector = Injector(output, self._writable, self._cannot or ("" if armed else _UNARMED), owner_of)
         self._turn = threading.Lock()
         self._closed = "the source is not connected yet"
         self._items: list[Item] = []
@@ -93,9 +109,10 @@ class CommandDesk:
         outcomes: Sequence[str | Lost] = [Lost.UNKNOWN] * len(writes)
         error = ""
         try:
-            outcomes = write(writes)
+            outcomes = _one_each(write(writes), writes)
         except WriteLostError as lost:
-            outcomes, error = lost.outcomes, str(lost)
+            error = str(lost)
+            outcomes = _one_each(lost.outcomes, writes)
             raise
         except BaseException as unforeseen:
             error = str(unforeseen)
@@ -114,6 +131,8 @@ class CommandDesk:
                 for writer in range(queues.writers):  # one of each in turn
                     taken |= self._take_one(writer)
             self._expire(self._take(lambda item: self._now_ns() > item.command.deadline_ns))
+            self._injector.look()
+            self._output.flush()
             if not self._stopped:
                 queues.wait(seen, self._patience_ns())
 
@@ -133,10 +152,12 @@ class CommandDesk:
         self._end(items, [(EventKind.EXPIRED, "no cycle came before its deadline")] * len(items))
 
     def _patience_ns(self) -> int:
-        """Until the first deadline of what waits."""
+        """Until the first deadline of what waits, or until clients are looked after; negative: for ever."""
         with self._turn:
             deadlines = [item.command.deadline_ns for item in self._items]
-        return max(0, min(deadlines) - self._now_ns()) + 1_000_000 if deadlines else -1
+        waits = [max(0, min(deadlines) - self._now_ns()) + 1_000_000] if deadlines else []
+        waits += [wait_ns for wait_ns in (self._injector.patience_ns, self._output.patience_ns) if wait_ns >= 0]
+        return min(waits, default=-1)
 
     def _make_room(self) -> None:
         """What was held for want of room can be judged."""
@@ -168,16 +189,25 @@ class CommandDesk:
 
     def _judge(self, command: Command) -> bool:
         """Accept or reject; False if there is no room before the next cycle, and the command is held."""
+        layer = self._injector.toward_device(command)
+        write = command.kind is CommandKind.WRITE or layer is not None
         reason = self._refusal(command)
+        if not reason and layer is not None:
+            reason = uncovered(layer, command.writes)
+        if not reason:
+            reason = self._unwritable(command) if write else self._injector.take(command)
         if reason:
-            self._writer.event(_record(EventKind.REJECTED, Item(command, 0), len(command.writes), reason))
+            self._writer.event(
+                Record(EventKind.REJECTED, reason, command.writer, command.id, 0, max(1, len(command.writes)))
+            )
+        if reason or not write:
             return True
         if not self._has_room(command):
             self._held = command
             return False
-        items = [Item(command, place) for place in range(len(command.writes))]
+        items = list(self._divert(command, layer))
         for item in items:  # outside the lock, which the loop must never wait for long
-            for part in _parts(item):
+            for part in pieces(EventKind.ACCEPTED, command, item.place, item.parts(), layer):
                 self._writer.event(part)
         with self._turn:
             closed = self._closed
@@ -185,9 +215,23 @@ class CommandDesk:
                 self._items += items
         if closed:
             self._end(items, [(EventKind.EXPIRED, closed)] * len(items))
-        elif self._accepted is not None:
+        elif items:
             self._accepted()
         return True
+
+    def _divert(self, command: Command, above: Injection | None) -> Iterator[Item]:
+        """Hand over what injections take of a command, and give what they leave for the device."""
+        for place, write in enumerate(command.writes):
+            taken, bits = self._injector.injections.divert(write, above)
+            for layer, parts in taken:
+                for record in pieces(EventKind.DIVERTED, command, place, parts, layer):
+                    self._writer.event(record)
+            if not taken:
+                yield Item(command, place)
+            elif any(bits):
+                yield Item(command, place, bits)
+            else:
+                self._end([Item(command, place)], [(EventKind.TAKEN, "")])
 
     def _has_room(self, command: Command) -> bool:
         with self._turn:
@@ -204,6 +248,10 @@ class CommandDesk:
         late_ns = self._now_ns() - command.deadline_ns
         if late_ns > 0:
             return f"it came {late_ns / 1e6:.0f} ms after its deadline"
+        return ""
+
+    def _unwritable(self, command: Command) -> str:
+        """Why nothing, or not this, can be written to the device; empty if it can."""
         if self._cannot:
             return self._cannot
         if self._closed:
@@ -225,21 +273,18 @@ class CommandDesk:
                 self._writer.event(_record(kind, first, count, text))
 
 
+def _one_each(outcomes: Sequence[_Outcome], writes: Sequence[Write]) -> Sequence[_Outcome]:
+    """What a connector says became of its writes; ConnectorError: it does not say it of each."""
+    if len(outcomes) != len(writes):
+        raise ConnectorError(f"the connector tells {len(outcomes)} outcomes of {len(writes)} writes")
+    return outcomes
+
+
 def _record(kind: EventKind, item: Item, count: int, text: str = "") -> Record:
     command, write = item.command, item.write
     return Record(
         kind, text, command.writer, command.id, item.place, count, write.offset, write.mask, len(write.data)
     )  # fmt: skip
-
-
-def _parts(item: Item) -> Iterator[Record]:
-    """The events that tell of an accepted item with its data; several if these are long."""
-    command, (offset, mask, data) = item.command, item.write
-    for start in range(0, len(data), EVENT_DATA_SIZE):
-        part = data[start : start + EVENT_DATA_SIZE]
-        yield Record(
-            EventKind.ACCEPTED, "", command.writer, command.id, item.place, 1, offset + start, mask, len(part), part
-        )  # fmt: skip
 
 
 def _runs(items: Sequence[Item]) -> Iterator[tuple[Item, int]]:

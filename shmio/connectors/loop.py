@@ -11,16 +11,20 @@ import re
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple, Protocol, TypeVar
 
 from shmio.connectors.base import Connector
 from shmio.connectors.desk import CommandDesk
+from shmio.connectors.injector import OwnerOf
+from shmio.connectors.output import Image, Output
 from shmio.connectors.schedule import Backoff, Due, Schedule
 from shmio.errors import ConnectorError
+from shmio.layout.write import Write
 from shmio.logs import fields
-from shmio.segment import BlockWriter, EventKind, Quality, Record
+from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
 
 STABLE_NS = 1_000_000_000
 """A connection that has lasted this long has put its failures behind it."""
@@ -106,14 +110,24 @@ class SourceLoop:
         schedule: Schedule,
         clock: Clock,
         writable: Iterable[str] = (),
+        *,
+        armed: bool = False,
+        owner_of: OwnerOf = lambda _: None,
     ) -> None:
-        """``writable``: patterns of what commands may write."""
+        """``writable``: patterns of what commands may write. ``armed``, ``owner_of``: see :class:`CommandDesk`."""
         self._connector = connector
         self._writer = writer
         self._schedule = schedule
         self._clock = clock
-        accepted = clock.nudge if connector.prompt else None
-        self.desk = CommandDesk(writer, writable if connector.can_write else None, clock.now_ns, accepted)
+        self._output = Output(writer, clock.now_ns)
+        self.desk = CommandDesk(
+            self._output,
+            writable if connector.can_write else None,
+            clock.now_ns,
+            armed=armed or connector.provenance is not Provenance.LIVE,
+            owner_of=owner_of,
+            accepted=clock.nudge if connector.prompt else lambda: None,
+        )
         self._backoff = Backoff()
         self._connected_ns: int | None = None
         self._accepting = False
@@ -148,11 +162,15 @@ class SourceLoop:
 
     def _stops_before(self, due: Due) -> bool:
         """Wait until a cycle is due, and carry out before then what need not wait for it; True: told to stop."""
-        while not self._clock.wait_ns(due.due_ns - self._clock.now_ns()):
+        until_ns = due.due_ns
+        while not self._clock.wait_ns(until_ns - self._clock.now_ns()):
             if self._clock.now_ns() >= due.due_ns:
                 return False
-            if self.desk.waiting and not self.poll(max(0, due.cycle - 1)):
-                return True
+            until_ns = min(due.due_ns, self._output.next_ns) if self.desk.waiting else due.due_ns
+            if self.desk.waiting and self._clock.now_ns() >= until_ns:
+                if not self.poll(max(0, due.cycle - 1)):
+                    return True
+                until_ns = due.due_ns
         return True
 
     def poll(self, cycle: int) -> bool:
@@ -163,9 +181,9 @@ class SourceLoop:
                 self._connect()
             if self.desk.waiting:
                 self._drain()
-                self._call(lambda: self.desk.carry_out(self._connector.write))
+                self._call(lambda: self.desk.carry_out(partial(self._write, cycle)))
             if len(self._under_way) < self._connector.depth:
-                self._under_way.append(_Submitted(cycle, self._clock.now_ns(), time.monotonic_ns(), time.time_ns()))
+                self._under_way.append(self._asked(cycle))
                 self._call(self._connector.submit)
             else:
                 self.counters.overruns += 1  # the device is behind by all that may be under way
@@ -173,6 +191,16 @@ class SourceLoop:
         except ConnectorError as error:
             return self._fail(cycle, str(error) or "the connector gave no reason")
         return True
+
+    def _write(self, cycle: int, writes: Sequence[Write]) -> list[str]:
+        """Hand over what is to be written; of a prompt connector the frame that shows it comes before the outcomes."""
+        refusals = self._connector.write(writes)
+        if self._connector.prompt:
+            self._publish(self._asked(cycle), self._connector.read())
+        return refusals
+
+    def _asked(self, cycle: int) -> _Submitted:
+        return _Submitted(cycle, self._clock.now_ns(), time.monotonic_ns(), time.time_ns())
 
     def _drain(self) -> None:
         """Publish what was asked for before a write: no frame that follows its event is older than it."""
@@ -202,14 +230,8 @@ class SourceLoop:
         quality = Quality.UNCERTAIN if doubt else Quality.GOOD
         self._tell(quality, doubt, asked.cycle)
         self._raw, self._read_ns = raw, asked.utc_ns
-        self._writer.publish(
-            raw,
-            cycle=asked.cycle,
-            source_ns=asked.utc_ns,
-            quality=quality,
-            provenance=self._connector.provenance,
-            reason=doubt,
-            asked_ns=asked.monotonic_ns,
+        self._output.publish(
+            Image(raw, asked.cycle, asked.utc_ns, quality, self._connector.provenance, doubt, asked.monotonic_ns)
         )
         self.counters.polls += 1
         if not self._accepting:  # not before an image has shown that the block is as its layout says
@@ -246,7 +268,8 @@ class SourceLoop:
         """Publish one bad frame for each new reason, with the last bytes known; other measures are none."""
         self.desk.close(reason)
         if self._tell(Quality.BAD, reason, cycle):
-            self._writer.publish(self._raw, cycle=cycle, source_ns=self._read_ns, quality=Quality.BAD, reason=reason)
+            provenance = self._connector.provenance
+            self._output.publish(Image(self._raw, cycle, self._read_ns, Quality.BAD, provenance, reason))
 
     def _tell(self, quality: Quality, reason: str, cycle: int) -> bool:
         """Log and write down a change of quality or of its reason; whether it was one."""

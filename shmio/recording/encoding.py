@@ -21,7 +21,7 @@ EVENT: Final = "shmio.event.v1"
 GAP: Final = "json"
 
 _FRAME: Final = struct.Struct("<QQqqqQIBBHHHII")
-_EVENT: Final = struct.Struct("<QQQqqqQIIIIIIHBBHH")
+_EVENT: Final = struct.Struct("<QQQqqqQQIIIIIIHBBHH")
 _EFFECTIVE: Final = 1  # flag: an effective image follows the raw one
 
 FRAME_SCHEMA: Final = b"""Little-endian. u64 number, u64 cycle, i64 publish (ns, CLOCK_MONOTONIC), i64 clock (ns since \
@@ -30,9 +30,9 @@ the instance's start), i64 source (ns UTC), u64 event (last one before), u32 inc
 u16 reason size, u16 0, u32 image size, u32 delay (us; age of the image when published); then reason (UTF-8), raw, \
 effective."""
 EVENT_SCHEMA: Final = b"""Little-endian. u64 number, u64 frame (last one before), u64 cycle, i64 publish (ns, \
-CLOCK_MONOTONIC), i64 clock (ns since the instance's start), i64 UTC (ns), u64 command, u32 incarnation, u32 writer, \
-u32 item, u32 items, u32 offset, u32 size, u16 kind, u8 quality, u8 mask, u16 data size, u16 text size; then data, \
-text (UTF-8)."""
+CLOCK_MONOTONIC), i64 clock (ns since the instance's start), i64 UTC (ns), u64 command, u64 injection, \
+u32 incarnation, u32 writer, u32 item, u32 items, u32 offset, u32 size, u16 kind, u8 quality, u8 mask, \
+u16 data size, u16 text size; then data, text (UTF-8)."""
 GAP_SCHEMA: Final = b"""{"type": "object", "properties": {"source": {"type": "string"}, "block": {"type": "integer"}, \
 "what": {"enum": ["frames", "events"]}, "first": {"type": "integer"}, "last": {"type": "integer"}, \
 "count": {"type": "integer"}, "reason": {"enum": ["overtaken", "not running", "no room", \
@@ -113,7 +113,7 @@ def encode_event(event: Event) -> bytes:
     text = event.text.encode()
     head = _EVENT.pack(
         event.number, event.frame, event.cycle, event.publish_ns, event.clock_ns, event.utc_ns, event.command,
-        event.incarnation, event.writer, event.item, event.items, event.offset, event.size,
+        event.injection, event.incarnation, event.writer, event.item, event.items, event.offset, event.size,
         event.kind, event.quality, event.mask, len(event.data), len(text),
     )  # fmt: skip
     return b"".join((head, event.data, text))
@@ -123,7 +123,9 @@ def decode_event(data: bytes) -> Event:
     """The event of a message; ValueError."""
     if len(data) < _EVENT.size:
         raise ValueError("an event is shorter than its header")
-    number, frame, cycle, publish_ns, clock_ns, utc_ns, command, incarnation, *rest = _EVENT.unpack_from(data)
+    number, frame, cycle, publish_ns, clock_ns, utc_ns, command, injection, incarnation, *rest = _EVENT.unpack_from(
+        data
+    )
     writer, item, items, offset, size, kind, quality, mask, data_size, text_size = rest
     text_at = _EVENT.size + data_size
     if len(data) != text_at + text_size or data_size > EVENT_DATA_SIZE:
@@ -132,7 +134,7 @@ def decode_event(data: bytes) -> Event:
     return Event(
         number, kind, frame, cycle, publish_ns, clock_ns, utc_ns, incarnation, known,
         writer, command, item, items, offset, mask, size,
-        data[_EVENT.size : text_at], data[text_at:].decode("utf-8", "replace"),
+        data[_EVENT.size : text_at], data[text_at:].decode("utf-8", "replace"), injection,
     )  # fmt: skip
 
 

@@ -6,15 +6,16 @@ The byte format is docs/reference/segment-format.md; a local program starts with
 from shmio.layout.write import Write
 from shmio.segment.block import Attributes, Block, BlockWriter
 from shmio.segment.build import BlockSpec, segment_size
-from shmio.segment.commands import Command, CommandSender
+from shmio.segment.commands import Command, CommandKind, CommandSender, Direction
 from shmio.segment.cursor import Cursor
-from shmio.segment.events import ENDS, NO_WRITER, Event, EventKind, EventRing, Record
+from shmio.segment.events import DONE, ENDS, NO_WRITER, Event, EventKind, EventRing, Record
 from shmio.segment.frame import Frame, Provenance, Quality
 from shmio.segment.header import State
 from shmio.segment.processes import Activity, Phase, ProcessSlot, ProcessSpec, Report, Supervised
 from shmio.segment.segment import PREFIX, Segment, instances, running_instances
 
 __all__ = [
+    "DONE",
     "ENDS",
     "NO_WRITER",
     "PREFIX",
@@ -24,8 +25,10 @@ __all__ = [
     "BlockSpec",
     "BlockWriter",
     "Command",
+    "CommandKind",
     "CommandSender",
     "Cursor",
+    "Direction",
     "Event",
     "EventKind",
     "EventRing",

@@ -17,18 +17,21 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 
 from shmio.errors import CommandError, NotRunningError, PathError, QualityError, SegmentError
 from shmio.layout.codec import Value
 from shmio.layout.model import Register
-from shmio.layout.topic import look_up, parse_topic
+from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.segment.block import Block
 from shmio.segment.commander import Commander, Outcome
+from shmio.segment.commands import Direction
 from shmio.segment.cursor import Cursor
 from shmio.segment.frame import Frame, Quality
 from shmio.segment.processes import Activity, Report
 from shmio.segment.segment import Segment, running_instances
+from shmio.segment.shadow import Shadow
+from shmio.segment.standing import Standing
 from shmio.segment.view import Reading, View, reading
 
 TURN_S = 1.0
@@ -175,21 +178,52 @@ class Attachment:
         The attachment must be ``writable``. All values are accepted by the source or none; what the device says is
         told for each. PathError, ValueRangeError, CommandError: nothing has been sent.
         """
-        blocks = self._blocks()
-        default = next(iter(blocks)) if len(blocks) == 1 else None
-        topics = [parse_topic(path, blocks, default) for path in values]
+        block, topics = self._of_one_source("write", values)
         for path, topic in zip(values, topics, strict=True):
             if topic.direction == "out":
                 raise PathError(f"{path}: what comes out of a source is not written; leave out /out")
+        return self._commander(block).write(
+            {topic.path: value for topic, value in zip(topics, values.values(), strict=True)}, timeout_s
+        )
+
+    def inject(self, *paths: str, priority: int = 0, keep: bool = False, name: str = "") -> Shadow:
+        """Lay a shadow over registers, elements, structures or patterns of one source, all ``/out`` or all ``/in``.
+
+        Without a suffix it is over ``/out``. Of several over a register the one of the highest ``priority`` is
+        outermost, of equal ones the newest. With ``keep`` it stays when this program ends, until somebody lifts it. The
+        attachment must be ``writable``. PathError; CommandError: the source refuses, or does not answer.
+        """
+        block, topics = self._of_one_source("injection", paths)
+        directions = {topic.direction or "out" for topic in topics}
+        if len(directions) != 1:
+            raise PathError("an injection is over /out or over /in, not over both")
+        direction = Direction.IN if "in" in directions else Direction.OUT
+        commander = self._commander(block)
+        number = commander.inject(
+            [topic.path or "**" for topic in topics], direction=direction, priority=priority, keep=keep, name=name
+        )
+        return Shadow(commander, number, direction, keep=keep)
+
+    def injections(self) -> dict[str, tuple[Standing, ...]]:
+        """What stands at present, by source; the innermost first."""
+        return {source: block.standing.read() for source, block in self._blocks().items()}
+
+    def lift(self, source: str, number: int) -> None:
+        """Lift an injection, whoever laid it. PathError: no such source; CommandError: no such injection."""
+        self._commander(self.block(source)).lift(number)
+
+    def _of_one_source(self, what: str, paths: Collection[str]) -> tuple[Block, list[Topic]]:
+        """The block and the topics of paths that must be of one source; PathError."""
+        blocks = self._blocks()
+        default = next(iter(blocks)) if len(blocks) == 1 else None
+        topics = [parse_topic(path, blocks, default) for path in paths]
+        for path, topic in zip(paths, topics, strict=True):
             if topic.source not in blocks:
                 raise PathError(f"{path}: nothing is served under {topic.source} in this version")
         sources = {topic.source for topic in topics}
         if len(sources) != 1:
-            raise PathError(f"one write is for one source, these are for {', '.join(sorted(sources)) or 'none'}")
-        commander = self._commander(blocks[sources.pop()])
-        return commander.write(
-            {topic.path: value for topic, value in zip(topics, values.values(), strict=True)}, timeout_s
-        )
+            raise PathError(f"one {what} is for one source, these are for {', '.join(sorted(sources)) or 'none'}")
+        return blocks[sources.pop()], topics
 
     def _commander(self, block: Block) -> Commander:
         """The commander for a block, in the name of one of the guests' places, kept from the first write on."""

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from shmio.layout.model import Layout
     from shmio.segment._atomics import FrameTuple
     from shmio.segment.commands import CommandQueues
+    from shmio.segment.standing import StandingCell
 
 Bytes = bytes | bytearray | memoryview
 
@@ -75,6 +76,7 @@ class Block:
         ring: Ring,
         events: Ring,
         commands: CommandQueues,
+        standing: StandingCell,
         attributes: Attributes,
         retired: Callable[[], bool] = lambda: False,
         section: int = 0,
@@ -86,6 +88,8 @@ class Block:
         self.ring = ring
         self.events = EventRing(events, retired)
         self.commands = commands
+        self.standing = standing
+        """The injections that stand on it at present."""
         self.attributes = attributes
         self._retired = retired
 

@@ -20,9 +20,10 @@ from shmio.segment.events import EVENT_SIZE, EVENT_SLOTS
 from shmio.segment.header import HEADER_SIZE, SECTION_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
 from shmio.segment.processes import GUESTS, ProcessSpec, ProcessTable, supervisor_beat
 from shmio.segment.shm import SharedObject
+from shmio.segment.standing import CELL_SIZE
 
 RING_SECONDS = 8
-SECTIONS_PER_BLOCK = 5
+SECTIONS_PER_BLOCK = 6
 SPARE_SECTIONS = 40 * SECTIONS_PER_BLOCK
 SPARE_PROCESSES = 16 + GUESTS
 EVENT_STRIDE = -(-(_atomics.RAW_OFFSET + EVENT_SIZE) // 64) * 64
@@ -77,6 +78,7 @@ class BlockSpec:
             (SectionKind.EVENTS, _atomics.RING_HEADER_SIZE + EVENT_SLOTS * EVENT_STRIDE, events),
             (SectionKind.COMMANDS, commands.section_size(self.layout.size), queues),
             (SectionKind.SOURCE, len(attributes), attributes),
+            (SectionKind.STANDING, CELL_SIZE, b""),
         ]
 
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, Unpack
 
-from shmio.errors import CommandError, ValueRangeError
+from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
-from shmio.layout.write import Write, bits_of, cover, encode
-from shmio.segment.commands import CommandSender
-from shmio.segment.events import ENDS, Event, EventKind
+from shmio.layout.write import Write, bits_of, cover, encode, merge
+from shmio.segment.commands import CommandKind, CommandSender, Laid
+from shmio.segment.events import DONE, ENDS, Event, EventKind
 
 if TYPE_CHECKING:
     from shmio.segment.block import Block
@@ -36,8 +36,8 @@ class Outcome:
 
     @property
     def done(self) -> bool:
-        """Whether the device confirmed it."""
-        return self.kind is EventKind.WRITTEN
+        """Whether the device confirmed it, or an injection took it in the device's place."""
+        return self.kind in DONE
 
 
 @dataclass(slots=True)
@@ -84,19 +84,59 @@ class Commander:
         All or none is accepted by the source. PathError: no such register; CommandError: not writable, or the source
         takes nothing; ValueRangeError: a value does not fit. Nothing has been sent then. Never waits.
         """
-        writes: list[Write] = []
-        for path, value in values.items():
-            register = self._register(path)
-            try:
-                writes.append(encode(register, value, self.block.layout.byte_order))
-            except ValueRangeError as error:
-                raise ValueRangeError(f"{self.block.source}/{path}: {error}") from None
+        writes = [self._encode(self._register(path), path, value) for path, value in values.items()]
+        return self._send(tuple(values), writes, timeout_s)
+
+    def shadow(self, injection: int, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
+        """Give values as an injection's: to consumers if it lies over ``/out``, toward the device if over ``/in``.
+
+        PathError, ValueRangeError, CommandError: nothing has been sent.
+        """
+        writes = [self._encode(find(self.block.layout, path), path, value) for path, value in values.items()]
+        return self.outcomes(self._send(tuple(values), writes, timeout_s, CommandKind.SHADOW, injection))
+
+    def inject(self, patterns: Iterable[str], timeout_s: float | None = None, **laid: Unpack[Laid]) -> int:
+        """Lay an injection over all that the patterns name (see :func:`shmio.layout.write.cover`); its number.
+
+        Consumers see what they saw, until it gives values. PathError: there is no such register; CommandError: the
+        source refuses, or does not answer.
+        """
+        bits = cover(self.block.layout, patterns)
+        if not any(bits):
+            raise PathError(f"{self.block.source}: {', '.join(patterns)} names no register")
+        ticket = self._send(("",), merge(bits, bits, [(0, len(bits))]), timeout_s, CommandKind.INJECT, **laid)
+        self._expect(ticket, EventKind.INJECTED)
+        return ticket.number
+
+    def lift(self, injection: int, timeout_s: float | None = None) -> None:
+        """Lift an injection, whoever laid it. CommandError: there is none, or the source does not answer."""
+        self._expect(self._send(("",), [], timeout_s, CommandKind.LIFT, injection), EventKind.LIFTED)
+
+    def _expect(self, ticket: Ticket, kind: EventKind) -> None:
+        (outcome,) = self.outcomes(ticket)
+        if outcome.kind is not kind:
+            raise CommandError(f"{self.block.source}: {outcome.text}")
+
+    def _encode(self, register: Register, path: str, value: object) -> Write:
+        try:
+            return encode(register, value, self.block.layout.byte_order)
+        except ValueRangeError as error:
+            raise ValueRangeError(f"{self.block.source}/{path}: {error}") from None
+
+    def _send(
+        self,
+        paths: tuple[str, ...],
+        writes: Sequence[Write],
+        timeout_s: float | None,
+        kind: CommandKind = CommandKind.WRITE,
+        injection: int = 0,
+        **laid: Unpack[Laid],
+    ) -> Ticket:
         wait_s = self.timeout_s if timeout_s is None else timeout_s
         deadline_ns = time.monotonic_ns() + round(wait_s * 1e9)
         events, incarnation = self.block.events.cursor(), self.block.incarnation
-        number = self._sender.submit(writes, deadline_ns)
-        until_ns = deadline_ns + round(PATIENCE_S * 1e9)
-        return Ticket(number, tuple(values), incarnation, until_ns, events)
+        number = self._sender.submit(writes, deadline_ns, kind, injection, **laid)
+        return Ticket(number, paths, incarnation, deadline_ns + round(PATIENCE_S * 1e9), events)
 
     def outcomes(self, ticket: Ticket) -> list[Outcome]:
         """Wait until all is over and say what became of each value, in the order they were given."""

@@ -12,7 +12,8 @@ import struct
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from enum import IntEnum
+from typing import TYPE_CHECKING, Final, TypedDict, Unpack
 
 from shmio.errors import CommandError
 from shmio.layout.write import Write
@@ -30,24 +31,65 @@ MAX_WRITES: Final = 4096
 SECTION_HEADER_SIZE: Final = 64
 _SECTION: Final = struct.Struct("<IIII")
 _BELL_AT: Final = 16
-_COMMAND: Final = struct.Struct("<QIIqB7x")
+MAX_NAME_BYTES: Final = 256
+
+_COMMAND: Final = struct.Struct("<QIIqBBHiQ")
 _WRITE: Final = struct.Struct("<IIB7x")
-_KIND_WRITE: Final = 1
+_KEEP: Final = 2  # flag beside the direction
+
+
+class CommandKind(IntEnum):
+    """What a command asks for, and what its items are."""
+
+    WRITE = 1
+    """Items are written to the device, or go to the injections on their way."""
+    INJECT = 2
+    """An injection is laid over the bits that the items' data set; the command's number is its own."""
+    SHADOW = 3
+    """An injection gives values: to consumers if it lies over ``/out``, to the device if over ``/in``."""
+    LIFT = 4
+    """An injection is lifted; there are no items."""
+
+
+class Direction(IntEnum):
+    """Which way an injection stands in."""
+
+    OUT = 0
+    IN = 1
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What a writer wants done. ``deadline_ns``: CLOCK_MONOTONIC after which it must not be begun."""
+    """What a writer wants done. ``deadline_ns``: CLOCK_MONOTONIC after which it must not be begun.
+
+    ``injection``: the one to lift, or whose values these are. With INJECT: ``direction``, ``priority`` (the highest is
+    outermost), ``keep`` (it outlives its client), ``name`` (at most MAX_NAME_BYTES in UTF-8).
+    """
 
     writer: int
     id: int
     incarnation: int
     deadline_ns: int
     writes: tuple[Write, ...]
+    kind: CommandKind = CommandKind.WRITE
+    injection: int = 0
+    direction: Direction = Direction.OUT
+    priority: int = 0
+    keep: bool = False
+    name: str = ""
 
     def pack(self) -> bytes:
         """The record in a queue."""
-        parts = [_COMMAND.pack(self.id, self.incarnation, len(self.writes), self.deadline_ns, _KIND_WRITE)]
+        name = self.name.encode()
+        flags = self.direction | (_KEEP if self.keep else 0)
+        parts = [
+            _COMMAND.pack(
+                self.id, self.incarnation, len(self.writes), self.deadline_ns, self.kind, flags, len(name),
+                self.priority, self.injection,
+            ),
+            name,
+            bytes(-len(name) % 8),
+        ]  # fmt: skip
         for write in self.writes:
             parts += (_WRITE.pack(write.offset, len(write.data), write.mask), write.data, bytes(-len(write.data) % 8))
         return b"".join(parts)
@@ -56,10 +98,14 @@ class Command:
     def unpack(cls, writer: int, record: bytes) -> Command:
         """Read a record; ValueError: it is none of ours."""
         try:
-            number, incarnation, count, deadline_ns, kind = _COMMAND.unpack_from(record)
-            if kind != _KIND_WRITE or not 0 < count <= MAX_WRITES:
+            head = _COMMAND.unpack_from(record)
+            number, incarnation, count, deadline_ns, kind, flags, name_size, priority, injection = head
+            if (count > 0) != (CommandKind(kind) is not CommandKind.LIFT) or count > MAX_WRITES:
                 raise ValueError(f"kind {kind} with {count} items")
-            at, writes = _COMMAND.size, []
+            name = record[_COMMAND.size : _COMMAND.size + name_size]
+            if len(name) != name_size or name_size > MAX_NAME_BYTES or flags > Direction.IN | _KEEP:
+                raise ValueError(f"flags {flags}, a name of {name_size} bytes")
+            at, writes = _COMMAND.size + name_size + -name_size % 8, []
             for _ in range(count):
                 offset, size, mask = _WRITE.unpack_from(record, at)
                 at += _WRITE.size
@@ -69,7 +115,10 @@ class Command:
                 at += size + -size % 8
         except struct.error as error:
             raise ValueError(str(error)) from None
-        return cls(writer, number, incarnation, deadline_ns, tuple(writes))
+        return cls(
+            writer, number, incarnation, deadline_ns, tuple(writes), CommandKind(kind), injection,
+            Direction(flags & Direction.IN), priority, bool(flags & _KEEP), name.decode("utf-8", "replace"),
+        )  # fmt: skip
 
 
 def capacity_for(layout_size: int) -> int:
@@ -139,6 +188,15 @@ class CommandQueues:
         return self._offset + SECTION_HEADER_SIZE + writer * self._stride
 
 
+class Laid(TypedDict, total=False):
+    """How an injection is laid; see :class:`Command`."""
+
+    direction: Direction
+    priority: int
+    keep: bool
+    name: str
+
+
 class CommandSender:
     """A writer's end toward one block; the writer's process holds the role that has this queue."""
 
@@ -150,17 +208,26 @@ class CommandSender:
         # Never the number of a predecessor's command, whose outcome may still come.
         self._next = secrets.randbits(62) + 1
 
-    def submit(self, writes: Sequence[Write], deadline_ns: int) -> int:
+    def submit(
+        self,
+        writes: Sequence[Write],
+        deadline_ns: int,
+        kind: CommandKind = CommandKind.WRITE,
+        injection: int = 0,
+        **laid: Unpack[Laid],
+    ) -> int:
         """Send one command; its number. It is for the source's present process only, and for the time until then.
 
         CommandError: the queue is full, or can never hold that much. Never waits.
         """
         source = self.block.source
-        if not 0 < len(writes) <= MAX_WRITES:
+        if not (len(writes) > 0) == (kind is not CommandKind.LIFT) or len(writes) > MAX_WRITES:
             raise CommandError(f"{source}: a command has 1 to {MAX_WRITES} items, this has {len(writes)}")
         with self._turn:
             number, self._next = self._next, self._next + 1
-            record = Command(self.writer, number, self.block.incarnation, deadline_ns, tuple(writes)).pack()
+            incarnation = self.block.incarnation
+            command = Command(self.writer, number, incarnation, deadline_ns, tuple(writes), kind, injection, **laid)
+            record = command.pack()
             queues = self.block.commands
             if len(record) + 8 > queues.capacity:
                 most = queues.capacity - 8

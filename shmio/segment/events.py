@@ -1,4 +1,4 @@
-"""What happened to a block between frames: commands and their outcomes, changes of quality, starts and ends.
+"""What happened to a block between frames: commands and their outcomes, injections, changes of quality, starts, ends.
 
 An event ring works like a frame ring and is written by the same process. An event names the frame it follows, a frame
 the event it follows, so that both together are one order.
@@ -23,12 +23,12 @@ EVENT_DATA_SIZE: Final = 256
 EVENT_SLOTS: Final = 2048
 NO_WRITER: Final = 0xFFFFFFFF
 
-_RECORD: Final = struct.Struct("<HHIQIIBxHI")
+_RECORD: Final = struct.Struct("<HHIQIIBxHIQ")
 EVENT_SIZE: Final = _RECORD.size + EVENT_DATA_SIZE
 
 
 class EventKind(IntEnum):
-    """What happened. A command's item is accepted or rejected; if accepted, one of the four ends follows."""
+    """What happened. A command's item is accepted or rejected; if accepted, one of the :data:`ENDS` follows."""
 
     STARTED = 1
     STOPPED = 2
@@ -44,15 +44,37 @@ class EventKind(IntEnum):
     """Not sent, and will not be."""
     UNKNOWN = 9
     """Sent, but no answer came."""
+    DIVERTED = 10
+    """What was written went to an injection instead of the device: these bits of it, with data."""
+    TAKEN = 11
+    """The end of an item of which nothing was left for the device: an injection took it."""
+    INJECTED = 12
+    """An injection was laid; the end of the command that asked for it, whose number is its own."""
+    LIFTED = 13
+    """An injection was lifted, with the reason; the end of the command that asked for it, if one did."""
+    SHADOWED = 14
+    """An injection gave values, with data, that consumers see since the frame before."""
 
     def __str__(self) -> str:
         return self.name.lower()
 
 
 ENDS: Final = frozenset(
-    {EventKind.REJECTED, EventKind.WRITTEN, EventKind.REFUSED, EventKind.EXPIRED, EventKind.UNKNOWN}
+    {
+        EventKind.REJECTED,
+        EventKind.WRITTEN,
+        EventKind.REFUSED,
+        EventKind.EXPIRED,
+        EventKind.UNKNOWN,
+        EventKind.TAKEN,
+        EventKind.INJECTED,
+        EventKind.LIFTED,
+        EventKind.SHADOWED,
+    }
 )
 """Kinds after which nothing more is said of an item; REJECTED: of a command."""
+DONE: Final = frozenset({EventKind.WRITTEN, EventKind.TAKEN})
+"""Ends with which a write has gone where it was meant to, or to the injection on its way."""
 
 
 class Event(NamedTuple):
@@ -61,7 +83,8 @@ class Event(NamedTuple):
     ``frame``: number of the last frame before it. ``kind`` is a plain number where this version does not know it.
     ``writer``: the command ring it is about, or NO_WRITER; ``command``: the writer's number of the command. It tells
     of ``items`` of its items from ``item`` on; ``offset``, ``mask``, ``size``: what the first of them writes (mask 0:
-    whole bytes); ``data``: these bytes, with ACCEPTED only. ``text``: the reason.
+    whole bytes); ``data``: these bytes, with ACCEPTED, DIVERTED and SHADOWED only. ``text``: the reason, or the name of
+    ``injection``, the one it is about (0: none).
     """
 
     number: int
@@ -82,6 +105,7 @@ class Event(NamedTuple):
     size: int
     data: bytes
     text: str
+    injection: int = 0
 
 
 class Record(NamedTuple):
@@ -97,23 +121,24 @@ class Record(NamedTuple):
     mask: int = 0
     size: int = 0
     data: bytes = b""
+    injection: int = 0
 
     def pack(self) -> bytes:
         """The payload, EVENT_SIZE bytes."""
         what = (self.kind, len(self.data), self.writer, self.command)
-        packed = _RECORD.pack(*what, self.item, self.offset, self.mask, self.items, self.size)
+        packed = _RECORD.pack(*what, self.item, self.offset, self.mask, self.items, self.size, self.injection)
         return packed + self.data.ljust(EVENT_DATA_SIZE, b"\0")
 
 
 def decode(fields: FrameTuple) -> Event:
     """An event from a ring's copy; bounds are checked, for the bytes are another process's."""
     number, cycle, publish_ns, clock_ns, utc_ns, incarnation, quality, _, frame, _, text, raw, _ = fields
-    kind, data_size, writer, command, item, offset, mask, items, size = _RECORD.unpack_from(raw)
+    kind, data_size, writer, command, item, offset, mask, items, size, injection = _RECORD.unpack_from(raw)
     data = raw[_RECORD.size : _RECORD.size + min(data_size, EVENT_DATA_SIZE)]
     known = Quality(quality) if quality <= Quality.GOOD else Quality.BAD
     return Event(
         number, kind, frame, cycle, publish_ns, clock_ns, utc_ns, incarnation, known,
-        writer, command, item, items, offset, mask, size, data, text,
+        writer, command, item, items, offset, mask, size, data, text, injection,
     )  # fmt: skip
 
 

@@ -33,12 +33,12 @@ class Provenance(IntEnum):
 class Frame(NamedTuple):
     """A validated copy of one frame of a block. All times are in ns.
 
-    ``raw`` is what the source delivered, in its own byte order; ``effective`` is what consumers see, None while it
-    equals raw. ``publish_ns`` is CLOCK_MONOTONIC, ``clock_ns`` the instance's clock since its start, ``source_ns``
-    UTC. ``delay_us``: how old the image may have been already when it was published, the time of the device's answer;
-    ``cycle`` counts the periods of the source's schedule, so frames of two incarnations of the source's process
-    are told apart from frames that a reader lost. ``source_ns`` of a bad frame is that of the image it repeats; 0: the
-    source never had one, and the image is zeros.
+    ``raw`` is what the source delivered, in its own byte order, and ``provenance`` where that comes from; ``effective``
+    is what consumers see, None while nothing is injected. ``publish_ns`` is CLOCK_MONOTONIC, ``clock_ns`` the
+    instance's clock since its start, ``source_ns`` UTC. ``delay_us``: how old the image may have been already when it
+    was published, the time of the device's answer; ``cycle`` counts the periods of the source's schedule, so frames of
+    two incarnations of the source's process are told apart from frames that a reader lost. ``source_ns`` of a bad frame
+    is that of the image it repeats; 0: the source never had one, and the image is zeros.
     """
 
     number: int

@@ -55,6 +55,7 @@ class SectionKind(IntEnum):
     EVENTS = 3
     COMMANDS = 4
     SOURCE = 5
+    STANDING = 6
 
 
 @dataclass(frozen=True, slots=True)

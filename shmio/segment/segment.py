@@ -18,6 +18,7 @@ from shmio.segment.events import EVENT_SIZE
 from shmio.segment.header import HEADER_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
 from shmio.segment.processes import SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
 from shmio.segment.shm import SharedObject
+from shmio.segment.standing import StandingCell
 
 PREFIX = "shmio-"
 
@@ -144,13 +145,14 @@ class Segment:
             frames = _atomics.Ring(memory, *part(SectionKind.FRAMES))
             events = _atomics.Ring(memory, *part(SectionKind.EVENTS))
             queues = CommandQueues(memory, *part(SectionKind.COMMANDS))
+            standing = StandingCell(memory, *part(SectionKind.STANDING))
         except (LayoutError, ValueError, msgspec.MsgspecError) as error:
             raise FormatError(f"{name}: block {described.name}: {error}") from None
         if frames.frame_size != layout.size or events.frame_size != EVENT_SIZE:
             raise FormatError(f"{name}: block {described.name}: rings and layout differ in size")
         head = self.header
         return Block(
-            described.name, layout, frames, events, queues, attributes,
+            described.name, layout, frames, events, queues, standing, attributes,
             lambda: header.retired(memory, head, layout_at), layout_at,
         )  # fmt: skip
 

@@ -70,8 +70,14 @@ class View:
         topic = parse_topic(path, (self.source,), self.source)
         if topic.direction == "in":
             raise PathError(f"{path}: a frame holds what comes out of its source; leave out /in")
-        register = find(self.layout, topic.path)
-        return codec(register, self.layout.byte_order).decode(self.frame.image)
+        return self._decode(topic.path, self.frame.image)
+
+    def original(self, path: str) -> Value:
+        """What the source delivered, whatever injections show instead; PathError."""
+        return self._decode(parse_topic(path, (self.source,), self.source).path, self.frame.raw)
+
+    def _decode(self, path: str, image: bytes) -> Value:
+        return codec(find(self.layout, path), self.layout.byte_order).decode(image)
 
     @cached_property
     def array(self) -> np.ndarray[Any, np.dtype[Any]]:
@@ -97,7 +103,19 @@ def reading(block: Block, register: Register, frame: Frame | None) -> Reading:
     if quality is not Quality.BAD and _holds_none(value):
         quality, reason = Quality.BAD, f"the bytes are no {register.type}"
     source_time = frame.source_ns / 1e9 if known else None
-    return Reading(value, quality, reason, str(frame.provenance), source_time, round(frame.age_ns(now_ns) / 1e9, 6))
+    provenance = _provenance(block, register, frame)
+    return Reading(value, quality, reason, str(provenance), source_time, round(frame.age_ns(now_ns) / 1e9, 6))
+
+
+def _provenance(block: Block, register: Register, frame: Frame) -> Provenance:
+    """Where a register's value comes from: some of a frame's may be injected."""
+    if frame.effective is None:
+        return frame.provenance
+    mask = 0xFF if register.bit is None or register.dims else 1 << register.bit
+    for standing in block.standing.read():
+        if standing.direction == "out" and standing.covers(register.offset, register.size, mask):
+            return Provenance.INJECTED
+    return frame.provenance
 
 
 def _holds_none(value: Value) -> bool:

@@ -13,7 +13,7 @@ from typing import Final
 from shmio.endpoints.grpc.echo import Echo, Message
 from shmio.errors import CommandError
 from shmio.layout.model import Register
-from shmio.segment import ENDS, Block, Event, EventKind
+from shmio.segment import DONE, ENDS, Block, Event, EventKind
 from shmio.segment.commander import PATIENCE_S, Commander
 from shmio.segment.events import EVENT_DATA_SIZE
 
@@ -167,7 +167,7 @@ class Inlet:
                 pending.accepted()
         if event.kind in ENDS:  # of the one item there is
             kind = EventKind(event.kind)
-            self._end(event.command, kind, "" if kind is EventKind.WRITTEN else f"{kind}: {event.text}")
+            self._end(event.command, kind, "" if kind in DONE else f"{kind}: {event.text}")
 
     def _restarted(self, event: Event) -> None:
         """A successor rejects what its predecessor had not taken; of what it had taken nobody knows."""

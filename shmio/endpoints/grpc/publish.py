@@ -16,7 +16,7 @@ from shmio.endpoints.grpc.topics import Topics
 from shmio.errors import CommandError, ShmioError
 from shmio.layout.model import Register
 from shmio.layout.topic import shorten
-from shmio.segment import EventKind
+from shmio.segment import DONE, EventKind
 
 
 class Request(NamedTuple):
@@ -97,8 +97,9 @@ class Publisher:
                 answer.set_result((EventKind.ACCEPTED, ""))
 
         def ended(kind: EventKind, reason: str) -> None:
-            if kind is EventKind.WRITTEN:
+            if kind in DONE:
                 self.published += 1
+                accepted()  # which nobody said, if an injection took all of it
             elif answer.done():
                 self._refusals.add(reason, request.path, peer)
             else:
@@ -134,7 +135,7 @@ class Publisher:
         return task
 
     def _ended(self, stream: _Stream, path: str, peer: str, kind: EventKind, reason: str) -> None:
-        if kind is EventKind.WRITTEN:
+        if kind in DONE:
             self.published += 1
         else:
             self._refusals.add(reason, path, peer)

@@ -17,6 +17,7 @@ import shmio
 from shmio.cli.set import read_value
 from shmio.cli.user import main
 from shmio.connectors.desk import CommandDesk
+from shmio.connectors.output import Output
 from shmio.errors import ConnectorError, ValueRangeError
 from shmio.layout.model import Layout, Register
 from shmio.segment import Attributes, BlockSpec, BlockWriter, Segment
@@ -50,7 +51,7 @@ class Device:
         self.idle = False
         self.taken = threading.Event()
         self._writer = writer
-        self._desk = CommandDesk(writer, WRITABLE, time.monotonic_ns)
+        self._desk = CommandDesk(Output(writer), WRITABLE, time.monotonic_ns)
         self._stop = threading.Event()
         self._threads = [threading.Thread(target=self._desk.run), threading.Thread(target=self._cycles)]
         self.desk.open()
@@ -264,14 +265,14 @@ def test_what_nobody_knows_is_said_with_what_to_do(device: Device, capsys: pytes
 
 def test_it_waits_no_longer_than_told(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
     device.idle = True
-    assert main(["set", "--timeout", "0.01", "cell/count", "1"]) == 1
+    assert main(["set", "--timeout", "0.2", "cell/count", "1"]) == 1
     assert "no cycle came before its deadline" in capsys.readouterr().err
 
 
 def test_sources_have_a_command_each_and_what_was_written_is_told(
     device: Device, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["set", "--timeout", "0.01", "cell/count", "5", "other/count", "6"]) == 1
+    assert main(["set", "--timeout", "0.2", "cell/count", "5", "other/count", "6"]) == 1
     out, err = capsys.readouterr()
     assert out.splitlines()[0] == "cell/count   written"
     assert err.startswith("other/count: the source gave no answer in time")

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.batch import Item, coalesce
 from shmio.connectors.desk import MAX_WAITING, CommandDesk
+from shmio.connectors.output import Output
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
 from shmio.segment import (
@@ -49,7 +50,7 @@ class Bench:
 
     def __init__(self, writer: BlockWriter, writable: Sequence[str] | None = WRITABLE) -> None:
         self.now_ns = 0
-        self.desk = CommandDesk(writer, writable, lambda: self.now_ns)
+        self.desk = CommandDesk(Output(writer), writable, lambda: self.now_ns)
         self.sender = CommandSender(writer.block, 4)
         self._events: Cursor[Event] = writer.block.events.cursor()
         self._thread = threading.Thread(target=self.desk.run)
@@ -249,6 +250,23 @@ def test_an_item_of_which_a_part_was_done_is_not_expired(bench: Bench) -> None:
     with pytest.raises(ConnectorError):
         bench.desk.carry_out(lost)
     assert [bench.event().kind for _ in range(2)] == [EventKind.UNKNOWN, EventKind.EXPIRED]
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_of_a_connector_that_tells_too_little_nothing_is_known(bench: Bench, lost: bool) -> None:
+    number = bench.send(Write(0, 0, b"\0\1"), Write(6, 0, b"\1"))
+    for _ in range(2):
+        assert bench.event().kind == EventKind.ACCEPTED
+
+    def write(_: Sequence[Write]) -> list[str]:
+        if lost:
+            raise WriteLostError("cut", [""])
+        return [""]
+
+    with pytest.raises(ConnectorError, match="1 outcomes of 2 writes"):
+        bench.desk.carry_out(write)
+    end = bench.event()
+    assert (end.command, end.item, end.items, end.kind) == (number, 0, 2, EventKind.UNKNOWN)
 
 
 def test_the_refusal_of_one_item_is_told_of_that_item(bench: Bench) -> None:

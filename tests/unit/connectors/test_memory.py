@@ -79,12 +79,14 @@ def test_what_is_written_is_there_at_once_and_stays(segment: Segment) -> None:
     def until(path: str, value: object) -> None:
         while (frame := cursor.next(20)) is None or values(segment, frame)[path] != value:
             assert frame is not None, f"{path} was not seen as {value}"
+        assert frame.cycle * PERIOD_NS <= frame.clock_ns, "of a cycle that has not begun"
         cycles.append(frame.cycle)
 
     with running(segment) as commander:
         for number in range(20):
             (outcome,) = commander.write({"position": number + 0.25})
             assert outcome.kind is EventKind.WRITTEN
+            assert values(segment)["position"] == number + 0.25, "the outcome was told before the frame"
             until("position", number + 0.25)
         commander.write({"lamps/3": True, "name": "R800"})
         until("name", "R800")

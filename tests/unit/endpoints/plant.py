@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 
 from shmio.connectors.desk import CommandDesk
+from shmio.connectors.output import Output
 from shmio.errors import ConnectorError
 from shmio.segment import BlockWriter, Write
 from tests.unit.endpoints.harness import LAYOUT, WRITABLE
@@ -21,7 +22,7 @@ class Plant:
         self.written: list[Write] = []
         self.refusal = ""
         self.lost = False
-        self.desk = CommandDesk(writer, WRITABLE, time.monotonic_ns)
+        self.desk = CommandDesk(Output(writer), WRITABLE, time.monotonic_ns)
         self.desk.open()
         self._cycles = 0
         self._stop = threading.Event()

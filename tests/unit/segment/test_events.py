@@ -35,11 +35,11 @@ def test_an_event_comes_out_as_it_went_in(writer: BlockWriter) -> None:
     writer.publish(b"\0\1", cycle=6)
     writer.cycle = 7
     data = bytes(range(200))
-    number = writer.event(Record(EventKind.ACCEPTED, "grün", 4, 99, 3, 1, 12, 0, 200, data))
+    number = writer.event(Record(EventKind.ACCEPTED, "grün", 4, 99, 3, 1, 12, 0, 200, data, 77))
     event = writer.block.events.read(number)
     assert event is not None
     assert (event.number, event.frame, event.cycle, event.quality) == (2, 1, 7, Quality.GOOD)
-    assert event[9:] == (4, 99, 3, 1, 12, 0, 200, data, "grün")
+    assert event[9:] == (4, 99, 3, 1, 12, 0, 200, data, "grün", 77)
     frame = writer.block.latest()
     assert frame is not None
     assert event.publish_ns - event.clock_ns == frame.publish_ns - frame.clock_ns

@@ -1,0 +1,127 @@
+"""``shmio inject``: shadows over registers, as long as the command runs."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import threading
+from contextlib import ExitStack
+from typing import Any
+
+import msgspec
+
+from shmio.cli.run import dumps
+from shmio.cli.set import Pairs, read_value, seconds
+from shmio.errors import CommandError, PathError, ValueRangeError
+from shmio.layout.codec import Value
+from shmio.layout.topic import Topic, look_up, parse_topic
+from shmio.logs import printable
+from shmio.segment.attach import Attachment
+from shmio.segment.events import EventKind
+
+HELP = "Have consumers, or with /in the device, get other values than they would, until Ctrl-C."
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's own arguments."""
+    parser.epilog = (
+        "Over PATH or PATH/out consumers see VALUE; over PATH/in the device gets it, and nothing that others write. "
+        "VALUE is JSON or an S7 literal. Without any PATH: what is injected at present."
+    )
+    parser.add_argument("pairs", nargs="*", action=Pairs, metavar="PATH VALUE", help="register or array element")
+    parser.add_argument("--for", dest="for_s", type=seconds, metavar="S", help="lift after so many seconds")
+    parser.add_argument("--priority", type=int, default=0, metavar="N", help="the highest is outermost (default: 0)")
+    parser.add_argument("--name", default="", help="what it is called in the list")
+    parser.add_argument("--keep", action="store_true", help="leave it there, until it is lifted by its number")
+    parser.add_argument("--lift", metavar="NUMBER", type=int, help="lift one, whoever laid it")
+    parser.add_argument("--lift-all", action="store_true", help="lift all of them, of all sources")
+
+
+def execute(cell: Attachment, options: argparse.Namespace) -> int:
+    """Lay, list, or lift. PathError, ValueRangeError, CommandError."""
+    if options.lift_all or options.lift is not None:
+        return _lift(cell, options)
+    if not options.pairs:
+        _list(cell, as_json=options.json)
+        return 0
+    wanted: dict[tuple[str, str], dict[str, Value]] = {}
+    for path, text in options.pairs:
+        topic, value = _read(cell, path, text)
+        wanted.setdefault((topic.source, topic.direction or "out"), {})[f"{topic.source}/{topic.path}"] = value
+    with ExitStack() as stack:
+        for (_, direction), values in wanted.items():
+            paths = [f"{path}/{direction}" for path in values]
+            shadow = cell.inject(*paths, priority=options.priority, keep=options.keep, name=options.name)
+            stack.enter_context(shadow)
+            for path, outcome in zip(paths, shadow.set(values), strict=True):
+                if not (outcome.done or outcome.kind is EventKind.SHADOWED):
+                    raise CommandError(f"{path}: {outcome.text}")
+            print(f"{shadow.number}: {', '.join(map(printable, paths))}", flush=True)
+        if not options.keep:
+            _wait(options.for_s)
+    return 0
+
+
+def _read(cell: Attachment, path: str, text: str) -> tuple[Topic, Value]:
+    sources = cell.sources
+    topic = parse_topic(path, sources, sources[0] if len(sources) == 1 else None)
+    if topic.source not in sources:
+        raise PathError(f"{path}: nothing is served under {topic.source} in this version")
+    register = look_up(cell.block(topic.source).layout, topic)
+    try:
+        return topic, read_value(text, register)
+    except ValueRangeError as error:
+        raise ValueRangeError(f"{path}: {str(error).removeprefix(f'{register.path}: ')}") from None
+
+
+def _wait(for_s: float | None) -> None:
+    """Until Ctrl-C, SIGTERM or the time is over; then all is lifted."""
+    over = threading.Event()
+    for sign in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(sign, lambda *_: over.set())
+    over.wait(for_s)
+
+
+def _lift(cell: Attachment, options: argparse.Namespace) -> int:
+    chosen = [
+        (source, one)
+        for source, standing in cell.injections().items()
+        for one in standing
+        if options.lift_all or one.id == options.lift
+    ]
+    if not chosen and options.lift is not None:
+        raise CommandError(f"there is no injection {options.lift}; shmio inject lists them")
+    for source, one in chosen:
+        cell.lift(source, one.id)
+        print(f"{one.id}: lifted from {source}{f' ({printable(one.name)})' if one.name else ''}")
+    return 0
+
+
+def _list(cell: Attachment, *, as_json: bool) -> None:
+    """What stands, with the registers that it is over."""
+    found: list[dict[str, Any]] = []
+    for source, standing in cell.injections().items():
+        layout = cell.block(source).layout
+        for one in standing:
+            over = [
+                f"{source}/{register.path}"
+                for register in layout.registers
+                if one.covers(register.offset, register.size, _mask(register.bit, bool(register.dims)))
+            ]
+            fields = msgspec.to_builtins(one)
+            found.append({"source": source, **{k: v for k, v in fields.items() if k != "ranges"}, "registers": over})
+    if as_json:
+        print(dumps(found))
+        return
+    for one_found in found:
+        paths = one_found["registers"]
+        more = f" and {len(paths) - 3} more" if paths[3:] else ""
+        keep = ", kept" if one_found["keep"] else ""
+        print(
+            f"{one_found['id']}  {', '.join(map(printable, paths[:3]))}{more} /{one_found['direction']}, "
+            f"priority {one_found['priority']}, pid {one_found['pid']}{keep}  {printable(one_found['name'])}".rstrip()
+        )
+
+
+def _mask(bit: int | None, array: bool) -> int:
+    return 0xFF if bit is None or array else 1 << bit
