@@ -49,10 +49,15 @@ async def _serve(worker: Worker) -> None:
     served = ", ".join(str(Address(address.host, port)) for address, port in zip(addresses, ports, strict=True))
     worker.log.info("serving %s", served)
     worker.running()
+    reading: asyncio.Task[list[str]] | None = None
     while not stopping.is_set():
-        if changed := await feeds.follow():
-            worker.log.info("a reload added, changed or ended %s", ", ".join(changed))
-            services.move(changed)
+        reading = reading or loop.create_task(feeds.follow())
+        await asyncio.wait((reading,), timeout=BEAT_S)  # big layouts take longer than a hang: it beats meanwhile
+        if reading.done():
+            if changed := reading.result():
+                worker.log.info("a reload added, changed or ended %s", ", ".join(changed))
+                services.move(changed)
+            reading = None
         if not feeds.alive:
             raise RuntimeError("a feed ended; the endpoint starts anew")
         streams, dropped, published, refused = services.counters
@@ -61,6 +66,8 @@ async def _serve(worker: Worker) -> None:
             await asyncio.wait_for(stopping.wait(), BEAT_S)
         except TimeoutError:
             continue
+    if reading is not None:
+        reading.cancel()
     feeds.stop()
     await server.stop()
     feeds.join()
