@@ -10,7 +10,7 @@ from typing import Any
 
 import grpc
 import pytest
-from google.protobuf.json_format import MessageToDict
+from google.protobuf.struct_pb2 import Value
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from shmio.config import Address
@@ -147,8 +147,15 @@ async def message(stream: Any) -> tuple[str, Any]:
     return got.header.path, plain(got.value)
 
 
-def plain(value: Any) -> Any:
-    return MessageToDict(value)
+def plain(value: Value) -> Any:
+    """A google.protobuf.Value as Python's."""
+    kind = value.WhichOneof("kind")
+    if kind == "list_value":
+        return [plain(item) for item in value.list_value.values]
+    if kind == "struct_value":
+        return {name: plain(item) for name, item in value.struct_value.fields.items()}
+    assert kind is not None
+    return None if kind == "null_value" else getattr(value, kind)
 
 
 async def refusal(call: Any) -> tuple[grpc.StatusCode, str]:

@@ -1,4 +1,4 @@
-"""What version 2 puts together by hand is what protobuf's own messages would be."""
+"""Values of version 2 as who reads them gets them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from google.protobuf.struct_pb2 import Value
 
 from shmio.endpoints.grpc.values import MAX_LEVELS, encoder, from_wire, path_field, shape, time_stamp, to_wire
 from shmio.errors import ValueRangeError
-from shmio.layout.model import Layout, Register
+from shmio.layout.codec import codec
+from shmio.layout.model import ByteOrder, Layout, Register, array_size
 from shmio.layout.topic import Topic
+from shmio.layout.types import element_type
 from shmio.wire import simlog_v2_pb2 as v2
 from tests.unit.endpoints.harness import plain
 
@@ -31,18 +33,11 @@ from tests.unit.endpoints.harness import plain
         "",
         "M\u00fcller \U0001f600",
         "x" * 300,
-        [],
         [1, [2.5, "a"], None],
     ],
 )
 def test_a_value_is_protobufs_value(value: Any) -> None:
-    assert plain(Value.FromString(to_wire(value))) == value
-
-
-def test_numbers_that_are_none() -> None:
-    assert math.isnan(Value.FromString(to_wire(math.nan)).number_value)
-    assert Value.FromString(to_wire(-math.inf)).number_value == -math.inf
-    assert math.copysign(1, Value.FromString(to_wire(-0.0)).number_value) == -1
+    assert plain(to_wire(value)) == value
 
 
 class Picture:
@@ -53,6 +48,43 @@ class Picture:
 
     def __init__(self, image: bytes) -> None:
         self.image = image
+
+
+@pytest.mark.parametrize("order", ["big", "little"])
+@pytest.mark.parametrize(
+    ("kind", "values"),
+    [
+        ("REAL", [0.5, -0.0, math.nan, math.inf, -math.inf]),
+        ("LREAL", [0.1, 1e300, -1.5]),
+        ("BYTE", list(range(256)) * 8),
+        ("SINT", [-128, 127]),
+        ("UINT", [0, 65535]),
+        ("DINT", [-(2**31), 2**31 - 1]),
+        ("LINT", [-(2**63), 2**53]),
+        ("ULINT", [2**64 - 1]),
+        ("TIME", [-1, 5]),
+        ("TIME_OF_DAY", [1, None]),
+        ("STRING[3]", ["a", None]),
+        ("BOOL", [True, False] * 5),
+    ],
+)
+def test_an_array_is_a_list_of_the_same_values(kind: str, values: list[Any], order: ByteOrder) -> None:
+    element = element_type(kind)
+    assert element is not None
+    bit = 0 if kind == "BOOL" else None
+    size = array_size(element, (len(values),))
+    register = Register("a", kind, ((1, len(values)),), 2, bit, size, len(values))
+    known = [next(value for value in values if value is not None) if value is None else value for value in values]
+    image = bytearray(2 + size)
+    codec(register, order).encode_into(known, image)
+    if None in values:
+        image[2 + element.stride : 2 + element.stride + 4] = b"\xff" * 4
+    layout = Layout("DB1", 1, len(image), False, (register,), order)
+    encoded = encoder(shape(layout, Topic("cell", "a")), layout)(Picture(bytes(image)))
+    assert encoded is not None
+    message = v2.SimlogMessage.FromString(encoded.under(b""))
+    assert message.type == v2.LIST
+    assert repr(plain(message.value)) == repr([float(v) if type(v) is int else v for v in plain(to_wire(values))])
 
 
 def test_a_structure_has_the_names_of_its_members_and_null_for_bytes_that_are_no_value() -> None:
