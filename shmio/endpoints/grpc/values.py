@@ -196,7 +196,7 @@ def _structure(found: Shape, layout: Layout) -> Callable[[bytes], bytes]:
     def serialise(image: bytes) -> bytes:
         value = WireValue()
         fill(image, value)
-        return value.SerializeToString()
+        return value.SerializeToString(deterministic=True)  # equal values are equal bytes: maps have no order
 
     return serialise
 

@@ -27,7 +27,7 @@ async def run(port: int) -> dict[str, Any]:
         out, _ = await asyncio.wait_for(process.communicate(), TIMEOUT_S)
     except TimeoutError:
         process.kill()
-        await process.wait()
+        await process.communicate()
         raise
     assert process.returncode == 0
     found: dict[str, Any] = json.loads(out)

@@ -99,7 +99,10 @@ def test_a_structure_has_the_names_of_its_members_and_null_for_bytes_that_are_no
     encode = encoder(found, layout)
     first = encode(Picture(b"\xff\xfe\2\1x\0\1\2\0"))
     second = encode(Picture(b"\0\1\2\3x\0\1\2\0"))
+    again = encode(Picture(b"\xff\xfe\2\1x\0\1\2\0"))
     assert first is not None
+    assert again is not None
+    assert again.rest == first.rest
     assert second is not None
     message = v2.SimlogMessage.FromString(first.under(path_field("SIM://zone")))
     assert (message.header.path, message.header.timestamp.ToNanoseconds()) == ("SIM://zone", 3_000_000_007)

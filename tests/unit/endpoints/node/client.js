@@ -22,7 +22,8 @@ const number = (value) => ({ type: 'NUMBER', value: { numberValue: value } });
 function plain(value) {
   if (value.kind === 'listValue') return value.listValue.values.map(plain);
   if (value.kind === 'structValue') {
-    return Object.fromEntries(Object.entries(value.structValue.fields).map(([name, item]) => [name, plain(item)]));
+    const names = Object.keys(value.structValue.fields).sort(); // a map has no order
+    return Object.fromEntries(names.map((name) => [name, plain(value.structValue.fields[name])]));
   }
   return value.kind === 'nullValue' ? null : value[value.kind];
 }
