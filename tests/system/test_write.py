@@ -79,7 +79,7 @@ def test_what_is_published_comes_out_of_the_controller_for_every_subscriber(cell
         assert next(frames)["Outputs/100"] == 7
         assert view["Outputs/100"] == 0
     until(lambda: (counters(cell)["published"], counters(cell)["refused"]) == (1, 1), "both counted")
-    assert "publish refused: nothing: no such register" in cell.logs()
+    assert "publish refused: cell/nothing: no such register" in cell.logs()
 
 
 def test_the_example_publishes(cell: Cell) -> None:
