@@ -112,7 +112,7 @@ def test_what_is_odd_is_told_as_check_tells_it(cell: Cell) -> None:
     edit(cell, "period_ms = 20", 'period_ms = 20\nwritable = ["Outpts"]')
     done = cell.supervisor("reload")
     file = cell.folder / "supervisor.toml"
-    warning = f"{file}: warning: source[0].writable: 'Outpts' names nothing in DB201"
+    warning = f"{file}: warning: source[0].writable: 'Outpts' names nothing in DB201; did you mean Outputs?"
     assert (done.returncode, done.stderr) == (0, f"{warning}\n")
     assert "cell: restarted" in done.stdout
     assert warning in cell.supervisor("check", "-c", str(file)).stdout.splitlines()

@@ -169,7 +169,7 @@ def test_what_is_no_time_is_refused(file: str, time: str, said: Output) -> None:
 
 def test_a_path_that_names_nothing_is_refused(file: str, said: Output) -> None:
     assert main(["cat", file, "cell/cout"]) == 1
-    assert said() == ([], ["cout: no such register in DB1; near: count"])
+    assert said() == ([], ["cell/cout: no such register in DB1; near: count"])
     assert main(["cat", file, "cell/x*"]) == 1
     assert said()[1] == ["cell/x*: no register of this recording has such a path"]
     assert main(["cat", file, "cell/speed"]) == 0, "it is in the second layout only"
