@@ -342,11 +342,21 @@ def test_wrong_usage_is_2(arguments: list[str], capsys: pytest.CaptureFixture[st
     assert stop.value.code == 2
 
 
-@pytest.mark.parametrize("verb", [["down"], ["restart", "cell"], ["logs"], ["status"]])
-def test_with_nothing_running_verbs_say_so(verb: list[str], instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("verb", "said"),
+    [
+        (["down"], "no instance '{}' is running"),
+        (["restart", "cell"], "no instance '{}' is running"),
+        (["logs"], "no instance '{}' is running"),
+        (["status"], "{}: stopped; it is not running"),
+    ],
+)
+def test_with_nothing_running_verbs_say_so(
+    verb: list[str], said: str, instance: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main([*verb, "--instance", instance]) == 1
     error = capsys.readouterr().err
-    assert f"no instance {instance!r} is running" in error
+    assert said.format(instance) in error
     assert error.count("\n") == 1
 
 
