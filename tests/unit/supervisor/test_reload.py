@@ -248,7 +248,7 @@ def test_what_does_not_run_is_told_and_the_rest_goes_on(launch: Launch) -> None:
     assert cell.status().state == "degraded"
     assert {name: pid for name, pid in cell.pids().items() if name != "press"} == before
     answer = cell.reload([*CELL, PRESS])
-    assert answer["done"] == ["press: restarted, as its configuration has changed"]
+    assert answer["done"] == ["press: started again, as it was not running"]
     assert cell.of("press").state == "running"
 
 
