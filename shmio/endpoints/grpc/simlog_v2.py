@@ -118,7 +118,9 @@ class SimlogV2:
 
     async def inject(self, _: bytes, context: Context) -> bytes:
         """Not built yet: UNIMPLEMENTED."""
-        await context.abort(grpc.StatusCode.UNIMPLEMENTED, "Inject: this version of shmio has no injection yet")
+        await context.abort(
+            grpc.StatusCode.UNIMPLEMENTED, "Inject: not by gRPC yet; shmio inject does it on the instance's host"
+        )
         raise AssertionError  # abort never returns
 
     async def publish(self, messages: AsyncIterator[bytes], context: Context) -> Empty:
