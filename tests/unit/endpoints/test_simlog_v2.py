@@ -360,7 +360,7 @@ def test_what_is_not_built_yet_says_so(segment: Segment) -> None:
         inject = v2.InjectRequest(targetPath="cell/step/out", shadowPathPrefix="p")
         status, text = await refusal(served.v2.Inject(inject, timeout=TIMEOUT_S))
         assert status is Status.UNIMPLEMENTED
-        assert "no injection" in text
+        assert "not by gRPC yet" in text
 
     serve(segment, test)
 
