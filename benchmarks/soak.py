@@ -3,7 +3,8 @@
 A reader of its own follows every frame: cycles must follow each other, quality must stay good. What the subscribers got
 is held against how often their registers changed; the recording against the frames. Memory and descriptors of each
 process are taken every few seconds; what the second half holds more than the second quarter is growth. Witnesses, a
-process on each core that only sleeps at the same rate, tell when the machine itself made loops late.
+process on each core that only sleeps, before all others if it may, tell when the machine itself stood still: a cycle
+that was skipped then is told apart from one that was skipped by shmio, of which there must be none.
 """
 
 from __future__ import annotations
@@ -33,8 +34,10 @@ REGISTERS = [f"Robot_800/Axs{axis}_Pos" for axis in range(1, 6)]
 FIRST_S = 1.0
 """Overruns in the first second do not count: everybody is starting."""
 SAMPLE_S = 5.0
+STALL_MS = PERIOD_MS / 2
+"""A witness that comes so late tells of a stall."""
 NEAR_S = 0.1
-"""What happens within this time of each other has one cause."""
+"""A cycle that is skipped so soon after a stall was skipped by it: the device and the network catch up, too."""
 
 
 @dataclass
@@ -120,7 +123,7 @@ def soak(running: Instance, duration_s: float) -> list[str]:
     with ExitStack() as stack:
         subscribers = stack.enter_context(Child("subscriber.py", running.grpc, *paths))
         cores = sorted(os.sched_getaffinity(0))
-        witnesses = [stack.enter_context(Child("witness.py", PERIOD_MS, core)) for core in cores]
+        witnesses = [stack.enter_context(Child("witness.py", STALL_MS, core)) for core in cores]
         thread.start()
         begun_s = time.monotonic()
         end_s = begun_s + duration_s
@@ -131,7 +134,8 @@ def soak(running: Instance, duration_s: float) -> list[str]:
         follower.stopping.set()
         thread.join()
         messages = int(subscribers.finish()["messages"])
-        delays = [(at_s, late_s) for witness in witnesses for at_s, late_s in witness.finish()]
+        seen = [witness.finish() for witness in witnesses]
+    stalls = [(at_s, late_s) for one in seen for at_s, late_s in one["late"]]
     after = slots["cell"].counters
     rows, problems = [], []
     for name, taken in sizes.items():
@@ -151,18 +155,22 @@ def soak(running: Instance, duration_s: float) -> list[str]:
         f"{follower.skipped} cycles skipped, {follower.missed} missed by the reader; {changes} changes, "
         f"{messages} messages received, {slots['grpc'].counters['dropped']} dropped"
     )
+    own = 0
     for at_s, count in follower.skips:
-        near = [f"{late_s * 1000:.0f} ms late" for when_s, late_s in delays if abs(when_s - at_s) < NEAR_S + late_s]
-        print(f"at {at_s - begun_s:.1f} s: {count} cycles skipped; the witnesses were {', '.join(near) or 'in time'}")
+        near = [late_s for when_s, late_s in stalls if when_s - STALL_MS / 1000 <= at_s <= when_s + late_s + NEAR_S]
+        own += 0 if near else count
+        why = f"the machine stood still for {max(near) * 1000:.0f} ms" if near else "the machine did not stand still"
+        print(f"at {at_s - begun_s:.1f} s: {count} cycles skipped; {why}")
+    rank = "before all others" if all(one["first"] for one in seen) else "at the priority of others"
     print(
-        f"the witnesses were late by {PERIOD_MS / 2:g} ms and more {len(delays)} times, "
-        f"by {max((late_s for _, late_s in delays), default=0) * 1000:.0f} ms at most"
+        f"the machine stood still for {STALL_MS:g} ms and more {len(stalls)} times, by the witnesses, {rank}; for "
+        f"{max((late_s for _, late_s in stalls), default=0) * 1000:.0f} ms at most, for "
+        f"{sum(late_s for _, late_s in stalls):.1f} s in all; {own} of {follower.skipped} skipped cycles came without it"
     )
     for name, value in (
-        ("overruns after the first second", overruns),
         ("failed polls", failures),
         ("frames that are not good", follower.bad),
-        ("cycles without a frame", follower.skipped),
+        ("cycles skipped while the machine went on", own),
         ("frames missed by the reader", follower.missed),
         ("messages dropped", slots["grpc"].counters["dropped"]),
         ("restarts", sum(slot.supervised.restarts for slot in slots.values())),
