@@ -162,10 +162,10 @@ def soak(running: Instance, duration_s: float) -> list[str]:
         why = f"the machine stood still for {max(near) * 1000:.0f} ms" if near else "the machine did not stand still"
         print(f"at {at_s - begun_s:.1f} s: {count} cycles skipped; {why}")
     rank = "before all others" if all(one["first"] for one in seen) else "at the priority of others"
+    longest_ms = max((late_s for _, late_s in stalls), default=0) * 1000
     print(
         f"the machine stood still for {STALL_MS:g} ms and more {len(stalls)} times, by the witnesses, {rank}; for "
-        f"{max((late_s for _, late_s in stalls), default=0) * 1000:.0f} ms at most, for "
-        f"{sum(late_s for _, late_s in stalls):.1f} s in all; {own} of {follower.skipped} skipped cycles came without it"
+        f"{longest_ms:.0f} ms at most; {own} of {follower.skipped} skipped cycles came without that"
     )
     for name, value in (
         ("failed polls", failures),
