@@ -13,6 +13,7 @@
     │   ├── AlreadyRunningError  another supervisor holds the instance
     │   └── FormatError          the segment's format is not one this version knows
     ├── CommandError       a command cannot be sent to its source, or was not carried out
+    ├── TimeError          time cannot be moved, or a step failed
     ├── QualityError       the value exists but is not good
     ├── ConnectorError     the device did not answer as it should; carries a reason code
     ├── RecordingError     a recording cannot be written, or is none that this version can read
@@ -85,6 +86,10 @@ class FormatError(SegmentError):
 
 class CommandError(ShmioError):
     """A command cannot be sent to its source, or the source or its device did not carry it out; says which and why."""
+
+
+class TimeError(ShmioError):
+    """Another program moves time, or a step failed; names who it is, or who did not answer, and why."""
 
 
 class QualityError(ShmioError):

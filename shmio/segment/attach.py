@@ -106,7 +106,7 @@ class Attachment:
         frame = block.latest()
         if frame is None:
             raise QualityError(f"source {block.source}: no data yet")
-        return _view(block, frame)
+        return View(block, frame)
 
     def stream(self, source: str | None = None, timeout_s: float | None = None) -> Iterator[View]:
         """Every frame from this call on, once, in order, gaps counted; ends after ``timeout_s`` without one.
@@ -121,7 +121,7 @@ class Attachment:
         while True:
             frame = self._next(block, cursor, timeout_s)
             if frame is not None:
-                yield _view(block, frame, cursor.missed - missed)
+                yield View(block, frame, cursor.missed - missed)
                 missed = cursor.missed
             elif block.retired:
                 if not cursor.behind:
@@ -166,7 +166,7 @@ class Attachment:
         while True:
             frame = self._next(block, cursor, None if deadline_s is None else deadline_s - time.monotonic())
             if frame is not None:
-                return _view(block, frame)
+                return View(block, frame)
             if not block.retired:
                 return None
             block = self._successor(block)
@@ -246,10 +246,6 @@ class Attachment:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _view(block: Block, frame: Frame, missed: int = 0) -> View:
-    return View(block.source, frame, block.layout, block.stale_ns, missed, block.section)
 
 
 def take_guest(segment: Segment) -> int:

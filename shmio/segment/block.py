@@ -19,6 +19,7 @@ from shmio.segment.header import cut
 if TYPE_CHECKING:
     from shmio.layout.model import Layout
     from shmio.segment._atomics import FrameTuple
+    from shmio.segment.clock import ClockPage
     from shmio.segment.commands import CommandQueues
     from shmio.segment.standing import StandingCell
 
@@ -61,6 +62,8 @@ class Attributes:
     """Patterns of what may be written."""
     armed: bool = False
     """Whether an injection may reach the device."""
+    stepped: bool = False
+    """Whether it lives on the instance's clock: in virtual time it publishes a frame for each step."""
 
 
 class Block:
@@ -78,8 +81,9 @@ class Block:
         commands: CommandQueues,
         standing: StandingCell,
         attributes: Attributes,
-        retired: Callable[[], bool] = lambda: False,
-        section: int = 0,
+        retired: Callable[[], bool],
+        section: int,
+        clock: ClockPage,
     ) -> None:
         self.source = source
         self.section = section
@@ -91,6 +95,7 @@ class Block:
         self.standing = standing
         """The injections that stand on it at present."""
         self.attributes = attributes
+        self.clock = clock
         self._retired = retired
 
     @property
@@ -112,6 +117,14 @@ class Block:
     def stale_ns(self) -> int:
         """Age from which a frame is bad."""
         return self.ring.stale_ns
+
+    def now_ns(self) -> int:
+        """What the ages of its frames are taken against: the instance's clock or CLOCK_MONOTONIC."""
+        return self.clock.now_ns() if self.attributes.stepped else time.monotonic_ns()
+
+    def assess(self, frame: Frame) -> tuple[Quality, str]:
+        """Quality of a frame of this block as of now, and its reason."""
+        return frame.assess(self.stale_ns, self.now_ns())
 
     def latest(self) -> Frame | None:
         """A copy of the newest frame; None before the source has published its first.
@@ -147,10 +160,16 @@ class BlockWriter:
         self._turn = threading.Lock()  # so that frames and events are in one order
         self.cycle = 0
         """The present cycle, which events are stamped with."""
+        self.at_ns: int | None = None
+        """What frames and events are stamped with in virtual time, comparable to CLOCK_MONOTONIC; None: now."""
         self._quality = Quality.BAD
         self.incarnation = block.ring.begin()
         block.events.ring.begin(self.incarnation)
         self.event(Record(EventKind.STARTED, f"pid {os.getpid()}"))
+
+    def now_ns(self) -> int:
+        """The time that a frame would be stamped with now."""
+        return self.block.now_ns() if self.at_ns is None else self.at_ns
 
     def publish(
         self,
@@ -167,11 +186,11 @@ class BlockWriter:
         """Publish one frame of ``layout.size`` bytes and wake its readers; returns its number.
 
         ``source_ns`` is UTC, default now; 0: no image yet. ``reason`` says why quality is not
-        good; it is cut at 256 bytes. ``asked_ns`` (CLOCK_MONOTONIC): when the device was asked for the image, which
+        good; it is cut at 256 bytes. ``asked_ns`` (as :meth:`now_ns`): when the device was asked for the image, which
         may be as old as that; default now.
         """
         with self._turn:
-            now_ns = time.monotonic_ns()
+            now_ns = self.now_ns()
             self._quality = quality
             return self.block.ring.publish(
                 raw,
@@ -193,7 +212,7 @@ class BlockWriter:
         ``quality``: the new one, for QUALITY; default: that of the last frame.
         """
         with self._turn:
-            now_ns = time.monotonic_ns()
+            now_ns = self.now_ns()
             number = self.block.events.ring.publish(
                 record.pack(),
                 None,

@@ -16,6 +16,7 @@ from shmio import __version__
 from shmio.layout.model import Layout
 from shmio.segment import _atomics, commands, header
 from shmio.segment.block import Attributes
+from shmio.segment.clock import ClockPage, page_size
 from shmio.segment.events import EVENT_SIZE, EVENT_SLOTS
 from shmio.segment.header import HEADER_SIZE, SECTION_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
 from shmio.segment.processes import GUESTS, ProcessSpec, ProcessTable, supervisor_beat
@@ -25,6 +26,7 @@ from shmio.segment.standing import CELL_SIZE
 RING_SECONDS = 8
 SECTIONS_PER_BLOCK = 6
 SPARE_SECTIONS = 40 * SECTIONS_PER_BLOCK
+OWN_SECTIONS = 1  # that are no block's: the clock page
 SPARE_PROCESSES = 16 + GUESTS
 EVENT_STRIDE = -(-(_atomics.RAW_OFFSET + EVENT_SIZE) // 64) * 64
 
@@ -108,11 +110,16 @@ def wake(memory: memoryview, entries: Iterable[SectionEntry]) -> None:
 
 def segment_size(blocks: Sequence[BlockSpec], processes: int) -> int:
     """Bytes of a segment built from these; what ``check`` prints."""
-    return HEADER_SIZE + sum(_table_sizes(len(blocks), processes)) + sum(block.size for block in blocks)
+    tables = sum(_table_sizes(len(blocks), processes))
+    return HEADER_SIZE + tables + sum(block.size for block in blocks) + _clock_size(processes)
+
+
+def _clock_size(processes: int) -> int:
+    return align(page_size(processes + SPARE_PROCESSES), 64)
 
 
 def _table_sizes(blocks: int, processes: int) -> tuple[int, int]:
-    sections = SECTIONS_PER_BLOCK * blocks + SPARE_SECTIONS
+    sections = SECTIONS_PER_BLOCK * blocks + SPARE_SECTIONS + OWN_SECTIONS
     return align(sections * SECTION_SIZE, 64), (processes + SPARE_PROCESSES) * SLOT_SIZE
 
 
@@ -123,6 +130,8 @@ def build_segment(
     processes: Sequence[ProcessSpec],
     mode: str,
     control: str,
+    *,
+    stepped: bool,
 ) -> None:
     """Make room in a new object and write all of it; the magic last."""
     size = segment_size(blocks, len(processes))
@@ -148,6 +157,11 @@ def build_segment(
         header.write_supervisor(memory, os.getpid(), State.STARTING)
         supervisor_beat(memory)
         entries = write_blocks(memory, HEADER_SIZE + sections_size + processes_size, 0, blocks)
+        clock_size = _clock_size(len(processes))
+        clock_at = size - clock_size
+        ClockPage.write_new(memory, clock_at, head.process_capacity, virtual=stepped)
+        own = len(entries)
+        entries.append(SectionEntry(SectionKind.CLOCK, False, clock_at, clock_size, own, "clock", bytes(32)))
         header.change_sections(memory, head, entries)
         header.finish(memory)
 

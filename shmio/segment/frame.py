@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -34,11 +33,12 @@ class Frame(NamedTuple):
     """A validated copy of one frame of a block. All times are in ns.
 
     ``raw`` is what the source delivered, in its own byte order, and ``provenance`` where that comes from; ``effective``
-    is what consumers see, None while nothing is injected. ``publish_ns`` is CLOCK_MONOTONIC, ``clock_ns`` the
-    instance's clock since its start, ``source_ns`` UTC. ``delay_us``: how old the image may have been already when it
-    was published, the time of the device's answer; ``cycle`` counts the periods of the source's schedule, so frames of
-    two incarnations of the source's process are told apart from frames that a reader lost. ``source_ns`` of a bad frame
-    is that of the image it repeats; 0: the source never had one, and the image is zeros.
+    is what consumers see, None while nothing is injected. ``publish_ns`` is CLOCK_MONOTONIC, or in its place what
+    virtual time has made of it; ``clock_ns`` the instance's clock since its start, ``source_ns`` UTC. ``delay_us``: how
+    old the image may have been already when it was published, the time of the device's answer; ``cycle`` counts the
+    periods of the source's schedule, so frames of two incarnations of the source's process are told apart from frames
+    that a reader lost, and then goes on with the steps. ``source_ns`` of a bad frame is that of the image it repeats;
+    0: the source never had one, and the image is zeros.
     """
 
     number: int
@@ -60,12 +60,15 @@ class Frame(NamedTuple):
         """What consumers see: effective if there is one, else raw."""
         return self.raw if self.effective is None else self.effective
 
-    def age_ns(self, now_ns: int | None = None) -> int:
-        """The most that the image can be old: the time since the device was asked for it."""
-        return (time.monotonic_ns() if now_ns is None else now_ns) - self.publish_ns + 1000 * self.delay_us
+    def age_ns(self, now_ns: int) -> int:
+        """The most that the image can be old: the time since the device was asked for it.
 
-    def assess(self, stale_ns: int, now_ns: int | None = None) -> tuple[Quality, str]:
-        """Quality and reason as of now: a frame that is too old is never good."""
+        ``now_ns``: of the clock that its block lives on, :meth:`Block.now_ns`.
+        """
+        return now_ns - self.publish_ns + 1000 * self.delay_us
+
+    def assess(self, stale_ns: int, now_ns: int) -> tuple[Quality, str]:
+        """Quality and reason as of then: a frame that is too old is never good."""
         if self.quality is not Quality.BAD:
             age_ns = self.age_ns(now_ns)
             if age_ns > stale_ns:

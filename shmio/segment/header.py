@@ -56,6 +56,7 @@ class SectionKind(IntEnum):
     COMMANDS = 4
     SOURCE = 5
     STANDING = 6
+    CLOCK = 7
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +122,10 @@ class Header:
 
 @dataclass(frozen=True, slots=True)
 class SectionEntry:
-    """One line of the section table. ``layout``: index of the layout's section, for all others of a block."""
+    """One line of the section table. ``layout``: index of the layout's section, for all others of a block.
+
+    What is no block's has its own index there.
+    """
 
     kind: int
     retired: bool

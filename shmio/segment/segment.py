@@ -13,6 +13,7 @@ from shmio.layout.model import Layout
 from shmio.segment import _atomics, header, shm
 from shmio.segment.block import Attributes, Block, BlockWriter
 from shmio.segment.build import SECTIONS_PER_BLOCK, BlockSpec, align, build_segment, wake, write_blocks
+from shmio.segment.clock import ClockPage
 from shmio.segment.commands import CommandQueues
 from shmio.segment.events import EVENT_SIZE
 from shmio.segment.header import HEADER_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
@@ -37,6 +38,7 @@ class Segment:
         self.memory = memoryview(shared.map())
         self.header = Header.read(self.memory, shared.name)
         self.processes = ProcessTable(shared, self.memory, self.header)
+        self.clock = self._clock()
         self._known: dict[int, Block] = {}  # by the section of its layout
         self.blocks = self._find_blocks()
 
@@ -50,8 +52,9 @@ class Segment:
         mode: str = "live",
         control: str = "",
         group: str | None = None,
+        stepped: bool = False,
     ) -> Segment:
-        """Build a new segment and hold its supervisor's lock.
+        """Build a new segment and hold its supervisor's lock. ``stepped``: time stands at 0 until somebody steps.
 
         AlreadyRunningError: there is a segment of this name, with or without a living supervisor (see
         :func:`shmio.segment.leftover.clear` for the latter). SegmentError: there is no room.
@@ -67,7 +70,7 @@ class Segment:
             if not shared.try_lock(SUPERVISOR_LOCK) or not shared.current():
                 raise AlreadyRunningError(f"another supervisor is just starting instance {instance}")
             try:
-                build_segment(shared, instance, blocks, processes, mode, control)
+                build_segment(shared, instance, blocks, processes, mode, control, stepped=stepped)
                 return cls(shared, instance)
             except BaseException:
                 shm.unlink(name)
@@ -95,6 +98,20 @@ class Segment:
         except BaseException:
             shared.close()
             raise
+
+    def _clock(self) -> ClockPage:
+        head, name = self.header, self.shared.name
+        _, count = header.table_state(self.memory)
+        for entry in header.read_sections(self.memory, head, count, name):
+            if entry.kind == SectionKind.CLOCK:
+                try:  # on memory of its own: what has been read is still judged by it when the segment is closed
+                    memory = memoryview(self.shared.map())
+                    return ClockPage(memory, entry.offset, entry.size, head.started_ns, head.process_capacity)
+                except ValueError as error:
+                    raise FormatError(f"{name}: {error}") from None
+        raise FormatError(
+            f"{name} has no clock page, so shmio {head.version} that made it is older: use one version for both"
+        )
 
     def _find_blocks(self) -> dict[str, Block]:
         self._entries = entries = self._sections()
@@ -153,7 +170,7 @@ class Segment:
         head = self.header
         return Block(
             described.name, layout, frames, events, queues, standing, attributes,
-            lambda: header.retired(memory, head, layout_at), layout_at,
+            lambda: header.retired(memory, head, layout_at), layout_at, self.clock,
         )  # fmt: skip
 
     @property
@@ -218,7 +235,7 @@ class Segment:
         wake(self.memory, ended.values())
 
     def clock_ns(self, now_ns: int) -> int:
-        """The instance's clock, ns since its start, at a time of CLOCK_MONOTONIC."""
+        """The instance's clock, ns since its start, at a time of CLOCK_MONOTONIC, or one that is comparable."""
         return now_ns - self.header.started_ns
 
     def writer(self, source: str) -> BlockWriter:

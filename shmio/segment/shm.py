@@ -112,6 +112,10 @@ class SharedObject:
             raise
         return True
 
+    def unlock(self, byte: int) -> None:
+        """Give the lock on one byte back."""
+        fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, struct.pack(_FLOCK, fcntl.F_UNLCK, os.SEEK_SET, byte, 1, 0))
+
     def locked(self, byte: int) -> bool:
         """Whether another holder has the byte; works on a read-only object (a read lock would conflict too)."""
         query = struct.pack(_FLOCK, fcntl.F_RDLCK, os.SEEK_SET, byte, 1, 0)

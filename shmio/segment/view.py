@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
 class Reading:
     """One register as of now. ``value`` is the last one known even while quality is bad; None if there never was one.
 
-    ``source_time`` is UTC in s, ``age_s`` the time since the frame was published.
+    ``source_time`` is UTC in s, ``age_s`` the time since the frame was published, by its source's clock.
     """
 
     value: Value
@@ -42,13 +41,25 @@ class View:
     ``missed`` counts the frames lost between the one before in its stream and this one.
     """
 
-    source: str
+    block: Block
+    """The one that the frame is of."""
     frame: Frame
-    layout: Layout
-    stale_ns: int
     missed: int = 0
-    section: int = 0
-    """Which of the blocks that its source has had; a reload may give it another, whose frames count from 1."""
+
+    @property
+    def source(self) -> str:
+        """Name of the source."""
+        return self.block.source
+
+    @property
+    def section(self) -> int:
+        """Which of the blocks that its source has had; a reload may give it another, whose frames count from 1."""
+        return self.block.section
+
+    @property
+    def layout(self) -> Layout:
+        """Of the frame's image."""
+        return self.block.layout
 
     @property
     def cycle(self) -> int:
@@ -58,12 +69,12 @@ class View:
     @property
     def quality(self) -> Quality:
         """Quality as of now: it turns bad with age."""
-        return self.frame.assess(self.stale_ns)[0]
+        return self.block.assess(self.frame)[0]
 
     @property
     def reason(self) -> str:
         """Why quality is not good; empty if it is."""
-        return self.frame.assess(self.stale_ns)[1]
+        return self.block.assess(self.frame)[1]
 
     def __getitem__(self, path: str) -> Value:
         """The value of a register, or of an array's element, whatever the quality; PathError."""
@@ -96,7 +107,7 @@ def reading(block: Block, register: Register, frame: Frame | None) -> Reading:
     """One register of one frame, with what is known about it now."""
     if frame is None:
         return Reading(None, Quality.BAD, "no data yet", str(Provenance.LIVE), None, None)
-    now_ns = time.monotonic_ns()
+    now_ns = block.now_ns()
     quality, reason = frame.assess(block.stale_ns, now_ns)
     known = frame.source_ns != 0
     value = codec(register, block.layout.byte_order).decode(frame.image) if known else None

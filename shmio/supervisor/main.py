@@ -258,7 +258,7 @@ class Supervisor:
             except SegmentError:
                 qualities.append(Quality.BAD)
             else:
-                qualities.append(None if frame is None else frame.assess(block.stale_ns)[0])
+                qualities.append(None if frame is None else block.assess(frame)[0])
         return qualities
 
     def _tell(self, now_ns: int) -> None:

@@ -157,7 +157,7 @@ def _process(segment: Segment, slot: ProcessSlot, supervised: bool, now_ns: int)
     else:
         if frame is not None:
             cycle = frame.cycle
-            quality, reason = frame.assess(block.stale_ns, time.monotonic_ns())
+            quality, reason = block.assess(frame)
     return SourceStatus(
         **msgspec.structs.asdict(values),
         quality=str(quality),

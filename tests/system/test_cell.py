@@ -130,7 +130,7 @@ class Load:
 
     def good(self) -> bool:
         frame = self._block.latest()
-        return frame is not None and frame.assess(self._block.stale_ns)[0] is Quality.GOOD
+        return frame is not None and self._block.assess(frame)[0] is Quality.GOOD
 
     def stop(self) -> None:
         self._stopping.set()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-import time
 from collections.abc import Callable, Iterable, Sized
 from typing import NamedTuple, Protocol
 
@@ -134,7 +133,7 @@ class Feed:
     def _settle(self) -> None:
         """Give those who are owed a value the newest one, if it is good."""
         frame = self.block.latest() if self._owed else None
-        if frame is None or frame.assess(self.block.stale_ns)[0] is Quality.BAD:
+        if frame is None or self.block.assess(frame)[0] is Quality.BAD:
             return
         for listener, channel in self._owed.items():
             listener.since = frame.number
@@ -188,9 +187,9 @@ class Feed:
             frame = cursor.next(timeout_s=min(WAIT_S, block.stale_ns / 1e9))
             if frame is None and retired:
                 return
-            good = frame is not None and frame.assess(block.stale_ns)[0] is not Quality.BAD
+            good = frame is not None and block.assess(frame)[0] is not Quality.BAD
             # Age by the next frame's time, if there is one: it may have been stale while nobody was awake to see it.
-            until_ns = frame.publish_ns if frame else time.monotonic_ns()
+            until_ns = frame.publish_ns if frame else block.now_ns()
             stale = shown is not None and shown.age_ns(until_ns) > block.stale_ns
             if shown is not None and (stale or (frame is not None and not good)):
                 since = shown.number + 1 if frame is None else frame.number

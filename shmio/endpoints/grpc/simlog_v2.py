@@ -187,7 +187,7 @@ class SimlogV2:
     def _message(self, path: str, source: str, found: Shape, frame: Frame | None) -> bytes:
         block = self._topics.feed(source).block
         message = None
-        if frame is not None and frame.assess(block.stale_ns)[0] is not Quality.BAD:
+        if frame is not None and block.assess(frame)[0] is not Quality.BAD:
             message = encoder(found, block.layout)(frame)
         if message is None:
             message = nothing(time_stamp(frame.clock_ns) if frame else b"")

@@ -303,7 +303,7 @@ def test_who_joins_while_the_source_stalls_gets_the_value_of_a_register_that_nev
         served.publish(image(step=7))
         frame = feed.block.latest()
         assert frame is not None
-        while not frame.age_ns() > SOON_STALE_NS:  # noqa: ASYNC110  age is what is waited for
+        while not frame.age_ns(feed.block.now_ns()) > SOON_STALE_NS:  # noqa: ASYNC110  age is what is waited for
             await asyncio.sleep(0.01)
         late = Recorder()
         feed.listen(STEP, late)

@@ -1,0 +1,191 @@
+"""The clock page: what time it is in an instance, which step was asked for, who has delivered which.
+
+The section is described in docs/reference/segment-format.md. The owner of time writes it (``coordinator``), anybody
+reads it, and each process has a bell there that is rung when the page has something for it to do.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import time
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Final
+
+from shmio.errors import SegmentError
+from shmio.segment import _atomics
+from shmio.segment.header import cut, text
+
+STEP_SIZE_NS: Final = 50_000_000
+"""The size of a step unless somebody has set another."""
+
+_SLOTS_AT: Final = 8
+_BELL_AT: Final = 0
+_DELIVERED_BELL_AT: Final = 4
+_COPIES_AT: Final = (64, 320)
+_TABLE_AT: Final = 576
+_ENTRY: Final = struct.Struct("<QII")  # delivered, bell, 0
+_STATE: Final = struct.Struct("<IIQqqQqdI4x168s")
+_NOTE_SIZE: Final = 167
+_PLAYING: Final = 1
+_STEPPING: Final = 2
+
+
+class ClockMode(IntEnum):
+    """What moves time."""
+
+    WALL = 0
+    VIRTUAL = 1
+    """Only steps do, from the moment when a program took time over until the instance ends."""
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
+@dataclass(frozen=True, slots=True)
+class ClockState:
+    """The page at one moment.
+
+    ``step``: number of the last step asked for; ``time_ns``: the instance's clock after it, ``dt_ns`` before which it
+    was that much less; in wall time ``time_ns`` is now. ``stepping``: that step is under way. ``done``: number of the
+    last one that all participants have finished. ``owner``: pid of who moves time; 0: nobody. ``note``: whom a step
+    waits for, or why the last one failed.
+    """
+
+    mode: ClockMode = ClockMode.WALL
+    step: int = 0
+    time_ns: int = 0
+    dt_ns: int = 0
+    done: int = 0
+    step_size_ns: int = STEP_SIZE_NS
+    playing: bool = False
+    rate: float = 1.0
+    stepping: bool = False
+    owner: int = 0
+    note: str = ""
+
+    @property
+    def virtual(self) -> bool:
+        """Whether only steps move time."""
+        return self.mode is ClockMode.VIRTUAL
+
+    @property
+    def present_ns(self) -> int:
+        """The instance's clock: while a step is under way still what it was before that."""
+        return self.time_ns - self.dt_ns if self.stepping else self.time_ns
+
+
+class Bell:
+    """A futex word in shared memory: who waits is woken when it is rung. Works on a read-only mapping, but to ring."""
+
+    def __init__(self, memory: memoryview, offset: int) -> None:
+        self._memory = memory
+        self._offset = offset
+
+    def value(self) -> int:
+        """To be read before looking for news."""
+        return _atomics.bell(self._memory, self._offset)
+
+    def ring(self) -> None:
+        """Wake all who wait."""
+        _atomics.bell_ring(self._memory, self._offset)
+
+    def wait(self, seen: int, timeout_ns: int = -1) -> int:
+        """Wait until the value differs from ``seen``, or for so long (negative: for ever); the value then."""
+        return _atomics.bell_wait(self._memory, self._offset, seen, timeout_ns)
+
+
+class ClockPage:
+    """The section of one segment; several threads may use it, to write it is the owner of time's alone."""
+
+    def __init__(self, memory: memoryview, offset: int, size: int, started_ns: int, slots: int) -> None:
+        """``started_ns``: the clock's zero on CLOCK_MONOTONIC. ValueError: the section is none of this geometry."""
+        if size < page_size(slots) or _word(memory, offset + _SLOTS_AT) != slots:
+            raise ValueError("the clock page is too short, or has not a place for each process")
+        self._memory = memory
+        self._offset = offset
+        self._started_ns = started_ns
+        self.bell = Bell(memory, offset + _BELL_AT)
+        """Rung at every change of the page."""
+        self.delivered_bell = Bell(memory, offset + _DELIVERED_BELL_AT)
+        """Rung by those who deliver steps."""
+
+    @staticmethod
+    def write_new(memory: memoryview, offset: int, slots: int, *, virtual: bool) -> None:
+        """The page of a new segment; ``virtual``: time stands at 0 until somebody steps."""
+        struct.pack_into("<I", memory, offset + _SLOTS_AT, slots)
+        _write(memory, offset, ClockState(ClockMode.VIRTUAL if virtual else ClockMode.WALL))
+
+    def read(self) -> ClockState:
+        """The page as it is now. SegmentError: it cannot be read, which no writer of ours brings about."""
+        for at in _COPIES_AT * 4:  # one of them is whole, whenever their writer was killed
+            data = _atomics.cell_read(self._memory, self._offset + at, _STATE.size)
+            if data is not None:
+                state = _unpack(data)
+                return state if state.virtual else replace(state, time_ns=time.monotonic_ns() - self._started_ns)
+        raise SegmentError("the clock page makes no sense: restart the instance: shmio-supervisor down, up")
+
+    def write(self, state: ClockState) -> None:
+        """Write the page and ring its bell; the owner of time alone."""
+        _write(self._memory, self._offset, state)
+        self.bell.ring()
+
+    def now_ns(self) -> int:
+        """What ages of frames that live on this clock are taken against, comparable to CLOCK_MONOTONIC.
+
+        In wall time it is CLOCK_MONOTONIC.
+        """
+        return self._started_ns + self.read().present_ns
+
+    def monotonic_ns(self, time_ns: int) -> int:
+        """A time of the instance's clock as one that is comparable to CLOCK_MONOTONIC."""
+        return self._started_ns + time_ns
+
+    def slot_bell(self, index: int) -> Bell:
+        """The bell of the process in this slot of the table: rung when the page has something for it to do."""
+        return Bell(self._memory, self._entry(index) + 8)
+
+    def delivered(self, index: int) -> int | None:
+        """The last step that the process in this slot has delivered; None: it delivers none."""
+        count = _atomics.load64(self._memory, self._entry(index))
+        return count - 1 if count else None
+
+    def deliver(self, index: int, step: int) -> None:
+        """Tell that every change up to this step, and its marker, have been delivered; the process's alone.
+
+        From the first call on each step waits for this process as long as it lives.
+        """
+        _atomics.store64(self._memory, self._entry(index), step + 1)
+        self.delivered_bell.ring()
+
+    def _entry(self, index: int) -> int:
+        return self._offset + _TABLE_AT + index * _ENTRY.size
+
+
+def page_size(slots: int) -> int:
+    """Bytes of the section for a process table of so many slots."""
+    return _TABLE_AT + slots * _ENTRY.size
+
+
+def _word(memory: memoryview, offset: int) -> int:
+    return int.from_bytes(memory[offset : offset + 4], "little")
+
+
+def _write(memory: memoryview, offset: int, state: ClockState) -> None:
+    flags = (_PLAYING if state.playing else 0) | (_STEPPING if state.stepping else 0)
+    data = _STATE.pack(
+        state.mode, flags, state.step, state.time_ns, state.dt_ns, state.done, state.step_size_ns, state.rate,
+        state.owner, cut(state.note, _NOTE_SIZE),
+    )  # fmt: skip
+    for at in _COPIES_AT:
+        _atomics.cell_write(memory, offset + at, data)
+
+
+def _unpack(data: bytes) -> ClockState:
+    mode, flags, step, time_ns, dt_ns, done, step_size_ns, rate, owner, note = _STATE.unpack(data)
+    return ClockState(
+        ClockMode.VIRTUAL if mode else ClockMode.WALL, step, time_ns, dt_ns, done, step_size_ns,
+        bool(flags & _PLAYING), rate if math.isfinite(rate) and rate > 0 else 1.0, bool(flags & _STEPPING), owner,
+        text(note),
+    )  # fmt: skip

@@ -1,0 +1,154 @@
+"""The clock page, as its owner writes and others read it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+
+from shmio.errors import FormatError
+from shmio.layout.model import Layout, Register
+from shmio.segment import Attributes, BlockSpec, ProcessSpec, Quality, Segment
+from shmio.segment.clock import ClockMode, ClockState
+from shmio.segment.header import SectionKind, read_sections, table_state
+
+LAYOUT = Layout("DB1", 1, 4, False, (Register("count", "UDINT", (), 0, None, 4, 1),))
+STATE = ClockState(
+    ClockMode.VIRTUAL, 12, 5_000_000_000, 20_000_000, 11, 30_000_000, True, 2.5, True, 4711, "step 12 waits for sim"
+)
+
+
+def spec(name: str, *, stepped: bool) -> BlockSpec:
+    return BlockSpec(name, LAYOUT, 20_000_000, 500_000_000, 1 << 20, Attributes("memory", stepped=stepped))
+
+
+@pytest.fixture
+def segment(instance: str) -> Iterator[Segment]:
+    blocks = [spec("sim", stepped=True), spec("cell", stepped=False)]
+    processes = [ProcessSpec("sim", "source"), ProcessSpec("cell", "source")]
+    with Segment.create(instance, blocks, processes) as segment:
+        yield segment
+        segment.unlink()
+
+
+def test_a_new_instance_lives_in_wall_time(segment: Segment) -> None:
+    before_ns = time.monotonic_ns() - segment.header.started_ns
+    state = segment.clock.read()
+    after_ns = time.monotonic_ns() - segment.header.started_ns
+    assert (state.mode, state.step, state.done, state.playing, state.owner) == (ClockMode.WALL, 0, 0, False, 0)
+    assert state.step_size_ns == 50_000_000
+    assert before_ns <= state.time_ns <= after_ns
+    assert state.time_ns == state.present_ns
+
+
+def test_time_stands_at_zero_in_one_that_is_stepped_from_the_start(instance: str) -> None:
+    with Segment.create(instance, [], [], stepped=True) as segment:
+        state = segment.clock.read()
+        assert (str(state.mode), state.time_ns, state.step) == ("virtual", 0, 0)
+        assert segment.clock.now_ns() == segment.header.started_ns
+        segment.unlink()
+
+
+def test_who_opens_the_segment_reads_what_was_written(segment: Segment, instance: str) -> None:
+    segment.clock.write(STATE)
+    with Segment.open(instance) as reader:
+        assert reader.clock.read() == STATE
+
+
+def test_the_present_is_before_the_step_that_is_under_way(segment: Segment) -> None:
+    segment.clock.write(STATE)
+    assert segment.clock.now_ns() == segment.header.started_ns + 4_980_000_000
+    segment.clock.write(replace(STATE, stepping=False))
+    assert segment.clock.now_ns() == segment.header.started_ns + 5_000_000_000
+
+
+@pytest.mark.parametrize("copy", [64, 320])
+def test_a_writer_that_died_half_way_hides_nothing(segment: Segment, copy: int) -> None:
+    segment.clock.write(STATE)
+    (entry,) = [
+        entry
+        for entry in read_sections(segment.memory, segment.header, table_state(segment.memory)[1], "")
+        if entry.kind == SectionKind.CLOCK
+    ]
+    at = entry.offset + copy
+    odd = int.from_bytes(segment.memory[at : at + 8], "little") | 1
+    segment.memory[at : at + 8] = odd.to_bytes(8, "little")
+    assert segment.clock.read() == STATE
+    segment.clock.write(replace(STATE, step=13))
+    assert segment.clock.read().step == 13
+
+
+def test_a_rate_that_is_none_is_one(segment: Segment) -> None:
+    segment.clock.write(replace(STATE, rate=float("nan")))
+    assert segment.clock.read().rate == 1.0
+
+
+def test_a_long_note_is_cut(segment: Segment) -> None:
+    segment.clock.write(replace(STATE, note="ä" * 200))
+    assert segment.clock.read().note == "ä" * 83
+
+
+def test_every_change_rings_the_bell_and_no_other(segment: Segment, instance: str) -> None:
+    with Segment.open(instance) as reader:
+        bell, own = reader.clock.bell, reader.clock.slot_bell(0)
+        seen, seen_own = bell.value(), own.value()
+        woken = threading.Thread(target=bell.wait, args=(seen,))
+        woken.start()
+        segment.clock.write(STATE)
+        woken.join()
+        assert bell.value() != seen
+        assert own.value() == seen_own
+        segment.clock.slot_bell(0).ring()
+        assert own.value() != seen_own
+
+
+def test_deliveries_are_told_by_slot(segment: Segment, instance: str) -> None:
+    with Segment.open(instance) as reader:
+        assert reader.clock.delivered(1) is None
+        seen = reader.clock.delivered_bell.value()
+        segment.clock.deliver(1, 0)
+        assert reader.clock.delivered(1) == 0
+        segment.clock.deliver(1, 12)
+        assert (reader.clock.delivered(0), reader.clock.delivered(1)) == (None, 12)
+        assert reader.clock.delivered_bell.value() != seen
+
+
+def test_ages_are_taken_against_the_clock_that_a_block_lives_on(segment: Segment) -> None:
+    sim, cell = segment.writer("sim"), segment.writer("cell")
+    hour_ns = 3_600_000_000_000
+    segment.clock.write(replace(STATE, time_ns=hour_ns, stepping=False))
+    sim.publish(bytes(4), cycle=12)
+    cell.publish(bytes(4), cycle=12)
+    frames = {}
+    for name in ("sim", "cell"):
+        frame = segment.blocks[name].latest()
+        assert frame is not None
+        frames[name] = frame
+    assert frames["sim"].publish_ns == segment.header.started_ns + hour_ns
+    assert frames["sim"].clock_ns == hour_ns
+    assert frames["cell"].clock_ns < hour_ns, "a device's frames keep real time"
+    assert frames["sim"].age_ns(segment.blocks["sim"].now_ns()) == 0
+    segment.clock.write(replace(STATE, time_ns=hour_ns + 600_000_000, stepping=False))
+    block = segment.blocks["sim"]
+    assert frames["sim"].assess(block.stale_ns, block.now_ns())[0] is Quality.BAD
+    assert frames["cell"].assess(block.stale_ns, segment.blocks["cell"].now_ns())[0] is Quality.GOOD
+
+
+def test_a_step_stamps_its_frames_and_events_with_its_own_time(segment: Segment) -> None:
+    writer = segment.writer("sim")
+    writer.at_ns = segment.clock.monotonic_ns(7_000_000_000)
+    writer.publish(bytes(4), cycle=1, asked_ns=writer.now_ns())
+    frame = segment.blocks["sim"].latest()
+    assert frame is not None
+    assert (frame.clock_ns, frame.delay_us) == (7_000_000_000, 0)
+
+
+def test_a_segment_without_a_clock_page_is_refused(segment: Segment, instance: str) -> None:
+    count = table_state(segment.memory)[1]
+    kind_at = segment.header.sections_offset + (count - 1) * 128
+    segment.memory[kind_at : kind_at + 4] = (99).to_bytes(4, "little")
+    with pytest.raises(FormatError, match=r"no clock page.*older"):
+        Segment.open(instance)
