@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 from shmio.segment import Segment
 from shmio.supervisor import policy
 from shmio.supervisor.fleet import Fleet
@@ -11,7 +9,6 @@ from shmio.supervisor.plan import Job, Plan
 from shmio.supervisor.reconcile import reconcile
 from shmio.supervisor.states import Event, State
 
-WARNINGS_BYTES: Final = 32_000
 SETTLED = (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED)
 
 
@@ -77,16 +74,6 @@ class Change:
             self._fleet.drop(name)
         for job in self._coming:
             self._fleet.assign(job)
-
-    def warnings(self) -> list[str]:
-        """What is odd about the new configuration, as far as an answer has room, and how much more there is."""
-        warnings, room = self.plan.warnings, WARNINGS_BYTES
-        for count, warning in enumerate(warnings):
-            room -= len(warning.encode())
-            if room < 0:
-                more = f"… and {len(warnings) - count} more warnings: shmio-supervisor check prints them"
-                return [*warnings[:count], more]
-        return list(warnings)
 
     def outcome(self) -> tuple[list[str], list[str]]:
         """What was done, and what came out badly, a line each."""

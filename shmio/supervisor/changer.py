@@ -149,8 +149,8 @@ class Changer:
         kept = list(change.changes.kept)
         log.info("the change is over", extra=fields(kept=len(kept)))
         self._change = None
-        told = {"done": done, "problems": problems, "kept": kept}
-        self._tell(lambda answer: answer.ok(warnings=change.warnings(), **told))
+        told = {"warnings": list(change.plan.warnings), "done": done, "problems": problems, "kept": kept}
+        self._tell(lambda answer: answer.ok(**told))
 
     def _tell(self, how: Callable[[Answer], None]) -> None:
         """Answer who has asked, if nobody has yet."""

@@ -29,6 +29,7 @@ from typing import Any, Final
 import msgspec
 
 from shmio.errors import ControlError, UnreachableError
+from shmio.supervisor.shorten import cut, shorten
 from shmio.supervisor.socketpath import remove_socket
 
 MAX_REQUEST_BYTES: Final = 4096
@@ -74,12 +75,12 @@ class Answer:
         self._client = client
 
     def ok(self, **values: object) -> None:
-        """Done."""
-        self._server.answer(self._client, {"ok": True, **values})
+        """Done. Of lists of lines as many are told as there is room for."""
+        self._server.answer(self._client, shorten({"ok": True, **values}, MAX_ANSWER_BYTES - 1))
 
     def error(self, message: str) -> None:
         """Not done, and why."""
-        self._server.answer(self._client, {"error": message})
+        self._server.answer(self._client, {"error": cut(message)})
 
 
 class ControlServer:

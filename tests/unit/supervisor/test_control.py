@@ -76,6 +76,48 @@ def test_a_request_arrives_as_it_was_sent(served: Served, request_: Request) -> 
     assert answer_to(client) == {"ok": True, "more": 1}
 
 
+LONG = "x" * 1500
+
+
+@pytest.mark.parametrize(
+    ("sizes", "whole"),
+    [
+        ({"warnings": 10, "done": 10, "problems": 10}, ["warnings", "done", "problems"]),
+        ({"warnings": 500, "done": 10, "problems": 10}, ["done", "problems"]),
+        ({"warnings": 20, "done": 40, "problems": 10}, ["problems"]),
+        ({"warnings": 0, "done": 200, "problems": 200}, []),
+    ],
+)
+def test_of_a_long_answer_the_least_urgent_lines_are_left_out_first(
+    served: Served, sizes: dict[str, int], whole: list[str]
+) -> None:
+    client = served.client(b'{"do": "reload"}\n')
+    kept = [f"{number:040}" for number in range(200)]
+    served.requests[0][1].ok(**{key: [LONG] * size for key, size in sizes.items()}, kept=kept)
+    received = b""
+    with client:
+        while data := client.recv(4096):
+            received += data
+    assert len(received) <= control.MAX_ANSWER_BYTES
+    answer = json.loads(received)
+    assert answer["kept"] == kept
+    for key, size in sizes.items():
+        told = answer[key]
+        if key in whole or not size:
+            assert told == [LONG] * size
+        else:
+            assert told[-1].startswith(f"… and {size - len(told) + 1} more")
+    if not whole:
+        assert len(answer["done"]) == 1
+        assert len(received) > control.MAX_ANSWER_BYTES - 2 * len(LONG), "there is no more room"
+
+
+def test_a_long_error_is_cut(served: Served) -> None:
+    client = served.client(b'{"do": "reload"}\n')
+    served.requests[0][1].error("é" * 100_000)
+    assert answer_to(client) == {"error": "é" * 1999 + "…"}
+
+
 def test_a_successors_socket_is_left_to_it(served: Served) -> None:
     successor = Served(served.path)
     served.server.retire()

@@ -35,6 +35,9 @@ def test_what_is_odd_is_told_as_far_as_an_answer_has_room(launch: Launch) -> Non
     told = cell.reload(CELL, warnings=["é" * 1000] * 1000)["warnings"]
     assert 0 < len(told) < 100
     assert told[-1] == f"… and {1000 - len(told) + 1} more warnings: shmio-supervisor check prints them"
+    told = cell.reload(CELL, warnings=["\1" * 9000] * 60)["warnings"]
+    assert told[0] == "\1" * 1999 + "…", "six bytes each on their way"
+    assert told[-1] == f"… and {60 - len(told) + 1} more warnings: shmio-supervisor check prints them"
 
 
 def test_the_configuration_is_as_old_as_its_last_good_reload(launch: Launch) -> None:
