@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pwd
 import select
 import signal
 import time
@@ -198,22 +199,40 @@ def _maps(pid: int, inode: int, right: str = "") -> bool:
 def end(instance: str, workers: Iterable[Worker]) -> None:
     """Have processes end, by SIGTERM, then SIGKILL, with ``GRACE_S`` for each; returns when they have.
 
-    SegmentError: some have not, by name and pid.
+    SegmentError: some have not, by name and pid, or are another user's, who is named.
     """
     alive = {worker.pidfd: worker for worker in workers}
+    stuck: list[str] = []
     for sign in (signal.SIGTERM, signal.SIGKILL):
         for fd in _ended(alive, 0):
             del alive[fd]
-        for fd in alive:
-            with suppress(ProcessLookupError, PermissionError):
-                signal.pidfd_send_signal(fd, sign)
+        for fd, worker in list(alive.items()):
+            try:
+                with suppress(ProcessLookupError):
+                    signal.pidfd_send_signal(fd, sign)
+            except PermissionError:
+                stuck.append(f"{worker.name}: {_foreign(worker.pid)}")
+                del alive[fd]
         deadline = time.monotonic() + GRACE_S
         while alive and (rest_s := deadline - time.monotonic()) > 0:
             for fd in _ended(alive, rest_s):
                 del alive[fd]
-    if alive:
-        stuck = "; ".join(f"{worker.name}: {survivor(worker.pid)}" for worker in alive.values())
-        raise SegmentError(f"instance {instance!r} has processes that do not end: {stuck}; then try again")
+    stuck += [f"{worker.name}: {survivor(worker.pid)}" for worker in alive.values()]
+    if stuck:
+        raise SegmentError(f"instance {instance!r} has processes that do not end: {'; '.join(stuck)}; then try again")
+
+
+def _foreign(pid: int) -> str:
+    """What to say of a process that this user may not end, with the remedy."""
+    try:
+        uid = Path(f"/proc/{pid}").stat().st_uid
+    except OSError:
+        return f"pid {pid} belongs to another user, so only that user or root can end it: sudo kill {pid}"
+    try:
+        owner = pwd.getpwuid(uid).pw_name
+    except KeyError:
+        owner = str(uid)
+    return f"pid {pid} belongs to user {owner}, so only {owner} or root can end it: sudo kill {pid}"
 
 
 def survivor(pid: int) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pwd
 import signal
 import subprocess
 import sys
@@ -105,6 +106,30 @@ def test_what_does_not_end_is_named_and_keeps_the_segment(instance: str, monkeyp
         assert instance in instances()
         assert clear(instance)[0].startswith(f"stopped cell, pid {orphan}")
     assert instance not in instances()
+
+
+def test_another_users_process_is_told_by_its_owner(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    command = [sys.executable, "-c", SUPERVISOR, instance, ORPHAN.format(stubborn=False)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as supervisor:
+        assert supervisor.stdout is not None
+        orphan = int(supervisor.stdout.readline())
+        supervisor.kill()
+        supervisor.wait()
+
+        def refuse(*_: object) -> None:
+            raise PermissionError
+
+        owner = pwd.getpwuid(os.getuid()).pw_name
+        with monkeypatch.context() as held:
+            held.setattr("shmio.segment.leftover.signal.pidfd_send_signal", refuse)
+            with pytest.raises(SegmentError) as caught:
+                clear(instance)
+        assert str(caught.value) == (
+            f"instance {instance!r} has processes that do not end: cell: pid {orphan} belongs to user {owner}, so only "
+            f"{owner} or root can end it: sudo kill {orphan}; then try again"
+        )
+        assert instance in instances()
+        assert clear(instance)[0].startswith(f"stopped cell, pid {orphan}")
 
 
 def test_an_unfinished_segment_is_removed(instance: str) -> None:
