@@ -8,12 +8,12 @@ import select
 import signal
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from typing import NamedTuple
 
 from shmio import __version__
-from shmio.errors import AlreadyRunningError, FormatError, SegmentError, UnfinishedError
+from shmio.errors import AlreadyRunningError, FormatError, NotRunningError, SegmentError, UnfinishedError
 from shmio.segment import shm
 from shmio.segment.header import HEADER_SIZE, State
 from shmio.segment.processes import SUPERVISOR_LOCK, ProcessSlot
@@ -64,6 +64,18 @@ def read(shared: SharedObject, instance: str) -> Segment:
     if segment.header.version != __version__:
         raise FormatError(f"{shared.name} was made by shmio {segment.header.version}, this is {__version__}")
     return segment
+
+
+def living(instance: str) -> bool:
+    """Whether processes of the instance run, of whatever version of shmio they are. SegmentError: no permission."""
+    try:
+        with Segment.open(instance) as segment:
+            return any(slot.alive() for slot in segment.processes)
+    except NotRunningError:
+        return False
+    except FormatError:
+        with closing(SharedObject.open(PREFIX + instance)) as shared, _opened(_workers(shared)) as found:
+            return bool(found)
 
 
 def clear(instance: str, forget_control: Callable[[str], object] = lambda _: None) -> list[str]:

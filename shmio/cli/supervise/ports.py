@@ -1,4 +1,4 @@
-"""Addresses that another program listens on already, found before anything starts."""
+"""Addresses to listen on: whether they are of this host, and who listens there already; before anything starts."""
 
 from __future__ import annotations
 
@@ -8,18 +8,37 @@ import socket
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-from shmio.config import Address
-from shmio.errors import EndpointError, ShmioError
+from shmio.config import Address, Config
+from shmio.errors import ConfigError, EndpointError, ShmioError
 from shmio.segment import instances
 from shmio.supervisor.plan import Plan
 from shmio.supervisor.status import read_status
 
 # proc(5), /proc/net/tcp: addresses are 32-bit words in hexadecimal, each in the host's byte order.
 _MAPPED: Final = "0000000000000000FFFF0000"
-_ANY: Final = frozenset({"0" * 8, "0" * 32})
+_ANY_IPV4: Final = "0" * 8
+_ANY: Final = "0" * 32
 _LISTEN: Final = "0A"
+
+
+def check_listening(config: Config) -> None:
+    """ConfigError when the name of a host to listen on is none, or two addresses are one port; 0 is any free one."""
+    listening = [(f"emulator[{i}].listen", emulator.listen) for i, emulator in enumerate(config.emulator)]
+    if config.grpc:
+        listening += [(f"grpc.listen[{i}]", text) for i, text in enumerate(config.grpc.listen)]
+    seen: list[tuple[str, str, int, set[str]]] = []
+    for key, text in listening:
+        address = Address.parse(text)
+        try:
+            hosts = _hosts(address)
+        except ConfigError as error:
+            raise ConfigError(f"{key}: {error}") from None
+        for other, told, port, others in seen:
+            if port == address.port != 0 and _share(hosts, others):
+                raise ConfigError(f"{key}: {text} is the port of {other} ({told}) already; choose another")
+        seen.append((key, text, address.port, hosts))
 
 
 def check_ports(plan: Plan) -> None:
@@ -36,18 +55,45 @@ def check_ports(plan: Plan) -> None:
 
 
 def in_use(address: Address) -> bool:
-    """Whether somebody listens there; of a name with several addresses, on all of them."""
+    """Whether somebody listens there; of a name with several addresses, on all of them. ConfigError."""
     with suppress(OSError):
-        places = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
-        return address.port != 0 and all(_taken(family, place) for family, _, _, _, place in places)
+        return address.port != 0 and all(_taken(family, place) for family, place in _places(address))
     return False
 
 
-def _taken(family: int, place: object) -> bool:
+def _places(address: Address) -> list[tuple[int, tuple[Any, ...]]]:
+    """(family, socket address) of each address that the host has; ConfigError if it has none."""
+    try:
+        found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as error:  # UnicodeError: a part of the name is empty, or too long
+        why = error.strerror if isinstance(error, OSError) else "it is no name of a host"
+        raise ConfigError(
+            f"{address}: {address.host!r} cannot be resolved ({why}); write an address or a name of this host"
+        ) from None
+    return [(family, place) for family, _, _, _, place in found]
+
+
+def _hosts(address: Address) -> set[str]:
+    """All that a host's name stands for, as /proc/net/tcp writes it."""
+    return {
+        _words(socket.inet_pton(family, str(place[0]).partition("%")[0])).removeprefix(_MAPPED)
+        for family, place in _places(address)
+    }
+
+
+def _share(hosts: set[str], others: set[str]) -> bool:
+    """Whether who listens on these keeps who listens on those from the same port: [::] takes IPv4, too."""
+    if hosts & others or _ANY in hosts | others:
+        return True
+    ours, theirs = ({host for host in all_ if len(host) == len(_ANY_IPV4)} for all_ in (hosts, others))
+    return bool(ours and theirs and _ANY_IPV4 in ours | theirs)
+
+
+def _taken(family: int, place: tuple[Any, ...]) -> bool:
     with socket.socket(family) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections that are over do not count
         try:
-            probe.bind(place)  # type: ignore[arg-type]
+            probe.bind(place)
         except OSError as error:
             return error.errno == errno.EADDRINUSE
     return False
@@ -69,19 +115,15 @@ def _holder(address: Address) -> str:
 
 def _listening(address: Address) -> Iterator[str]:
     """The inodes of the sockets that listen there."""
-    wanted = {
-        _words(socket.inet_pton(family, str(place[0]).partition("%")[0]))
-        for family, _, _, _, place in socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
-    }
+    wanted = _hosts(address)
     for table in ("tcp", "tcp6"):
         with suppress(OSError):
             for line in Path("/proc/net", table).read_text().splitlines()[1:]:
                 fields = line.split()
                 host, _, port = fields[1].partition(":")
-                if fields[3] == _LISTEN and int(port, 16) == address.port:
-                    hosts = {host.removeprefix(_MAPPED)}
-                    if hosts & wanted or hosts & _ANY or wanted & _ANY:
-                        yield fields[9]
+                there = fields[3] == _LISTEN and int(port, 16) == address.port
+                if there and _share({host.removeprefix(_MAPPED)}, wanted):
+                    yield fields[9]
 
 
 def _words(packed: bytes) -> str:

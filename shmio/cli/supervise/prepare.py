@@ -10,6 +10,7 @@ import msgspec
 
 from shmio.cli.supervise.host import check_host
 from shmio.cli.supervise.layouts import LayoutFiles
+from shmio.cli.supervise.ports import check_listening
 from shmio.config import Address, Config, Emulator, Source, load
 from shmio.config.read import unknown_option
 from shmio.config.wording import named
@@ -46,7 +47,7 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
     files = LayoutFiles(config)
     try:
         check_host(config)
-        _check_listening(config)
+        check_listening(config)
         layouts = {source.name: _check_source(i, source, files) for i, source in enumerate(config.source)}
         emulated = {emulator.name: _check_emulator(i, emulator, files) for i, emulator in enumerate(config.emulator)}
         odd = [*_odd(config, layouts), *_not_served(config, layouts, emulated), *_unread(emulated)]
@@ -118,19 +119,6 @@ def _check_numbers(key: str, layouts: Sequence[Layout]) -> None:
             alone = f'; block = "{layout.name}" beside it, to serve that block alone' if len(layouts) > 1 else ""
             why = f"the data block {layout.name!r} has no number in its name"
             raise ConfigError(f"{key}.dbNumber: this key is needed, for {why}{alone}")
-
-
-def _check_listening(config: Config) -> None:
-    """No address twice; port 0 is any free one."""
-    listening = [(f"emulator[{i}].listen", emulator.listen) for i, emulator in enumerate(config.emulator)]
-    if config.grpc:
-        listening += [(f"grpc.listen[{i}]", text) for i, text in enumerate(config.grpc.listen)]
-    seen: dict[Address, str] = {}
-    for key, text in listening:
-        address = Address.parse(text)
-        if address.port and address in seen:
-            raise ConfigError(f"{key}: {text} is the address of {seen[address]} already")
-        seen[address] = key
 
 
 def _odd(config: Config, layouts: dict[str, Layout]) -> list[str]:

@@ -22,7 +22,7 @@ from shmio.cli.supervise.prepare import Prepared, peer, prepare
 from shmio.cli.target import ask, config_file, option_for
 from shmio.errors import AlreadyRunningError, ConfigError, ControlError, ShmioError
 from shmio.logs import printable
-from shmio.segment import PREFIX, Segment, State, instances
+from shmio.segment import PREFIX, Segment, State, instances, leftover
 from shmio.segment.segment import refuse_second
 from shmio.supervisor import control
 from shmio.supervisor.main import Supervisor
@@ -69,7 +69,7 @@ def _refuse(plan: Plan) -> None:
         refuse_second(plan.instance)
     except AlreadyRunningError as error:
         raise AlreadyRunningError(f"{error}{_whose(plan)}") from None
-    if plan.instance not in instances():
+    if not leftover.living(plan.instance):
         check_ports(plan)
 
 

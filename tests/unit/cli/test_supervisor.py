@@ -238,6 +238,9 @@ def test_check_tells_what_the_instance_takes(example: Edit, instance: str, capsy
     assert instance not in instances()
 
 
+TAKEN = "is the port of emulator[0].listen (127.0.0.1:1102) already; choose another"
+
+
 @pytest.mark.parametrize(
     ("old", "new", "error"),
     [
@@ -260,7 +263,25 @@ def test_check_tells_what_the_instance_takes(example: Edit, instance: str, capsy
         ('connector = "s7"', 'connector = "s8"', "source[0].connector: no connector 's8'; there are:"),
         ('kind = "s7"', 'kind = "s8"', "emulator[0].kind: 's8' is none; there are: s7"),
         ('program = "a50"', 'program = "a51"', "emulator[0].program: 'a51' is none; there are: a50"),
-        ('"127.0.0.1:8090"', '"127.0.0.1:1102"', "grpc.listen[1]: 127.0.0.1:1102 is the address of emulator[0].listen"),
+        ('"127.0.0.1:8090"', '"127.0.0.1:1102"', f"grpc.listen[1]: 127.0.0.1:1102 {TAKEN}"),
+        ('"127.0.0.1:8090"', '"localhost:1102"', f"grpc.listen[1]: localhost:1102 {TAKEN}"),
+        ('"127.0.0.1:8090"]', '"0.0.0.0:1102"]\ninsecure = true', f"grpc.listen[1]: 0.0.0.0:1102 {TAKEN}"),
+        ('"127.0.0.1:8090"]', '"[::]:1102"]\ninsecure = true', f"grpc.listen[1]: [::]:1102 {TAKEN}"),
+        (
+            '"127.0.0.1:8090"]',
+            '"[::ffff:127.0.0.1]:1102"]\ninsecure = true',
+            "grpc.listen[1]: [::ffff:127.0.0.1]:1102 is",
+        ),
+        (
+            '"127.0.0.1:8090"]',
+            '"a..b:1103"]\ninsecure = true',
+            "grpc.listen[1]: a..b:1103: 'a..b' cannot be resolved (it",
+        ),
+        (
+            '"127.0.0.1:8090"]',
+            '"no.invalid:1103"]\ninsecure = true',
+            "grpc.listen[1]: no.invalid:1103: 'no.invalid' can",
+        ),
         ('"Outputs", ', '"a//b", ', "source[0].writable: "),
         ("period_ms = 20", "period_ms = 20\nproperties = 'none.ini'", "source[0].properties: "),
     ],
@@ -272,6 +293,14 @@ def test_faults_are_named(example: Edit, old: str, new: str, error: str, capsys:
         output = capsys.readouterr()
         assert output.err.startswith(f"supervisor.toml: {error}")
         assert output.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("address", ["127.0.0.2:1102", "[::1]:1102", "localhost:0"])
+def test_other_addresses_may_have_the_same_port(
+    example: Edit, address: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example('"127.0.0.1:8090"', f'"{address}"')
+    assert main(["check"]) == 0, capsys.readouterr().err
 
 
 def test_faults_of_a_layout_have_their_place(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:

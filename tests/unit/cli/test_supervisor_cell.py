@@ -257,6 +257,17 @@ def test_a_port_that_another_program_has_is_found_before_the_start(cell: Cell, a
     assert not (cell.folder / "logs").exists()
 
 
+def test_a_left_over_segment_without_processes_hides_no_taken_port(cell: Cell) -> None:
+    Path("/dev/shm", f"shmio-{cell.instance}").touch()
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        serve_on(cell, f"127.0.0.1:{port}")
+        error = cell.run("up", "--detach", status=1).stderr
+    assert error.startswith(f"grpc: cannot listen on 127.0.0.1:{port}: another program listens there; ")
+
+
 @pytest.mark.parametrize("name", ["plc", "grpc"])
 def test_a_port_that_another_instance_has_is_said_to_be_its(cell: Cell, name: str) -> None:
     serve_on(cell, f"127.0.0.1:{free_port()}")

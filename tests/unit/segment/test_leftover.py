@@ -14,7 +14,7 @@ import pytest
 
 from shmio.errors import AlreadyRunningError, NotRunningError, SegmentError
 from shmio.segment import ProcessSpec, Segment, instances
-from shmio.segment.leftover import clear
+from shmio.segment.leftover import clear, living
 
 SUPERVISOR = """
 import subprocess, sys
@@ -76,6 +76,7 @@ def test_another_versions_processes_are_found_without_its_format(instance: str, 
             assert process.stdout is not None
             assert int(process.stdout.readline()) == process.pid
             running[name] = process
+        assert living(instance) is (field == "abi")
         assert clear(instance) == [
             f"segment shmio-{instance} is of another version of shmio",
             f"stopped {modules['workers']}, pid {running['workers'].pid}, which had lost its supervisor",
@@ -134,6 +135,7 @@ def test_another_users_process_is_told_by_its_owner(instance: str, monkeypatch: 
 
 def test_an_unfinished_segment_is_removed(instance: str) -> None:
     (Path("/dev/shm") / f"shmio-{instance}").touch()
+    assert not living(instance)
     assert clear(instance) == [f"removed the left-over segment shmio-{instance}"]
 
 
