@@ -6,24 +6,16 @@ import time
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 
-import msgspec
-
-from shmio.errors import AlreadyRunningError, FormatError, LayoutError, NotRunningError, SegmentError, UnfinishedError
-from shmio.layout.model import Layout
+from shmio.errors import AlreadyRunningError, NotRunningError, SegmentError, UnfinishedError
 from shmio.segment import _atomics, header, shm
-from shmio.segment.block import Attributes, Block, BlockWriter
+from shmio.segment.block import Block, BlockWriter
 from shmio.segment.build import SECTIONS_PER_BLOCK, BlockSpec, align, build_segment, wake, write_blocks
-from shmio.segment.clock import ClockPage
-from shmio.segment.commands import CommandQueues
-from shmio.segment.events import EVENT_SIZE
 from shmio.segment.header import HEADER_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
 from shmio.segment.processes import SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
+from shmio.segment.sections import read_block, read_clock
 from shmio.segment.shm import SharedObject
-from shmio.segment.standing import StandingCell
 
 PREFIX = "shmio-"
-
-_ATTRIBUTES = msgspec.json.Decoder(Attributes)  # as in layout/document.py: built before there are threads
 
 
 class Segment:
@@ -38,7 +30,7 @@ class Segment:
         self.memory = memoryview(shared.map())
         self.header = Header.read(self.memory, shared.name)
         self.processes = ProcessTable(shared, self.memory, self.header)
-        self.clock = self._clock()
+        self.clock = read_clock(shared, self.memory, self.header)
         self._known: dict[int, Block] = {}  # by the section of its layout
         self.blocks = self._find_blocks()
 
@@ -99,20 +91,6 @@ class Segment:
             shared.close()
             raise
 
-    def _clock(self) -> ClockPage:
-        head, name = self.header, self.shared.name
-        _, count = header.table_state(self.memory)
-        for entry in header.read_sections(self.memory, head, count, name):
-            if entry.kind == SectionKind.CLOCK:
-                try:  # on memory of its own: what has been read is still judged by it when the segment is closed
-                    memory = memoryview(self.shared.map())
-                    return ClockPage(memory, entry.offset, entry.size, head.started_ns, head.process_capacity)
-                except ValueError as error:
-                    raise FormatError(f"{name}: {error}") from None
-        raise FormatError(
-            f"{name} has no clock page, so shmio {head.version} that made it is older: use one version for both"
-        )
-
     def _find_blocks(self) -> dict[str, Block]:
         self._entries = entries = self._sections()
         layouts = [index for index, entry in enumerate(entries) if entry.kind == SectionKind.LAYOUT]
@@ -121,9 +99,9 @@ class Segment:
     def _found(self, layout: int) -> Block:
         """The block whose layout is in this section; always the same object."""
         if layout not in self._known:
-            entries = enumerate(self._entries)
-            parts = {entry.kind: index for index, entry in entries if entry.layout == layout and index != layout}
-            self._known[layout] = self._block(self._entries, layout, parts)
+            self._known[layout] = read_block(
+                self.memory, self.header, self.shared.name, self._entries, layout, self.clock
+            )
         return self._known[layout]
 
     @property
@@ -144,34 +122,6 @@ class Segment:
             entries = header.read_sections(self.memory, self.header, count, self.shared.name)
             if self.generation == self._generation:  # or else a change came between; there are at most a few
                 return entries
-
-    def _block(self, entries: list[SectionEntry], layout_at: int, parts: dict[int, int]) -> Block:
-        memory, name = self.memory, self.shared.name
-        described = entries[layout_at]
-
-        def part(kind: SectionKind) -> tuple[int, int]:
-            if kind not in parts:
-                raise FormatError(f"{name}: block {described.name} has no {kind.name.lower()}")
-            entry = entries[parts[kind]]
-            return entry.offset, entry.size
-
-        try:
-            layout = Layout.from_json(bytes(memory[described.offset : described.offset + described.size]))
-            at, size = part(SectionKind.SOURCE)
-            attributes = _ATTRIBUTES.decode(bytes(memory[at : at + size]))
-            frames = _atomics.Ring(memory, *part(SectionKind.FRAMES))
-            events = _atomics.Ring(memory, *part(SectionKind.EVENTS))
-            queues = CommandQueues(memory, *part(SectionKind.COMMANDS))
-            standing = StandingCell(memory, *part(SectionKind.STANDING))
-        except (LayoutError, ValueError, msgspec.MsgspecError) as error:
-            raise FormatError(f"{name}: block {described.name}: {error}") from None
-        if frames.frame_size != layout.size or events.frame_size != EVENT_SIZE:
-            raise FormatError(f"{name}: block {described.name}: rings and layout differ in size")
-        head = self.header
-        return Block(
-            described.name, layout, frames, events, queues, standing, attributes,
-            lambda: header.retired(memory, head, layout_at), layout_at, self.clock,
-        )  # fmt: skip
 
     @property
     def generation(self) -> int:

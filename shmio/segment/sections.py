@@ -1,0 +1,67 @@
+"""What the sections of a segment hold: the clock page, and blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+
+from shmio.errors import FormatError, LayoutError
+from shmio.layout.model import Layout
+from shmio.segment import _atomics, header
+from shmio.segment.block import Attributes, Block
+from shmio.segment.clock import ClockPage
+from shmio.segment.commands import CommandQueues
+from shmio.segment.events import EVENT_SIZE
+from shmio.segment.header import Header, SectionEntry, SectionKind
+from shmio.segment.shm import SharedObject
+from shmio.segment.standing import StandingCell
+
+_ATTRIBUTES = msgspec.json.Decoder(Attributes)  # as in layout/document.py: built before there are threads
+
+
+def read_clock(shared: SharedObject, memory: memoryview, head: Header) -> ClockPage:
+    """The clock page; FormatError."""
+    _, count = header.table_state(memory)
+    for entry in header.read_sections(memory, head, count, shared.name):
+        if entry.kind == SectionKind.CLOCK:
+            try:  # on memory of its own: what has been read is still judged by it when the segment is closed
+                own = memoryview(shared.map())
+                return ClockPage(own, entry.offset, entry.size, head.started_ns, head.process_capacity)
+            except ValueError as error:
+                raise FormatError(f"{shared.name}: {error}") from None
+    raise FormatError(
+        f"{shared.name} has no clock page, so shmio {head.version} that made it is older: use one version for both"
+    )
+
+
+def read_block(
+    memory: memoryview, head: Header, name: str, entries: Sequence[SectionEntry], layout_at: int, clock: ClockPage
+) -> Block:
+    """The block whose layout is the section of this index; ``name``: of the segment. FormatError."""
+    described = entries[layout_at]
+    parts = {
+        entry.kind: entry for index, entry in enumerate(entries) if entry.layout == layout_at and index != layout_at
+    }
+
+    def part(kind: SectionKind) -> tuple[int, int]:
+        if kind not in parts:
+            raise FormatError(f"{name}: block {described.name} has no {kind.name.lower()}")
+        return parts[kind].offset, parts[kind].size
+
+    try:
+        layout = Layout.from_json(bytes(memory[described.offset : described.offset + described.size]))
+        at, size = part(SectionKind.SOURCE)
+        attributes = _ATTRIBUTES.decode(bytes(memory[at : at + size]))
+        frames = _atomics.Ring(memory, *part(SectionKind.FRAMES))
+        events = _atomics.Ring(memory, *part(SectionKind.EVENTS))
+        queues = CommandQueues(memory, *part(SectionKind.COMMANDS))
+        standing = StandingCell(memory, *part(SectionKind.STANDING))
+    except (LayoutError, ValueError, msgspec.MsgspecError) as error:
+        raise FormatError(f"{name}: block {described.name}: {error}") from None
+    if frames.frame_size != layout.size or events.frame_size != EVENT_SIZE:
+        raise FormatError(f"{name}: block {described.name}: rings and layout differ in size")
+    return Block(
+        described.name, layout, frames, events, queues, standing, attributes,
+        lambda: header.retired(memory, head, layout_at), layout_at, clock,
+    )  # fmt: skip
