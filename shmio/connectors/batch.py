@@ -7,7 +7,7 @@ from itertools import groupby
 from typing import Final, NamedTuple
 
 from shmio.connectors.base import Lost
-from shmio.layout.write import Write, merge
+from shmio.layout.write import Write, apply, merge
 from shmio.segment import Command, EventKind
 
 End = tuple[EventKind, str]
@@ -62,8 +62,9 @@ def coalesce(items: Sequence[Item], size: int) -> tuple[list[Write], set[int]]:
         for item, own in group:
             offset, stop = item.write.offset, item.write.offset + len(own)
             ranges.append((offset, stop))
-            for at, (bits, byte) in enumerate(zip(own, item.write.data, strict=True), offset):
-                image[at] = image[at] & ~bits | byte & bits
+            for part in item.parts():
+                apply(part, image)
+            for at, bits in enumerate(own, offset):
                 bits_kept[at] |= bits
         writes += merge(image, bits_kept, ranges)
         for start, stop in ranges:

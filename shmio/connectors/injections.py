@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from shmio.layout.write import Write, merge
+from shmio.layout.write import Write, apply, merge
 from shmio.segment import Direction
 
 MAX_INJECTIONS: Final = 64
@@ -97,16 +97,12 @@ class Injections:
         return taken, bits.tobytes()
 
 
-def shadow(injection: Injection, writes: Iterable[Write]) -> str:
+def shadow(injection: Injection, writes: Sequence[Write]) -> str:
     """Give consumers other values for bits that an injection covers; why not, or empty."""
-    writes = list(writes)
     if reason := uncovered(injection, writes):
         return reason
     for write in writes:
-        span = slice(write.offset, write.offset + len(write.data))
-        bits = np.full(len(write.data), write.mask or 0xFF, np.uint8)
-        old = injection.values[span]
-        injection.values[span] = old ^ (old ^ np.frombuffer(write.data, np.uint8)) & bits
+        apply(write, injection.values.data)
     return ""
 
 

@@ -9,7 +9,7 @@ import msgspec
 from shmio.connectors.base import Connector
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
-from shmio.layout.write import Write
+from shmio.layout.write import Write, apply
 from shmio.segment import Provenance
 
 
@@ -48,11 +48,8 @@ class MemoryConnector(Connector):
 
     def write(self, writes: Sequence[Write]) -> list[str]:
         """Change them; nothing refuses."""
-        for offset, mask, data in writes:
-            if mask:
-                self._image[offset] = self._image[offset] & ~mask | data[0] & mask
-            else:
-                self._image[offset : offset + len(data)] = data
+        for write in writes:
+            apply(write, self._image)
         return [""] * len(writes)
 
     def close(self) -> None:

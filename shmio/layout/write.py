@@ -35,6 +35,15 @@ def encode(register: Register, value: object, byte_order: ByteOrder = "big") -> 
     return Write(register.offset, mask, bytes(image[register.offset :]))
 
 
+def apply(write: Write, image: bytearray | memoryview) -> None:
+    """Change an image as a write says."""
+    offset, mask, data = write
+    if mask:
+        image[offset] = image[offset] & (mask ^ 0xFF) | data[0] & mask
+    else:
+        image[offset : offset + len(data)] = data
+
+
 def bits_of(register: Register) -> bytes:
     """A mask of ``size`` bytes in which the bits that the register's :func:`encode` writes are set."""
     if register.bit is None or register.dims:

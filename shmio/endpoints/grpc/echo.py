@@ -7,7 +7,7 @@ from typing import Final, NamedTuple, Protocol
 
 from shmio.endpoints.grpc.subject import Subject
 from shmio.layout.model import Register
-from shmio.layout.write import bits_of
+from shmio.layout.write import Write, apply, bits_of
 from shmio.segment import Block, Event, EventKind
 
 
@@ -141,13 +141,8 @@ class Echo:
         self._mask = bytearray(len(self._image))
 
     def _apply(self, event: Event) -> None:
-        start, stop = event.offset, event.offset + len(event.data)
-        if event.mask:
-            self._image[start] = self._image[start] & ~event.mask | event.data[0] & event.mask
-            self._mask[start] |= event.mask
-        else:
-            self._image[start:stop] = event.data
-            self._mask[start:stop] = b"\xff" * len(event.data)
+        apply(Write(event.offset, event.mask, event.data), self._image)
+        apply(Write(event.offset, event.mask, b"\xff" * len(event.data)), self._mask)
 
     def _touch(self, channel: InChannel, event: Event, messages: list[Message]) -> None:
         """Show a channel when the last of its bits is written; what remains in part is shown by :meth:`_rest`."""
