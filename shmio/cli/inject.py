@@ -106,7 +106,7 @@ def _list(cell: Attachment, *, as_json: bool) -> None:
             over = [
                 f"{source}/{register.path}"
                 for register in layout.registers
-                if one.covers(register.offset, register.size, _mask(register.bit, bool(register.dims)))
+                if one.covers(register)
             ]
             fields = msgspec.to_builtins(one)
             found.append({"source": source, **{k: v for k, v in fields.items() if k != "ranges"}, "registers": over})
@@ -121,7 +121,3 @@ def _list(cell: Attachment, *, as_json: bool) -> None:
             f"{one_found['id']}  {', '.join(map(printable, paths[:3]))}{more} /{one_found['direction']}, "
             f"priority {one_found['priority']}, pid {one_found['pid']}{keep}  {printable(one_found['name'])}".rstrip()
         )
-
-
-def _mask(bit: int | None, array: bool) -> int:
-    return 0xFF if bit is None or array else 1 << bit

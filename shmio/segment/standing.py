@@ -10,6 +10,8 @@ from typing import Final
 
 import msgspec
 
+from shmio.layout.model import Register
+from shmio.layout.write import bits_of
 from shmio.segment import _atomics
 
 STANDING_SIZE: Final = 16_384
@@ -32,9 +34,10 @@ class Standing(msgspec.Struct, frozen=True):
     pid: int
     ranges: tuple[tuple[int, int, int], ...]
 
-    def covers(self, offset: int, size: int, mask: int = 0xFF) -> bool:
-        """Whether any of these bits is covered."""
-        return any(offset < at + count and at < offset + size and bits & mask for at, count, bits in self.ranges)
+    def covers(self, register: Register) -> bool:
+        """Whether any bit of a register is covered."""
+        start, stop, own = register.offset, register.offset + register.size, bits_of(register)[0]
+        return any(start < at + count and at < stop and bits & own for at, count, bits in self.ranges)
 
 
 _DECODER = msgspec.json.Decoder(tuple[Standing, ...])  # as in layout/document.py: built before there are threads

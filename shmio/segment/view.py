@@ -122,9 +122,8 @@ def _provenance(block: Block, register: Register, frame: Frame) -> Provenance:
     """Where a register's value comes from: some of a frame's may be injected."""
     if frame.effective is None:
         return frame.provenance
-    mask = 0xFF if register.bit is None or register.dims else 1 << register.bit
     for standing in block.standing.read():
-        if standing.direction == "out" and standing.covers(register.offset, register.size, mask):
+        if standing.direction == "out" and standing.covers(register):
             return Provenance.INJECTED
     return frame.provenance
 

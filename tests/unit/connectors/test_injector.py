@@ -167,8 +167,7 @@ def test_events_tell_what_was_done(rig: Rig) -> None:
     (standing,) = rig.block.standing.read()
     assert (standing.id, standing.direction, standing.priority, standing.name) == (number, "out", 3, "drive test")
     assert (standing.writer, standing.pid, standing.keep) == (4, 100, False)
-    assert standing.covers(LAYOUT.registers[LAYOUT.by_path["speed"]].offset, 2)
-    assert not standing.covers(0, 8)
+    assert [register.path for register in LAYOUT.registers if standing.covers(register)] == ["speed"]
     rig.other.shadow(number, {"speed": 258})
     given = rig.event(EventKind.SHADOWED)
     assert (given.injection, given.writer, given.data) == (number, 5, b"\2\1")
