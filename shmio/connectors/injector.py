@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Final
 
@@ -31,6 +32,7 @@ class Injector:
         self._writable = np.frombuffer(writable, np.uint8)
         self._refuse_in = refuse_in
         self._owner_of = owner_of
+        self._look_ns = 0  # of CLOCK_MONOTONIC, whatever clock the source has: clients live by that
         self._resume()
 
     @property
@@ -40,8 +42,10 @@ class Injector:
 
     @property
     def patience_ns(self) -> int:
-        """When to :meth:`look` next; negative: there is nothing to look after."""
-        return LOOK_NS if any(not layer.keep for layer in self.injections.layers) else -1
+        """How long until :meth:`look` has something to do; negative: there is nothing to look after."""
+        if all(layer.keep for layer in self.injections.layers):
+            return -1
+        return max(0, self._look_ns - time.monotonic_ns())
 
     def toward_device(self, command: Command) -> Injection | None:
         """The injection over ``/in`` whose values a command carries; None: it carries no such values."""
@@ -61,7 +65,10 @@ class Injector:
         return self._shadow(layer, command)
 
     def look(self) -> None:
-        """Lift what nobody keeps and whose client is gone."""
+        """Lift what nobody keeps and whose client is gone; however often it is called, at most every ``LOOK_NS``."""
+        if self.patience_ns != 0:
+            return
+        self._look_ns = time.monotonic_ns() + LOOK_NS
         gone = {
             layer.id
             for layer in self.injections.layers

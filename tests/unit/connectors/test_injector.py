@@ -83,6 +83,7 @@ class Rig:
         self.block = segment.blocks["cell"]
         self.device = Device()
         self.owners = {4: Owner(4, 100), 5: Owner(5, 200)}
+        self.asked: list[int] = []
         self.armed = armed
         self.client = Commander(self.block, 4)
         self.other = Commander(self.block, 5)
@@ -95,12 +96,16 @@ class Rig:
         schedule = Schedule(self.segment.header.started_ns, PERIOD_NS)
         writer = self.segment.writer("cell")
         loop = SourceLoop(
-            self.device, writer, schedule, self._clock, WRITABLE, armed=self.armed, owner_of=self.owners.get
+            self.device, writer, schedule, self._clock, WRITABLE, armed=self.armed, owner_of=self._owner_of
         )
         self._threads = [threading.Thread(target=run) for run in (loop.run, loop.desk.run)]
         for thread in self._threads:
             thread.start()
         self.until(lambda frame: frame.quality is Quality.GOOD)
+
+    def _owner_of(self, writer: int) -> Owner | None:
+        self.asked.append(writer)
+        return self.owners.get(writer)
 
     def stop(self) -> None:
         self._clock.stop()
@@ -245,6 +250,17 @@ def test_a_shadow_goes_when_its_client_does_unless_it_is_to_be_kept(rig: Rig) ->
     lifted = rig.event(EventKind.LIFTED)
     assert (lifted.injection, lifted.text) == (gone, "its client is gone")
     rig.sees({"axis/1": 11, "axis/2": 12, "speed": 0})
+
+
+def test_clients_are_looked_after_now_and_then_however_many_commands_come(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shmio.connectors.injector.LOOK_NS", 10**15)
+    rig.asked.clear()
+    number = rig.client.inject(["speed"])
+    for value in range(20):
+        rig.client.shadow(number, {"speed": value})
+    assert rig.asked == [4, 4], "when it was laid, and at the first look"
 
 
 def test_injections_outlive_the_sources_process(rig: Rig) -> None:
