@@ -133,11 +133,8 @@ class SourceLoop:
         self._accepting = False
         self._under_way: deque[_Submitted] = deque()
         self._state: tuple[Quality, str] | None = None  # as last told; the reason without its numbers
-        last = writer.block.latest()
-        self._raw = last.raw if last else bytes(writer.block.layout.size)
-        self._read_ns = last.source_ns if last else 0  # UTC of the last good image; 0: there was none
-        if self._read_ns:
-            connector.resume(self._raw)
+        if self._output.source_ns:
+            connector.resume(self._output.raw)
         self.counters = Counters()
         self.note = ""
 
@@ -229,7 +226,6 @@ class SourceLoop:
         doubt = self._connector.doubt
         quality = Quality.UNCERTAIN if doubt else Quality.GOOD
         self._tell(quality, doubt, asked.cycle)
-        self._raw, self._read_ns = raw, asked.utc_ns
         self._output.publish(
             Image(raw, asked.cycle, asked.utc_ns, quality, self._connector.provenance, doubt, asked.monotonic_ns)
         )
@@ -269,7 +265,8 @@ class SourceLoop:
         self.desk.close(reason)
         if self._tell(Quality.BAD, reason, cycle):
             provenance = self._connector.provenance
-            self._output.publish(Image(self._raw, cycle, self._read_ns, Quality.BAD, provenance, reason))
+            raw, source_ns = self._output.raw, self._output.source_ns
+            self._output.publish(Image(raw, cycle, source_ns, Quality.BAD, provenance, reason))
 
     def _tell(self, quality: Quality, reason: str, cycle: int) -> bool:
         """Log and write down a change of quality or of its reason; whether it was one."""

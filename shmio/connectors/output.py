@@ -57,6 +57,11 @@ class Output:
         return bytes(self.writer.block.layout.size) if self._last is None else self._last.raw
 
     @property
+    def source_ns(self) -> int:
+        """When the device had that image, ns since 1970; 0: none has come from it yet."""
+        return 0 if self._last is None else self._last.source_ns
+
+    @property
     def next_ns(self) -> int:
         """When the next frame between two cycles may come, on the clock given."""
         return self._next_ns
