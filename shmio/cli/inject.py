@@ -103,11 +103,7 @@ def _list(cell: Attachment, *, as_json: bool) -> None:
     for source, standing in cell.injections().items():
         layout = cell.block(source).layout
         for one in standing:
-            over = [
-                f"{source}/{register.path}"
-                for register in layout.registers
-                if one.covers(register)
-            ]
+            over = [f"{source}/{register.path}" for register in layout.registers if one.covers(register)]
             fields = msgspec.to_builtins(one)
             found.append({"source": source, **{k: v for k, v in fields.items() if k != "ranges"}, "registers": over})
     if as_json:
