@@ -13,16 +13,22 @@ SURELY_NOT = {EventKind.REJECTED, EventKind.REFUSED, EventKind.EXPIRED}
 
 
 @dataclass
-class WriteCheck:
-    """Holds what a writer is told of its values to what the PLC got; each value is written once."""
+class _ValueCheck:
+    """Of values toward one source."""
 
     source: Source
     complain: Complain
     counts: Counts = field(default_factory=Counts)
-    _known: dict[int, tuple[EventKind, int | None]] = field(default_factory=dict)
 
     def _since_ns(self, value: int) -> int | None:
         return None if self.source.landed is None else self.source.landed.since_ns(value)
+
+
+@dataclass
+class WriteCheck(_ValueCheck):
+    """Holds what a writer is told of its values to what the PLC got; each value is written once."""
+
+    _known: dict[int, tuple[EventKind, int | None]] = field(default_factory=dict)
 
     def outcome(self, value: int, kind: EventKind, text: str) -> None:
         """What the writer was told of ``value``."""
@@ -55,12 +61,9 @@ LATE_NS = 6_500_000_000
 
 
 @dataclass
-class PublishCheck:
+class PublishCheck(_ValueCheck):
     """Holds values sent by SimlogAPI v1 Publish, which tells no outcome, to what the PLC got: in time, and once."""
 
-    source: Source
-    complain: Complain
-    counts: Counts = field(default_factory=Counts)
     _landed: dict[int, tuple[int, int | None]] = field(default_factory=dict)
     """When a value was sent, and when it got to the PLC."""
 
@@ -73,7 +76,7 @@ class PublishCheck:
         """See what has become of them, as often as one likes."""
         for value in values:
             sent_ns, before_ns = self._landed[value]
-            since_ns = None if self.source.landed is None else self.source.landed.since_ns(value)
+            since_ns = self._since_ns(value)
             if before_ns is not None and since_ns != before_ns:
                 self.complain(f"{self.source.name}: {value} came to the PLC at {before_ns} and again at {since_ns}")
             elif since_ns is not None and since_ns > sent_ns + LATE_NS + slack_ns:

@@ -14,9 +14,24 @@ import shmio
 from shmio.errors import ControlError
 from shmio.segment import Quality, Segment
 from shmio.supervisor.control import Reload, Restart, Where
-from tests.unit.supervisor.harness import CELL, Job, Launch, until
+from tests.unit.supervisor.harness import CELL, Job, Launch, Launched, until
 
 PRESS: Job = ("press", "source", ["good"])
+
+
+def refused_later(cell: Launched) -> tuple[threading.Thread, list[str]]:
+    """A reload asked for in a thread, and the errors that it will have ended with."""
+    outcomes: list[str] = []
+
+    def reload() -> None:
+        try:
+            cell.reload(CELL)
+        except ControlError as error:
+            outcomes.append(str(error))
+
+    asking = threading.Thread(target=reload)
+    asking.start()
+    return asking, outcomes
 
 
 def test_nothing_new_touches_nothing(launch: Launch) -> None:
@@ -284,16 +299,7 @@ def test_a_stop_does_not_wait_for_a_plan(launch: Launch) -> None:
     cell = launch()
     cell.wait_state("running")
     os.mkfifo(cell.folder / "slow")
-    outcomes: list[str] = []
-
-    def reload() -> None:
-        try:
-            cell.reload(CELL)
-        except ControlError as error:
-            outcomes.append(str(error))
-
-    asking = threading.Thread(target=reload)
-    asking.start()
+    asking, outcomes = refused_later(cell)
     with (cell.folder / "slow").open("w"):
         assert cell.stop() == 0
     asking.join()
@@ -317,16 +323,7 @@ def test_a_plan_that_does_not_come_is_given_up_and_another_one_made(launch: Laun
 def test_a_stop_ends_a_change_under_way(launch: Launch) -> None:
     cell = launch([*CELL, ("press", "source", ["stubborn"])], grace_s=3600)
     cell.wait_state("running")
-    outcomes: list[str] = []
-
-    def reload() -> None:
-        try:
-            cell.reload(CELL)
-        except ControlError as error:
-            outcomes.append(str(error))
-
-    asking = threading.Thread(target=reload)
-    asking.start()
+    asking, outcomes = refused_later(cell)
     until(lambda: cell.of("press").note == "stopping")
     with pytest.raises(ControlError, match="just being changed"):
         cell.request(Restart("plc"))
