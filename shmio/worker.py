@@ -41,6 +41,8 @@ class Worker:
             raise SegmentError(f"the segment of instance {spec['instance']!r} is another run's; this process ends")
         self.slot = self.segment.processes.find(self.name)
         self._take_role()
+        self.before = self.slot.report
+        """What the process before in this role reported last."""
         self._heed_signals()
         self._report = Report(os.getpid(), Activity.STARTING, time.monotonic_ns())
         self.slot.report = self._report

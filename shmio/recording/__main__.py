@@ -10,12 +10,16 @@ import msgspec
 from shmio import worker
 from shmio.config import Recorder as Settings
 from shmio.recording.attach import ConfigFiles
+from shmio.recording.encoding import Reason
 from shmio.recording.predecessor import places
-from shmio.recording.recorder import Recorder
+from shmio.recording.recorder import Recorder, Start
 from shmio.recording.series import Series
+from shmio.segment import Report
 from shmio.worker import BEAT_S, Worker
 
 BY = "supervised"
+NOTE = "to "
+"""How a recorder that is well begins its note; the name of its file follows."""
 
 
 def run(worker: Worker) -> None:
@@ -24,9 +28,11 @@ def run(worker: Worker) -> None:
     directory, segment = Path(settings.directory), worker.segment
     worker.running()  # its search for what its predecessor has may take a while
     known = places(directory, segment, BY, worker.slot.beat)
-    series = Series(segment, settings, BY, known, ConfigFiles(Path(worker.config["config_file"])))
+    elsewhere = _elsewhere(worker.before, directory)
+    start = Start(known, reason=Reason.ELSEWHERE if elsewhere else Reason.NOT_RUNNING)
+    series = Series(segment, settings, BY, start, ConfigFiles(Path(worker.config["config_file"])))
     goes_on = ", going on where its predecessor ended" if known else ""
-    worker.log.info("recording to %s%s", series.recorder.output.path, goes_on)
+    worker.log.info("recording to %s%s%s", series.recorder.output.path, goes_on, elsewhere)
     _record(worker, series)
     recorder = series.recorder
     if not recorder.close():
@@ -35,6 +41,14 @@ def run(worker: Worker) -> None:
     _report(worker, recorder, "")
     counters = recorder.counters
     worker.log.info("%d frames, %d events, %d missed", counters.frames, counters.events, counters.missed)
+
+
+def _elsewhere(before: Report, directory: Path) -> str:
+    """What to say of a predecessor whose file is not in this folder; empty if there was none, or it is here."""
+    name = before.note.removeprefix(NOTE)
+    if name == before.note or (directory / name).exists():
+        return ""
+    return f"; {name} of the recorder before is not in this folder: what the rings no longer hold is there alone"
 
 
 def _record(worker: Worker, series: Series) -> None:
@@ -57,7 +71,7 @@ def _record(worker: Worker, series: Series) -> None:
 def _report(worker: Worker, recorder: Recorder, problem: str) -> None:
     counters = recorder.counters
     numbers = (counters.frames, counters.events, counters.missed, recorder.output.written)
-    worker.report(numbers, note=problem or f"to {recorder.output.path.name}")
+    worker.report(numbers, note=problem or f"{NOTE}{recorder.output.path.name}")
 
 
 if __name__ == "__main__":

@@ -35,8 +35,8 @@ u32 incarnation, u32 writer, u32 item, u32 items, u32 offset, u32 size, u16 kind
 u16 data size, u16 text size; then data, text (UTF-8)."""
 GAP_SCHEMA: Final = b"""{"type": "object", "properties": {"source": {"type": "string"}, "block": {"type": "integer"}, \
 "what": {"enum": ["frames", "events"]}, "first": {"type": "integer"}, "last": {"type": "integer"}, \
-"count": {"type": "integer"}, "reason": {"enum": ["overtaken", "not running", "no room", \
-"unsure"]}, \
+"count": {"type": "integer"}, "reason": {"enum": ["overtaken", "not running", "elsewhere", \
+"no room", "unsure"]}, \
 "after_ns": {"type": "integer"}, "before_ns": {"type": "integer"}}}"""
 
 
@@ -47,6 +47,8 @@ class Reason(StrEnum):
     """The source had overwritten it before the recorder came to it."""
     NOT_RUNNING = "not running"
     """It was overwritten while no recorder ran."""
+    ELSEWHERE = "elsewhere"
+    """The recorder before wrote to another folder: ``recorder.directory`` was changed, or its file taken away."""
     NO_ROOM = "no room"
     """The disk was full or too slow, and so was the memory set aside for that."""
     UNSURE = "unsure"

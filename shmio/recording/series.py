@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
 from shmio.config import Recorder as Settings
 from shmio.errors import RecordingError
 from shmio.recording.attach import Attachments
-from shmio.recording.encoding import Place, Reason
+from shmio.recording.encoding import Reason
 from shmio.recording.output import Output, create
 from shmio.recording.recorder import Recorder, Start
 from shmio.segment import Segment
@@ -30,17 +29,15 @@ class Series:
     the rest is a gap there.
     """
 
-    def __init__(
-        self, segment: Segment, settings: Settings, by: str, places: Mapping[int, Place], attachments: Attachments
-    ) -> None:
-        """``places``: where the recorder before ended. RecordingError: no file can be made."""
+    def __init__(self, segment: Segment, settings: Settings, by: str, start: Start, attachments: Attachments) -> None:
+        """``start``: where the recorder before ended. RecordingError: no file can be made."""
         self._segment = segment
         self._settings = settings
         self._by = by
         self._attachments = attachments
         self._wait_s = FIRST_WAIT_S
         self._again_s = 0.0
-        self.recorder = self._begin(Start(places))
+        self.recorder = self._begin(start)
 
     def _begin(self, start: Start) -> Recorder:
         settings = self._settings

@@ -100,6 +100,23 @@ def test_what_the_ring_no_longer_has_is_a_gap_to_the_predecessor(segment: Segmen
     assert second.counts("missed") == gap.count
 
 
+def test_what_a_recorder_with_another_folder_has_is_said_to_be_elsewhere(segment: Segment, tmp_path: Path) -> None:
+    writer = segment.writer("cell")
+    with Process(segment, tmp_path) as first:
+        publish(writer, 10)
+        until(lambda: first.counts("frames") == 10, "frames")
+        old = first.file
+        first.stop()
+    publish(writer, 2 * RING)
+    with Process(segment, tmp_path, directory=str(tmp_path / "other")) as second:
+        until(lambda: second.counts("frames") + second.counts("missed") == 2 * RING + 10, "all, or missed")
+        second.stop()
+    assert f"; {old.name} of the recorder before is not in this folder" in second.log.read_text()
+    [file] = (tmp_path / "other").iterdir()
+    [gap] = gaps(file)
+    assert (gap.what, gap.first, gap.reason) == ("frames", 1, Reason.ELSEWHERE)
+
+
 def test_a_clock_set_back_does_not_change_who_came_last(segment: Segment, tmp_path: Path) -> None:
     writer = segment.writer("cell")
     files = []
