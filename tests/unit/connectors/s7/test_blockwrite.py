@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import struct
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from snap7.datatypes import S7Area
 
-from shmio.connectors.s7.blockwrite import waves
+from shmio.connectors.base import Lost
+from shmio.connectors.s7.blockwrite import ends, waves
 from shmio.emulators.s7_jobs import Fault, Jobs, Memory, Traits
 from shmio.layout.write import Write
 
@@ -142,3 +144,33 @@ def test_a_job_that_is_refused_as_a_whole_refuses_each_of_its_writes() -> None:
         outcomes = outcomes_of(controller(block, 480, fault), 480, [Write(0, 0, b"a"), Write(1, 1, b"\1")])
         assert all(text in outcome for outcome in outcomes)
     assert block == bytes(SIZE)
+
+
+@pytest.mark.parametrize(
+    ("sent", "answered", "fault", "first", "second"),
+    [
+        (0, 0, None, Lost.UNSENT, Lost.UNSENT),
+        (2, 0, None, Lost.UNKNOWN, Lost.UNSENT),
+        (2, 1, None, Lost.UNKNOWN, Lost.UNSENT),
+        (2, 2, None, Lost.UNKNOWN, Lost.UNSENT),  # done in part: neither written nor surely not
+        (5, 4, None, Lost.UNKNOWN, Lost.UNKNOWN),
+        (5, 5, None, "", ""),
+        (2, 2, Fault.WRITE_PROTECTED, "access denied", Lost.UNSENT),
+        (2, 1, Fault.WRITE_PROTECTED, Lost.UNKNOWN, Lost.UNSENT),
+    ],
+)
+def test_what_is_known_of_a_write_of_several_jobs_when_the_session_is_lost(
+    sent: int, answered: int, fault: Fault | None, first: str | Lost, second: str | Lost
+) -> None:
+    plc = controller(bytearray(SIZE), 100, fault)
+    outcomes = ["", ""]
+    (wave,) = waves(201, 100, [Write(0, 0, bytes(300)), Write(350, 0, b"xy")], outcomes)
+    assert wave.count == 5, "the second is in the last job, with the end of the first"
+    for index, request in enumerate(split(wave.take(sent, 0))[:answered]):
+        wave.accept(index, framed(plc.answer(memoryview(request)[7:])))
+    for told, wanted in zip(ends(outcomes, [wave]), (first, second), strict=True):
+        if isinstance(told, str) and isinstance(wanted, str):
+            assert wanted in told
+            assert bool(wanted) is bool(told)
+        else:
+            assert told is wanted
