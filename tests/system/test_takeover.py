@@ -72,11 +72,34 @@ def test_only_what_differs_is_replaced(cell: Cell) -> None:
     kill(before["grpc"], signal.SIGSTOP)  # shows no sign of life by the time it is looked at, or soon after
     file = cell.folder / "supervisor.toml"
     file.write_text(file.read_text().replace("timeout = 1000", "timeout = 900"))
-    assert cell.supervisor("up", "--detach").returncode == 0
+    up = cell.supervisor("up", "--detach")
+    assert up.returncode == 0, up.stderr
+    assert f"cell, pid {before['cell']}, was replaced at once: its configuration has changed\n" in up.stdout
+    assert f"plc, pid {before['plc']}, was" not in up.stdout
     until(lambda: pids(cell)["grpc"] not in (None, before["grpc"]), "the frozen process is replaced")
     after = pids(cell)
     assert after["cell"] != before["cell"]
     assert after["plc"] == before["plc"]
+
+
+def test_what_a_take_over_finds_is_told_as_it_is_by_now(cell: Cell) -> None:
+    """A reload has made the segment larger; the endpoint is in the configuration no more."""
+    file = cell.folder / "supervisor.toml"
+    first = cell.status()["segment_bytes"]
+    file.write_text(file.read_text().replace("period_ms = 20", "period_ms = 25"))
+    assert cell.supervisor("reload").returncode == 0
+    grown = cell.status()["segment_bytes"]
+    assert grown == Path(f"/dev/shm/shmio-{cell.instance}").stat().st_size
+    assert grown > first + 2**20, "it has another ring"
+    grpc_pid = pids(cell)["grpc"]
+    kill_supervisor(cell)
+    text = file.read_text()
+    file.write_text(text[: text.index("[grpc]")])
+    up = cell.supervisor("up", "--detach")
+    assert up.returncode == 0, up.stderr
+    assert f"segment shmio-{cell.instance} ({grown / 1e6:.1f} MB), logs in " in up.stdout
+    assert f"grpc, pid {grpc_pid}, was stopped at once: the configuration has it no more\n" in up.stdout
+    assert list(pids(cell)) == ["plc", "cell"]
 
 
 def test_another_versions_instance_starts_anew(cell: Cell) -> None:

@@ -102,3 +102,28 @@ def test_watch_says_when_a_reload_has_taken_its_register(instance: str) -> None:
         segment.unlink()
     assert watch.returncode == 1
     assert "no such register" in err
+
+
+@pytest.mark.parametrize(
+    ("patterns", "gone"),
+    [
+        (("press/a",), "source 'press' was"),
+        (("cell/a", "press/a"), "source 'press' was"),
+        (("press/a", "robot/a"), "sources press, robot were"),
+    ],
+)
+def test_watch_says_when_a_reload_has_removed_its_source(instance: str, patterns: tuple[str, ...], gone: str) -> None:
+    names = ("cell", "press", "robot")
+    specs = [BlockSpec(name, LAYOUT, 20_000_000, 3600 * 10**9, 1 << 16) for name in names]
+    with Segment.create(instance, specs, []) as segment:
+        for name in names:
+            segment.writer(name).publish(b"\0\7", cycle=1, source_ns=1)
+        with watching("--instance", instance, *patterns) as watch:
+            assert watch.stdout is not None
+            seen = {watch.stdout.readline().split()[1] for _ in patterns}
+            segment.change(retire=["press", "robot"])
+            out, err = watch.communicate(timeout=20)
+        segment.unlink()
+    assert seen == set(patterns)
+    assert (watch.returncode, out) == (1, "")
+    assert err == f"{gone} removed from instance {instance!r} by a reload\n"
