@@ -20,7 +20,7 @@ from shmio.logs import printable
 from shmio.recording.damage import Damage
 from shmio.recording.encoding import EVENT, FRAME, GAP, Gap
 from shmio.recording.reader import Channel, Message, Reader
-from shmio.recording.survey import survey
+from shmio.recording.survey import Survey, survey
 from shmio.segment import Event, EventKind, Frame, Quality
 from shmio.segment.scan import ChangeScan
 
@@ -42,15 +42,27 @@ def execute(arguments: argparse.Namespace) -> int:
         printer: Printer = JsonLines() if arguments.json else Table()
         wanted = {c.number for c in channels if c.number in views or (c.encoding == EVENT and c.source in sources)}
         wanted |= {c.number for c in channels if c.encoding == GAP}
-        damaged = complaints.damage
+        damaged, silent = complaints.damage, True
         for message in reader.messages(lambda channel: channel.number in wanted, from_ns, to_ns, damaged):
             for line in _lines(message, views, sources, printer):
                 print(line)
+                silent = False
         sys.stdout.flush()
+        if silent:
+            print(printable(f"{reader.file}: {_nothing(found)}"), file=sys.stderr)
         if not reader.records.closed:
             end = printable(f"{reader.file} was not closed: {reader.records.damage}")
             print(end, file=sys.stderr)
     return int(complaints.any)
+
+
+def _nothing(found: Survey) -> str:
+    """Why nothing was printed."""
+    tracks = [track for track in found.tracks.values() if track.channel.source]
+    if not tracks:
+        return "nothing is recorded in it"
+    first_ns, last_ns = min(track.first_ns for track in tracks), max(track.last_ns for track in tracks)
+    return f"nothing of what was asked for is in it then; it goes from {local(first_ns)} to {local(last_ns)}"
 
 
 class Complaints:
