@@ -6,6 +6,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from shmio.errors import PathError
+from shmio.layout.codec import Value
 from shmio.layout.glob import select
 from shmio.layout.model import Layout, Register
 from shmio.layout.text import json_value, to_text
@@ -71,11 +72,14 @@ def as_json(reading: Reading, register: Register) -> dict[str, Any]:
 
 def as_line(path: str, reading: Reading, register: Register, width: int) -> str:
     """A reading as a line for people; quality is said unless it is good."""
-    text = "-" if reading.value is None else printable(to_text(reading.value, register))
-    if len(text) > SHOWN_CHARACTERS:
-        text = text[: SHOWN_CHARACTERS - 1] + "…"
     quality = "" if reading.quality is Quality.GOOD else f"  {reading.quality}: {printable(reading.reason)}"
-    return f"{printable(path):<{width}}  {text}{quality}"
+    return f"{printable(path):<{width}}  {shown(reading.value, register)}{quality}"
+
+
+def shown(value: Value, register: Register) -> str:
+    """A value for people: no more than ``SHOWN_CHARACTERS`` of it; ``-`` if there is none, ``""`` if it is empty."""
+    text = "-" if value is None else printable(to_text(value, register)) or '""'
+    return text if len(text) <= SHOWN_CHARACTERS else text[: SHOWN_CHARACTERS - 1] + "…"
 
 
 def _iso(seconds: float) -> str:

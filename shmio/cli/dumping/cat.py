@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from shmio.cli.dumping.moments import MAX_NS, iso, local, lost, parse_time
-from shmio.cli.readings import SHOWN_CHARACTERS, registers_at
+from shmio.cli.readings import registers_at, shown
 from shmio.cli.run import dumps
 from shmio.errors import PathError, RecordingError
 from shmio.layout.codec import codec
 from shmio.layout.model import Layout, Register
-from shmio.layout.text import json_value, to_text
+from shmio.layout.text import json_value
 from shmio.layout.topic import parse_topic
 from shmio.logs import printable
 from shmio.recording.damage import Damage
@@ -228,7 +228,7 @@ class Table:
         """The values; quality is said unless it is good."""
         known = frame.source_ns != 0
         cells = [
-            _short(to_text(decode.decode(frame.image), register)) if known else "-"
+            shown(decode.decode(frame.image) if known else None, register)
             for register, decode in zip(view.registers, view.codecs, strict=True)
         ]
         if view is not self._view:
@@ -256,8 +256,3 @@ class Table:
 
     def _row(self, cells: Sequence[str]) -> str:
         return "  ".join(cell.ljust(width) for cell, width in zip(cells, self._widths, strict=True))
-
-
-def _short(text: str) -> str:
-    text = printable(text)
-    return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 1]}…"

@@ -37,6 +37,16 @@ def test_the_instance_is_that_of_the_file_here_even_if_spoilt(running: str, caps
     assert capsys.readouterr().out == "cell/a  7\n"
 
 
+def test_an_empty_text_is_seen(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+    layout = Layout("DB1", 1, 8, False, (Register("name", "STRING[6]", (), 0, None, 8, 1),))
+    with Segment.create(instance, [BlockSpec("cell", layout, 20_000_000, 3600 * 10**9, 1 << 16)], []) as segment:
+        for image, line in ((b"\6\0", 'cell/name  ""\n'), (b"\6\1a", "cell/name  a\n")):
+            segment.writer("cell").publish(image.ljust(8, b"\0"), cycle=1, source_ns=1)
+            assert main(["get", "--instance", instance, "cell/name"]) == 0
+            assert capsys.readouterr().out == line
+        segment.unlink()
+
+
 @pytest.mark.parametrize("name", ["../../etc", "", "a b"])
 def test_what_is_no_name_is_refused(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["list", "--instance", name]) == 1
