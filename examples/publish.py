@@ -55,7 +55,7 @@ async def main() -> int:
         except grpc.aio.AioRpcError as error:
             print(f"{options.address}: {error.code().name}: {error.details()}", file=sys.stderr)
             return 1
-    print(f"sent {len(texts)}; the server has done with them")
+    print(f"{len(texts)} sent, and the server is done with them; what was refused is named in its log")
     return 0
 
 
