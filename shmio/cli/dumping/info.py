@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Iterator
+from itertools import groupby
 from typing import Any
 
 import msgspec
@@ -35,7 +37,7 @@ def execute(arguments: argparse.Namespace) -> int:
         failed = failed or bool(described["damage"])
         found.append(described)
         if not arguments.json:
-            print("\n".join(map(printable, _lines(described))))
+            print("\n".join(map(printable, _folded(_lines(described)))))
     if arguments.json and found:
         print(dumps(found[0] if len(arguments.files) == 1 else found, indent=2))
     return int(failed)
@@ -157,6 +159,13 @@ def _lines(found: dict[str, Any]) -> list[str]:
     if found["checked"] and not found["damage"]:
         lines.append(f"  all of it was read: {found['chunks']} chunks, {found['messages']} messages, no damage")
     return lines + [f"  damage: {text}" for text in found["damage"]]
+
+
+def _folded(lines: list[str]) -> Iterator[str]:
+    """The lines, those that follow one like them counted."""
+    for line, alike in groupby(lines):
+        count = sum(1 for _ in alike)
+        yield line if count == 1 else f"{line} ({count} of these)"
 
 
 def _gap(gap: dict[str, Any]) -> str:

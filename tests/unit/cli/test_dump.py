@@ -96,6 +96,20 @@ def test_info_tells_what_is_in_a_file(file: str, segment: Segment, said: Output)
     assert any(f"{gap['count']} frames, 1 to {gap['last']}: overtaken" in line for line in out)
 
 
+def test_info_folds_equal_lines(segment: Segment, tmp_path: Path, said: Output) -> None:
+    """As of a source that reloads have given one block after the other."""
+    work = recorder(segment, tmp_path / "dumps")
+    for turn in range(3):
+        publish(segment.writer("cell"), 1, first=turn)
+        work.turn()
+        segment.change(add=[spec("cell")], retire=["cell"])
+    assert work.close()
+    assert main(["info", str(work.output.path)]) == 0
+    out, _ = said()
+    [line] = [line for line in out if "  cell: " in line]
+    assert line.endswith(": 1 frames, 1 events (3 of these)")
+
+
 def test_cat_prints_a_line_for_each_change(file: str, said: Output) -> None:
     assert main(["cat", file, "cell/count"]) == 0
     out, err = said()
