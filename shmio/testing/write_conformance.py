@@ -12,6 +12,7 @@ from typing import ClassVar, Protocol
 
 import pytest
 
+from shmio.connectors.base import Lost, WriteLostError
 from shmio.errors import ConnectorError
 from shmio.segment import CommandSender, Event, EventKind, Frame, Quality, Write
 from shmio.testing.conformance import PATIENCE_S, ConnectorConformance, Rig, Run
@@ -155,3 +156,47 @@ class WriteConformance(ConnectorConformance):
                 assert done == (end.kind == EventKind.WRITTEN), end
         frame = writer.written(Write(rig.spare, 0, b"at last!"))
         assert frame.raw[rig.spare : rig.spare + SPARE] == b"at last!"
+
+    @pytest.mark.parametrize("fault", ["cut before", "cut in the answer", "no answer"])
+    def test_of_each_lost_write_what_is_said_is_true(self, rig: WriteRig, fault: str) -> None:
+        """Several writes at once, and the connection breaks: what was written is there, what was not sent is not.
+
+        A connector that raises another ConnectorError than WriteLostError says nothing of any.
+        """
+        writes = [Write(rig.spare + place, 0, bytes([place + 1])) for place in range(SPARE)]
+        connector = rig.connector()
+        try:
+            connector.connect()
+            if fault == "cut before":
+                rig.proxy.cut()
+            elif fault == "cut in the answer":
+                rig.proxy.cut_after(1)
+            else:
+                rig.proxy.hold()
+            with pytest.raises(ConnectorError) as raised:
+                connector.write(writes)
+            connector.close()
+            rig.proxy.pass_all()
+            connector.connect()
+            found = connector.read()
+        finally:
+            connector.close()
+        if isinstance(raised.value, WriteLostError):
+            for (offset, _, data), outcome in zip(writes, raised.value.outcomes, strict=True):
+                if outcome is not Lost.UNKNOWN:
+                    assert (found[offset : offset + 1] == data) == (outcome == ""), (offset, outcome)
+
+    def test_without_a_connection_nothing_is_sent(self, rig: WriteRig) -> None:
+        """Before the first connect, and after a close: an error, and the device is as it was."""
+        connector = rig.connector()
+        try:
+            for _ in range(2):
+                with pytest.raises(ConnectorError) as raised:
+                    connector.write([Write(rig.spare, 0, b"lost")])
+                if isinstance(raised.value, WriteLostError):
+                    assert raised.value.outcomes == (Lost.UNSENT,)
+                connector.connect()
+                assert connector.read()[rig.spare : rig.spare + 4] == bytes(4)
+                connector.close()
+        finally:
+            connector.close()
