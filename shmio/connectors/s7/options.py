@@ -61,5 +61,14 @@ def _is_host(text: str) -> bool:
     try:
         ipaddress.ip_address(text)
     except ValueError:
-        return re.fullmatch(r"[^\s:/\[\]@]+", text) is not None
+        return re.fullmatch(r"[^\s:/\[\]@]+", text) is not None and _is_name(text)
+    return True
+
+
+def _is_name(text: str) -> bool:
+    """Whether it can be looked up: no part of it is empty or longer than 63 bytes."""
+    try:
+        text.encode("idna")
+    except UnicodeError:
+        return False
     return True

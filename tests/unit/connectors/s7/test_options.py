@@ -50,6 +50,8 @@ def test_slot_follows_the_model_unless_given(model: str | None, slot: int) -> No
         {"host": "s7://plc"},
         {"host": "[::1]"},
         {"host": "the plc"},
+        {"host": "plc..example"},
+        {"host": f"{'x' * 64}.example"},
         {"model": "S7_2000"},
         {"model": "LOGO"},
         {"model": ""},
