@@ -17,7 +17,6 @@ from shmio.layout.codec import Value
 from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.logs import printable
 from shmio.segment.attach import Attachment
-from shmio.segment.events import EventKind
 
 HELP = "Have consumers, or with /in the device, get other values than they would, until Ctrl-C."
 
@@ -54,7 +53,7 @@ def execute(cell: Attachment, options: argparse.Namespace) -> int:
             shadow = cell.inject(*paths, priority=options.priority, keep=options.keep, name=options.name)
             stack.enter_context(shadow)
             for path, outcome in zip(paths, shadow.set(values), strict=True):
-                if not (outcome.done or outcome.kind is EventKind.SHADOWED):
+                if not outcome.done:
                     raise CommandError(f"{path}: {outcome.text}")
             print(f"{shadow.number}: {', '.join(map(printable, paths))}", flush=True)
         if not options.keep:
@@ -83,16 +82,16 @@ def _wait(for_s: float | None) -> None:
 
 
 def _lift(cell: Attachment, options: argparse.Namespace) -> int:
-    chosen = [
-        (source, one)
-        for source, standing in cell.injections().items()
-        for one in standing
-        if options.lift_all or one.id == options.lift
-    ]
-    if not chosen and options.lift is not None:
-        raise CommandError(f"there is no injection {options.lift}; shmio inject lists them")
+    if options.lift_all:
+        chosen = cell.lift_all()
+    else:
+        standing = [(source, one) for source, all_of_it in cell.injections().items() for one in all_of_it]
+        chosen = [(source, one) for source, one in standing if one.id == options.lift]
+        if not chosen:
+            raise CommandError(f"there is no injection {options.lift}; shmio inject lists them")
+        for source, one in chosen:
+            cell.lift(source, one.id)
     for source, one in chosen:
-        cell.lift(source, one.id)
         print(f"{one.id}: lifted from {source}{f' ({printable(one.name)})' if one.name else ''}")
     return 0
 

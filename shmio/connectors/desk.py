@@ -221,6 +221,7 @@ class CommandDesk:
 
     def _divert(self, command: Command, above: Injection | None) -> Iterator[Item]:
         """Hand over what injections take of a command, and give what they leave for the device."""
+        ended: list[Item] = []
         for place, write in enumerate(command.writes):
             taken, bits = self._injector.injections.divert(write, above)
             for layer, parts in taken:
@@ -231,7 +232,8 @@ class CommandDesk:
             elif any(bits):
                 yield Item(command, place, bits)
             else:
-                self._end([Item(command, place)], [(EventKind.TAKEN, "")])
+                ended.append(Item(command, place))
+        self._end(ended, [(EventKind.TAKEN, "")] * len(ended))  # now all that injections get of it has been told
 
     def _has_room(self, command: Command) -> bool:
         with self._turn:

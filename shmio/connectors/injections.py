@@ -74,12 +74,43 @@ class Injections:
     def effective(self, raw: bytes) -> bytes | None:
         """What consumers see of an image; None: the image itself."""
         layers = [layer for layer in self.layers if layer.direction is Direction.OUT]
-        if not layers:
-            return None
+        return self.seen(raw, layers).tobytes() if layers else None
+
+    def seen(self, raw: bytes, inner: Iterable[Injection]) -> Bits:
+        """What these layers over ``/out`` make of an image."""
         image = np.frombuffer(raw, np.uint8).copy()
-        for layer in layers:
+        for layer in inner:
             image ^= (image ^ layer.values) & layer.cover
-        return image.tobytes()
+        return image
+
+    def inner(self, layer: Injection) -> list[Injection]:
+        """The layers over ``/out`` that are further in than one of them."""
+        return [other for other in self.layers[: self.layers.index(layer)] if other.direction is Direction.OUT]
+
+    def outer(self, layer: Injection) -> list[Injection]:
+        """Those that are further out; of one over ``/in`` none."""
+        if layer.direction is Direction.IN:
+            return []
+        return [other for other in self.layers[self.layers.index(layer) + 1 :] if other.direction is Direction.OUT]
+
+    def beneath(self, raw: bytes, layer: Injection) -> list[Write]:
+        """What a layer over ``/out`` gets from those further in; the rest of its bits come from the device."""
+        inner = self.inner(layer)
+        bits = np.zeros(self.size, np.uint8)
+        for other in inner:
+            bits |= other.cover & layer.cover
+        return merge(self.seen(raw, inner).tobytes(), bits.tobytes(), [(0, self.size)] if inner else [])
+
+    def onward(self, layer: Injection, write: Write) -> list[tuple[Injection, list[Write]]]:
+        """What of the values that a layer over ``/out`` gives goes to those further out, instead of to consumers."""
+        taken: list[tuple[Injection, list[Write]]] = []
+        bits = np.full(len(write.data), write.mask or 0xFF, np.uint8)
+        for other in self.outer(layer):
+            hit = bits & other.cover[write.offset : write.offset + len(write.data)]
+            if hit.any():
+                taken.append((other, _writes(write, hit)))
+                bits &= ~hit
+        return taken
 
     def divert(self, write: Write, above: Injection | None) -> tuple[list[tuple[Injection, list[Write]]], bytes]:
         """What of a write goes to injections on its way to the device, and which of its bits are left for that.

@@ -91,37 +91,55 @@ class Injector:
             if (cover & ~self._writable).any():
                 return "it covers what is not writable; name that in the source's `writable`"
         with self._output.turn:
-            raw = self._output.raw
-            values = np.frombuffer(self.injections.effective(raw) or raw, np.uint8).copy()
             layer = Injection(
-                command.id, command.direction, command.priority, command.keep, command.name, owner, cover, values
+                command.id, command.direction, command.priority, command.keep, command.name, owner, cover, cover
             )
             if reason := self.injections.lay(layer):
                 return reason
+            layer.values = self.injections.seen(self._output.raw, self.injections.inner(layer))
             try:
                 self._show()
             except ValueError as error:
                 self.injections.lift(lambda other: other is layer)
                 return str(error)
-            self._output.show([_about(EventKind.INJECTED, layer, command.name)])
+            above = [layer, *self.injections.outer(layer)] if layer.direction is Direction.OUT else []
+            end = _about(EventKind.INJECTED, layer, command.name)
+            self._output.show([*self._beneath(above, end), end])
         return ""
 
     def _lift(self, which: Callable[[Injection], bool], reason: str, command: Command | None) -> None:
         with self._output.turn:
-            lifted = self.injections.lift(which)
+            gone = [layer for layer in self.injections.layers if which(layer)]
+            above = {other.id for layer in gone for other in self.injections.outer(layer)}
+            self.injections.lift(which)
             self._show()
-            self._output.show(_about(EventKind.LIFTED, layer, reason, command) for layer in lifted)
+            ends = [_about(EventKind.LIFTED, layer, reason, command) for layer in gone]
+            left = [layer for layer in self.injections.layers if layer.id in above]
+            self._output.show([*self._beneath(left, ends[0]), *ends] if ends else [])
 
     def _shadow(self, layer: Injection, command: Command) -> str:
         with self._output.turn:
             if reason := shadow(layer, command.writes):
                 return reason
-            self._output.show(
+            diverted = [
+                record
+                for place, write in enumerate(command.writes)
+                for other, parts in self.injections.onward(layer, write)
+                for record in pieces(EventKind.DIVERTED, command, place, parts, other)
+            ]
+            shadowed = [
                 record
                 for place, write in enumerate(command.writes)
                 for record in pieces(EventKind.SHADOWED, command, place, [write], layer)
-            )
+            ]
+            self._output.show(diverted + shadowed)
         return ""
+
+    def _beneath(self, layers: Iterable[Injection], end: Record) -> Iterator[Record]:
+        """What layers over ``/out`` get by now from those further in; told before ``end``, which is why it changed."""
+        for layer in layers:
+            about = Record(EventKind.DIVERTED, layer.name, end.writer, end.command, injection=layer.id)
+            yield from _parts(about, self.injections.beneath(self._output.raw, layer))
 
     def _show(self) -> None:
         """Tell everybody what stands; ValueError: it is too much."""
@@ -157,12 +175,15 @@ def pieces(
     kind: EventKind, command: Command, place: int, writes: Iterable[Write], layer: Injection | None
 ) -> Iterator[Record]:
     """Events that tell of parts of an item with their data; several if these are long."""
+    name, number = (layer.name, layer.id) if layer else ("", 0)
+    return _parts(Record(kind, name, command.writer, command.id, place, 1, injection=number), writes)
+
+
+def _parts(about: Record, writes: Iterable[Write]) -> Iterator[Record]:
     for offset, mask, data in writes:
         for start in range(0, len(data), EVENT_DATA_SIZE):
             part = data[start : start + EVENT_DATA_SIZE]
-            name, number = (layer.name, layer.id) if layer else ("", 0)
-            at = offset + start
-            yield Record(kind, name, command.writer, command.id, place, 1, at, mask, len(part), part, number)
+            yield about._replace(offset=offset + start, mask=mask, size=len(part), data=part)
 
 
 def _about(kind: EventKind, layer: Injection, text: str, command: Command | None = None) -> Record:

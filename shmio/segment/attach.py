@@ -18,6 +18,7 @@ import os
 import threading
 import time
 from collections.abc import Collection, Iterator, Mapping
+from functools import partial
 
 from shmio.errors import CommandError, NotRunningError, PathError, QualityError, SegmentError
 from shmio.layout.codec import Value
@@ -26,11 +27,11 @@ from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.segment.block import Block
 from shmio.segment.commander import Commander, Outcome
 from shmio.segment.commands import Direction
-from shmio.segment.cursor import Cursor
+from shmio.segment.cursor import Cursor, Entry
 from shmio.segment.frame import Frame, Quality
 from shmio.segment.processes import Activity, Report
 from shmio.segment.segment import Segment, running_instances
-from shmio.segment.shadow import Shadow
+from shmio.segment.shadow import Shadow, lift_all
 from shmio.segment.standing import Standing
 from shmio.segment.view import Reading, View, reading
 
@@ -137,15 +138,15 @@ class Attachment:
             raise NotRunningError(f"source {block.source!r} was removed from instance {self.instance!r} by a reload")
         return successor
 
-    def _next(self, block: Block, cursor: Cursor[Frame], timeout_s: float | None) -> Frame | None:
-        """Wait for a frame in turns: a stopped instance rings no bell."""
+    def _next(self, block: Block, cursor: Cursor[Entry], timeout_s: float | None) -> Entry | None:
+        """Wait for a frame or an event in turns: a stopped instance rings no bell."""
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             rest_s = TURN_S if deadline_s is None else deadline_s - time.monotonic()
             retired = block.retired  # before looking: what was published before the end is still read
-            frame = cursor.next(min(rest_s, TURN_S))
-            if frame is not None or retired:
-                return frame
+            entry = cursor.next(min(rest_s, TURN_S))
+            if entry is not None or retired:
+                return entry
             if not self.current:
                 raise NotRunningError(f"instance {self.instance!r} has stopped")
             if rest_s < TURN_S:
@@ -199,10 +200,11 @@ class Attachment:
             raise PathError("an injection is over /out or over /in, not over both")
         direction = Direction.IN if "in" in directions else Direction.OUT
         commander = self._commander(block)
+        events = block.events.cursor()  # from before it is laid: what it diverts at once is not missed
         number = commander.inject(
             [topic.path or "**" for topic in topics], direction=direction, priority=priority, keep=keep, name=name
         )
-        return Shadow(commander, number, direction, keep=keep)
+        return Shadow(commander, number, direction, events, partial(self._next, block), keep=keep)
 
     def injections(self) -> dict[str, tuple[Standing, ...]]:
         """What stands at present, by source; the innermost first."""
@@ -211,6 +213,15 @@ class Attachment:
     def lift(self, source: str, number: int) -> None:
         """Lift an injection, whoever laid it. PathError: no such source; CommandError: no such injection."""
         self._commander(self.block(source)).lift(number)
+
+    def lift_all(self) -> list[tuple[str, Standing]]:
+        """Lift all injections of all sources, whoever laid them: (source, injection) of each.
+
+        All are tried, and at once. CommandError: some still stand, and why.
+        """
+        standing = [(source, one) for source, ones in self.injections().items() for one in ones]
+        lift_all([(self._commander(self.block(source)), one.id) for source, one in standing])
+        return standing
 
     def _of_one_source(self, what: str, paths: Collection[str]) -> tuple[Block, list[Topic]]:
         """The block and the topics of paths that must be of one source; PathError."""

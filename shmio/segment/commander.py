@@ -13,6 +13,7 @@ from shmio.layout.model import Register
 from shmio.layout.topic import find
 from shmio.layout.write import Write, bits_of, cover, encode, merge
 from shmio.segment.commands import CommandKind, CommandSender, Laid
+from shmio.segment.diverted import apply
 from shmio.segment.events import DONE, ENDS, Event, EventKind
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ class Outcome:
 
     @property
     def done(self) -> bool:
-        """Whether the device confirmed it, or an injection took it in the device's place."""
+        """Whether the device confirmed it or an injection took it in the device's place; of a shadow's, it is seen."""
         return self.kind in DONE
 
 
@@ -95,6 +96,19 @@ class Commander:
         writes = [self._encode(find(self.block.layout, path), path, value) for path, value in values.items()]
         return self.outcomes(self._send(tuple(values), writes, timeout_s, CommandKind.SHADOW, injection))
 
+    def give(self, injection: int, values: Mapping[str, object], timeout_s: float | None = None) -> Ticket:
+        """Send values as an injection's, neighbours joined: items are not values. Errors as of :meth:`shadow`."""
+        image, bits = bytearray(self.block.layout.size), bytearray(self.block.layout.size)
+        ranges = []
+        for path, value in values.items():
+            register = find(self.block.layout, path)
+            write = self._encode(register, path, value)
+            apply(image, [write])
+            apply(bits, [write._replace(data=bits_of(register))])
+            ranges.append((write.offset, write.offset + len(write.data)))
+        writes = merge(image, bits, ranges)
+        return self._send(("",) * len(writes), writes, timeout_s, CommandKind.SHADOW, injection)
+
     def inject(self, patterns: Iterable[str], timeout_s: float | None = None, **laid: Unpack[Laid]) -> int:
         """Lay an injection over all that the patterns name (see :func:`shmio.layout.write.cover`); its number.
 
@@ -104,13 +118,25 @@ class Commander:
         bits = cover(self.block.layout, patterns)
         if not any(bits):
             raise PathError(f"{self.block.source}: {', '.join(patterns)} names no register")
-        ticket = self._send(("",), merge(bits, bits, [(0, len(bits))]), timeout_s, CommandKind.INJECT, **laid)
+        ticket = self.lay(bits, timeout_s, **laid)
         self._expect(ticket, EventKind.INJECTED)
         return ticket.number
 
+    def lay(self, bits: bytes, timeout_s: float | None = None, **laid: Unpack[Laid]) -> Ticket:
+        """Ask for an injection over these bits, whose number is the ticket's. CommandError: not sent. Never waits."""
+        return self._send(("",), merge(bits, bits, [(0, len(bits))]), timeout_s, CommandKind.INJECT, **laid)
+
     def lift(self, injection: int, timeout_s: float | None = None) -> None:
         """Lift an injection, whoever laid it. CommandError: there is none, or the source does not answer."""
-        self._expect(self._send(("",), [], timeout_s, CommandKind.LIFT, injection), EventKind.LIFTED)
+        self.expect_lifted(self.ask_to_lift(injection, timeout_s))
+
+    def ask_to_lift(self, injection: int, timeout_s: float | None = None) -> Ticket:
+        """The first half of :meth:`lift`. CommandError: not sent. Never waits."""
+        return self._send(("",), [], timeout_s, CommandKind.LIFT, injection)
+
+    def expect_lifted(self, ticket: Ticket) -> None:
+        """The second half of :meth:`lift`."""
+        self._expect(ticket, EventKind.LIFTED)
 
     def _expect(self, ticket: Ticket, kind: EventKind) -> None:
         (outcome,) = self.outcomes(ticket)

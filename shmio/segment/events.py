@@ -45,7 +45,7 @@ class EventKind(IntEnum):
     UNKNOWN = 9
     """Sent, but no answer came."""
     DIVERTED = 10
-    """What was written went to an injection instead of the device: these bits of it, with data."""
+    """What was written, or given by an injection beneath it, went to an injection: these bits, with data."""
     TAKEN = 11
     """The end of an item of which nothing was left for the device: an injection took it."""
     INJECTED = 12
@@ -73,8 +73,8 @@ ENDS: Final = frozenset(
     }
 )
 """Kinds after which nothing more is said of an item; REJECTED: of a command."""
-DONE: Final = frozenset({EventKind.WRITTEN, EventKind.TAKEN})
-"""Ends with which a write has gone where it was meant to, or to the injection on its way."""
+DONE: Final = frozenset({EventKind.WRITTEN, EventKind.TAKEN, EventKind.SHADOWED})
+"""Ends with which a value has gone where it was meant to, or to the injection on its way."""
 
 
 class Event(NamedTuple):

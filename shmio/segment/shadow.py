@@ -2,13 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
+from shmio.errors import CommandError
+from shmio.layout.codec import Value
 from shmio.layout.topic import parse_topic
-from shmio.segment.commander import Commander, Outcome
+from shmio.segment.commander import Commander, Outcome, Ticket
 from shmio.segment.commands import Direction
+from shmio.segment.cursor import Cursor
+from shmio.segment.diverted import Diverted, Gatherer, apply, values
+from shmio.segment.events import Event, EventKind
+
+Next = Callable[[Cursor[Event], float | None], Event | None]
+"""The next event of a cursor, waited for so many s; None: there is none, or will be none. NotRunningError."""
+
+
+@dataclass(frozen=True, slots=True)
+class Diversion:
+    """What one command wrote that went to an injection.
+
+    ``values``: by path in the block; of an array that was written in part, its elements. ``writer``, ``command``: whose
+    it was, as in events. ``clock_ns``: when, on the instance's clock; ``utc_ns``: in UTC. ``missed``: events lost
+    between the one before and this one, which may have been of this shadow.
+    """
+
+    values: Mapping[str, Value]
+    writer: int
+    command: int
+    clock_ns: int
+    utc_ns: int
+    missed: int
 
 
 class Shadow:
@@ -17,12 +44,27 @@ class Shadow:
     Until it is given values, consumers go on seeing what they saw; over ``/in``, nothing reaches the device.
     """
 
-    def __init__(self, commander: Commander, number: int, direction: Direction, *, keep: bool) -> None:
+    def __init__(
+        self,
+        commander: Commander,
+        number: int,
+        direction: Direction,
+        events: Cursor[Event],
+        next_event: Next,
+        *,
+        keep: bool,
+    ) -> None:
+        """``events``: from before it was laid."""
         self.source = commander.block.source
         self.number = number
         """By which anybody may lift it, or give values to it."""
         self.direction = direction
         self._commander = commander
+        self._events = events
+        self._gathered = Gatherer()
+        self._missed = 0
+        self._image = bytearray(commander.block.layout.size)  # what was diverted so far
+        self._next_event = next_event
         self._keep = keep
 
     def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
@@ -33,6 +75,29 @@ class Shadow:
         """
         paths = {parse_topic(path, (self.source,), self.source).path: value for path, value in values.items()}
         return self._commander.shadow(self.number, paths, timeout_s)
+
+    def diverted(self, timeout_s: float | None = None) -> Iterator[Diversion]:
+        """What went to this shadow since it was laid: over ``/in`` what others wrote, command by command, in order.
+
+        Over ``/out``: what shadows further from consumers gave; what the source delivers is in the frames. Each is told
+        once, also to a second iterator. It ends when the shadow is lifted, and after ``timeout_s`` without any; None
+        waits for ever. NotRunningError when the instance has stopped.
+        """
+        until_s = _deadline(timeout_s)
+        while (event := self._next_event(self._events, _rest(until_s))) is not None:
+            for diverted in self._gathered.follow(event):
+                if diverted.injection == self.number:
+                    yield self._diversion(diverted)
+                    until_s = _deadline(timeout_s)
+            if event.kind == EventKind.LIFTED and event.injection == self.number:
+                return
+
+    def _diversion(self, diverted: Diverted) -> Diversion:
+        apply(self._image, diverted.writes)
+        missed, self._missed = self._events.missed - self._missed, self._events.missed
+        event = diverted.event
+        written = values(self._commander.block.layout, bytes(self._image), diverted.writes)
+        return Diversion(written, event.writer, event.command, event.clock_ns, event.utc_ns, missed)
 
     def lift(self) -> None:
         """Lift it; consumers see what the source delivers. CommandError: it was lifted already, or no answer came."""
@@ -46,3 +111,30 @@ class Shadow:
     ) -> None:
         if not self._keep:
             self.lift()
+
+
+def lift_all(injections: Iterable[tuple[Commander, int]]) -> None:
+    """Lift all of these; those that are gone by then count as lifted. CommandError: some still stand, and why."""
+    asked: list[tuple[Commander, Ticket]] = []
+    chosen, reasons = list(injections), dict[str, None]()
+    for commander, number in chosen:
+        try:
+            asked.append((commander, commander.ask_to_lift(number)))
+        except CommandError as error:
+            reasons[str(error)] = None
+    for commander, ticket in asked:
+        try:
+            commander.expect_lifted(ticket)
+        except CommandError as error:
+            reasons[str(error)] = None
+    left = [number for commander, number in chosen if any(one.id == number for one in commander.block.standing.read())]
+    if left:
+        raise CommandError(f"{len(left)} of {len(chosen)} injections still stand: {'; '.join(reasons)}")
+
+
+def _deadline(timeout_s: float | None) -> float | None:
+    return None if timeout_s is None else time.monotonic() + timeout_s
+
+
+def _rest(until_s: float | None) -> float | None:
+    return None if until_s is None else until_s - time.monotonic()

@@ -1,0 +1,90 @@
+"""What goes to injections: their events put together again, command by command."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from itertools import product
+from typing import Final, NamedTuple
+
+from shmio.layout.codec import Value, codec
+from shmio.layout.model import Layout, Register
+from shmio.layout.write import Write, bits_of
+from shmio.segment.events import Event, EventKind
+
+
+class Diverted(NamedTuple):
+    """What one command wrote that went to one injection: in its parts, in the order of the events."""
+
+    injection: int
+    event: Event
+    """The last of its events: its time, whose command it was."""
+    writes: tuple[Write, ...]
+
+
+_Key = tuple[int, int, int]
+_NOBODY: Final = (0, 0, 0)
+
+
+class Gatherer:
+    """Gathers the events about what was diverted; give it all events of a block, in order.
+
+    A command is whole when it says something else, for that it does at once, or when another one is diverted.
+    """
+
+    def __init__(self) -> None:
+        self._command: _Key = _NOBODY
+        self._parts: dict[int, list[Event]] = {}
+
+    def follow(self, event: Event) -> list[Diverted]:
+        """What is whole by this event."""
+        command = event.incarnation, event.writer, event.command
+        if event.kind != EventKind.DIVERTED:
+            return self._whole() if command == self._command or event.kind == EventKind.STARTED else []
+        whole = [] if command == self._command else self._whole()
+        self._command = command
+        self._parts.setdefault(event.injection, []).append(event)
+        return whole
+
+    def _whole(self) -> list[Diverted]:
+        whole = [
+            Diverted(injection, parts[-1], tuple(Write(part.offset, part.mask, part.data) for part in parts))
+            for injection, parts in self._parts.items()
+        ]
+        self._command, self._parts = _NOBODY, {}
+        return whole
+
+
+def apply(image: bytearray, writes: Iterable[Write]) -> None:
+    """Bring writes to an image. What lies outside it, as only another process's mistake can, is passed over."""
+    for offset, mask, data in writes:
+        if offset + len(data) > len(image) or not data:
+            continue
+        if mask:
+            image[offset] = image[offset] & ~mask | data[0] & mask
+        else:
+            image[offset : offset + len(data)] = data
+
+
+def values(layout: Layout, image: bytes, writes: Iterable[Write]) -> dict[str, Value]:
+    """The values in an image of what was written, by path: registers, or of arrays written in part their elements."""
+    bits = bytearray(layout.size)
+    apply(bits, (Write(offset, mask, b"\xff" * len(data)) for offset, mask, data in writes))
+    found: dict[str, Value] = {}
+    for register in layout.registers:
+        share = _share(bits, register)
+        in_part = register.dims and any(share) and share != bits_of(register)
+        for part in _elements(layout, register) if in_part else (register,):
+            if any(_share(bits, part)):
+                found[part.path] = codec(part, layout.byte_order).decode(image)
+    return found
+
+
+def _share(bits: bytearray, register: Register) -> bytes:
+    """The part of these bits that is a register's."""
+    own = bits[register.offset : register.offset + register.size]
+    return bytes(bit & mine for bit, mine in zip(own, bits_of(register), strict=True))
+
+
+def _elements(layout: Layout, register: Register) -> Iterator[Register]:
+    for index in product(*(range(low, high + 1) for low, high in register.dims)):
+        yield layout.element(register, index)

@@ -1,0 +1,141 @@
+"""What goes to injections, and what programs see of it: chains of them, and the stream of what was diverted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+import shmio
+from shmio.connectors.injections import Owner
+from shmio.errors import CommandError
+from shmio.layout.codec import Value
+from shmio.segment import EventKind, Segment
+from shmio.segment.attach import Attachment
+from shmio.segment.standing import Standing, encode
+from tests.unit.connectors import test_injector
+from tests.unit.connectors.test_injector import LAYOUT, Rig
+
+segment = test_injector.segment
+GUEST = 0
+"""The command queue of the only program from outside."""
+
+
+@pytest.fixture
+def rig(segment: Segment) -> Iterator[Rig]:
+    rig = Rig(segment)
+    rig.owners[GUEST] = Owner(GUEST, 300)
+    yield rig
+    rig.stop()
+
+
+@pytest.fixture
+def local(rig: Rig) -> Iterator[Attachment]:
+    with shmio.attach(rig.segment.instance, writable=True) as local:
+        yield local
+
+
+def beneath(rig: Rig, number: int, until: EventKind) -> list[tuple[int, bytes]]:
+    """(offset, data) of all that is diverted to an injection until an event of this kind."""
+    found = []
+    while (event := rig.events.next(20)) is None or event.kind != until:
+        assert event is not None
+        if event.kind == EventKind.DIVERTED and event.injection == number:
+            found.append((event.offset, event.data))
+    return found
+
+
+SPEED = LAYOUT.registers[LAYOUT.by_path["speed"]].offset
+
+
+def test_what_an_inner_injection_gives_goes_to_the_one_further_out(rig: Rig) -> None:
+    inner = rig.client.inject(["speed", "axis"])
+    rig.client.shadow(inner, {"speed": 5})
+    outer = rig.other.inject(["speed", "position"])
+    assert beneath(rig, inner, EventKind.INJECTED) == []
+    assert beneath(rig, outer, EventKind.INJECTED) == [(SPEED, b"\5\0")], "what it finds there"
+    rig.client.shadow(inner, {"speed": 6, "axis/1": 7})
+    assert beneath(rig, outer, EventKind.SHADOWED) == [(SPEED, b"\6\0")]
+    assert (rig.value("speed"), rig.value("axis/1")) == (5, 7), "consumers hold the outer one's value"
+    rig.other.shadow(outer, {"speed": 8})
+    assert rig.value("speed") == 8
+    rig.other.lift(outer)
+    assert rig.value("speed") == 6
+
+
+def test_one_that_is_laid_beneath_another_finds_what_is_there(rig: Rig) -> None:
+    rig.client.write({"speed": 3})
+    rig.sees({"speed": 3})
+    outer = rig.client.inject(["speed"], priority=1)
+    rig.client.shadow(outer, {"speed": 100})
+    inner = rig.other.inject(["speed"])
+    assert beneath(rig, outer, EventKind.INJECTED) == []
+    assert beneath(rig, outer, EventKind.INJECTED) == [(SPEED, b"\3\0")], "not the outer one's own value"
+    innermost = rig.other.inject(["speed"], priority=-1)
+    rig.other.shadow(innermost, {"speed": 4})
+    rig.other.lift(inner)
+    found = beneath(rig, outer, EventKind.LIFTED)
+    assert found[-1] == (SPEED, b"\4\0")
+    rig.other.lift(innermost)
+    assert beneath(rig, outer, EventKind.LIFTED) == [], "it is the device's again"
+    assert rig.value("speed") == 100
+
+
+def test_a_program_gets_what_others_write_command_by_command(rig: Rig, local: Attachment) -> None:
+    with local.inject("cell/speed/in", "cell/axis/in", "cell/lamps/2/in") as shadow:
+        lamps = [place in (2, 3) for place in range(10)]
+        rig.client.write({"speed": 20})
+        rig.client.write({"axis/1": 1, "axis/2": 2, "lamps": lamps})
+        rig.client.write({"speed": 20})
+        stream = shadow.diverted(timeout_s=20)
+        written: list[dict[str, Value]] = [dict(next(stream).values) for _ in range(3)]
+        assert written == [{"speed": 20}, {"axis/1": 1, "axis/2": 2, "lamps/2": True}, {"speed": 20}]
+        shadow.set({"cell/speed": 21})
+        rig.sees({"speed": 21})
+        rig.client.write({"speed": 22})
+        one = next(shadow.diverted(timeout_s=20))
+        assert (one.values, one.writer, one.missed) == ({"speed": 22}, 4, 0)
+        assert one.clock_ns > 0
+        assert list(shadow.diverted(timeout_s=0.01)) == []
+    assert list(shadow.diverted()) == [], "it has an end when the shadow is lifted"
+
+
+def test_whole_arrays_and_what_is_longer_than_an_event(rig: Rig, local: Attachment) -> None:
+    with local.inject("cell/lamps/in") as shadow:
+        rig.client.write({"lamps": [True] * 10})
+        rig.client.write({"lamps/0": False})
+        stream = shadow.diverted(timeout_s=20)
+        assert next(stream).values == {"lamps": [True] * 10}
+        assert next(stream).values == {"lamps/0": False}
+
+
+def test_a_program_is_told_how_much_it_missed(rig: Rig, local: Attachment) -> None:
+    with local.inject("cell/speed/in") as shadow:
+        stream = shadow.diverted(timeout_s=20)
+        rig.client.write({"speed": 1})
+        assert next(stream).missed == 0
+        head = rig.block.events.head()
+        while rig.block.events.head() < head + rig.block.events.ring.slot_count:
+            rig.client.shadow(1, {"speed": 1})  # there is no such injection
+        rig.client.write({"speed": 2})
+        one = next(stream)
+        assert one.values == {"speed": 2}
+        assert one.missed > 0
+
+
+def test_all_injections_are_lifted_at_once_whoever_laid_them(rig: Rig, local: Attachment) -> None:
+    numbers = {rig.client.inject(["speed"]), rig.other.inject(["axis"], keep=True)}
+    kept = local.inject("cell/lamps", keep=True)
+    lifted = local.lift_all()
+    assert {one.id for _, one in lifted} == numbers | {kept.number}
+    assert {source for source, _ in lifted} == {"cell"}
+    assert local.injections() == {"cell": ()}
+    assert local.lift_all() == []
+
+
+def test_what_cannot_be_lifted_is_named(rig: Rig, local: Attachment) -> None:
+    one = Standing(5, "out", 0, keep=True, name="", writer=0, pid=0, ranges=())
+    rig.block.standing.write(encode([one]))  # of which the source knows nothing
+    with pytest.raises(CommandError, match="1 of 1 injections still stand: cell: there is no injection 5"):
+        local.lift_all()
+    rig.block.standing.write(encode([]))
