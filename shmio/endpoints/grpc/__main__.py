@@ -9,6 +9,7 @@ import msgspec
 from shmio import worker
 from shmio.config import Address, Grpc
 from shmio.endpoints.grpc.feeds import Feeds
+from shmio.endpoints.grpc.hold import Hold
 from shmio.endpoints.grpc.server import Server
 from shmio.endpoints.grpc.services import Services
 from shmio.errors import SegmentError
@@ -40,10 +41,12 @@ async def _serve(worker: Worker) -> None:
         tasks.add(task)
         task.add_done_callback(tasks.discard)
 
-    feeds = Feeds(worker.segment, writer, loop, on_quality)
-    services = Services(feeds, config.default_source)
+    hold = Hold()
+    feeds = Feeds(worker.segment, writer, loop, on_quality, hold)
+    services = Services(worker.segment, worker.slot, hold, feeds, config.default_source)
     server = Server(services)
     feeds.start()
+    await services.stepper.start()
     addresses = [Address.parse(text) for text in config.listen]
     ports = await server.start(addresses, config.tls)
     served = ", ".join(str(Address(address.host, port)) for address, port in zip(addresses, ports, strict=True))
@@ -58,8 +61,8 @@ async def _serve(worker: Worker) -> None:
                 worker.log.info("a reload added, changed or ended %s", ", ".join(changed))
                 services.move(changed)
             reading = None
-        if not feeds.alive:
-            raise RuntimeError("a feed ended; the endpoint starts anew")
+        if not (feeds.alive and services.stepper.alive):
+            raise RuntimeError("a thread ended that should not have; the endpoint starts anew")
         streams, dropped, published, refused = services.counters
         worker.report((streams, feeds.messages, dropped, published, refused))
         try:
@@ -69,8 +72,10 @@ async def _serve(worker: Worker) -> None:
     if reading is not None:
         reading.cancel()
     feeds.stop()
+    await services.stepper.stop()
     await server.stop()
     feeds.join()
+    services.stepper.join()
 
 
 if __name__ == "__main__":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sized
+from collections.abc import Callable, Iterable, Sized
 from typing import Final, NamedTuple, Protocol
 
 from shmio.endpoints.grpc.subject import Subject
@@ -26,7 +26,7 @@ class InChannel:
 
     def __init__(self, subject: Subject) -> None:
         self.encode = subject.encode
-        self.listeners: set[Listener] = set()
+        self.listeners: dict[Listener, None] = {}  # in the order in which they came
         self.start = min(register.offset for register in subject.registers)
         self.stop = max(register.offset + register.size for register in subject.registers)
         self.bits = _bits(subject.registers, self.stop)
@@ -55,8 +55,10 @@ class Echo:
     belong to the event loop's thread, ``follow`` and ``skip`` to that of the events.
     """
 
-    def __init__(self, block: Block) -> None:
+    def __init__(self, block: Block, stamp: Callable[[Event], tuple[int, int]]) -> None:
+        """``stamp``: number and time, ns of the instance's clock, of the message about an event."""
         self._block = block
+        self._stamp = stamp
         self._channels: dict[Subject, InChannel] = {}
         self._table: tuple[InChannel, ...] = ()
         self._frame = -1  # the image is this frame, and what was accepted since
@@ -72,12 +74,12 @@ class Echo:
         if channel is None:
             channel = self._channels[subject] = InChannel(subject)
             self._table = tuple(self._channels.values())
-        channel.listeners.add(listener)
+        channel.listeners[listener] = None
 
     def leave(self, subject: Subject, listener: Listener) -> None:
         """Leave; the last listener takes the channel with it."""
         channel = self._channels[subject]
-        channel.listeners.discard(listener)
+        channel.listeners.pop(listener, None)
         if not channel.listeners:
             del self._channels[subject]
             self._table = tuple(self._channels.values())
@@ -165,7 +167,7 @@ class Echo:
         return messages
 
     def _show(self, channel: InChannel, event: Event, messages: list[Message]) -> None:
-        message = channel.encode(_Written(event.frame, event.clock_ns, bytes(self._image)))
+        message = channel.encode(_Written(*self._stamp(event), bytes(self._image)))
         if message is not None:
             messages.append((channel, message))
 

@@ -6,12 +6,14 @@ import asyncio
 import logging
 import threading
 from collections.abc import Callable, Iterable, Sized
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
+from shmio.endpoints.grpc.channel import Channel, Listener
+from shmio.endpoints.grpc.hold import Hold, Moment, Still
 from shmio.endpoints.grpc.inlet import Inlet
 from shmio.endpoints.grpc.subject import Subject
-from shmio.segment import Block, Frame, Quality
-from shmio.segment.scan import ChangeScan, entries
+from shmio.segment import Block, Event, Frame, Quality
+from shmio.segment.scan import ChangeScan
 
 log = logging.getLogger("shmio.grpc")
 
@@ -22,30 +24,6 @@ WAIT_S = 0.2
 """Longest wait for a frame before age is looked at."""
 
 
-class Listener(Protocol):
-    """One stream; called in the event loop's thread."""
-
-    since: int
-    """Frame whose value the stream already has."""
-
-    def deliver(self, message: Sized) -> None:
-        """Take one message for this stream."""
-
-    def lose(self) -> None:
-        """Quality is bad: what was not sent yet must not be sent any more."""
-
-
-class Channel:
-    """A subject as somebody listens to it: how a frame becomes a message, and who gets it."""
-
-    def __init__(self, subject: Subject, slot: int) -> None:
-        """``slot``: its place in the feed's table."""
-        self.encode = subject.encode
-        self.listeners: set[Listener] = set()
-        self.slot = slot
-        self.entries = entries(subject.registers, slot)
-
-
 class _Table(NamedTuple):
     slots: tuple[Channel | None, ...]
     scan: ChangeScan
@@ -54,8 +32,9 @@ class _Table(NamedTuple):
 class Feed:
     """Delivers the changes of one block's registers to listeners while quality is good.
 
-    On recovery from bad quality every register is delivered again. ``listen`` and ``leave`` belong to the event loop's
-    thread; the thread of the feed only reads the table that they replace.
+    On recovery from bad quality every register is delivered again. While it is held, which a block on the instance's
+    clock is in virtual time, nothing is delivered but by :meth:`step`. All but the thread of the feed belongs to the
+    event loop's; it only reads the table that :meth:`listen` and :meth:`leave` replace.
     """
 
     def __init__(
@@ -64,12 +43,19 @@ class Feed:
         writer: int,
         loop: asyncio.AbstractEventLoop,
         on_quality: Callable[[str, bool], None],
+        hold: Hold | None = None,
     ) -> None:
-        """``writer``: the command queue of this process."""
+        """``writer``: the command queue of this process. ``hold``: virtual time; default: there is none."""
         self.block = block
-        self.inlet = Inlet(block, writer, loop)
+        self.inlet = Inlet(block, writer, loop, self._stamp)
         """The other direction."""
         self.messages = 0
+        self._hold = hold or Hold()
+        self._held = self._hold.on and block.attributes.stepped
+        self._turn = threading.Lock()  # around each frame that is looked at, so that none is after it was held
+        self._stepped = False  # since it is held
+        self._shown: Frame | Still | None = None  # what listeners have seen; None while quality is bad
+        self._good = False  # as last told
         self._loop = loop
         self._on_quality = on_quality
         self._channels: dict[Subject, Channel] = {}
@@ -93,6 +79,8 @@ class Feed:
 
     def start(self) -> None:
         """Begin to follow the block."""
+        if self._held:
+            self._adopt(self.block.latest())
         self._thread.start()
         self.inlet.start()
 
@@ -113,7 +101,7 @@ class Feed:
             slot = self._free.pop() if self._free else len(self._channels)
             channel = self._channels[subject] = Channel(subject, slot)
             self._rebuild()
-        channel.listeners.add(listener)
+        channel.listeners[listener] = None
         listener.since = 0
         self._owed[listener] = channel
         self._settle()
@@ -122,7 +110,7 @@ class Feed:
         """Leave; the last listener takes the channel with it."""
         self._owed.pop(listener, None)
         channel = self._channels[subject]
-        channel.listeners.discard(listener)
+        channel.listeners.pop(listener, None)
         if not channel.listeners:
             del self._channels[subject]
             self._free.append(channel.slot)
@@ -130,8 +118,52 @@ class Feed:
                 self._outdated = True
                 self._loop.call_soon(self._rebuild)
 
+    def hold(self) -> None:
+        """Show nothing any more but by :meth:`step`, if the block is on the instance's clock.
+
+        What was shown before is delivered when the event loop has had a turn.
+        """
+        with self._turn:
+            self._held = self.block.attributes.stepped
+
+    def step(self) -> None:
+        """Show what differs between the values shown last and the newest frame, as of the step that is delivered.
+
+        The order is that of the block, whoever listens. SegmentError: no frame can be read.
+        """
+        if not self._held:
+            return
+        self._stepped = True
+        frame = self.block.latest()
+        if frame is None or frame.quality is Quality.BAD:
+            self._shown = None
+            return
+        shown, self._shown = self._shown, Still(*self._hold.moment, frame.image)
+        for channel in sorted(self._news(shown, frame), key=lambda channel: channel.order):
+            self._keep(channel.listeners, channel.encode(self._shown))
+        self._settle()
+
+    def _keep(self, listeners: Iterable[Listener], message: Sized | None) -> None:
+        if message is not None:
+            self.messages += 1
+            for listener in listeners:
+                self._owed.pop(listener, None)
+                listener.keep(message)
+
+    def _adopt(self, frame: Frame | None) -> None:
+        """Before the first step the first good image is shown as it is."""
+        if self._held and not self._stepped and self._shown is None and frame and frame.quality is not Quality.BAD:
+            self._shown = Still(*self._hold.moment, frame.image)
+            self._settle()
+
     def _settle(self) -> None:
-        """Give those who are owed a value the newest one, if it is good."""
+        """Give those who are owed a value the newest one that is shown, if it is good."""
+        if self._held:
+            if self._shown is not None:
+                for listener, channel in list(self._owed.items()):
+                    self._keep([listener], channel.encode(self._shown))
+                self._owed.clear()
+            return
         frame = self.block.latest() if self._owed else None
         if frame is None or self.block.assess(frame)[0] is Quality.BAD:
             return
@@ -158,7 +190,6 @@ class Feed:
                 if listener.since < frame:
                     listener.lose()
                     listener.since = 0  # it may have lost this very value
-        self._on_quality(self.block.source, False)
 
     def _rebuild(self) -> None:
         slots: list[Channel | None] = [None] * (len(self._channels) + len(self._free))
@@ -179,7 +210,6 @@ class Feed:
         block = self.block
         newest = block.latest()
         cursor = block.cursor(after=newest.number - 1 if newest else 0)
-        shown: Frame | None = None  # what listeners have seen; None while quality is bad
         while not self._stopping.is_set():
             if cursor.behind > CATCH_UP_FRAMES:
                 cursor = block.cursor(after=block.ring.head() - 1)
@@ -187,27 +217,55 @@ class Feed:
             frame = cursor.next(timeout_s=min(WAIT_S, block.stale_ns / 1e9))
             if frame is None and retired:
                 return
-            good = frame is not None and block.assess(frame)[0] is not Quality.BAD
-            # Age by the next frame's time, if there is one: it may have been stale while nobody was awake to see it.
-            until_ns = frame.publish_ns if frame else block.now_ns()
-            stale = shown is not None and shown.age_ns(until_ns) > block.stale_ns
-            if shown is not None and (stale or (frame is not None and not good)):
-                since = shown.number + 1 if frame is None else frame.number
-                shown = None
-                self._loop.call_soon_threadsafe(self._turn_bad, since)
-            if frame is not None and good:
-                self._show(shown, frame)
-                shown = frame
+            with self._turn:
+                if self._held:
+                    self._look(frame)
+                else:
+                    self._take(frame)
 
-    def _show(self, shown: Frame | None, frame: Frame) -> None:
+    def _take(self, frame: Frame | None) -> None:
+        """Show a frame if it is good, and turn bad if it is not, or none came for too long."""
+        block, shown = self.block, self._shown
+        good = frame is not None and block.assess(frame)[0] is not Quality.BAD
+        # Age by the next frame's time, if there is one: it may have been stale while nobody was awake to see it.
+        until_ns = frame.publish_ns if frame else block.now_ns()
+        stale = isinstance(shown, Frame) and shown.age_ns(until_ns) > block.stale_ns
+        if shown is not None and (stale or (frame is not None and not good)):
+            since = shown.number + 1 if frame is None else frame.number
+            shown = self._shown = None
+            self._loop.call_soon_threadsafe(self._turn_bad, since)
+            self._tell(good=False)
+        if frame is not None and good:
+            self._tell(good=True)
+            self._show(shown, frame)
+            self._shown = frame
+
+    def _look(self, frame: Frame | None) -> None:
+        """Tell quality at once also while values wait for a step."""
+        if frame is not None:
+            self._tell(good=frame.quality is not Quality.BAD)
+            if not self._stepped and self._shown is None:
+                self._loop.call_soon_threadsafe(self._adopt, frame)
+
+    def _tell(self, *, good: bool) -> None:
+        if good != self._good:
+            self._good = good
+            self._loop.call_soon_threadsafe(self._on_quality, self.block.source, good)
+
+    def _show(self, shown: Frame | Still | None, frame: Frame) -> None:
         """Encode what has changed since the frame shown before; everything, if there is none."""
-        slots, scan = self._table
-        if shown is None:
-            self._loop.call_soon_threadsafe(self._on_quality, self.block.source, True)
-            news: Iterable[Channel | None] = slots
-        else:
-            news = [slots[i] for i in scan.changed(shown.image, frame.image)]
-        batch = [(channel, message) for channel in news if channel and (message := channel.encode(frame)) is not None]
+        news = self._news(shown, frame)
+        batch = [(channel, message) for channel in news if (message := channel.encode(frame)) is not None]
         if batch or self._owed:
             self.messages += len(batch)
             self._loop.call_soon_threadsafe(self._deliver, frame.number, batch)
+
+    def _news(self, shown: Frame | Still | None, frame: Frame) -> list[Channel]:
+        """The channels whose bytes have changed since then; all, if nothing was shown."""
+        slots, scan = self._table
+        news = slots if shown is None else [slots[i] for i in scan.changed(shown.image, frame.image)]
+        return [channel for channel in news if channel]
+
+    def _stamp(self, event: Event) -> tuple[int, int]:
+        """Number and time of what is told of an event: the frame before it, in virtual time the step before."""
+        return self._hold.moment if self._held else Moment(event.frame, event.clock_ns)

@@ -6,6 +6,7 @@ import asyncio
 from collections.abc import Callable, Iterator, Mapping
 
 from shmio.endpoints.grpc.feed import Feed
+from shmio.endpoints.grpc.hold import Hold
 from shmio.segment import Segment
 
 
@@ -18,13 +19,18 @@ class Feeds(Mapping[str, Feed]):
         writer: int,
         loop: asyncio.AbstractEventLoop,
         on_quality: Callable[[str, bool], None],
+        hold: Hold | None = None,
     ) -> None:
-        """``writer``: the command queue of this process. ``on_quality``: told whether a source is good by now."""
+        """``writer``: the command queue of this process. ``on_quality``: told whether a source is good by now.
+
+        ``hold``: see :class:`Feed`.
+        """
         self._segment = segment
         self._generation = -1  # of the segment when it was last read
         self._writer = writer
         self._loop = loop
         self._on_quality = on_quality
+        self._hold = hold
         self._feeds: dict[str, Feed] = {}
         self._ended: list[Feed] = []
         self._ended_messages = 0
@@ -52,7 +58,7 @@ class Feeds(Mapping[str, Feed]):
         """Begin to follow all blocks that are not followed yet."""
         for source, block in self._segment.blocks.items():
             if source not in self._feeds:
-                feed = self._feeds[source] = Feed(block, self._writer, self._loop, self._on_quality)
+                feed = self._feeds[source] = Feed(block, self._writer, self._loop, self._on_quality, self._hold)
                 self._on_quality(source, False)
                 feed.start()
 

@@ -50,10 +50,16 @@ class Inlet:
     All but the thread belongs to the event loop.
     """
 
-    def __init__(self, block: Block, writer: int, loop: asyncio.AbstractEventLoop) -> None:
-        """``writer``: the command queue of this process."""
+    def __init__(
+        self,
+        block: Block,
+        writer: int,
+        loop: asyncio.AbstractEventLoop,
+        stamp: Callable[[Event], tuple[int, int]],
+    ) -> None:
+        """``writer``: the command queue of this process. ``stamp``: see :class:`Echo`."""
         self.block = block
-        self.echo = Echo(block)
+        self.echo = Echo(block, stamp)
         self._writer = writer
         self._loop = loop
         self._commander = Commander(block, writer)
@@ -67,6 +73,9 @@ class Inlet:
         self._freed: asyncio.Future[None] | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._cursor = block.events.cursor()
+        self._told = self._cursor.last  # number of the last event whose messages are on their way to the event loop
+        self._asked: tuple[int, asyncio.Future[None]] | None = None
+        self._asking = threading.Lock()  # around these two
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"inlet-{block.source}", daemon=True)
 
@@ -131,6 +140,17 @@ class Inlet:
             self._open_events += events
             if self._timer is None:
                 self._set_timer()
+
+    async def caught_up(self) -> None:
+        """Wait until what has been told so far is delivered, to those who listen to what is written too."""
+        told = self._loop.create_future()
+        with self._asking:
+            head = self.block.events.head()
+            if self._told < head and self.alive:
+                self._asked = head, told
+            else:
+                self._loop.call_soon(_set, told)  # behind what is on its way
+        await told
 
     async def _prepare(self) -> None:
         if not self._prepared:
@@ -235,6 +255,7 @@ class Inlet:
             retired = self.block.retired
             event = cursor.next(WAIT_S)
             if event is None:
+                self._tell(cursor.last)
                 if retired:
                     self._loop.call_soon_threadsafe(self._retired)
                     return
@@ -254,6 +275,20 @@ class Inlet:
                     break
             if ours or messages:
                 self._loop.call_soon_threadsafe(self._on_events, ours, messages)
+            self._tell(cursor.last)
+
+    def _tell(self, number: int) -> None:
+        """All up to this event is on its way."""
+        with self._asking:
+            self._told = number
+            if self._asked is not None and self._asked[0] <= number:
+                self._loop.call_soon_threadsafe(_set, self._asked[1])
+                self._asked = None
+
+
+def _set(future: asyncio.Future[None]) -> None:
+    if not future.done():
+        future.set_result(None)
 
 
 def _cost(register: Register) -> tuple[int, int]:

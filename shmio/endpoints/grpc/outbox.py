@@ -21,6 +21,10 @@ EVENT_BOUND: Final = 2 * EVENT_SLOTS
 """Events that may wait in a stream; an inlet that catches up delivers half of it at once."""
 BOUND_BYTES: Final = 8 << 20
 """Of values, and of events, that wait in a stream."""
+STEP_BOUND: Final = 16_384
+"""Values that may wait of which none may be left out: what one step changes in all topics of a stream."""
+STEP_BOUND_BYTES: Final = 64 << 20
+"""The same in bytes. All streams share them."""
 
 Finish = Callable[[Any], bytes]
 
@@ -32,9 +36,10 @@ class _Load:
         self.count = 0
         self.size = 0
 
-    def full(self, message: Sized, bound: int) -> bool:
+    def full(self, message: Sized, bound: int, bound_bytes: int | None = None) -> bool:
         """Whether one more would be too much. A single one never is, however long."""
-        return self.count > 0 and (self.count >= bound or self.size + len(message) > BOUND_BYTES)
+        most = BOUND_BYTES if bound_bytes is None else bound_bytes
+        return self.count > 0 and (self.count >= bound or self.size + len(message) > most)
 
     def add(self, message: Sized) -> None:
         self.count += 1
@@ -57,6 +62,9 @@ class Outbox:
         self._next = 0
         self._waiter: asyncio.Future[None] | None = None
         self._ended = False
+        self._owed = 0  # messages up to this number are waited for
+        self._taken = 0  # those before this number have left, or were dropped
+        self._told: asyncio.Future[None] | None = None
 
     def add(self, lane: _Lane, message: Sized) -> int:
         """Take a message; its number."""
@@ -87,9 +95,43 @@ class Outbox:
         self.failure = self.failure or reason
         self.clear()
         self.end()
+        self._tell()
+
+    def owe(self) -> None:
+        """What has been added so far is waited for by :meth:`taken`."""
+        self._owed = self._next
+
+    @property
+    def owing(self) -> bool:
+        """Whether its client has not taken all that is waited for."""
+        return self._taken < self._owed and not self.failure
+
+    async def taken(self) -> None:
+        """Wait until its client has taken all that is owed, or its stream is over."""
+        while self.owing:
+            self._told = asyncio.get_running_loop().create_future()
+            try:
+                await self._told
+            finally:
+                self._told = None
+
+    def close(self) -> None:
+        """Its stream is over: nothing is owed any more."""
+        self._owed = 0
+        self._tell()
+
+    def _tell(self) -> None:
+        """Have :meth:`taken` look."""
+        if self._told is not None and not self._told.done() and not self.owing:
+            self._told.set_result(None)
 
     async def pop(self) -> bytes | None:
-        """The oldest message, waited for; None at the end, from where it begins anew."""
+        """The oldest message, waited for; None at the end, from where it begins anew.
+
+        The one given before is with the client then, as far as flow control lets it.
+        """
+        self._taken = next(iter(self._waiting), self._next)
+        self._tell()
         while not self._waiting:
             if self._ended:
                 self._ended = False
@@ -126,6 +168,16 @@ class _Lane:
         """Drop what waits of it."""
         while self._numbers:
             self._outbox.drop(self._numbers.popleft())
+
+    def keep(self, message: Sized) -> None:
+        """Add one of a step's messages, of which none is left out: without room for it the whole outbox fails.
+
+        The step waits until the client has taken it.
+        """
+        if self.load.full(message, STEP_BOUND, STEP_BOUND_BYTES):
+            self._outbox.fail(f"{self.load.count} values wait to be read: too many change in one step for this stream")
+        self._add(message)
+        self._outbox.owe()
 
     def _add(self, message: Sized) -> None:
         if self._outbox.failure:
@@ -217,3 +269,16 @@ class Outboxes:
         finally:
             self._open.discard(outbox)
             self._dropped += outbox.dropped
+            outbox.close()
+
+    async def taken(self, patience_s: float) -> None:
+        """Wait until all clients have taken what they are owed; the streams of those that do not in time end."""
+        owing = [outbox for outbox in self._open if outbox.owing]
+        try:
+            async with asyncio.timeout(patience_s):
+                for outbox in owing:
+                    await outbox.taken()
+        except TimeoutError:
+            for outbox in owing:
+                if outbox.owing:
+                    outbox.fail(f"the client has not taken the values of a step within {patience_s:g} s")

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Coroutine
+from contextlib import suppress
 from functools import partial
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError
 
+from shmio.endpoints.grpc.arrivals import Arrivals
 from shmio.endpoints.grpc.inlet import Done, Inlet
 from shmio.endpoints.grpc.refusals import Refusals
 from shmio.endpoints.grpc.topics import Topics
@@ -17,6 +19,9 @@ from shmio.errors import CommandError, ShmioError
 from shmio.layout.model import Register
 from shmio.layout.topic import shorten
 from shmio.segment import DONE, EventKind
+
+SETTLE_S: Final = 5.0
+"""So long a step waits for what its client has sent before it, and goes on sending."""
 
 
 class Request(NamedTuple):
@@ -34,8 +39,48 @@ class _Stream:
     """One Publish call: how many of its values are under way, and who waits for them."""
 
     def __init__(self) -> None:
+        self.received = 0
         self.open = 0
         self.settled: asyncio.Future[None] | None = None
+        self.unheard = 0  # values that their source has neither accepted nor refused
+        self._heard: asyncio.Future[None] | None = None
+
+    async def heard(self) -> None:
+        """Wait until sources have answered all that has been received."""
+        while self.unheard:
+            self._heard = self._heard or asyncio.get_running_loop().create_future()
+            await asyncio.shield(self._heard)
+
+    def hear(self) -> None:
+        """One is answered."""
+        self.unheard -= 1
+        if not self.unheard and self._heard is not None:
+            self._heard.set_result(None)
+            self._heard = None
+
+
+class _Value:
+    """One value of a stream."""
+
+    def __init__(self, stream: _Stream) -> None:
+        self._stream = stream
+        self._heard = False
+        stream.open += 1
+        stream.unheard += 1
+
+    def hear(self) -> None:
+        """Its source has accepted or refused it."""
+        if not self._heard:
+            self._heard = True
+            self._stream.hear()
+
+    def end(self) -> None:
+        """It has its end."""
+        self.hear()
+        stream = self._stream
+        stream.open -= 1
+        if stream.open == 0 and stream.settled is not None and not stream.settled.done():
+            stream.settled.set_result(None)
 
 
 class Publisher:
@@ -49,6 +94,8 @@ class Publisher:
         self._topics = topics
         self._refusals = Refusals()
         self._waiting: set[asyncio.Task[None]] = set()
+        self._streams: dict[str, set[_Stream]] = {}  # of each peer
+        self._arrivals = Arrivals()
 
     @property
     def refused(self) -> int:
@@ -61,28 +108,53 @@ class Publisher:
         What was taken is carried out even if the client is gone meanwhile.
         """
         stream = _Stream()
-        async for message in messages:
-            path = ""
-            try:
-                request = parse(message)
-                path = request.path
-                inlet, register, value = self._read(request)
-            except DecodeError:
-                self._refusals.add(f"{len(message)} bytes are no PubRequest", path, peer)
-                continue
-            except ShmioError as error:
-                self._refusals.add(str(error), path, peer)
-                continue
-            stream.open += 1
-            sending = self._send(inlet, register, value, partial(self._ended, stream, path, peer))
-            if inlet.ready(register):
-                await sending
-            else:  # meanwhile nothing is read: the client is slowed down by the flow control of its stream
-                await asyncio.shield(self._keep(sending))
-        if stream.open:
-            stream.settled = asyncio.get_running_loop().create_future()
-            await stream.settled
+        streams = self._streams.setdefault(peer, set())
+        streams.add(stream)
+        try:
+            async for message in messages:
+                stream.received += 1
+                await self._take(stream, message, parse, peer)
+            if stream.open:
+                stream.settled = asyncio.get_running_loop().create_future()
+                await stream.settled
+        finally:
+            streams.discard(stream)
+            if not streams:
+                self._streams.pop(peer, None)
         return Empty()
+
+    async def _take(self, stream: _Stream, message: bytes, parse: Parse, peer: str) -> None:
+        path = ""
+        try:
+            request = parse(message)
+            path = request.path
+            inlet, register, wanted = self._read(request)
+        except DecodeError:
+            self._refusals.add(f"{len(message)} bytes are no PubRequest", path, peer)
+            return
+        except ShmioError as error:
+            self._refusals.add(str(error), path, peer)
+            return
+        value = _Value(stream)
+        sending = self._send(inlet, register, wanted, partial(self._ended, value, path, peer), value.hear)
+        if inlet.ready(register):
+            await sending
+        else:  # meanwhile nothing is read: the client is slowed down by the flow control of its stream
+            await asyncio.shield(self._keep(sending))
+
+    async def settle(self, peer: str) -> None:
+        """Wait until sources have accepted or refused all that has come on a client's streams.
+
+        What has come and was not read yet is read. A client that goes on sending is waited for ``SETTLE_S`` at most.
+        """
+        with suppress(TimeoutError):
+            async with asyncio.timeout(SETTLE_S):
+                before: dict[_Stream, int] | None = None
+                while (now := {stream: stream.received for stream in self._streams.get(peer, ())}) != before:
+                    for stream in now:
+                        await stream.heard()
+                    before = now
+                    await self._arrivals.handled()
 
     async def write(self, request: Request, peer: str) -> tuple[EventKind, str]:
         """Write one value: (ACCEPTED, "") as soon as its source has accepted it, else how it ended before, and why.
@@ -122,9 +194,11 @@ class Publisher:
             raise CommandError(f"{shorten(request.path)}: what comes out of a source is not published to; use /in")
         return self._topics.feed(topic.source).inlet, register, request.read(register)
 
-    async def _send(self, inlet: Inlet, register: Register, value: object, done: Done) -> None:
+    async def _send(
+        self, inlet: Inlet, register: Register, value: object, done: Done, accepted: Callable[[], None]
+    ) -> None:
         try:
-            await inlet.send(register, value, done)
+            await inlet.send(register, value, done, accepted)
         except ShmioError as error:
             done(EventKind.REJECTED, str(error))
 
@@ -134,11 +208,9 @@ class Publisher:
         task.add_done_callback(self._waiting.discard)
         return task
 
-    def _ended(self, stream: _Stream, path: str, peer: str, kind: EventKind, reason: str) -> None:
+    def _ended(self, value: _Value, path: str, peer: str, kind: EventKind, reason: str) -> None:
         if kind in DONE:
             self.published += 1
         else:
             self._refusals.add(reason, path, peer)
-        stream.open -= 1
-        if stream.open == 0 and stream.settled is not None and not stream.settled.done():
-            stream.settled.set_result(None)
+        value.end()

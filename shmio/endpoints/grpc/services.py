@@ -7,24 +7,36 @@ from collections.abc import Collection, Mapping
 import grpc
 
 from shmio.endpoints.grpc.feed import Feed
+from shmio.endpoints.grpc.hold import Hold
 from shmio.endpoints.grpc.outbox import Outboxes
 from shmio.endpoints.grpc.publish import Publisher
 from shmio.endpoints.grpc.simlog_v1 import SimlogV1
 from shmio.endpoints.grpc.simlog_v2 import SimlogV2
+from shmio.endpoints.grpc.simserver import SimServer
+from shmio.endpoints.grpc.stepper import Stepper
 from shmio.endpoints.grpc.topics import Topics
+from shmio.segment import ProcessSlot, Segment
 
 
 class Services:
     """What a server offers on each of its addresses."""
 
-    def __init__(self, feeds: Mapping[str, Feed], default_source: str | None) -> None:
-        """``default_source``: that of paths which name none; default: the only one."""
+    def __init__(
+        self, segment: Segment, slot: ProcessSlot, hold: Hold, feeds: Mapping[str, Feed], default_source: str | None
+    ) -> None:
+        """``slot``: this process's in the table. ``hold``: that of the feeds.
+
+        ``default_source``: that of paths which name none; default: the only one.
+        """
         topics = Topics(feeds, default_source)
         self._outboxes = Outboxes()
         self._publisher = Publisher(topics)
+        self.stepper = Stepper(segment, slot, hold, feeds, self._outboxes, self._publisher)
+        """The instance's time."""
         self._services = (
-            SimlogV1(topics, self._publisher, self._outboxes),
-            SimlogV2(topics, self._publisher, self._outboxes),
+            SimlogV1(topics, self._publisher, self._outboxes, self.stepper),
+            SimlogV2(topics, self._publisher, self._outboxes, self.stepper.marks),
+            SimServer(self.stepper, self._outboxes),
         )
 
     @property
@@ -44,4 +56,5 @@ class Services:
     def move(self, sources: Collection[str]) -> None:
         """Have the streams of these sources go over to the feeds that there are by now."""
         for service in self._services:
-            service.move(sources)
+            if not isinstance(service, SimServer):
+                service.move(sources)

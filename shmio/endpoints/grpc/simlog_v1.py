@@ -1,7 +1,8 @@
-"""SimlogAPI version 1, package ``simulation.server``: GetTopic, Subscribe and Publish; no more for now."""
+"""SimlogAPI version 1, package ``simulation.server``; without injection for now."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import AsyncIterator, Collection
 from functools import lru_cache, partial
 from typing import Any, Final
@@ -9,20 +10,27 @@ from typing import Any, Final
 import grpc
 from google.protobuf.empty_pb2 import Empty
 
+from shmio.endpoints.grpc.hold import Moment
 from shmio.endpoints.grpc.outbox import EventLane, Lane, Outbox, Outboxes, StateLane
 from shmio.endpoints.grpc.publish import Publisher, Request
+from shmio.endpoints.grpc.stepper import Stepper
 from shmio.endpoints.grpc.subject import Encode, Picture, Subject
-from shmio.endpoints.grpc.topics import Topics
-from shmio.errors import PathError, ValueRangeError
+from shmio.endpoints.grpc.topics import Mark, Topics
+from shmio.errors import PathError, ShmioError, TimeError, ValueRangeError
 from shmio.layout.codec import Value, codec
 from shmio.layout.model import Layout, Register
 from shmio.layout.text import from_text, to_text, wire_type
 from shmio.layout.topic import Topic, find, shorten
+from shmio.logs import fields
 from shmio.wire import simlog_v1_pb2 as wire
 
 SERVICE: Final = wire.DESCRIPTOR.services_by_name["SimlogAPI"].full_name
 
 Context = grpc.aio.ServicerContext[Any, Any]
+
+_MARK_TYPES: Final = {Mark.STEP: "int", Mark.CLOCK: "time"}
+
+log = logging.getLogger("shmio.grpc")
 
 
 class SimlogV1:
@@ -30,19 +38,21 @@ class SimlogV1:
 
     name = SERVICE
 
-    def __init__(self, topics: Topics, publisher: Publisher, outboxes: Outboxes) -> None:
+    def __init__(self, topics: Topics, publisher: Publisher, outboxes: Outboxes, stepper: Stepper) -> None:
         self._topics = topics
         self._publisher = publisher
         self._outboxes = outboxes
+        self._stepper = stepper
         self._streams: dict[Outbox, str] = {}  # and their source
 
     def handlers(self) -> grpc.GenericRpcHandler:
         """The service's calls, for a server."""
+        unary = grpc.unary_unary_rpc_method_handler
         decode = wire.TopicDescriptor.FromString
-        calls = {
-            "GetTopic": grpc.unary_unary_rpc_method_handler(
-                self.get_topic, decode, wire.TopicDescriptor.SerializeToString
-            ),
+        calls: dict[str, grpc.RpcMethodHandler[Any, Any]] = {
+            "setStepSize": unary(self.set_step_size, wire.StepSizeRequest.FromString, Empty.SerializeToString),
+            "step": unary(self.step, wire.StepRequest.FromString, wire.StepResponse.SerializeToString),
+            "GetTopic": unary(self.get_topic, decode, wire.TopicDescriptor.SerializeToString),
             # No serializer: a change is encoded once, by the feed, and its bytes go to every stream.
             "Subscribe": grpc.unary_stream_rpc_method_handler(self.subscribe, decode),
             # No deserializer either: bytes that are no message must not end the stream.
@@ -50,8 +60,35 @@ class SimlogV1:
         }
         return grpc.method_handlers_generic_handler(SERVICE, calls)
 
+    async def set_step_size(self, request: wire.StepSizeRequest, context: Context) -> Empty:
+        """How far a step moves time, in ms; from now on only steps do.
+
+        INVALID_ARGUMENT: no step goes so far; FAILED_PRECONDITION: time is another program's to move.
+        """
+        try:
+            await self._stepper.set_step_size(request.step * 1_000_000)
+        except ValueRangeError as error:
+            await context.abort(grpc.StatusCode.INVALID_ARGUMENT, str(error))
+        except TimeError as error:
+            await context.abort(grpc.StatusCode.FAILED_PRECONDITION, str(error))
+        return Empty()
+
+    async def step(self, _: wire.StepRequest, context: Context) -> wire.StepResponse:
+        """Step, after all that has come on this client's Publish streams; 0 when all streams have taken the step.
+
+        -1: it failed, the log says why.
+        """
+        try:
+            await self._stepper.step(peer=context.peer())
+        except ShmioError as error:
+            log.warning("step failed: %s", error, extra=fields(peer=context.peer()))
+            return wire.StepResponse(code=-1)
+        return wire.StepResponse(code=0)
+
     async def get_topic(self, request: wire.TopicDescriptor, context: Context) -> wire.TopicDescriptor:
         """Tell a topic's type; NOT_FOUND, INVALID_ARGUMENT for a structure."""
+        if mark := await self._mark(request.path, context):
+            return wire.TopicDescriptor(path=request.path, msgType=_MARK_TYPES[mark])
         _, register = await self._resolve(request.path, context)
         return wire.TopicDescriptor(path=request.path, msgType=wire_type(register))
 
@@ -63,6 +100,10 @@ class SimlogV1:
         with RESOURCE_EXHAUSTED. When a reload changes the source the stream goes on, if there still is such a register;
         else it ends with NOT_FOUND.
         """
+        if mark := await self._mark(request.path, context):
+            async for moment in self._follow(mark, context):
+                yield moment
+            return
         topic, register = await self._resolve(request.path, context)
         told = False
         with self._outboxes.opened() as outbox:
@@ -89,6 +130,18 @@ class SimlogV1:
             finally:
                 del self._streams[outbox]
 
+    async def _follow(self, mark: Mark, context: Context) -> AsyncIterator[bytes]:
+        """Stream a topic of time."""
+        with self._outboxes.opened() as outbox:
+            leave = self._stepper.marks.listen(mark, _marked, StateLane(outbox))
+            try:
+                await context.send_initial_metadata(())
+                while (message := await outbox.pop()) is not None:
+                    yield message
+            finally:
+                leave()
+            await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, outbox.failure)
+
     def move(self, sources: Collection[str]) -> None:
         """Have the streams of these sources go over to the feeds that there are by now."""
         for outbox, source in self._streams.items():
@@ -106,6 +159,14 @@ class SimlogV1:
     async def publish(self, messages: AsyncIterator[bytes], context: Context) -> Empty:
         """Write the values of a stream, in its order, and answer when it has ended and all of them have."""
         return await self._publisher.publish(messages, _parse, context.peer())
+
+    async def _mark(self, path: str, context: Context) -> Mark | None:
+        """The topic of time that a path names; NOT_FOUND."""
+        try:
+            return self._topics.mark(path)
+        except PathError as error:
+            await context.abort(grpc.StatusCode.NOT_FOUND, str(error))
+            raise  # abort never returns
 
     async def _resolve(self, path: str, context: Context) -> tuple[Topic, Register]:
         try:
@@ -148,6 +209,12 @@ def encoder(register: Register, layout: Layout) -> Encode:
         return kind + text + _time_stamp(frame.number, frame.clock_ns)
 
     return encode
+
+
+def _marked(mark: Mark, moment: Moment) -> bytes:
+    """The message of a topic of time; the clock has it where a client looks for it, and no value."""
+    value = str(moment.number) if mark is Mark.STEP else ""
+    return wire.ROSMessage(type=_MARK_TYPES[mark], value=value).SerializeToString() + _time_stamp(*moment)
 
 
 @lru_cache(maxsize=64)  # a frame or two for each feed

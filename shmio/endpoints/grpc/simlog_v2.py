@@ -1,4 +1,4 @@
-"""SimlogAPI version 2, package ``simlog.server``; without injection and stepping for now."""
+"""SimlogAPI version 2, package ``simlog.server``; without injection for now."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any, Final, NoReturn
 import grpc
 from google.protobuf.empty_pb2 import Empty
 
+from shmio.endpoints.grpc.marks import Marks
 from shmio.endpoints.grpc.outbox import Outboxes
 from shmio.endpoints.grpc.publish import Publisher, Request
 from shmio.endpoints.grpc.subscribers import Subscribers
@@ -47,11 +48,11 @@ class SimlogV2:
 
     name = SERVICE
 
-    def __init__(self, topics: Topics, publisher: Publisher, outboxes: Outboxes) -> None:
+    def __init__(self, topics: Topics, publisher: Publisher, outboxes: Outboxes, marks: Marks) -> None:
         self._topics = topics
         self._publisher = publisher
         self._outboxes = outboxes
-        self._subscribers = Subscribers(topics)
+        self._subscribers = Subscribers(topics, marks)
 
     def handlers(self) -> grpc.GenericRpcHandler:
         """The service's calls, for a server. Values are serialised where they are made, and once."""
@@ -77,6 +78,8 @@ class SimlogV2:
     async def get_topic_info(self, request: wire.TopicInfoRequest, _: Context) -> wire.TopicInfo:
         """Tell what a topic is; ``exists`` is false, and no more said, for what does not exist."""
         try:
+            if self._topics.mark(request.path):
+                return wire.TopicInfo(path=request.path, type=wire.NUMBER, direction=wire.OUT, exists=True)
             topic, found = self._find(request.path)
             direction = await self._direction(topic, found)
         except PathError:
@@ -87,7 +90,7 @@ class SimlogV2:
         """Stream the values of all topics that are subscribed for this uuid, in the order of the frames.
 
         INVALID_ARGUMENT: no uuid; RESOURCE_EXHAUSTED: too many subscribers, or this one does not read what is written
-        to ``/in``; ABORTED: another one came with its uuid.
+        to ``/in``, or what a step has changed; ABORTED: another one came with its uuid.
         """
         with self._outboxes.opened() as outbox:
             try:
@@ -107,8 +110,8 @@ class SimlogV2:
     async def subscribe(self, request: wire.SubscriptionRequest, context: Context) -> Empty:
         """Add a topic to a subscriber's stream: the current value if it is good, then every change.
 
-        Of ``/in``, what is written to it. NOT_FOUND: no such topic, or subscriber; INVALID_ARGUMENT: a structure too
-        large for a message; RESOURCE_EXHAUSTED: too many.
+        Of ``/in``, what is written to it; of ``SIMLOG://step`` each step, when all else of it has come. NOT_FOUND: no
+        such topic, or subscriber; INVALID_ARGUMENT: a structure too large for a message; RESOURCE_EXHAUSTED: too many.
         """
         try:
             await self._subscribers.subscribe(request.subscriberUUID, request.path)

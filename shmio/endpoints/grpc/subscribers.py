@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
+from shmio.endpoints.grpc.marks import Marks
 from shmio.endpoints.grpc.outbox import EventLane, Lane, Outbox, StateLane
-from shmio.endpoints.grpc.topics import Topics
-from shmio.endpoints.grpc.values import Encoded, path_field, shape, subject
+from shmio.endpoints.grpc.topics import Mark, Topics
+from shmio.endpoints.grpc.values import Encoded, marked, path_field, shape, subject
 from shmio.errors import EndpointError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import Topic, shorten
 from shmio.logs import fields
@@ -34,7 +35,7 @@ log = logging.getLogger("shmio.grpc")
 class _Subscription:
     """``leave``: None while no source has such a topic."""
 
-    topic: Topic
+    topic: Topic | Mark
     lane: Lane
     leave: Callable[[], None] | None = None
 
@@ -42,12 +43,13 @@ class _Subscription:
 class Subscriber:
     """One CreateSubscriber call."""
 
-    def __init__(self, topics: Topics, name: str, outbox: Outbox) -> None:
+    def __init__(self, topics: Topics, marks: Marks, name: str, outbox: Outbox) -> None:
         self.name = name
         self.outbox = outbox
         self.replaced = False
         """Whether another one of its uuid has taken its place."""
         self._topics = topics
+        self._marks = marks
         self._subscriptions: dict[str, _Subscription] = {}
 
     def __len__(self) -> int:
@@ -57,10 +59,10 @@ class Subscriber:
         """Subscribe to a topic; again, if it is already: nothing. PathError, ValueRangeError, EndpointError."""
         if path in self._subscriptions:
             return
-        topic = self._topics.topic(path)
+        topic = self._topics.mark(path) or self._topics.topic(path)
         finish = partial(Encoded.under, path=path_field(path))
         lane: Lane = StateLane(self.outbox, finish)
-        if topic.direction == "in":
+        if isinstance(topic, Topic) and topic.direction == "in":
             lane = EventLane(self.outbox, shorten(path), finish)
         subscription = _Subscription(topic, lane)
         self._join(subscription)
@@ -69,7 +71,7 @@ class Subscriber:
     def move(self, sources: Collection[str]) -> None:
         """Go over to the feeds that these sources have by now; a topic that is gone waits until it is back."""
         for path, subscription in self._subscriptions.items():
-            if subscription.topic.source in sources:
+            if isinstance(subscription.topic, Topic) and subscription.topic.source in sources:
                 self._leave(subscription)
                 try:
                     self._join(subscription)
@@ -83,10 +85,13 @@ class Subscriber:
         self._subscriptions.clear()
 
     def _join(self, subscription: _Subscription) -> None:
-        topic = subscription.topic
+        topic, lane = subscription.topic, subscription.lane
+        if isinstance(topic, Mark):
+            subscription.leave = self._marks.listen(topic, marked, lane)
+            return
         feed = self._topics.feed(topic.source)
         layout = feed.block.layout
-        subscription.leave = subscription.lane.join(feed, subject(shape(layout, topic), layout))
+        subscription.leave = lane.join(feed, subject(shape(layout, topic), layout))
 
     def _leave(self, subscription: _Subscription) -> None:
         if subscription.leave is not None:
@@ -97,8 +102,9 @@ class Subscriber:
 class Subscribers:
     """Those whose stream is open, by their uuid."""
 
-    def __init__(self, topics: Topics) -> None:
+    def __init__(self, topics: Topics, marks: Marks) -> None:
         self._topics = topics
+        self._marks = marks
         self._open: dict[str, Subscriber] = {}
         self._arrived = asyncio.Event()
 
@@ -120,7 +126,7 @@ class Subscribers:
             log.info("subscriber %s came again; its stream before ends", shorten(name), extra=fields(uuid=uuid))
         elif len(self._open) >= MAX_SUBSCRIBERS:
             raise EndpointError(f"there are {MAX_SUBSCRIBERS} subscribers already; one stream serves many topics")
-        subscriber = self._open[uuid] = Subscriber(self._topics, name, outbox)
+        subscriber = self._open[uuid] = Subscriber(self._topics, self._marks, name, outbox)
         self._arrived.set()
         self._arrived = asyncio.Event()
         return subscriber

@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from enum import Enum
+from typing import Final
 
 from shmio.endpoints.grpc.feed import Feed
 from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import Topic, look_up, parse_topic, shorten
+
+
+class Mark(Enum):
+    """A topic of time, which no source has: its path in canonical form."""
+
+    STEP = "simlog/step"
+    """The number of each step, when all else of that has been told."""
+    CLOCK = "model/clock"
+    """Simulation time."""
+
+
+_MARKS: Final = {mark.value: mark for mark in Mark}
 
 
 class Topics:
@@ -20,11 +34,25 @@ class Topics:
 
     def topic(self, path: str) -> Topic:
         """What a path says; PathError: no source of that name."""
-        default = self._default or (next(iter(self._feeds)) if len(self._feeds) == 1 else None)
-        topic = parse_topic(path, self._feeds, default)
+        topic = self._parse(path)
         if topic.source not in self._feeds:
-            raise PathError(f"{shorten(path)}: {topic.source} is reserved, and this version serves nothing there")
+            if self._mark(topic):
+                raise PathError(f"{shorten(path)}: it can be subscribed to, and nothing else")
+            raise PathError(
+                f"{shorten(path)}: {topic.source} is reserved; SIMLOG://step and model/clock are all there is"
+            )
         return topic
+
+    def mark(self, path: str) -> Mark | None:
+        """The topic of time that a path names; None: another one. PathError as of :meth:`topic`."""
+        return self._mark(self._parse(path))
+
+    def _mark(self, topic: Topic) -> Mark | None:
+        return _MARKS.get(f"{topic.source}/{topic.path}") if topic.direction != "in" else None
+
+    def _parse(self, path: str) -> Topic:
+        default = self._default or (next(iter(self._feeds)) if len(self._feeds) == 1 else None)
+        return parse_topic(path, self._feeds, default)
 
     def feed(self, source: str) -> Feed:
         """The feed of a source; PathError: a reload has removed it."""

@@ -14,7 +14,9 @@ from google.protobuf.struct_pb2 import NULL_VALUE, ListValue
 from google.protobuf.struct_pb2 import Value as WireValue
 from google.protobuf.timestamp_pb2 import Timestamp
 
+from shmio.endpoints.grpc.hold import Moment
 from shmio.endpoints.grpc.subject import Picture, Subject
+from shmio.endpoints.grpc.topics import Mark
 from shmio.errors import ValueRangeError
 from shmio.layout.codec import Value, codec
 from shmio.layout.model import Layout, Register
@@ -122,6 +124,13 @@ def time_stamp(clock_ns: int) -> bytes:
 def nothing(stamp: bytes) -> Encoded:
     """The message of a value that there is none of."""
     return Encoded(stamp, wire.SimlogMessage(type=wire.NULL, value=to_wire(None)).SerializeToString())
+
+
+def marked(mark: Mark, moment: Moment) -> Encoded:
+    """The message of a topic of time: a step's number, or seconds."""
+    value = moment.number if mark is Mark.STEP else moment.clock_ns / 1e9
+    message = wire.SimlogMessage(type=wire.NUMBER, value=to_wire(value))
+    return Encoded(time_stamp(moment.clock_ns), message.SerializeToString())
 
 
 def repeated(messages: Iterable[bytes]) -> bytes:

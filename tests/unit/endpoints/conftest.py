@@ -14,7 +14,8 @@ from tests.unit.endpoints.harness import LAYOUT, SOON_STALE_NS, STALE_NS, TIMEOU
 @contextmanager
 def _segment(instance: str, stale_ns: int) -> Iterator[Segment]:
     block = BlockSpec("cell", LAYOUT, 20_000_000, stale_ns, 1 << 20, Attributes("test", WRITABLE))
-    with Segment.create(instance, [block], [ProcessSpec("cell", "source")]) as segment:
+    processes = [ProcessSpec("cell", "source"), ProcessSpec("grpc", "grpc")]
+    with Segment.create(instance, [block], processes) as segment:
         yield segment
         segment.unlink()
 

@@ -15,6 +15,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from shmio.config import Address
 from shmio.endpoints.grpc.feed import Feed
+from shmio.endpoints.grpc.hold import Hold
 from shmio.endpoints.grpc.server import Server
 from shmio.endpoints.grpc.services import Services
 from shmio.layout.model import Layout, Register
@@ -23,6 +24,7 @@ from shmio.wire import simlog_v1_pb2 as wire
 from shmio.wire import simlog_v2_pb2 as v2
 from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
 from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as SimlogV2Stub
+from shmio.wire.simserver_pb2_grpc import SimServerAPIStub
 
 WRITER = 4
 LAYOUT = Layout(
@@ -68,6 +70,7 @@ class Endpoint:
         self.channel = grpc.aio.insecure_channel(f"127.0.0.1:{port}")
         self.stub: Any = SimlogAPIStub(self.channel)  # type: ignore[no-untyped-call]
         self.v2: Any = SimlogV2Stub(self.channel)  # type: ignore[no-untyped-call]
+        self.time: Any = SimServerAPIStub(self.channel)  # type: ignore[no-untyped-call]
         self.cycle = 0
 
     def publish(self, raw: bytes, quality: Quality = Quality.GOOD) -> None:
@@ -108,13 +111,15 @@ async def endpoint(segment: Segment) -> AsyncIterator[Endpoint]:
         tasks.add(asyncio.get_running_loop().create_task(server.set_source(source, good)))
 
     loop = asyncio.get_running_loop()
-    feeds = {name: Feed(block, WRITER, loop, on_quality) for name, block in segment.blocks.items()}
-    service = Services(feeds, "cell")
+    hold = Hold()
+    feeds = {name: Feed(block, WRITER, loop, on_quality, hold) for name, block in segment.blocks.items()}
+    service = Services(segment, segment.processes.find("grpc"), hold, feeds, "cell")
     server = Server(service)
     await server.set_source("cell", False)
     ports = await server.start([Address("127.0.0.1", 0)], None)
     for feed in feeds.values():
         feed.start()
+    await service.stepper.start()
     served = Endpoint(segment, feeds, service, ports[0])
     try:
         yield served
@@ -123,7 +128,9 @@ async def endpoint(segment: Segment) -> AsyncIterator[Endpoint]:
         for feed in feeds.values():
             feed.stop()
             feed.join()
+        await service.stepper.stop()
         await server.stop()
+        service.stepper.join()
         await asyncio.gather(*tasks)
 
 

@@ -40,7 +40,7 @@ def test_it_beats_while_layouts_are_read(segment: Segment, instance: str, monkey
         worker: Any = SimpleNamespace(
             on_stop=stops.append,
             config={"listen": ["127.0.0.1:0"]},
-            slot=SimpleNamespace(writer=WRITER),
+            slot=opened.processes.find("grpc"),
             segment=opened,
             log=logging.getLogger("test"),
             running=lambda: None,

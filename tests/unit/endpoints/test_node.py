@@ -55,7 +55,7 @@ def test_a_client_of_node_calls_as_clients_do(segment: Segment) -> None:
         assert found["info"] == info
         assert found["unknown"]["exists"] is False
         assert found["read"] == [["CELL://step", "NUMBER", 8], ["cell/axis", "STRUCT", {"position": 0, "speed": 0.5}]]
-        assert found["step"] == "NOT_FOUND"
+        assert found["step"] == {}
         assert found["refused"] == "INVALID_ARGUMENT"
         assert found["secret"] == "FAILED_PRECONDITION"
         assert found["inject"] == "UNIMPLEMENTED"

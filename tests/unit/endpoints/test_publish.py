@@ -131,7 +131,7 @@ WRONG = [
     (wire.PubRequest(), "the path names no register"),
     (message("cell/nothing", "1"), "no such register"),
     (message("nowhere://step", "1"), "no source of this name"),
-    (message("model/clock", "1"), "model is reserved"),
+    (message("model/clock", "1"), "it can be subscribed to, and nothing else"),
     (message("cell/axis", "1"), "a structure, not a register"),
     (message("cell/inputs/2", "1"), "index [2] is outside [0..1]"),
     (message("cell/step/out", "1"), "use /in"),

@@ -1,0 +1,39 @@
+"""Who listens to what comes out of a block: a subject, and the streams that want it."""
+
+from __future__ import annotations
+
+from collections.abc import Sized
+from typing import Protocol
+
+from shmio.endpoints.grpc.subject import Subject
+from shmio.segment.scan import entries
+
+
+class Listener(Protocol):
+    """One stream; called in the event loop's thread."""
+
+    since: int
+    """Frame whose value the stream already has."""
+
+    def deliver(self, message: Sized) -> None:
+        """Take one message for this stream."""
+
+    def keep(self, message: Sized) -> None:
+        """Take one message of a step: it must not be left out."""
+
+    def lose(self) -> None:
+        """Quality is bad: what was not sent yet must not be sent any more."""
+
+
+class Channel:
+    """A subject as somebody listens to it: how a frame becomes a message, and who gets it."""
+
+    def __init__(self, subject: Subject, slot: int) -> None:
+        """``slot``: its place in the feed's table."""
+        self.encode = subject.encode
+        self.listeners: dict[Listener, None] = {}  # in the order in which they came
+        self.slot = slot
+        first = subject.registers[0]
+        self.order = first.offset, first.bit or 0, subject.path, subject.wire
+        """Of those that a step has changed, whoever came first."""
+        self.entries = entries(subject.registers, slot)

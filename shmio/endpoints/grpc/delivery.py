@@ -1,0 +1,63 @@
+"""The delivery of a step: everything that it has changed, then its marker, each taken by every stream."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from shmio.endpoints.grpc.feed import Feed
+from shmio.endpoints.grpc.hold import Hold, Moment
+from shmio.endpoints.grpc.outbox import Outboxes
+from shmio.errors import SegmentError
+from shmio.segment.coordinator import Step
+
+PATIENCE_S: Final = 4.0
+"""So long clients have for the values of a step, and again for its marker; less than a step's own time-out together."""
+
+log = logging.getLogger("shmio.grpc")
+
+
+class Delivery:
+    """Delivers steps in one order to all streams, whoever has made them; for the event loop's thread.
+
+    First what was written before, then what has changed in all blocks on the instance's clock, in the segment's order;
+    when all streams have taken that, the marks; when they have taken those, it is over.
+    """
+
+    def __init__(self, hold: Hold, feeds: Mapping[str, Feed], outboxes: Outboxes) -> None:
+        self._hold = hold
+        self._feeds = feeds
+        self._outboxes = outboxes
+        self._turn = asyncio.Lock()
+
+    def begin(self, moment: Moment) -> None:
+        """Time has become virtual, and this is what was delivered of it."""
+        self._hold.on = True
+        self._hold.moment = moment
+        for feed in self._feeds.values():
+            feed.hold()
+
+    async def deliver(self, step: Step, mark: Callable[[], None]) -> bool:
+        """Deliver a step, and ``mark`` it; False if it has been already.
+
+        The stream of a client that does not read ends ``PATIENCE_S`` later.
+        """
+        async with self._turn:
+            if step.number <= self._hold.moment.number:
+                return False
+            for feed in list(self._feeds.values()):
+                if feed.block.attributes.stepped:
+                    await feed.inlet.caught_up()
+            await asyncio.sleep(0)  # what was shown before it was held is delivered then
+            self._hold.moment = Moment(step.number, step.time_ns)
+            for feed in list(self._feeds.values()):
+                try:
+                    feed.step()
+                except SegmentError as error:
+                    log.warning("step %d: %s", step.number, error)
+            await self._outboxes.taken(PATIENCE_S)
+            mark()
+            await self._outboxes.taken(PATIENCE_S)
+            return True

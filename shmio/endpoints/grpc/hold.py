@@ -1,0 +1,32 @@
+"""Virtual time as the endpoint has delivered it: what all feeds and services look at."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Moment(NamedTuple):
+    """A step, by its number, and the simulation time after it, in ns since the instance's start."""
+
+    number: int
+    clock_ns: int
+
+
+class Still(NamedTuple):
+    """A :class:`~shmio.endpoints.grpc.subject.Picture` of a block as a step has left it."""
+
+    number: int
+    clock_ns: int
+    image: bytes
+
+
+class Hold:
+    """Whether time is virtual, and the step that was delivered last.
+
+    From then on what comes out of blocks on the instance's clock is shown step by step. Written in the event loop's
+    thread alone.
+    """
+
+    def __init__(self) -> None:
+        self.on = False
+        self.moment = Moment(0, 0)
