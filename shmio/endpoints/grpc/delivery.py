@@ -56,7 +56,7 @@ class Delivery:
                 try:
                     feed.step()
                 except SegmentError as error:
-                    log.warning("step %d: %s", step.number, error)
+                    log.warning("step %d: %s", step.number, str(error))
             await self._outboxes.taken(PATIENCE_S)
             mark()
             await self._outboxes.taken(PATIENCE_S)

@@ -95,7 +95,7 @@ class Stepper:
             try:
                 await self.play(state.dt_ns or None, state.rate)
             except TimeError as error:
-                log.info("time is played by another program: %s", error)
+                log.info("time is played by another program: %s", str(error))
 
     @property
     def alive(self) -> bool:
@@ -234,7 +234,7 @@ class Stepper:
                 reason = ""
             except ShmioError as error:
                 if str(error) != reason:
-                    log.warning("playing: %s", error)
+                    log.warning("playing: %s", str(error))
                 reason = str(error)
             dt_ns = self._play_dt_ns or self._clock.read().step_size_ns
             due_s = max(due_s + dt_ns / 1e9 / self._rate, self._loop.time() - LATE_S)

@@ -6,6 +6,7 @@ import asyncio
 import struct
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from functools import cached_property
 from typing import Any
 
 import grpc
@@ -19,7 +20,7 @@ from shmio.endpoints.grpc.hold import Hold
 from shmio.endpoints.grpc.server import Server
 from shmio.endpoints.grpc.services import Services
 from shmio.layout.model import Layout, Register
-from shmio.segment import Quality, Segment
+from shmio.segment import BlockWriter, Quality, Segment
 from shmio.wire import simlog_v1_pb2 as wire
 from shmio.wire import simlog_v2_pb2 as v2
 from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
@@ -63,7 +64,6 @@ class Endpoint:
 
     def __init__(self, segment: Segment, feeds: dict[str, Feed], service: Services, port: int) -> None:
         self.segment = segment
-        self.writer = segment.writer("cell")
         self.feeds = feeds
         self.service = service
         self.port = port
@@ -72,6 +72,11 @@ class Endpoint:
         self.v2: Any = SimlogV2Stub(self.channel)  # type: ignore[no-untyped-call]
         self.time: Any = SimServerAPIStub(self.channel)  # type: ignore[no-untyped-call]
         self.cycle = 0
+
+    @cached_property
+    def writer(self) -> BlockWriter:
+        """Of the source ``cell``."""
+        return self.segment.writer("cell")
 
     def publish(self, raw: bytes, quality: Quality = Quality.GOOD) -> None:
         self.cycle += 1
@@ -113,9 +118,10 @@ async def endpoint(segment: Segment) -> AsyncIterator[Endpoint]:
     loop = asyncio.get_running_loop()
     hold = Hold()
     feeds = {name: Feed(block, WRITER, loop, on_quality, hold) for name, block in segment.blocks.items()}
-    service = Services(segment, segment.processes.find("grpc"), hold, feeds, "cell")
+    service = Services(segment, segment.processes.find("grpc"), hold, feeds, next(iter(feeds)))
     server = Server(service)
-    await server.set_source("cell", False)
+    for source in feeds:
+        await server.set_source(source, False)
     ports = await server.start([Address("127.0.0.1", 0)], None)
     for feed in feeds.values():
         feed.start()

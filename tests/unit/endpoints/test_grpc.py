@@ -54,7 +54,8 @@ def test_get_topic_tells_the_type(segment: Segment, path: str, kind: str) -> Non
 
 
 @pytest.mark.parametrize(
-    "path", ["", "/", "cell/nothing", "nothing", "cell/inputs/2", "model/time", "SIMLOG://step/in", "X://a", "%", "a//b"]
+    "path",
+    ["", "/", "cell/nothing", "nothing", "cell/inputs/2", "model/time", "SIMLOG://step/in", "X://a", "%", "a//b"],
 )
 def test_an_unknown_topic_is_not_found(segment: Segment, path: str) -> None:
     async def test(served: Endpoint) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from shmio.endpoints.grpc.__main__ import run
 from shmio.segment import Segment
-from tests.unit.endpoints.harness import TIMEOUT_S, WRITER
+from tests.unit.endpoints.harness import TIMEOUT_S
 
 
 def test_it_beats_while_layouts_are_read(segment: Segment, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
