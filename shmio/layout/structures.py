@@ -1,0 +1,179 @@
+"""Structures of known shape: those that SimlogAPI version 1 has messages for, ``proto/simlog_v1.proto``.
+
+In a tag table they are types; in a data block a structure is one of them if it has its members, in any order and case.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final, Literal, NamedTuple
+
+from shmio.errors import ValueRangeError
+from shmio.layout.model import Layout, Register
+from shmio.layout.types import INTEGERS
+
+Elementary = Literal["float", "uint32", "uint64", "string"]
+
+MAX_JOINTS: Final = 64
+MAX_POINTS: Final = 512
+
+
+class Member(NamedTuple):
+    """One member. ``type``: elementary, or the name of another structure."""
+
+    name: str
+    type: str
+    many: Literal["", "joints", "points"] = ""
+    """What there is one of it for, if it is an array."""
+    needed: bool = True
+    """Whether a structure without it is of another shape."""
+
+
+_HEADER: Final = Member("header", "Header", needed=False)
+
+SHAPES: Final[Mapping[str, tuple[Member, ...]]] = {
+    "time": (Member("sec", "uint64"), Member("nsec", "uint64")),
+    "duration": (Member("msec", "uint64"),),
+    "Header": (Member("seq", "uint32"), Member("stamp", "time"), Member("frame_id", "string")),
+    "Point": (Member("x", "float"), Member("y", "float"), Member("z", "float")),
+    "Quaternion": (Member("x", "float"), Member("y", "float"), Member("z", "float"), Member("w", "float")),
+    "PointStamped": (_HEADER, Member("point", "Point")),
+    "SafetyZone": (
+        _HEADER,
+        Member("zone", "string"),
+        Member("level", "float"),
+        Member("object1", "string"),
+        Member("object2", "string"),
+    ),
+    "SafetyZoneCmd": (Member("zone", "string"), Member("cmd", "string")),
+    "JointTrajectoryPoint": (
+        Member("positions", "float", "joints"),
+        Member("velocities", "float", "joints", needed=False),
+        Member("accelerations", "float", "joints", needed=False),
+        Member("effort", "float", "joints", needed=False),
+        Member("time_from_start", "duration", needed=False),
+    ),
+    "JointTrajectory": (
+        _HEADER,
+        Member("joint_names", "string", "joints"),
+        Member("points", "JointTrajectoryPoint", "points"),
+    ),
+}
+CONTENTS: Final[Mapping[str, str]] = {
+    "JointTrajectory": "joint_trajectory",
+    "Point": "point",
+    "PointStamped": "point_stamped",
+    "Quaternion": "quaternion",
+    "JointTrajectoryPoint": "joint_trajectory_point",
+    "Header": "timeStamp",
+    "SafetyZone": "safety_zone",
+    "SafetyZoneCmd": "safety_zone_cmd",
+}
+"""Those that a message may hold by themselves, and the field of the message."""
+
+_S7: Final[Mapping[str, str]] = {"float": "REAL", "uint32": "UDINT", "uint64": "ULINT", "string": "STRING[80]"}
+_FITS: Final[Mapping[str, frozenset[str]]] = {
+    "float": frozenset({"REAL", "LREAL"}),
+    "uint32": INTEGERS,
+    "uint64": INTEGERS,
+    "string": frozenset({"STRING", "WSTRING"}),
+}
+_LENGTHS: Final = {"JointTrajectoryPoint": ("joints",), "JointTrajectory": ("joints", "points")}
+_TYPE = re.compile(r"(\w+)\s*(?:\[([^\]]*)\])?", re.ASCII)
+_INDEX = re.compile(r"-?[0-9]{1,10}")
+
+
+def members(text: str) -> dict[str, str] | None:
+    """The members of a structure as a tag table's type names it, by path, and their types; None: it is none.
+
+    ``SafetyZone``, ``JointTrajectoryPoint[6]``, ``JointTrajectory[6, 20]``: joints, points. ValueRangeError: lengths
+    are missing, or too many or too large.
+    """
+    match = _TYPE.fullmatch(text.strip())
+    if match is None or match[1] not in CONTENTS:
+        return None
+    wanted = _LENGTHS.get(match[1], ())
+    given = [part.strip() for part in match[2].split(",")] if match[2] is not None else []
+    lengths = [int(part) for part in given if part.isascii() and part.isdigit() and len(part) < 6]
+    most = {"joints": MAX_JOINTS, "points": MAX_POINTS}
+    fits = len(lengths) == len(given) == len(wanted)
+    if not fits or not all(1 <= length <= most[what] for length, what in zip(lengths, wanted, strict=True)):
+        form = f"{match[1]}[{', '.join(wanted)}]" if wanted else match[1]
+        limits = f" with at most {' and '.join(f'{most[what]} {what}' for what in wanted)}" if wanted else ""
+        raise ValueRangeError(f"expected {form}{limits}, found {text}")
+    return dict(_expanded(match[1], dict(zip(wanted, lengths, strict=True)), ""))
+
+
+def _expanded(shape: str, lengths: Mapping[str, int], prefix: str) -> Iterator[tuple[str, str]]:
+    for member in SHAPES[shape]:
+        path = prefix + member.name
+        if member.type in _S7:
+            array = f"ARRAY[0..{lengths[member.many] - 1}] OF " if member.many else ""
+            yield path, array + _S7[member.type]
+        elif member.many:
+            for index in range(lengths[member.many]):
+                yield from _expanded(member.type, lengths, f"{path}/{index}/")
+        else:
+            yield from _expanded(member.type, lengths, f"{path}/")
+
+
+Found = Mapping[str, "Register | Found | Sequence[Found]"]
+"""What there is of a shape's members, by the shape's names: a register, a structure, or structures in their order."""
+
+
+def recognise(layout: Layout, path: str) -> tuple[str, Found] | None:
+    """The shape that the structure at a path has, and its members; None: none of those in ``CONTENTS``.
+
+    All needed members are there, with types that fit, and no others.
+    """
+    start = len(path) + 1
+    below = [layout.registers[index] for index in layout.members(path)]
+    parts = [(register.path[start:].lower().split("/"), register) for register in below]
+    for shape in CONTENTS:
+        if parts and (found := _match(shape, parts)):
+            return shape, found
+    return None
+
+
+_Parts = Sequence[tuple[Sequence[str], Register]]
+
+
+def _match(shape: str, parts: _Parts) -> Found | None:
+    """``parts``: the names, in lower case, that lead to each register from here."""
+    groups = _by_name(parts)
+    if groups.keys() - {member.name for member in SHAPES[shape]}:
+        return None
+    found: dict[str, Register | Found | Sequence[Found]] = {}
+    for member in SHAPES[shape]:
+        group = groups.get(member.name)
+        if group is None:
+            if member.needed:
+                return None
+            continue
+        value = _member(member, group)
+        if value is None:
+            return None
+        found[member.name] = value
+    return found
+
+
+def _member(member: Member, group: _Parts) -> Register | Found | Sequence[Found] | None:
+    if member.type in _FITS:
+        names, register = group[0]
+        fits = register.element.base in _FITS[member.type] and len(register.dims) == bool(member.many)
+        return register if len(group) == 1 and not names and fits else None
+    if not member.many:
+        return _match(member.type, group)
+    elements = _by_name(group)
+    if not all(_INDEX.fullmatch(index) for index in elements):
+        return None
+    found = [_match(member.type, elements[index]) for index in sorted(elements, key=int)]
+    return None if None in found else [value for value in found if value is not None]
+
+
+def _by_name(parts: _Parts) -> dict[str, list[tuple[Sequence[str], Register]]]:
+    groups: dict[str, list[tuple[Sequence[str], Register]]] = {}
+    for names, register in parts:
+        groups.setdefault(names[0] if names else "", []).append((names[1:], register))
+    return groups

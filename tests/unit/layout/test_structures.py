@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+import pytest
+
+from shmio.errors import LayoutError, ValueRangeError
+from shmio.layout.compiler import Source, compile_sources
+from shmio.layout.model import Layout
+from shmio.layout.structures import CONTENTS, members, recognise
+from shmio.layout.tagplace import place_tags
+
+LENGTHS = {"JointTrajectoryPoint": "[6]", "JointTrajectory": "[6, 3]"}
+
+
+def block(body: str) -> Layout:
+    source = f"DATA_BLOCK DB1 STRUCT z : Struct {body} END_STRUCT; END_STRUCT; BEGIN END_DATA_BLOCK"
+    (layout,) = compile_sources([Source("x.db", source.encode())]).layouts
+    return layout
+
+
+@pytest.mark.parametrize("shape", CONTENTS)
+def test_every_shape_is_a_type_of_tag_tables_and_recognised(shape: str) -> None:
+    layout = place_tags("t", {"zones/Z1": f"{shape}{LENGTHS.get(shape, '')}"})
+    assert layout.registers
+    found = recognise(layout, "zones/Z1")
+    assert found is not None
+    assert found[0] == shape
+    assert recognise(layout, "zones") is None
+
+
+def test_a_trajectory_has_as_many_joints_and_points_as_it_says() -> None:
+    inside = members("JointTrajectory[2, 3]")
+    assert inside is not None
+    assert inside["joint_names"] == "ARRAY[0..1] OF STRING[80]"
+    assert inside["points/2/effort"] == "ARRAY[0..1] OF REAL"
+    assert inside["points/2/time_from_start/msec"] == "ULINT"
+    assert len(inside) == 5 + 3 * 5
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("JointTrajectory", r"expected JointTrajectory\[joints, points\] with at most 64 joints and 512 points, found"),
+        ("JointTrajectory[6]", "found JointTrajectory"),
+        ("JointTrajectory[6, 513]", "found JointTrajectory"),
+        ("JointTrajectoryPoint[0]", r"expected JointTrajectoryPoint\[joints\] with at most 64 joints, found"),
+        ("JointTrajectoryPoint[-1]", "found JointTrajectoryPoint"),
+        ("SafetyZone[3]", r"expected SafetyZone, found SafetyZone\[3\]"),
+        ("Point[]", r"expected Point, found Point\[\]"),
+    ],
+)
+def test_wrong_lengths_are_refused(text: str, message: str) -> None:
+    with pytest.raises(ValueRangeError, match=message):
+        members(text)
+
+
+@pytest.mark.parametrize("text", ["LREAL", "STRING[20]", "time", "Pose", "ARRAY[0..1] OF Point"])
+def test_others_are_no_structures(text: str) -> None:
+    assert members(text) is None
+
+
+def test_a_data_block_may_have_them_in_any_order_and_case() -> None:
+    body = "Zone : String; LEVEL : LReal; Object2 : String[8]; object1 : WString;"
+    found = recognise(block(body), "z")
+    assert found is not None
+    assert found[0] == "SafetyZone"
+    assert list(found[1]) == ["zone", "level", "object1", "object2"]
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "x : Real; y : Real;",
+        "x : Real; y : Real; z : Int;",
+        "x : Real; y : Real; z : Real; v : Real;",
+        "x : Real; y : Real; z : Array[0..1] of Real;",
+        "x : Real; y : Real; z : Struct z : Real; END_STRUCT;",
+        "zone : String; level : Real; object1 : String; object2 : Int;",
+        "joint_names : Array[0..1] of String; points : Array[0..1] of Struct x : Real; END_STRUCT;",
+        "joint_names : Array[0..1] of String; points : Struct positions : Array[0..1] of Real; END_STRUCT;",
+    ],
+)
+def test_what_lacks_a_member_or_has_another_is_none(body: str) -> None:
+    assert recognise(block(body), "z") is None
+
+
+def test_arrays_of_structures_come_in_their_order() -> None:
+    points = "Array[8..11] of Struct positions : Array[1..2] of Real; END_STRUCT"
+    body = f"joint_names : Array[1..2] of String; points : {points};"
+    found = recognise(block(body), "z")
+    assert found is not None
+    inside = found[1]["points"]
+    assert isinstance(inside, list)
+    assert [point["positions"].path for point in inside] == [f"z/points/{index}/positions" for index in (8, 9, 10, 11)]
+
+
+def test_a_table_cannot_hide_more_registers_than_a_block_may_have() -> None:
+    with pytest.raises(LayoutError, match="expected at most 100000 registers, structures' members included"):
+        place_tags("t", {f"t{index}": "JointTrajectory[1, 512]" for index in range(100)})
+
+
+@pytest.mark.parametrize("key", ["a/in", "out"])
+def test_a_structure_has_no_direction_in_its_name_either(key: str) -> None:
+    with pytest.raises(LayoutError, match=f"{key}: it ends in a direction"):
+        place_tags("t", {key: "Point"})
+
+
+def test_a_structure_has_no_initial_value_of_its_own() -> None:
+    with pytest.raises(LayoutError, match="p: initial: a structure has none"):
+        place_tags("t", {"p": {"type": "Point", "initial": 1}})
