@@ -16,6 +16,7 @@
     ├── TimeError          time cannot be moved, or a step failed
     ├── QualityError       the value exists but is not good
     ├── ConnectorError     the device did not answer as it should; carries a reason code
+    ├── ModelError         a simulation model is declared wrongly, or its code failed; names it, and the line
     ├── RecordingError     a recording cannot be written, or is none that this version can read
     ├── EndpointError      an address cannot be served
     └── ControlError       the supervisor refused or did not answer
@@ -105,6 +106,10 @@ class ConnectorError(ShmioError):
 
 class EndpointError(ShmioError):
     """An address cannot be listened on, or its TLS files cannot be used."""
+
+
+class ModelError(ShmioError):
+    """A simulation model is declared wrongly, or its code failed; the message has the model's name, and the line."""
 
 
 class RecordingError(ShmioError):

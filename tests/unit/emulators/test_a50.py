@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from shmio.emulators.a50 import A50
-from shmio.emulators.a50_plant import ACTUATORS, AXIS_LIMITS, CYCLE_S, STEPS
 from shmio.errors import ConfigError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Layout
+from shmio.simulation.a50_plant import ACTUATORS, AXIS_LIMITS, CYCLE_S, STEPS
 
 PERIOD_S = 0.02  # at which it is watched
 MAX_DEG_PER_S = 123.0
@@ -160,7 +160,7 @@ def test_goes_by_the_layout_not_by_offsets(db201: Layout) -> None:
 @pytest.mark.parametrize("path", ["Inputs", "NCAchse1 Pos", "Robot_825/Axs6_Pos"])
 def test_names_the_register_that_is_missing_or_wrong(db201: Layout, path: str) -> None:
     without = replace(db201, registers=tuple(r for r in db201.registers if r.path != path))
-    with pytest.raises(ConfigError, match=f"no register {path.replace(' ', '_')}"):
+    with pytest.raises(ConfigError, match=f"needs a register {path.replace(' ', '_')}"):
         A50(without)
     other = replace(db201, registers=tuple(replace(r, type="DINT") if r.path == path else r for r in db201.registers))
     with pytest.raises(ConfigError, match="DINT"):

@@ -1,4 +1,4 @@
-"""How emulated axes move: along poses at given times, without jerks, and never quite still."""
+"""How axes move: along poses at given times, without jerks, and never quite still."""
 
 from __future__ import annotations
 

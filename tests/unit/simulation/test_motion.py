@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from shmio.emulators.motion import Track, smooth
+from shmio.simulation.motion import Track, smooth
 
 
 def test_smooth_begins_and_ends_at_rest() -> None:

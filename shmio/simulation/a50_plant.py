@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from itertools import accumulate
 from typing import NamedTuple
 
-from shmio.emulators.motion import Pose, Track
+from shmio.simulation.motion import Pose, Track
 
 # Number and duration in s of each step, in order.
 STEPS: Mapping[int, float] = {

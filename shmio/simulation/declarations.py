@@ -1,0 +1,140 @@
+"""What a model declares: its inputs, outputs, registers that are both, and parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from shmio.errors import LayoutError, ModelError, ShmioError
+from shmio.layout.model import Layout
+from shmio.layout.structures import members
+from shmio.layout.tagplace import place_tags
+from shmio.layout.topic import canonical_path
+
+if TYPE_CHECKING:
+    from shmio.simulation.model import Model
+
+
+class Declaration:
+    """One thing that a model declares: in the class it is this object, in a model its value.
+
+    A single register's value is a bool, int, float or str, as ``shmio.layout.scalar`` tabulates; an array's is a tuple,
+    of tuples for several dimensions, but a row of BYTE is bytes. A structure's is a dict of its members' values;
+    setting one changes the members that it names.
+    """
+
+    kind: ClassVar[str]
+    """What it is called in messages."""
+
+    def __init__(
+        self,
+        type: str | Mapping[str, str],  # noqa: A002  it is what the tables call it
+        initial: object = None,
+        *,
+        path: str = "",
+        unit: str = "",
+        comment: str = "",
+    ) -> None:
+        """Declare it; what is wrong is said by ModelError when the class is made.
+
+        ``type``: as a tag table has it: ``LREAL``, ``STRING[20]``, ``ARRAY[1..8] OF BOOL``, ``SafetyZone``; or, for a
+        structure of your own, those of its members by name. ``initial``: the value it begins with, default: that of the
+        type; of an array one flat list, of a structure a dict. ``path``: of the register, default: the attribute's
+        name. ``unit`` and ``comment`` go into the layout.
+        """
+        self.type = type
+        self.initial = initial
+        self.path = path
+        self.unit = unit
+        self.comment = comment
+        self.name = ""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+        self.path = self.path or name
+
+    def __get__(self, model: Model | None, owner: type) -> Any:
+        return self if model is None else model._ports[self.name].read()
+
+    def __set__(self, model: Model, value: object) -> None:
+        raise AttributeError(f"{self.name} is {self.kind}: a model reads it and cannot set it")
+
+    @cached_property
+    def members(self) -> Mapping[str, str] | None:
+        """The types of a structure's members, by their paths in it; None: it is no structure. ValueRangeError."""
+        return members(self.type) if isinstance(self.type, str) else self.type
+
+    @cached_property
+    def paths(self) -> Mapping[str, str]:
+        """The path of each register it stands for, by the member's; of one that is no structure under ``""``."""
+        inside = {"": ""} if self.members is None else {member: f"/{member}" for member in self.members}
+        return {member: canonical_path(self.path + end) for member, end in inside.items()}
+
+    @property
+    def tags(self) -> Mapping[str, object]:
+        """The entries of a tag table that it stands for; ValueRangeError: the type is none."""
+        if self.members is None:
+            return {self.path: self._tag(self.type, self.initial)}
+        initial = self.initial or {}
+        if not isinstance(initial, Mapping) or initial.keys() - self.members.keys():
+            raise ModelError(f"initial: expected a dict with some of {', '.join(self.members)}, found {initial!r}")
+        return {f"{self.path}/{name}": self._tag(kind, initial.get(name)) for name, kind in self.members.items()}
+
+    def _tag(self, kind: object, initial: object) -> Mapping[str, object]:
+        comment = f"{self.comment} [{self.unit}]" if self.unit else self.comment
+        return {"type": kind, "initial": list(initial) if isinstance(initial, tuple) else initial, "comment": comment}
+
+
+class Input(Declaration):
+    """A register that others write, or that a connection fills; the model reads it."""
+
+    kind = "an input"
+
+
+class Parameter(Declaration):
+    """A value that the configuration may give, under the attribute's name; it is no register, and never changes."""
+
+    kind = "a parameter"
+
+    def __init__(self, type: str, initial: object = None, *, unit: str = "", comment: str = "") -> None:  # noqa: A002
+        super().__init__(type, initial, unit=unit, comment=comment)
+
+
+class Output(Declaration):
+    """A register that the model computes, and nobody writes. It keeps its value until the model sets another."""
+
+    kind = "an output"
+
+    def __set__(self, model: Model, value: object) -> None:
+        model._ports[self.name].write(value)
+
+
+class InOut(Declaration):
+    """A register with two ends: what others write to it, and what the model makes of that. See :class:`Ends`."""
+
+    kind = "an in-out register"
+
+    def __get__(self, model: Model | None, owner: type) -> Any:
+        return self if model is None else model._ends[self.name]
+
+    def __set__(self, model: Model, value: object) -> None:
+        raise AttributeError(f"{self.name} is {self.kind}: set {self.name}.shown")
+
+
+def place_declarations(model: str, declarations: Iterable[Declaration]) -> Layout:
+    """Place what a model declares as a tag table does; ModelError names the model and all that is wrong."""
+    tags: dict[str, object] = {}
+    for declaration in declarations:
+        try:
+            own = declaration.tags
+        except ShmioError as error:
+            raise ModelError(f"model {model}: {declaration.name}: {error}") from None
+        if twice := own.keys() & tags.keys():
+            raise ModelError(f"model {model}: {declaration.name}: the path {min(twice)!r} is there already")
+        tags.update(own)
+    try:
+        return place_tags(model, tags)
+    except LayoutError as error:
+        problems = [diagnostic.message for diagnostic in error.diagnostics if diagnostic.severity == "error"]
+        raise ModelError(f"model {model}: {'; '.join(problems)}") from None

@@ -1,0 +1,78 @@
+"""The cell as a model; what moves when is tested as the emulated controller's program."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shmio.emulators.a50 import A50
+from shmio.layout.codec import codec
+from shmio.layout.compiler import Source, compile_sources
+from shmio.layout.model import Layout
+from shmio.layout.topic import find
+from shmio.layout.write import encode
+from shmio.simulation import ModelRunner, layout_of
+from shmio.simulation.a50 import A50Cell
+
+STEP_NS = 50_000_000
+AXIS = "Robot_825/Axs1_Pos"
+
+
+@pytest.fixture
+def db201() -> Layout:
+    source = Path(__file__).parents[3] / "db201.db"
+    (layout,) = compile_sources([Source(source.name, source.read_bytes())]).layouts
+    return layout
+
+
+def value(runner: ModelRunner, path: str) -> Any:
+    return codec(find(runner.layout, path), runner.layout.byte_order).decode(runner.image)
+
+
+def test_its_own_layout_has_the_signals_of_db201(db201: Layout) -> None:
+    own = {register.path: (register.type, register.dims) for register in layout_of(A50Cell).registers}
+    assert own == {register.path: (register.type, register.dims) for register in db201.registers}
+
+
+def test_moves_as_the_emulated_plant_does(db201: Layout) -> None:
+    program, runner = A50(db201), ModelRunner(A50Cell, db201)
+    frame = bytearray(db201.size)
+    program.step(0, frame)
+    seen = set()
+    for number in range(1, 400):
+        program.step(number / 20, frame)
+        assert runner.step(number * STEP_NS, STEP_NS) == frame
+        seen.add(value(runner, AXIS))
+    assert len(seen) > 100
+
+
+def test_hold_is_obeyed_and_taken_back(db201: Layout) -> None:
+    runner = ModelRunner(A50Cell, db201)
+    hold = find(db201, "Outputs/13")
+
+    def run(first: int, last: int) -> float:
+        for number in range(first, last):
+            runner.step(number * STEP_NS, STEP_NS)
+        position: float = value(runner, AXIS)
+        return position
+
+    moving = run(1, 161)
+    assert runner.write([encode(hold, 1, "big")]) == [""]
+    assert run(161, 200) == pytest.approx(moving)
+    assert value(runner, "Outputs/13") == 1
+    runner.write([encode(hold, 0, "big")])
+    assert run(200, 220) != pytest.approx(moving, abs=1)
+
+
+def test_what_it_does_not_drive_is_as_it_was_written(db201: Layout) -> None:
+    runner = ModelRunner(A50Cell, db201)
+    writes = [encode(find(db201, path), 0xA5, "big") for path in ("Inputs/0", "Inputs/20", "Outputs/0", "Outputs/18")]
+    assert runner.write(writes) == [""] * 4
+    runner.step(STEP_NS, STEP_NS)
+    assert [value(runner, path) for path in ("Inputs/20", "Outputs/18")] == [0xA5] * 2
+    assert 0xA5 not in [value(runner, path) for path in ("Inputs/0", "Outputs/0")]
+    assert runner.write([encode(find(db201, AXIS), 0.0, "big")]) == [
+        "the model computes Robot_825/Axs1_Pos: it is an output, which nobody writes"
+    ]
