@@ -1,6 +1,7 @@
 """Print the values of topics from another process or host, by SimlogAPI version 1.
 
-python examples/subscribe.py [--count N] [--ca CA.pem [--certificate C.pem --key K.pem]] HOST:PORT TOPIC...
+python examples/subscribe.py [--count N] [--ca CA.pem [--certificate C.pem --key K.pem]] [--token-file FILE]
+    HOST:PORT|unix:PATH TOPIC...
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ from shmio.wire.simlog_v1_pb2 import TopicDescriptor
 from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
 
 
-async def follow(stub: Any, path: str, count: int | None) -> None:
+async def follow(stub: Any, path: str, options: argparse.Namespace) -> None:
     """Print a topic's values as they come; the first is the present one."""
-    stream = stub.Subscribe(TopicDescriptor(path=path))
+    count = options.count
+    metadata = options.token_file and [("authorization", f"Bearer {options.token_file.read_text().strip()}")]
+    stream = stub.Subscribe(TopicDescriptor(path=path), metadata=metadata)
     for _ in itertools.count() if count is None else range(count):
         message = await stream.read()
         if message is grpc.aio.EOF:
@@ -45,13 +48,14 @@ async def main() -> int:
     parser.add_argument("--ca", type=Path, help="use TLS, and trust this authority (PEM)")
     parser.add_argument("--certificate", type=Path, help="our own certificate (PEM), where the server asks for one")
     parser.add_argument("--key", type=Path, help="its key (PEM)")
-    parser.add_argument("address", metavar="HOST:PORT")
+    parser.add_argument("--token-file", type=Path, help="the token to send, where the server asks for one")
+    parser.add_argument("address", metavar="HOST:PORT|unix:PATH")
     parser.add_argument("topics", metavar="TOPIC", nargs="+")
     options = parser.parse_args()
     async with channel_to(options) as channel:
         stub = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
         try:
-            await asyncio.gather(*(follow(stub, path, options.count) for path in options.topics))
+            await asyncio.gather(*(follow(stub, path, options) for path in options.topics))
         except grpc.aio.AioRpcError as error:
             print(f"{options.address}: {error.code().name}: {error.details()}", file=sys.stderr)
             return 1

@@ -35,6 +35,7 @@ class Worker:
         self.config: dict[str, Any] = spec["config"]
         self.stopping = threading.Event()
         self._on_stop: Callable[[], object] | None = None
+        self._on_reread: Callable[[], object] | None = None
         self.log = self._set_up_log(Path(spec["log_file"]))
         self.segment = Segment.open(spec["instance"], writable=True)
         if self.segment.header.epoch != spec["epoch"]:
@@ -94,8 +95,12 @@ class Worker:
         if self.stopping.is_set():
             call()
 
+    def on_reread(self, call: Callable[[], object]) -> None:
+        """Have ``call`` run in a thread of its own whenever a reload may have changed what it takes while it runs."""
+        self._on_reread = call
+
     def _heed_signals(self) -> None:
-        """Let SIGTERM set ``stopping``; Ctrl-C is the supervisor's.
+        """Let SIGTERM set ``stopping``, and SIGHUP have it reread; Ctrl-C is the supervisor's.
 
         The handler itself must touch no lock: the main thread may hold that of the event it would set.
         """
@@ -103,11 +108,14 @@ class Worker:
         os.set_blocking(writer, False)
         signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
         signal.signal(signal.SIGTERM, lambda *_: None)
+        signal.signal(signal.SIGHUP, lambda *_: None)
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         threading.Thread(target=self._await_signal, args=(reader,), name="signals", daemon=True).start()
 
     def _await_signal(self, reader: int) -> None:
-        os.read(reader, 1)
+        while os.read(reader, 1)[0] != signal.SIGTERM:
+            if self._on_reread is not None:
+                self._on_reread()
         self.stopping.set()
         if self._on_stop is not None:
             self._on_stop()

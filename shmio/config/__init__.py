@@ -1,7 +1,21 @@
 """``supervisor.toml``: read, checked, resolved (architecture: *Config*)."""
 
-from shmio.config.address import Address
-from shmio.config.model import Config, Emulator, Grpc, Instance, Recorder, Source, Tls
+from shmio.config.address import Address, UnixAddress, parse_address
+from shmio.config.model import Config, Emulator, Grpc, Instance, Recorder, Source, Tls, Token
 from shmio.config.read import RESERVED_SOURCES, load
 
-__all__ = ["RESERVED_SOURCES", "Address", "Config", "Emulator", "Grpc", "Instance", "Recorder", "Source", "Tls", "load"]
+__all__ = [
+    "RESERVED_SOURCES",
+    "Address",
+    "Config",
+    "Emulator",
+    "Grpc",
+    "Instance",
+    "Recorder",
+    "Source",
+    "Tls",
+    "Token",
+    "UnixAddress",
+    "load",
+    "parse_address",
+]

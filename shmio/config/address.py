@@ -1,11 +1,17 @@
-"""Listening addresses: ``host:port``, IPv6 in brackets."""
+"""Listening addresses: ``host:port``, IPv6 in brackets; and UNIX sockets, ``unix:PATH``."""
 
 from __future__ import annotations
 
 import ipaddress
+import os
 from dataclasses import dataclass
+from typing import Final
 
 from shmio.errors import ConfigError
+
+UNIX: Final = "unix:"
+MAX_PATH_BYTES: Final = 107
+"""Of a UNIX socket: sun_path holds 108 with the final zero, unix(7)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,3 +45,35 @@ class Address:
             return ipaddress.ip_address(self.host).is_loopback
         except ValueError:
             return False
+
+
+@dataclass(frozen=True, slots=True)
+class UnixAddress:
+    """A UNIX socket, by its file."""
+
+    path: str
+
+    @classmethod
+    def parse(cls, text: str) -> UnixAddress:
+        """Read ``unix:PATH``, or ``unix:///PATH`` as gRPC writes it; ConfigError otherwise."""
+        path = text.removeprefix(UNIX)
+        if path.startswith("//"):
+            path = path[2:]
+        if not text.startswith(UNIX) or not path:
+            raise ConfigError(f"{text!r} is not a UNIX socket; expected unix:PATH, such as unix:run/shmio.sock")
+        if len(os.fsencode(path)) > MAX_PATH_BYTES:
+            raise ConfigError(f"{text}: the path is longer than the {MAX_PATH_BYTES} bytes that a socket may have")
+        return cls(path)
+
+    def __str__(self) -> str:
+        return f"{UNIX}{self.path}"
+
+    @property
+    def loopback(self) -> bool:
+        """Only this machine can reach it."""
+        return True
+
+
+def parse_address(text: str) -> Address | UnixAddress:
+    """Read either; ConfigError otherwise."""
+    return UnixAddress.parse(text) if text.startswith(UNIX) else Address.parse(text)

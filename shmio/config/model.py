@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, field
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}\Z"
 NAME_RULE = "at most 40 letters, digits and _ . -, the first a letter or a digit"
@@ -14,6 +14,9 @@ Milliseconds = Annotated[float, Meta(gt=0, le=3_600_000)]
 Text = Annotated[str, Meta(min_length=1)]
 Texts = Annotated[list[Text], Meta(min_length=1)]
 DbNumber = Annotated[int, Meta(ge=1, le=65535)]
+
+ROLES = ("read", "write", "inject", "control")
+"""What a client of the gRPC endpoint may be allowed."""
 
 
 class Section(Struct, forbid_unknown_fields=True, kw_only=True):
@@ -80,13 +83,67 @@ class Tls(Section):
     client_ca: Text | None = None
 
 
+class Token(Section):
+    """``[[grpc.token]]``: a bearer token, by the file that holds it or by its hash, and what who shows it may do."""
+
+    name: Name
+    roles: Texts
+    token_file: Text | None = None
+    sha256: Text | None = None
+
+
+class Client(Section):
+    """``[[grpc.client]]``: what clients may do whose certificate has a name that one of the patterns fits."""
+
+    subject: Text | Texts
+    roles: Texts
+
+    @property
+    def patterns(self) -> list[str]:
+        """Globs over the certificate's common name and its alternative names."""
+        return [self.subject] if isinstance(self.subject, str) else self.subject
+
+
+class Listening(Section):
+    """``[[grpc.address]]``: an address with roles for clients that show nothing."""
+
+    listen: Text
+    roles: Texts = field(default_factory=lambda: ["read"])
+    insecure: bool = False
+    tokens_in_plain_text: bool = False
+
+
 class Grpc(Section):
     """``[grpc]``: the endpoint that serves remote programs."""
 
-    listen: Texts
+    listen: list[Text] = []
     default_source: Text | None = None
     insecure: bool = False
+    tokens_in_plain_text: bool = False
     tls: Tls | None = None
+    token: list[Token] = []
+    client: list[Client] = []
+    address: list[Listening] = []
+
+    @property
+    def guarded(self) -> bool:
+        """Whether the addresses of ``listen`` ask who is there."""
+        return bool(self.token or self.client)
+
+    @property
+    def listening(self) -> dict[str, Listening]:
+        """All addresses, by the keys that name them; those of ``listen`` with the roles of who shows nothing."""
+        roles = [] if self.guarded else list(ROLES)
+        found = {
+            f"grpc.listen[{index}]": Listening(
+                listen=text,
+                roles=roles,
+                insecure=self.insecure and self.tls is None,
+                tokens_in_plain_text=self.tokens_in_plain_text,
+            )
+            for index, text in enumerate(self.listen)
+        }
+        return found | {f"grpc.address[{index}].listen": address for index, address in enumerate(self.address)}
 
 
 class Recorder(Section):

@@ -10,8 +10,20 @@ from typing import Any
 
 import msgspec
 
-from shmio.config.address import Address
-from shmio.config.model import Config, Emulator, Grpc, Instance, Recorder, Section, Source, Tls
+from shmio.config.listening import check_listening, resolve
+from shmio.config.model import (
+    Client,
+    Config,
+    Emulator,
+    Grpc,
+    Instance,
+    Listening,
+    Recorder,
+    Section,
+    Source,
+    Tls,
+    Token,
+)
 from shmio.config.properties import read_properties
 from shmio.config.wording import explain, explain_toml, named
 from shmio.errors import ConfigError
@@ -27,8 +39,12 @@ _TABLES: dict[str, type[Section]] = {
     "emulator": Emulator,
     "grpc": Grpc,
     "grpc.tls": Tls,
+    "grpc.token": Token,
+    "grpc.client": Client,
+    "grpc.address": Listening,
     "recorder": Recorder,
 }
+_OF_GRPC = ("token", "client", "address")
 _DERIVED = ("folder", "options", "texts")  # fields that are no keys of the file
 
 
@@ -69,8 +85,9 @@ def read_tables(file: Path) -> dict[str, Any]:
 def _resolve(tables: dict[str, Any], folder: Path) -> Config:
     if "folder" in tables:
         raise ConfigError(_unknown("folder", ""))
-    for name in ("source", "emulator"):
-        if isinstance(tables.get(name), dict):
+    grpc = tables.get("grpc")
+    for name, table in [("source", tables), ("emulator", tables), *((f"grpc.{n}", grpc) for n in _OF_GRPC)]:
+        if isinstance(table, dict) and isinstance(table.get(name.removeprefix("grpc.")), dict):
             raise ConfigError(f"{name}: write [[{name}]], in two brackets: there can be several")
     _check_text(tables, "")
     sources = tables.get("source", [])
@@ -79,12 +96,9 @@ def _resolve(tables: dict[str, Any], folder: Path) -> Config:
     config = _convert({**tables, "folder": str(folder)})
     _check_names(config)
     _check_times(config)
-    _check_listening(config)
-    if config.grpc and config.grpc.tls:
-        tls = config.grpc.tls
-        for field in ("certificate", "key", "client_ca"):
-            if name := getattr(tls, field):
-                setattr(tls, field, str(config.path(name)))
+    check_listening(config)
+    if config.grpc:
+        resolve(config.grpc, config)
     return config
 
 
@@ -173,21 +187,3 @@ def _check_times(config: Config) -> None:
                 f"source[{index}].stale_ms: {source.stale_ms:g} is less than two periods of {source.period_ms:g} ms: "
                 "one late frame would make the source bad"
             )
-
-
-def _check_listening(config: Config) -> None:
-    for index, emulator in enumerate(config.emulator):
-        _check_address(f"emulator[{index}].listen", emulator.listen, emulator.insecure, "insecure = true beside it")
-    if config.grpc:
-        safe = config.grpc.insecure or config.grpc.tls is not None
-        for index, text in enumerate(config.grpc.listen):
-            _check_address(f"grpc.listen[{index}]", text, safe, "a [grpc.tls] table, or insecure = true beside it")
-
-
-def _check_address(key: str, text: str, safe: bool, remedy: str) -> None:
-    try:
-        address = Address.parse(text)
-    except ConfigError as error:
-        raise ConfigError(f"{key}: {error}") from None
-    if not address.loopback and not safe:
-        raise ConfigError(f"{key}: {text} can be reached from other hosts in plain text; that needs {remedy}")

@@ -27,8 +27,7 @@ class Change:
         self._stopped = False
         segment.processes.require(len(self.changes.started) - len(self.changes.stopped))
         segment.reserve(self.changes.add)  # the last to fail: what it takes is not given back
-        for name in self.changes.kept:
-            self._fleet.named(name).keep(self._jobs[name])
+        self._told = [name for name in self.changes.kept if self._fleet.named(name).keep(self._jobs[name])]
 
     @property
     def _leaving(self) -> tuple[str, ...]:
@@ -78,6 +77,7 @@ class Change:
     def outcome(self) -> tuple[list[str], list[str]]:
         """What was done, and what came out badly, a line each."""
         done = [f"{name}: stopped" for name in self.changes.stopped]
+        done += [f"{name}: told to take its tokens and roles anew" for name in self._told]
         problems = []
         for job in self._coming:
             managed = self._fleet.named(job.name)

@@ -144,8 +144,9 @@ class Fleet:
 
     def _spawn(self, managed: Managed) -> None:
         job = managed.job
-        description = job.describe(self._segment.instance, self._segment.header.epoch)
-        managed.slot.digest = digest(description)
+        place = self._segment.instance, self._segment.header.epoch
+        description = job.describe(*place)
+        managed.slot.digest = digest(job.identify(*place))
         try:
             child = Child.spawn(self._modules[job.kind], description, job.log_file)
         except OSError as error:

@@ -55,9 +55,13 @@ class Managed:
         self._job = job
         self.life = Life()
 
-    def keep(self, job: Job) -> None:
-        """Go on with the same job, as a new plan has it."""
-        self._job = job
+    def keep(self, job: Job) -> bool:
+        """Go on with the same job, as a new plan has it; whether its process is told to take the job's rules anew."""
+        before, self._job = self._job, job
+        if self.child is None or job.rules is None or not (job.rules or before is None or before.rules):
+            return False
+        self.child.reread()
+        return True
 
     def adopt(self, child: Adopted) -> None:
         """Take a process that another supervisor has started and that runs."""

@@ -28,6 +28,9 @@ MODULES: Final[Mapping[str, str]] = {
 }
 """The module that is a process of each kind."""
 
+RULES: Final[Mapping[str, tuple[str, ...]]] = {"grpc": ("token", "client")}
+"""Keys of a section that its process takes anew while it runs, by its kind."""
+
 MAX_PROCESSES = 200
 MODES = ("live", "log")
 """What this version can be started as; log: what serves others is left out."""
@@ -35,12 +38,16 @@ MODES = ("live", "log")
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A process to run: ``config`` is its section as resolved, what the process gets."""
+    """A process to run: ``config`` is its section as resolved, what the process gets.
+
+    ``rules`` is the part of the section that it takes anew while it runs, when it is told to; None: there is none.
+    """
 
     name: str
     kind: str
     log_file: Path
     config: dict[str, Any]
+    rules: dict[str, Any] | None = None
 
     @property
     def rank(self) -> int:
@@ -49,6 +56,13 @@ class Job:
 
     def describe(self, instance: str, epoch: int) -> bytes:
         """The JSON object that the process reads from its standard input."""
+        return self._json(instance, epoch, self.config | (self.rules or {}))
+
+    def identify(self, instance: str, epoch: int) -> bytes:
+        """What of it makes another process necessary when it changes."""
+        return self._json(instance, epoch, self.config)
+
+    def _json(self, instance: str, epoch: int, config: dict[str, Any]) -> bytes:
         return msgspec.json.encode(
             {
                 "instance": instance,
@@ -56,7 +70,7 @@ class Job:
                 "name": self.name,
                 "kind": self.kind,
                 "log_file": str(self.log_file),
-                "config": self.config,
+                "config": config,
             },
             order="deterministic",  # it is compared with what an earlier supervisor gave
         )
@@ -118,7 +132,8 @@ def make_plan(
         sections.append((emulator.name, "emulator", msgspec.to_builtins(emulator) | {"layouts": served}))
     sections += [(source.name, "source", msgspec.to_builtins(source)) for source in config.source]
     if config.grpc and mode != "log":
-        sections.append(("grpc", "grpc", msgspec.to_builtins(config.grpc)))
+        place = {"group": config.instance.group, "config_file": str(config_file.resolve())}
+        sections.append(("grpc", "grpc", msgspec.to_builtins(config.grpc) | place))
     if config.recorder:
         paths = {"directory": config.path(config.recorder.directory), "config_file": config_file.resolve()}
         recorder = msgspec.to_builtins(config.recorder) | {key: str(path) for key, path in paths.items()}
@@ -133,6 +148,14 @@ def make_plan(
         config_file=config_file.resolve(),
         log_dir=log_dir,
         blocks=blocks,
-        jobs=tuple(Job(name, kind, log_dir / f"{name}.log", section) for name, kind, section in sections),
+        jobs=tuple(_job(name, kind, log_dir / f"{name}.log", section) for name, kind, section in sections),
         warnings=tuple(warnings),
     )
+
+
+def _job(name: str, kind: str, log_file: Path, section: dict[str, Any]) -> Job:
+    rules = RULES.get(kind)
+    if rules is None:
+        return Job(name, kind, log_file, section)
+    found = {key: section.pop(key) for key in rules}
+    return Job(name, kind, log_file, section, {key: value for key, value in found.items() if value})

@@ -62,6 +62,10 @@ class Child:
         """Ask it to end."""
         self._popen.send_signal(signal.SIGTERM)
 
+    def reread(self) -> None:
+        """Have it read anew what it may take while it runs."""
+        self._popen.send_signal(signal.SIGHUP)
+
     def kill(self) -> None:
         """End it."""
         self._popen.kill()
@@ -93,6 +97,10 @@ class Adopted:
     def terminate(self) -> None:
         """Ask it to end."""
         self._send(signal.SIGTERM)
+
+    def reread(self) -> None:
+        """Have it read anew what it may take while it runs."""
+        self._send(signal.SIGHUP)
 
     def kill(self) -> None:
         """End it."""

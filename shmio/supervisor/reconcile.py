@@ -63,7 +63,7 @@ def reconcile(plan: Plan, epoch: int, processes: Mapping[str, Present], blocks: 
             started.append(job.name)
         elif (
             there.well
-            and there.digest == digest(job.describe(plan.instance, epoch))
+            and there.digest == digest(job.identify(plan.instance, epoch))
             and not (job.kind == "source" and job.name in changed)
         ):
             kept.append(job.name)

@@ -8,17 +8,20 @@ from pathlib import Path
 
 from shmio.config import Config
 from shmio.config.tls import read_tls
+from shmio.config.tokens import read_tokens
 from shmio.errors import ConfigError
 
 
 def check_host(config: Config) -> None:
-    """Group, folders of log files and recordings, TLS files; ConfigError. Nothing is made."""
+    """Group, folders of log files and recordings, TLS files, tokens; ConfigError. Nothing is made."""
     _check_group(config.instance.group)
     _check_folder("instance.log_dir", config.log_dir)
     if config.recorder:
         _check_folder("recorder.directory", config.path(config.recorder.directory))
-    if config.grpc and config.grpc.tls:
-        read_tls(config.grpc.tls)
+    if config.grpc:
+        if config.grpc.tls:
+            read_tls(config.grpc.tls)
+        read_tokens(config.grpc.token)
 
 
 def _check_group(name: str | None) -> None:

@@ -10,7 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
-from shmio.config import Address, Config
+from shmio.config import Address, Config, UnixAddress, parse_address
+from shmio.config.unixsocket import obstacle
 from shmio.errors import ConfigError, EndpointError, ShmioError
 from shmio.segment import instances
 from shmio.supervisor.plan import Plan
@@ -27,10 +28,16 @@ def check_listening(config: Config) -> None:
     """ConfigError when the name of a host to listen on is none, or two addresses are one port; 0 is any free one."""
     listening = [(f"emulator[{i}].listen", emulator.listen) for i, emulator in enumerate(config.emulator)]
     if config.grpc:
-        listening += [(f"grpc.listen[{i}]", text) for i, text in enumerate(config.grpc.listen)]
+        listening += [(key, address.listen) for key, address in config.grpc.listening.items()]
     seen: list[tuple[str, str, int, set[str]]] = []
+    sockets: dict[UnixAddress, str] = {}
     for key, text in listening:
-        address = Address.parse(text)
+        address = parse_address(text)
+        if isinstance(address, UnixAddress):
+            if address in sockets:
+                raise ConfigError(f"{key}: {text} is the socket of {sockets[address]} already; choose another")
+            sockets[address] = key
+            continue
         try:
             hosts = _hosts(address)
         except ConfigError as error:
@@ -48,9 +55,14 @@ def check_ports(plan: Plan) -> None:
     """
     for job in plan.jobs:
         listen = job.config.get("listen", ())
-        for text in (listen,) if isinstance(listen, str) else listen:
-            address = Address.parse(text)
-            if in_use(address):
+        texts = [listen] if isinstance(listen, str) else [*listen]
+        texts += [address["listen"] for address in job.config.get("address", ())]
+        for text in texts:
+            address = parse_address(text)
+            if isinstance(address, UnixAddress):
+                if reason := obstacle(address.path):
+                    raise EndpointError(f"{job.name}: cannot listen on {address}: {reason}")
+            elif in_use(address):
                 raise EndpointError(f"{job.name}: cannot listen on {address}: {_holder(address)}")
 
 

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import grp
+from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
 from shmio import worker
-from shmio.config import Address, Grpc
+from shmio.config import Address, Grpc, load
+from shmio.endpoints.grpc.doors import Doors
 from shmio.endpoints.grpc.feeds import Feeds
 from shmio.endpoints.grpc.hold import Hold
 from shmio.endpoints.grpc.server import Server
 from shmio.endpoints.grpc.services import Services
-from shmio.errors import SegmentError
+from shmio.errors import SegmentError, ShmioError
 from shmio.logs import fields
 from shmio.worker import BEAT_S, Worker
 
@@ -26,7 +30,8 @@ async def _serve(worker: Worker) -> None:
     loop = asyncio.get_running_loop()
     stopping = asyncio.Event()
     worker.on_stop(lambda: loop.call_soon_threadsafe(stopping.set))
-    config = msgspec.convert(worker.config, Grpc)
+    config, place = _settings(worker)
+    doors = Doors(config)
     tasks: set[asyncio.Task[None]] = set()
     good_ones: set[str] = set()
     writer = worker.slot.writer
@@ -41,16 +46,26 @@ async def _serve(worker: Worker) -> None:
         tasks.add(task)
         task.add_done_callback(tasks.discard)
 
+    def reread(file: Path) -> None:
+        task = loop.create_task(_take_anew(worker, file, doors, server))
+        tasks.add(task)
+        task.add_done_callback(tasks.discard)
+
     hold = Hold()
     feeds = Feeds(worker.segment, writer, loop, on_quality, hold)
     services = Services(worker.segment, worker.slot, hold, feeds, config.default_source)
     server = Server(services)
     feeds.start()
     await services.stepper.start()
-    addresses = [Address.parse(text) for text in config.listen]
-    ports = await server.start(addresses, config.tls)
-    served = ", ".join(str(Address(address.host, port)) for address, port in zip(addresses, ports, strict=True))
-    worker.log.info("serving %s", served)
+    ports = await server.start(doors.listeners, config.tls, place.gid)
+    addresses = [listener.address for listener in doors.listeners]
+    served = [
+        str(Address(address.host, port) if isinstance(address, Address) else address)
+        for address, port in zip(addresses, ports, strict=True)
+    ]
+    worker.log.info("serving %s", ", ".join(served))
+    if (file := place.config_file) is not None:
+        worker.on_reread(lambda: loop.call_soon_threadsafe(reread, file))
     worker.running()
     reading: asyncio.Task[list[str]] | None = None
     while not stopping.is_set():
@@ -76,6 +91,34 @@ async def _serve(worker: Worker) -> None:
     await server.stop()
     feeds.join()
     services.stepper.join()
+
+
+class _Place(NamedTuple):
+    """What the instance has beside its ``[grpc]`` section."""
+
+    config_file: Path | None
+    gid: int | None
+
+
+def _settings(worker: Worker) -> tuple[Grpc, _Place]:
+    config = dict(worker.config)
+    file, group = config.pop("config_file", None), config.pop("group", None)
+    place = _Place(file and Path(file), None if group is None else grp.getgrnam(group).gr_gid)
+    return msgspec.convert(config, Grpc), place
+
+
+async def _take_anew(worker: Worker, file: Path, doors: Doors, server: Server) -> None:
+    """Take tokens and roles as the configuration has them by now; calls that these do not allow end."""
+    try:
+        config = await asyncio.to_thread(load, file)
+        if config.grpc is None:
+            return  # the supervisor is about to stop this process
+        doors.take(config.grpc)
+    except ShmioError as error:
+        worker.log.error("tokens and roles stay as they were: %s", error)
+        return
+    ended = server.calls.review()
+    worker.log.info("took tokens and roles anew", extra=fields(tokens=len(config.grpc.token), calls_ended=ended))
 
 
 if __name__ == "__main__":

@@ -25,36 +25,55 @@ STEP_BOUND: Final = 16_384
 """Values that may wait of which none may be left out: what one step changes in all topics of a stream."""
 STEP_BOUND_BYTES: Final = 64 << 20
 """The same in bytes. All streams share them."""
+TOTAL_BYTES: Final = 256 << 20
+"""Of all that waits in all streams: when there is more, a stream may hold no more than its equal part of it."""
 
 Finish = Callable[[Any], bytes]
+
+
+class _Total:
+    """What waits in all streams."""
+
+    def __init__(self) -> None:
+        self.size = 0
+        self.streams = 0
+
+    def over(self, size: int) -> bool:
+        """Whether there is too much of it, and a stream that holds so much has a part in that."""
+        return self.size > TOTAL_BYTES and size > TOTAL_BYTES // max(1, self.streams)
 
 
 class _Load:
     """Messages of one kind that wait."""
 
-    def __init__(self) -> None:
+    def __init__(self, total: _Total) -> None:
         self.count = 0
         self.size = 0
+        self._total = total
 
     def full(self, message: Sized, bound: int, bound_bytes: int | None = None) -> bool:
         """Whether one more would be too much. A single one never is, however long."""
         most = BOUND_BYTES if bound_bytes is None else bound_bytes
-        return self.count > 0 and (self.count >= bound or self.size + len(message) > most)
+        size = self.size + len(message)
+        return self.count > 0 and (self.count >= bound or size > most or self._total.over(size))
 
     def add(self, message: Sized) -> None:
         self.count += 1
         self.size += len(message)
+        self._total.size += len(message)
 
     def remove(self, message: Sized) -> None:
         self.count -= 1
         self.size -= len(message)
+        self._total.size -= len(message)
 
 
 class Outbox:
     """Messages of its lanes in the order in which they came; for the event loop's thread alone, with one reader."""
 
-    def __init__(self) -> None:
-        self.states, self.events = _Load(), _Load()
+    def __init__(self, total: _Total | None = None) -> None:
+        total = total or _Total()
+        self.states, self.events = _Load(total), _Load(total)
         self.dropped = 0
         self.failure = ""
         """Why it ended; empty: it did not fail."""
@@ -84,6 +103,12 @@ class Outbox:
         """Drop all that waits."""
         for lane, _ in list(self._waiting.values()):
             lane.drop()
+
+    def close(self) -> None:
+        """Its stream is over: what waits is nobody's, and was not dropped for being too much."""
+        for lane, message in self._waiting.values():
+            lane.load.remove(message)
+        self._waiting.clear()
 
     def end(self) -> None:
         """Have the reader end once it has read what waits."""
@@ -250,6 +275,12 @@ class Outboxes:
     def __init__(self) -> None:
         self._open: set[Outbox] = set()
         self._dropped = 0
+        self._total = _Total()
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Of all messages that wait."""
+        return self._total.size
 
     def __len__(self) -> int:
         return len(self._open)
@@ -262,12 +293,14 @@ class Outboxes:
     @contextmanager
     def opened(self) -> Iterator[Outbox]:
         """One for a stream as long as that is open."""
-        outbox = Outbox()
+        outbox = Outbox(self._total)
         self._open.add(outbox)
+        self._total.streams += 1
         try:
             yield outbox
         finally:
             self._open.discard(outbox)
+            self._total.streams -= 1
             self._dropped += outbox.dropped
             outbox.close()
 

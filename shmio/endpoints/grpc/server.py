@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+import asyncio
+import os
+from collections.abc import Sequence
+from typing import Any
+from urllib.parse import quote
+
 import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
-from shmio.config import Address, Tls
+from shmio.config import Address, Tls, UnixAddress
 from shmio.config.tls import read_tls
+from shmio.config.unixsocket import SocketFile, clear
+from shmio.endpoints.grpc.doors import Listener
+from shmio.endpoints.grpc.gate import Calls, Gate
 from shmio.endpoints.grpc.services import Services
 from shmio.errors import EndpointError
 
 MAX_REQUEST_BYTES = 1 << 20
-MAX_CALLS = 4096
 
 _SERVING = health_pb2.HealthCheckResponse.SERVING
 _NOT_SERVING = health_pb2.HealthCheckResponse.NOT_SERVING
-_OPTIONS = [
+OPTIONS = [
     ("grpc.so_reuseport", 0),  # else a second server would take the same port in silence
     ("grpc.max_receive_message_length", MAX_REQUEST_BYTES),
     # A client whose host vanished is noticed within half a minute.
@@ -27,37 +35,27 @@ _OPTIONS = [
 
 
 class Server:
-    """All services on each of the addresses."""
+    """All services on each of the addresses, each behind a gate."""
 
-    def __init__(self, services: Services) -> None:
+    def __init__(self, services: Services, calls: Calls | None = None) -> None:
+        self.calls = Calls() if calls is None else calls
+        """Those that are open, on all addresses."""
+        self._services = services
         self._health = health.aio.HealthServicer()
-        self._server = grpc.aio.server(options=_OPTIONS, maximum_concurrent_rpcs=MAX_CALLS)
-        self._server.add_generic_rpc_handlers(services.handlers())
-        health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
-        self._names = services.names
-        names = [*self._names, health.SERVICE_NAME, reflection.SERVICE_NAME]
-        reflection.enable_server_reflection(names, self._server)
+        self._servers: list[grpc.aio.Server] = []
+        self._files: list[SocketFile] = []
 
-    async def start(self, addresses: list[Address], tls: Tls | None) -> list[int]:
+    async def start(self, listeners: Sequence[Listener], tls: Tls | None = None, gid: int | None = None) -> list[int]:
         """Listen on all addresses; the ports, for those that were 0.
 
-        ConfigError: a file of ``tls`` cannot be used. EndpointError names the address in the way.
+        ``gid``: the group that may open UNIX sockets, too. ConfigError: a file of ``tls`` cannot be used.
+        EndpointError names the address in the way.
         """
         credentials = _credentials(tls) if tls else None
-        ports = []
-        for address in addresses:
-            try:
-                if credentials:
-                    ports.append(self._server.add_secure_port(str(address), credentials))
-                else:
-                    ports.append(self._server.add_insecure_port(str(address)))
-            except RuntimeError:
-                raise EndpointError(
-                    f"grpc.listen: cannot listen on {address}: another program has it (ss -ltnp shows which), or this "
-                    "host has no such address"
-                ) from None
-        await self._server.start()
-        for service in (health.OVERALL_HEALTH, *self._names):
+        ports = [self._bind(listener, credentials, gid) for listener in listeners]
+        for server in self._servers:
+            await server.start()
+        for service in (health.OVERALL_HEALTH, *self._services.names):
             await self._health.set(service, _SERVING)
         return ports
 
@@ -68,7 +66,43 @@ class Server:
     async def stop(self) -> None:
         """Say so, end all streams, close."""
         await self._health.enter_graceful_shutdown()
-        await self._server.stop(grace=0.2)
+        await asyncio.gather(*(server.stop(grace=0.2) for server in self._servers))
+        for file in self._files:
+            file.remove()
+
+    def _bind(self, listener: Listener, credentials: grpc.ServerCredentials | None, gid: int | None) -> int:
+        address = listener.address
+        server = self._server(Gate(listener.door, self.calls))
+        self._servers.append(server)
+        if isinstance(address, UnixAddress):
+            clear(address.path)  # gRPC itself would take it from a living process
+        try:
+            if isinstance(address, Address):
+                if credentials and listener.encrypted:
+                    return server.add_secure_port(str(address), credentials)
+                return server.add_insecure_port(str(address))
+            before = os.umask(0o177)
+            try:
+                port = server.add_insecure_port(f"unix:{quote(address.path)}")
+            finally:
+                os.umask(before)
+        except RuntimeError:
+            raise EndpointError(
+                f"grpc: cannot listen on {address}: another program has it (ss -ltnp shows which), or this host has no "
+                "such address"
+            ) from None
+        self._files.append(SocketFile(address.path, gid))
+        return port
+
+    def _server(self, gate: Gate) -> grpc.aio.Server:
+        # More than all calls at once no connection is told to have room for.
+        options: list[tuple[str, Any]] = [*OPTIONS, ("grpc.max_concurrent_streams", self.calls.limits.calls)]
+        server = grpc.aio.server(options=options, interceptors=(gate,))
+        server.add_generic_rpc_handlers(self._services.handlers())
+        health_pb2_grpc.add_HealthServicer_to_server(self._health, server)
+        names = [*self._services.names, health.SERVICE_NAME, reflection.SERVICE_NAME]
+        reflection.enable_server_reflection(names, server)
+        return server
 
 
 def _credentials(tls: Tls) -> grpc.ServerCredentials:

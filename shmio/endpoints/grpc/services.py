@@ -49,6 +49,11 @@ class Services:
         """Streams of subscribers open, messages dropped on slow ones, messages published, and refused."""
         return len(self._outboxes), self._outboxes.dropped, self._publisher.published, self._publisher.refused
 
+    @property
+    def waiting_bytes(self) -> int:
+        """Of all messages that wait to be read by clients."""
+        return self._outboxes.waiting_bytes
+
     def handlers(self) -> list[grpc.GenericRpcHandler]:
         """The services' calls, for a server."""
         return [service.handlers() for service in self._services]

@@ -15,7 +15,10 @@ from google.protobuf.struct_pb2 import Value
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from shmio.config import Address
+from shmio.endpoints.grpc.access import Door, Keys
+from shmio.endpoints.grpc.doors import Listener
 from shmio.endpoints.grpc.feed import Feed
+from shmio.endpoints.grpc.gate import Calls, Limits
 from shmio.endpoints.grpc.hold import Hold
 from shmio.endpoints.grpc.server import Server
 from shmio.endpoints.grpc.services import Services
@@ -53,6 +56,10 @@ TIMEOUT_S = 60
 """When a test gives up; nothing waits for it to pass."""
 
 
+LOOPBACK = Listener(Address("127.0.0.1", 0), Door(Keys()))
+"""Open to all of this host."""
+
+
 def image(
     position: float = 0.0, speed: float = 0.0, running: bool = False, inputs: bytes = b"\0\0", step: int = 0
 ) -> bytes:
@@ -62,10 +69,11 @@ def image(
 class Endpoint:
     """A served segment, and a client of it."""
 
-    def __init__(self, segment: Segment, feeds: dict[str, Feed], service: Services, port: int) -> None:
+    def __init__(self, segment: Segment, feeds: dict[str, Feed], service: Services, server: Server, port: int) -> None:
         self.segment = segment
         self.feeds = feeds
         self.service = service
+        self.server = server
         self.port = port
         self.channel = grpc.aio.insecure_channel(f"127.0.0.1:{port}")
         self.stub: Any = SimlogAPIStub(self.channel)  # type: ignore[no-untyped-call]
@@ -109,7 +117,7 @@ class Endpoint:
 
 
 @asynccontextmanager
-async def endpoint(segment: Segment) -> AsyncIterator[Endpoint]:
+async def endpoint(segment: Segment, limits: Limits | None = None) -> AsyncIterator[Endpoint]:
     tasks: set[asyncio.Task[None]] = set()
 
     def on_quality(source: str, good: bool) -> None:
@@ -119,14 +127,14 @@ async def endpoint(segment: Segment) -> AsyncIterator[Endpoint]:
     hold = Hold()
     feeds = {name: Feed(block, WRITER, loop, on_quality, hold) for name, block in segment.blocks.items()}
     service = Services(segment, segment.processes.find("grpc"), hold, feeds, next(iter(feeds)))
-    server = Server(service)
+    server = Server(service, Calls(limits))
     for source in feeds:
         await server.set_source(source, False)
-    ports = await server.start([Address("127.0.0.1", 0)], None)
+    ports = await server.start([LOOPBACK])
     for feed in feeds.values():
         feed.start()
     await service.stepper.start()
-    served = Endpoint(segment, feeds, service, ports[0])
+    served = Endpoint(segment, feeds, service, server, ports[0])
     try:
         yield served
     finally:
@@ -140,9 +148,9 @@ async def endpoint(segment: Segment) -> AsyncIterator[Endpoint]:
         await asyncio.gather(*tasks)
 
 
-def serve(segment: Segment, test: Callable[[Endpoint], Awaitable[None]]) -> None:
+def serve(segment: Segment, test: Callable[[Endpoint], Awaitable[None]], limits: Limits | None = None) -> None:
     async def run() -> None:
-        async with endpoint(segment) as served:
+        async with endpoint(segment, limits) as served:
             await test(served)
 
     asyncio.run(run())

@@ -22,6 +22,7 @@ from shmio.wire import simlog_v1_pb2 as wire
 from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
 from tests.unit.endpoints.harness import (
     LAYOUT,
+    LOOPBACK,
     SOON_STALE_NS,
     TIMEOUT_S,
     Endpoint,
@@ -241,7 +242,7 @@ def test_a_taken_address_is_refused_by_name(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         second = Server(served.service)
         with pytest.raises(EndpointError, match=f"127.0.0.1:{served.port}"):
-            await second.start([Address("127.0.0.1", served.port)], None)
+            await second.start([LOOPBACK._replace(address=Address("127.0.0.1", served.port))])
         await second.stop()
 
     serve(segment, test)
@@ -258,7 +259,7 @@ def test_tls_serves_those_who_trust_it(segment: Segment, tmp_path: Path) -> None
 
     async def test(served: Endpoint) -> None:
         secure = Server(served.service)
-        (port,) = await secure.start([Address("localhost", 0)], tls)
+        (port,) = await secure.start([LOOPBACK._replace(address=Address("localhost", 0), encrypted=True)], tls)
         known = grpc.ssl_channel_credentials(
             authority.cert_pem.bytes(), client_cert.private_key_pem.bytes(), client_cert.cert_chain_pems[0].bytes()
         )
@@ -271,7 +272,7 @@ def test_tls_serves_those_who_trust_it(segment: Segment, tmp_path: Path) -> None
             assert await code(stub.GetTopic(topic, timeout=TIMEOUT_S)) is grpc.StatusCode.UNAVAILABLE
         unusable = Server(served.service)
         with pytest.raises(ConfigError, match=r"grpc\.tls\.(key|certificate)"):
-            await unusable.start([Address("localhost", 0)], Tls(certificate="/nowhere", key="/nowhere"))
+            await unusable.start([LOOPBACK], Tls(certificate="/nowhere", key="/nowhere"))
         await unusable.stop()
         await secure.stop()
 

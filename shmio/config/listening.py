@@ -1,0 +1,118 @@
+"""Who may be reached from where: the rules of addresses, tokens and roles."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from shmio.config.address import UNIX, Address, UnixAddress, parse_address
+from shmio.config.model import ROLES, Config, Grpc, Listening, Token
+from shmio.errors import ConfigError
+
+Place = Address | UnixAddress
+
+_DIGITS: Final = frozenset("0123456789abcdef")
+
+
+def check_listening(config: Config) -> None:
+    """Addresses, and what may be reached there in plain text; tokens and roles. ConfigError."""
+    for index, emulator in enumerate(config.emulator):
+        key, remedy = f"emulator[{index}].listen", "insecure = true beside it"
+        _check_address(key, emulator.listen, Address.parse, safe=emulator.insecure, remedy=remedy)
+    if config.grpc:
+        _check_tokens(config.grpc)
+        _check_addresses(config.grpc)
+
+
+def resolve(grpc: Grpc, config: Config) -> None:
+    """Make the section's paths absolute."""
+    grpc.listen = [_resolved(f"grpc.listen[{index}]", text, config) for index, text in enumerate(grpc.listen)]
+    for index, address in enumerate(grpc.address):
+        address.listen = _resolved(f"grpc.address[{index}].listen", address.listen, config)
+    for token in grpc.token:
+        if token.token_file is not None:
+            token.token_file = str(config.path(token.token_file))
+    if grpc.tls:
+        for field in ("certificate", "key", "client_ca"):
+            if name := getattr(grpc.tls, field):
+                setattr(grpc.tls, field, str(config.path(name)))
+
+
+def encrypted(grpc: Grpc, address: Listening) -> bool:
+    """Whether an address of :attr:`Grpc.listening` speaks TLS. A UNIX socket never does: nobody is between."""
+    return grpc.tls is not None and not address.insecure and not address.listen.startswith(UNIX)
+
+
+def takes_tokens(grpc: Grpc, address: Listening) -> bool:
+    """Whether tokens may be shown there: nobody else can read them on the way, or it is written down as meant."""
+    return encrypted(grpc, address) or parse_address(address.listen).loopback or address.tokens_in_plain_text
+
+
+def _resolved(key: str, text: str, config: Config) -> str:
+    if not text.startswith(UNIX):
+        return text
+    try:
+        return str(UnixAddress.parse(f"{UNIX}{config.path(UnixAddress.parse(text).path)}"))
+    except ConfigError as error:
+        raise ConfigError(f"{key}: {error}") from None
+
+
+def _check_addresses(grpc: Grpc) -> None:
+    if not grpc.listening:
+        raise ConfigError("grpc.listen: this key is needed")
+    for key, address in grpc.listening.items():
+        remedy = "a [grpc.tls] table, or insecure = true beside it"
+        _check_address(key, address.listen, parse_address, safe=address.insecure or grpc.tls is not None, remedy=remedy)
+        if not address.roles and grpc.token and not takes_tokens(grpc, address):
+            raise ConfigError(
+                f"{key}: {address.listen} is plain text that other hosts can reach, and would carry the tokens of "
+                "[[grpc.token]] for all to read: give it a [grpc.tls] table; or make it a [[grpc.address]] with roles "
+                "for clients without a token; or write tokens_in_plain_text = true beside it, if that is acceptable"
+            )
+        if not address.roles and not grpc.token and not encrypted(grpc, address):
+            raise ConfigError(
+                f"{key}: {address.listen} knows no certificates, and so none of [[grpc.client]]: make it a "
+                "[[grpc.address]] with roles for all who reach it, or add a [[grpc.token]]"
+            )
+    for index, address in enumerate(grpc.address):
+        _check_roles(f"grpc.address[{index}]", address.roles)
+
+
+def _check_address(key: str, text: str, parse: Callable[[str], Place], *, safe: bool, remedy: str) -> None:
+    try:
+        address = parse(text)
+    except ConfigError as error:
+        raise ConfigError(f"{key}: {error}") from None
+    if not address.loopback and not safe:
+        raise ConfigError(f"{key}: {text} can be reached from other hosts in plain text; that needs {remedy}")
+
+
+def _check_tokens(grpc: Grpc) -> None:
+    names: dict[str, str] = {}
+    for index, token in enumerate(grpc.token):
+        key = f"grpc.token[{index}]"
+        if token.name in names:
+            raise ConfigError(f"{key}.name: {token.name!r} is already the name of {names[token.name]}")
+        names[token.name] = key
+        _check_roles(key, token.roles)
+        _check_secret(key, token)
+    for index, client in enumerate(grpc.client):
+        _check_roles(f"grpc.client[{index}]", client.roles)
+    if grpc.client and (grpc.tls is None or grpc.tls.client_ca is None):
+        raise ConfigError("grpc.client: clients are known by their certificates: that needs client_ca in [grpc.tls]")
+
+
+def _check_roles(key: str, roles: Sequence[str]) -> None:
+    for index, role in enumerate(roles):
+        if role not in ROLES:
+            near = difflib.get_close_matches(role, ROLES, 1)
+            hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(ROLES)}"
+            raise ConfigError(f"{key}.roles[{index}]: no role {role!r}; {hint}")
+
+
+def _check_secret(key: str, token: Token) -> None:
+    if (token.token_file is None) == (token.sha256 is None):
+        raise ConfigError(f"{key}: give either token_file, a file with the token alone, or sha256, the token's hash")
+    if token.sha256 is not None and (len(token.sha256) != 64 or not _DIGITS.issuperset(token.sha256)):
+        raise ConfigError(f"{key}.sha256: expected 64 digits, as by: printf %s TOKEN | sha256sum")

@@ -1,0 +1,64 @@
+"""The endpoint's bearer tokens: read from their files, and known by their hashes from there on."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+from shmio.config.model import Token
+from shmio.errors import ConfigError
+
+MIN_LENGTH: Final = 20
+MAX_LENGTH: Final = 1024
+_OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
+
+
+class Secret(NamedTuple):
+    """A token: ``digest`` is its SHA-256. A hash of a random text needs no salt, and to test one must cost little."""
+
+    name: str
+    roles: frozenset[str]
+    digest: bytes
+
+
+def read_tokens(tokens: Sequence[Token]) -> tuple[Secret, ...]:
+    """Read the files of all; ConfigError names the key of one that will not do, and never says what is in it."""
+    found: dict[bytes, Secret] = {}
+    for index, token in enumerate(tokens):
+        key = f"grpc.token[{index}]"
+        digest = bytes.fromhex(token.sha256) if token.sha256 is not None else _read(key, str(token.token_file))
+        if digest in found:
+            raise ConfigError(f"{key}: the same token as that of {found[digest].name!r}; give each one of its own")
+        found[digest] = Secret(token.name, frozenset(token.roles), digest)
+    return tuple(found.values())
+
+
+def digest(token: bytes) -> bytes:
+    """What a token is known by."""
+    return hashlib.sha256(token).digest()
+
+
+def _read(key: str, name: str) -> bytes:
+    key = f"{key}.token_file: {name}"
+    try:
+        fd = os.open(name, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # which a pipe without a writer would block
+    except OSError as error:
+        raise ConfigError(f"{key}: {error.strerror}") from None
+    try:
+        mode = os.fstat(fd).st_mode
+        if not stat.S_ISREG(mode):
+            raise ConfigError(f"{key}: not a file")
+        if mode & _OTHERS:
+            raise ConfigError(f"{key}: mode {stat.S_IMODE(mode):04o} lets others in: chmod 600, and a new token")
+        text = os.read(fd, MAX_LENGTH + 3).rstrip(b"\r\n")
+    finally:
+        os.close(fd)
+    if not MIN_LENGTH <= len(text) <= MAX_LENGTH or not all(0x21 <= byte <= 0x7E for byte in text):
+        raise ConfigError(
+            f"{key}: expected one token of {MIN_LENGTH} to {MAX_LENGTH} letters, digits and signs, and nothing else: "
+            f"openssl rand -hex 32 makes one"
+        )
+    return digest(text)

@@ -1,0 +1,74 @@
+"""The file of a UNIX socket to listen on: who has it, whether it may be cleared, who may open it."""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+from contextlib import suppress
+from pathlib import Path
+
+from shmio.errors import EndpointError
+
+
+def clear(path: str) -> None:
+    """Remove a socket that nobody listens on any more, as a killed process leaves it.
+
+    EndpointError: the file is in the way; it is another process's, or no socket.
+    """
+    if (reason := obstacle(path)) is not None:
+        raise EndpointError(f"cannot listen on unix:{path}: {reason}")
+    with suppress(FileNotFoundError):
+        Path(path).unlink()
+
+
+def obstacle(path: str) -> str | None:
+    """Why a process of this user cannot listen there; None if it can."""
+    folder = Path(path).parent
+    if not folder.is_dir():
+        return f"there is no folder {folder}: mkdir -p it, or choose another path"
+    if not os.access(folder, os.W_OK | os.X_OK):
+        return f"the folder {folder} cannot be written"
+    try:
+        mode = os.lstat(path).st_mode
+    except FileNotFoundError:
+        return None
+    if not stat.S_ISSOCK(mode):
+        return "there is a file of that name that is no socket: move it away, or choose another path"
+    if listened_on(path):
+        return f"another program listens there; choose another path, or see which: ss -xlp src {path}"
+    return None
+
+
+def listened_on(path: str) -> bool:
+    """Whether somebody listens there; of one that may not be opened it is taken for granted."""
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.setblocking(False)  # its queue may be full
+        try:
+            probe.connect(path)
+        except (ConnectionRefusedError, FileNotFoundError):
+            return False
+        except OSError:
+            return True
+    return True
+
+
+class SocketFile:
+    """A socket that this process has made, to be removed when it no longer listens."""
+
+    def __init__(self, path: str, gid: int | None) -> None:
+        """Let its user open it, or a group's users as well. EndpointError."""
+        self._path = path
+        try:
+            if gid is not None:
+                os.chown(path, -1, gid)
+            Path(path).chmod(0o600 if gid is None else 0o660)
+            self._inode = os.lstat(path).st_ino
+        except OSError as error:
+            raise EndpointError(f"unix:{path}: {error.strerror}") from None
+
+    def remove(self) -> None:
+        """Remove it, unless somebody else has one of that name by now."""
+        with suppress(FileNotFoundError):
+            if os.lstat(self._path).st_ino == self._inode:
+                Path(self._path).unlink()

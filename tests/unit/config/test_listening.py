@@ -1,0 +1,124 @@
+"""Addresses, tokens and roles of ``[grpc]``: what is accepted, what each address gives, how what is not is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from shmio.config import Grpc, UnixAddress, load, parse_address
+from shmio.config.listening import encrypted, takes_tokens
+from shmio.errors import ConfigError
+
+TLS = '[grpc.tls]\ncertificate = "c.pem"\nkey = "k.pem"\n'
+MUTUAL = f'{TLS}client_ca = "ca.pem"\n'
+TOKEN = '[[grpc.token]]\nname = "dash"\nroles = ["read"]\ntoken_file = "dash.token"\n'
+CLIENT = '[[grpc.client]]\nsubject = "*.lab"\nroles = ["read", "write"]\n'
+OLD = '[[grpc.address]]\nlisten = "10.0.0.5:8089"\n'
+ALL = {"read", "write", "inject", "control"}
+
+
+def read(folder: Path, text: str) -> Grpc:
+    file = folder / "supervisor.toml"
+    file.write_text(f'[instance]\nname = "a"\n{text}')
+    grpc = load(file).grpc
+    assert grpc is not None
+    return grpc
+
+
+def served(grpc: Grpc) -> list[tuple[set[str], bool, bool]]:
+    """Of each address: roles of who shows nothing, whether it is encrypted, whether it takes tokens."""
+    return [(set(at.roles), encrypted(grpc, at), takes_tokens(grpc, at)) for at in grpc.listening.values()]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('[grpc]\nlisten = ["127.0.0.1:1", "unix:s"]\n', [(ALL, False, True)] * 2),
+        ('[grpc]\nlisten = ["10.0.0.5:1"]\ninsecure = true\n', [(ALL, False, False)]),
+        (f'[grpc]\nlisten = ["10.0.0.5:1", "unix:s"]\n{TLS}', [(ALL, True, True), (ALL, False, True)]),
+        (f'[grpc]\nlisten = ["127.0.0.1:1", "unix:s"]\n{TOKEN}', [(set(), False, True)] * 2),
+        (f'[grpc]\nlisten = ["10.0.0.5:1"]\n{MUTUAL}{CLIENT}', [(set(), True, True)]),
+        (
+            f'[grpc]\nlisten = ["10.0.0.5:1"]\ninsecure = true\ntokens_in_plain_text = true\n{TOKEN}',
+            [(set(), False, True)],
+        ),
+        (
+            f'[grpc]\nlisten = ["10.0.0.5:1"]\n{TLS}{TOKEN}{OLD}insecure = true\n',
+            [(set(), True, True), ({"read"}, False, False)],
+        ),
+        (f'[grpc]\nlisten = ["127.0.0.1:1"]\n{TLS}{OLD}', [(ALL, True, True), ({"read"}, True, True)]),
+        (
+            f'[grpc]\n{TLS}{TOKEN}[[grpc.address]]\nlisten = "unix:s"\nroles = ["read", "control"]\n',
+            [({"read", "control"}, False, True)],
+        ),
+    ],
+)
+def test_each_address_gives_its_roles(tmp_path: Path, text: str, expected: list[tuple[set[str], bool, bool]]) -> None:
+    assert served(read(tmp_path, text)) == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[grpc]\n", r"grpc\.listen: this key is needed"),
+        ('[grpc]\nlisten = ["unix:"]\n', r"grpc\.listen\[0\]: 'unix:' is not a UNIX socket"),
+        (f'[grpc]\nlisten = ["unix:{"x" * 120}"]\n', r"grpc\.listen\[0\]: unix:x*: the path is longer than the 107"),
+        (f'[grpc]\nlisten = ["10.0.0.5:1"]\n{OLD}', r"grpc\.listen\[0\]: .*plain text; that needs a \[grpc\.tls\]"),
+        (f'[grpc]\nlisten = ["127.0.0.1:1"]\n{OLD}', r"grpc\.address\[0\]\.listen: .*plain text; that needs"),
+        (
+            f'[grpc]\nlisten = ["10.0.0.5:1"]\ninsecure = true\n{TOKEN}',
+            r"grpc\.listen\[0\]: .*tokens of \[\[grpc\.token\]\] for all to read.*tokens_in_plain_text = true",
+        ),
+        (
+            f'[grpc]\nlisten = ["10.0.0.5:1", "unix:s"]\n{MUTUAL}{CLIENT}',
+            r"grpc\.listen\[1\]: unix:.*knows no certificates",
+        ),
+        (f'[grpc]\nlisten = ["127.0.0.1:1"]\n{TLS}{CLIENT}', r"grpc\.client: .*client_ca in \[grpc\.tls\]"),
+        (
+            f'[grpc]\nlisten = ["127.0.0.1:1"]\n{TOKEN.replace("read", "reed")}',
+            r"grpc\.token\[0\]\.roles\[0\]: no role 'reed'; did you mean read\?",
+        ),
+        (
+            f'[grpc]\nlisten = ["127.0.0.1:1"]\n{OLD}insecure = true\nroles = ["admin"]\n',
+            r"grpc\.address\[0\]\.roles\[0\]: no role 'admin'; there are: read, write, inject, control",
+        ),
+        (
+            f'[grpc]\nlisten = ["127.0.0.1:1"]\n{OLD}insecure = true\nroles = []\n',
+            r"grpc\.address\[0\]\.roles: must not be empty",
+        ),
+        (f'[grpc]\nlisten = ["127.0.0.1:1"]\n{TOKEN}{TOKEN}', r"grpc\.token\[1\]\.name: 'dash' is already"),
+        (f'[grpc]\nlisten = ["127.0.0.1:1"]\n{TOKEN}sha256 = "00"\n', r"grpc\.token\[0\]: give either token_file"),
+        (
+            '[grpc]\nlisten = ["127.0.0.1:1"]\n[[grpc.token]]\nname = "a"\nroles = ["read"]\n',
+            r"grpc\.token\[0\]: give either token_file",
+        ),
+        (
+            '[grpc]\nlisten = ["127.0.0.1:1"]\n[[grpc.token]]\nname = "a"\nroles = ["read"]\nsha256 = "hunter2"\n',
+            r"grpc\.token\[0\]\.sha256: expected 64 digits",
+        ),
+        ('[grpc]\nlisten = ["127.0.0.1:1"]\n[grpc.token]\nname = "a"\n', r"grpc\.token: write \[\[grpc\.token\]\]"),
+        (
+            '[grpc]\nlisten = ["127.0.0.1:1"]\n[[grpc.token]]\nname = "a"\nroles = ["read"]\ntoken = "hunter2"\n',
+            r"grpc\.token\[0\]\.token: unknown key; did you mean token_file\?",
+        ),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        read(tmp_path, text)
+    assert "hunter2" not in str(caught.value)
+
+
+def test_paths_are_relative_to_the_file(tmp_path: Path) -> None:
+    grpc = read(tmp_path, f'[grpc]\nlisten = ["unix:run/s", "unix:///abs/s"]\n{TOKEN}')
+    assert grpc.listen == [f"unix:{tmp_path}/run/s", "unix:/abs/s"]
+    assert grpc.token[0].token_file == f"{tmp_path}/dash.token"
+    assert parse_address(grpc.listen[1]) == UnixAddress("/abs/s")
+
+
+def test_a_folder_with_a_long_name_leaves_no_room_for_a_socket(tmp_path: Path) -> None:
+    folder = tmp_path / ("x" * 100)
+    folder.mkdir()
+    with pytest.raises(ConfigError, match=r"grpc\.listen\[0\]: unix:.*longer than the 107 bytes"):
+        read(folder, '[grpc]\nlisten = ["unix:s"]\n')

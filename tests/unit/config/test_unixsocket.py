@@ -1,0 +1,72 @@
+"""The file of a UNIX socket: what is in its way, who may open it, when it goes."""
+
+from __future__ import annotations
+
+import os
+import socket
+import stat
+from pathlib import Path
+
+import pytest
+
+from shmio.config.unixsocket import SocketFile, clear, obstacle
+from shmio.errors import EndpointError
+
+
+def bound(path: Path) -> socket.socket:
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(path))
+    return listener
+
+
+def test_what_a_dead_process_left_is_cleared(tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    clear(str(path))
+    bound(path).close()
+    assert path.is_socket()
+    assert obstacle(str(path)) is None
+    clear(str(path))
+    assert not path.exists()
+
+
+def test_what_a_living_one_has_is_not_taken(tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    with bound(path) as listener:
+        listener.listen(0)
+        for _ in range(3):  # its queue is full by then
+            with pytest.raises(EndpointError, match=rf"unix:{path}: another program listens there.*ss -xlp"):
+                clear(str(path))
+    assert path.is_socket()
+
+
+def test_what_is_no_socket_is_left(tmp_path: Path) -> None:
+    for name in ("file", "link"):
+        path = tmp_path / name
+        path.write_text("precious") if name == "file" else path.symlink_to(tmp_path / "file")
+        with pytest.raises(EndpointError, match="no socket: move it away"):
+            clear(str(path))
+        assert path.read_text() == "precious"
+    with pytest.raises(EndpointError, match=r"there is no folder .*nowhere: mkdir -p it"):
+        clear(str(tmp_path / "nowhere" / "s"))
+
+
+@pytest.mark.parametrize(("gid", "mode"), [(None, 0o600), (os.getegid(), 0o660)])
+def test_its_user_may_open_it_and_maybe_a_group(tmp_path: Path, gid: int | None, mode: int) -> None:
+    path = tmp_path / "s"
+    with bound(path):
+        file = SocketFile(str(path), gid)
+        assert stat.S_IMODE(path.stat().st_mode) == mode
+        assert path.stat().st_gid == os.getegid()
+        file.remove()
+        assert not path.exists()
+        file.remove()
+
+
+def test_another_ones_socket_of_that_name_stays(tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    with bound(path):
+        file = SocketFile(str(path), None)
+        path.rename(tmp_path / "old")  # so that its inode is not given to the next
+        with bound(path):
+            file.remove()
+            assert path.is_socket()

@@ -1,0 +1,164 @@
+"""Every call that clients make, a polite client beside the rude ones, and how to see that nothing is left of these."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import asynccontextmanager
+from typing import Any, NamedTuple
+
+import grpc
+from google.protobuf.struct_pb2 import Value
+from grpc_health.v1 import health_pb2
+from grpc_reflection.v1alpha import reflection_pb2
+
+from shmio.segment import Segment
+from shmio.wire import simlog_v1_pb2 as v1
+from shmio.wire import simlog_v2_pb2 as v2
+from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, endpoint, message, value
+from tests.unit.endpoints.plant import Plant
+from tests.unit.endpoints.test_publish import plant
+
+V1, V2 = "/simulation.server.SimlogAPI/", "/simlog.server.SimlogAPI/"
+HEALTH, REFLECTION = "/grpc.health.v1.Health/", "/grpc.reflection.v1alpha.ServerReflection/"
+
+
+class Call(NamedTuple):
+    """``many``: it takes a stream of messages. ``stays``: it is open until its client ends it, after its message."""
+
+    method: str
+    request: bytes
+    many: bool = False
+    stays: bool = False
+
+
+def _put(path: str) -> bytes:
+    data = v2.SimlogMessage(type=v2.NUMBER, value=Value(number_value=5))
+    return v2.PubRequest(topic=path, data=data).SerializeToString()
+
+
+CALLS = (
+    Call(V1 + "GetTopic", v1.TopicDescriptor(path="cell/inputs").SerializeToString()),
+    Call(V1 + "Subscribe", v1.TopicDescriptor(path="cell/inputs").SerializeToString(), stays=True),
+    Call(V1 + "Subscribe", v1.TopicDescriptor(path="cell/inputs/in").SerializeToString(), stays=True),
+    Call(
+        V1 + "Publish",
+        v1.PubRequest(
+            topic=v1.TopicDescriptor(path="cell/axis/speed/in"), data=v1.ROSMessage(type="double", value="1.0E-4")
+        ).SerializeToString(),
+        many=True,
+        stays=True,
+    ),
+    Call(V2 + "GetTopicInfo", v2.TopicInfoRequest(path="CELL://inputs").SerializeToString()),
+    Call(V2 + "CreateSubscriber", v2.Subscriber(name="rude", uuid="rude").SerializeToString(), stays=True),
+    Call(
+        V2 + "Subscribe", v2.SubscriptionRequest(path="CELL://inputs/out", subscriberUUID="polite").SerializeToString()
+    ),
+    Call(V2 + "Read", v2.ReadRequest(path=["CELL://inputs", "cell/axis"]).SerializeToString()),
+    Call(V2 + "Write", _put("CELL://axis/speed/in")),
+    Call(V2 + "PublishSynch", _put("CELL://axis/speed/in")),
+    Call(V2 + "Publish", _put("CELL://axis/speed/in"), many=True, stays=True),
+    Call(HEALTH + "Check", health_pb2.HealthCheckRequest(service="source.cell").SerializeToString()),
+    Call(HEALTH + "Watch", health_pb2.HealthCheckRequest(service="source.cell").SerializeToString(), stays=True),
+    Call(
+        REFLECTION + "ServerReflectionInfo",
+        reflection_pb2.ServerReflectionRequest(list_services="*").SerializeToString(),
+        many=True,
+        stays=True,
+    ),
+)
+"""What is served now; the subscriber ``polite`` is there."""
+
+
+class Polite:
+    """A client of both versions that reads what comes, as long as the others are rude."""
+
+    def __init__(self, served: Endpoint, device: Plant, first: Any, second: Any) -> None:
+        self._served = served
+        self.device = device
+        self._streams = first, second
+        self._values = itertools.count(1)
+
+    async def goes_on(self) -> None:
+        """A new value reaches both streams: the next thing on each."""
+        number = next(self._values) % 30_000
+        self.device.memory[12:14] = number.to_bytes(2, "big")
+        first, second = self._streams
+        assert await value(first) == str(number)
+        path, got = await message(second)
+        while path != "cell/step":  # one of the rude calls has it subscribe to another
+            path, got = await message(second)
+        assert got == number
+
+    async def alone(self) -> None:
+        """Nothing is left of any other: calls, streams, topics, values under way, bytes."""
+        served, feed = self._served, self._served.feeds["cell"]
+
+        async def left() -> bool:
+            await asyncio.sleep(0)
+            topics = {subject.path for subject in feed._channels} - {"inputs"}
+            return (len(served.server.calls), served.service.counters[0], topics) == (2, 2, {"step"}) and not (
+                feed.inlet.echo.busy or feed.inlet._pending or served.service.waiting_bytes
+            )
+
+        await served.until(left)
+        await self.goes_on()
+
+
+@asynccontextmanager
+async def polite(served: Endpoint, device: Plant) -> AsyncIterator[Polite]:
+    """A polite client that has its first values."""
+    await served.until(_good(served))
+    first, second = served.subscribe("cell/step"), await served.subscriber("polite", "cell/step")
+    assert await value(first) == "0"
+    assert await message(second) == ("cell/step", 0)
+    try:
+        yield Polite(served, device, first, second)
+    finally:
+        first.cancel()
+        second.cancel()
+
+
+def beside_a_polite_one(segment: Segment, test: Callable[[Endpoint, Polite], Awaitable[None]]) -> None:
+    """Run a test with a device that runs; nothing may be left of what it does."""
+
+    async def run() -> None:
+        async with endpoint(segment) as served, plant(served) as device, polite(served, device) as beside:
+            await test(served, beside)
+            await beside.alone()
+
+    asyncio.run(run())
+
+
+def connect(served: Endpoint) -> grpc.aio.Channel:
+    """A connection of its own."""
+    return grpc.aio.insecure_channel(f"127.0.0.1:{served.port}", [("grpc.use_local_subchannel_pool", 1)])
+
+
+def begin(channel: grpc.aio.Channel, call: Call, timeout_s: float = TIMEOUT_S) -> Any:
+    """Open a call and send nothing; its messages are bytes."""
+    return channel.stream_stream(call.method)(timeout=timeout_s)
+
+
+async def status(stream: Any) -> grpc.StatusCode:
+    """How it ends, after all that still comes."""
+    async with asyncio.timeout(TIMEOUT_S):
+        try:
+            while await stream.read() is not grpc.aio.EOF:
+                pass
+        except grpc.aio.AioRpcError as error:
+            return error.code()
+        except asyncio.CancelledError:
+            if not stream.cancelled():
+                raise
+        code: grpc.StatusCode = await stream.code()
+        return code
+
+
+def _good(served: Endpoint) -> Callable[[], Awaitable[bool]]:
+    async def good() -> bool:
+        await asyncio.sleep(0)
+        return served.segment.blocks["cell"].latest() is not None
+
+    return good

@@ -1,0 +1,43 @@
+"""The limits are those of the page on them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from shmio.endpoints.grpc import inlet, outbox, server, subscribers, values
+from shmio.endpoints.grpc.gate import Limits
+
+PAGE = Path(__file__).parents[3] / "docs/reference/grpc-access.md"
+ROW = re.compile(r"^\| (.+?) \| (\d+)( MiB| s)? \|", re.MULTILINE)
+LIMITS = Limits()
+MIB = 1 << 20
+SILENT_MS = sum(value for name, value in server.OPTIONS if name.startswith("grpc.keepalive_time"))
+
+
+@pytest.mark.parametrize(
+    ("what", "limit"),
+    [
+        ("a message from a client", server.MAX_REQUEST_BYTES // MIB),
+        ("calls open at once, on all addresses", LIMITS.calls),
+        (f"of these, left to clients with fewer than {LIMITS.share}", LIMITS.reserve),
+        ("time for a call's one message to come", LIMITS.message_s),
+        ("values of one topic that wait for a client", outbox.TOPIC_BOUND),
+        ("values of all topics of a stream that wait", outbox.STATE_BOUND),
+        ("messages of `/in` that wait in a stream", outbox.EVENT_BOUND),
+        ("bytes of each of both that wait in a stream", outbox.BOUND_BYTES // MIB),
+        ("bytes that wait in all streams", outbox.TOTAL_BYTES // MIB),
+        ("subscribers of version 2", subscribers.MAX_SUBSCRIBERS),
+        ("topics of a subscriber", subscribers.MAX_TOPICS),
+        ("topics of all subscribers", subscribers.MAX_ALL_TOPICS),
+        ("characters of a subscriber's name or uuid", subscribers.MAX_NAME),
+        ("elements of a value of version 2, or of one `Read`", values.MAX_ELEMENTS),
+        ("registers of a value of version 2, or of one `Read`", values.MAX_MEMBERS),
+        ("events of a source under way for what clients write", inlet.MAX_OPEN),
+        ("a client whose host is silent", SILENT_MS // 1000),
+    ],
+)
+def test_a_limit_is_as_documented(what: str, limit: float) -> None:
+    assert {name: int(number) for name, number, _ in ROW.findall(PAGE.read_text())}[what] == limit
