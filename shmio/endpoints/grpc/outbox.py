@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any, Final
 
 from shmio.endpoints.grpc.feed import CATCH_UP_FRAMES, Feed
+from shmio.endpoints.grpc.load import Load, Total
 from shmio.endpoints.grpc.subject import Subject
 from shmio.segment.events import EVENT_SLOTS
 
@@ -19,61 +20,20 @@ STATE_BOUND: Final = 4096
 """When so many values of all topics of a stream wait, it is given only the newest of each."""
 EVENT_BOUND: Final = 2 * EVENT_SLOTS
 """Events that may wait in a stream; an inlet that catches up delivers half of it at once."""
-BOUND_BYTES: Final = 8 << 20
-"""Of values, and of events, that wait in a stream."""
 STEP_BOUND: Final = 16_384
 """Values that may wait of which none may be left out: what one step changes in all topics of a stream."""
 STEP_BOUND_BYTES: Final = 64 << 20
 """The same in bytes. All streams share them."""
-TOTAL_BYTES: Final = 256 << 20
-"""Of all that waits in all streams: when there is more, a stream may hold no more than its equal part of it."""
 
 Finish = Callable[[Any], bytes]
-
-
-class _Total:
-    """What waits in all streams."""
-
-    def __init__(self) -> None:
-        self.size = 0
-        self.streams = 0
-
-    def over(self, size: int) -> bool:
-        """Whether there is too much of it, and a stream that holds so much has a part in that."""
-        return self.size > TOTAL_BYTES and size > TOTAL_BYTES // max(1, self.streams)
-
-
-class _Load:
-    """Messages of one kind that wait."""
-
-    def __init__(self, total: _Total) -> None:
-        self.count = 0
-        self.size = 0
-        self._total = total
-
-    def full(self, message: Sized, bound: int, bound_bytes: int | None = None) -> bool:
-        """Whether one more would be too much. A single one never is, however long."""
-        most = BOUND_BYTES if bound_bytes is None else bound_bytes
-        size = self.size + len(message)
-        return self.count > 0 and (self.count >= bound or size > most or self._total.over(size))
-
-    def add(self, message: Sized) -> None:
-        self.count += 1
-        self.size += len(message)
-        self._total.size += len(message)
-
-    def remove(self, message: Sized) -> None:
-        self.count -= 1
-        self.size -= len(message)
-        self._total.size -= len(message)
 
 
 class Outbox:
     """Messages of its lanes in the order in which they came; for the event loop's thread alone, with one reader."""
 
-    def __init__(self, total: _Total | None = None) -> None:
-        total = total or _Total()
-        self.states, self.events = _Load(total), _Load(total)
+    def __init__(self, total: Total | None = None) -> None:
+        total = total or Total()
+        self.states, self.events = Load(total), Load(total)
         self.dropped = 0
         self.failure = ""
         """Why it ended; empty: it did not fail."""
@@ -105,10 +65,12 @@ class Outbox:
             lane.drop()
 
     def close(self) -> None:
-        """Its stream is over: what waits is nobody's, and was not dropped for being too much."""
+        """Its stream is over: what waits is nobody's, and was not dropped for being too much; nothing is owed."""
         for lane, message in self._waiting.values():
             lane.load.remove(message)
         self._waiting.clear()
+        self._owed = 0
+        self._tell()
 
     def end(self) -> None:
         """Have the reader end once it has read what waits."""
@@ -139,11 +101,6 @@ class Outbox:
                 await self._told
             finally:
                 self._told = None
-
-    def close(self) -> None:
-        """Its stream is over: nothing is owed any more."""
-        self._owed = 0
-        self._tell()
 
     def _tell(self) -> None:
         """Have :meth:`taken` look."""
@@ -177,7 +134,7 @@ class Outbox:
 class _Lane:
     """One topic's part of an outbox."""
 
-    def __init__(self, outbox: Outbox, load: _Load, finish: Finish) -> None:
+    def __init__(self, outbox: Outbox, load: Load, finish: Finish) -> None:
         self.load = load
         self._outbox = outbox
         self._finish = finish
@@ -275,7 +232,7 @@ class Outboxes:
     def __init__(self) -> None:
         self._open: set[Outbox] = set()
         self._dropped = 0
-        self._total = _Total()
+        self._total = Total()
 
     @property
     def waiting_bytes(self) -> int:

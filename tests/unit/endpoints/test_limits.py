@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.endpoints.grpc import inlet, outbox, server, subscribers, values
+from shmio.endpoints.grpc import inlet, load, outbox, server, subscribers, values
 from shmio.endpoints.grpc.gate import Limits
 
 PAGE = Path(__file__).parents[3] / "docs/reference/grpc-access.md"
@@ -27,8 +27,8 @@ SILENT_MS = sum(value for name, value in server.OPTIONS if name.startswith("grpc
         ("values of one topic that wait for a client", outbox.TOPIC_BOUND),
         ("values of all topics of a stream that wait", outbox.STATE_BOUND),
         ("messages of `/in` that wait in a stream", outbox.EVENT_BOUND),
-        ("bytes of each of both that wait in a stream", outbox.BOUND_BYTES // MIB),
-        ("bytes that wait in all streams", outbox.TOTAL_BYTES // MIB),
+        ("bytes of each of both that wait in a stream", load.BOUND_BYTES // MIB),
+        ("bytes that wait in all streams", load.TOTAL_BYTES // MIB),
         ("subscribers of version 2", subscribers.MAX_SUBSCRIBERS),
         ("topics of a subscriber", subscribers.MAX_TOPICS),
         ("topics of all subscribers", subscribers.MAX_ALL_TOPICS),

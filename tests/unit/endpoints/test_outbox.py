@@ -6,6 +6,7 @@ import asyncio
 
 import pytest
 
+from shmio.endpoints.grpc import load
 from shmio.endpoints.grpc import outbox as module
 from shmio.endpoints.grpc.outbox import TOPIC_BOUND, EventLane, Outbox, Outboxes, StateLane
 
@@ -59,7 +60,7 @@ def test_topics_share_a_stream_in_the_order_of_their_values() -> None:
 def test_when_too_much_waits_in_all_each_topic_has_its_newest_value(
     monkeypatch: pytest.MonkeyPatch, bound: str, count: int
 ) -> None:
-    monkeypatch.setattr(module, bound, count)
+    monkeypatch.setattr(load if bound == "BOUND_BYTES" else module, bound, count)
 
     async def test() -> None:
         outbox = Outbox()
@@ -80,7 +81,7 @@ def test_when_too_much_waits_in_all_each_topic_has_its_newest_value(
 
 def test_events_wait_all_or_the_stream_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "EVENT_BOUND", 3)
-    monkeypatch.setattr(module, "BOUND_BYTES", 10)
+    monkeypatch.setattr(load, "BOUND_BYTES", 10)
 
     async def test() -> None:
         outbox = Outbox()
@@ -116,3 +117,24 @@ def test_what_was_dropped_is_counted_also_of_streams_that_are_over() -> None:
         lane.lose()
         assert (len(outboxes), outboxes.dropped) == (1, 1)
     assert (len(outboxes), outboxes.dropped) == (0, 1)
+
+
+def test_when_all_streams_hold_too_much_those_with_more_than_their_part_give_way(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(load, "TOTAL_BYTES", 100)
+    outboxes = Outboxes()
+    with outboxes.opened() as hog, outboxes.opened() as modest, outboxes.opened() as slow:
+        hogging, small, events = StateLane(hog), StateLane(modest), EventLane(slow, "cell/x/in")
+        for _ in range(10):
+            hogging.deliver(bytes(20))
+            assert outboxes.waiting_bytes <= 120
+        assert hog.dropped == 6
+        for _ in range(3):
+            small.deliver(bytes(10))
+        assert (modest.dropped, modest.states.count) == (0, 3)
+        for _ in range(4):
+            events.deliver(bytes(10))
+        assert slow.failure.startswith("cell/x/in: 3 messages wait to be read")
+    assert outboxes.waiting_bytes == 0
+    assert outboxes.dropped == hog.dropped + slow.dropped

@@ -12,7 +12,8 @@ from grpc_reflection.v1alpha import reflection_pb2
 
 from shmio.config.model import ROLES
 from shmio.endpoints.grpc.roles import NEEDS
-from shmio.endpoints.grpc.services import Services
+from shmio.segment import Segment
+from tests.unit.endpoints.harness import Endpoint, serve
 
 PAGE = Path(__file__).parents[3] / "docs/reference/grpc-access.md"
 
@@ -21,9 +22,14 @@ def calls(service: Any) -> set[str]:
     return {f"/{service.full_name}/{method.name}" for method in service.methods}
 
 
-def test_every_call_that_is_served_has_its_role() -> None:
+def test_every_call_that_is_served_has_its_role(segment: Segment) -> None:
     pool: Any = descriptor_pool.Default()
-    names = Services({}, None).names
+    names: list[str] = []
+
+    async def test(served: Endpoint) -> None:
+        names.extend(served.service.names)
+
+    serve(segment, test)
     own = set().union(*(calls(pool.FindServiceByName(name)) for name in names))
     assert own <= set(NEEDS), f"not in shmio/endpoints/grpc/roles.py, and so refused: {sorted(own - set(NEEDS))}"
     for module in (health_pb2, reflection_pb2):

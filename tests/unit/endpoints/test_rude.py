@@ -8,7 +8,7 @@ from typing import Any
 import grpc
 import pytest
 
-from shmio.endpoints.grpc.outbox import BOUND_BYTES
+from shmio.endpoints.grpc.load import BOUND_BYTES
 from shmio.endpoints.grpc.server import MAX_REQUEST_BYTES
 from shmio.segment import Segment
 from shmio.wire import simlog_v1_pb2 as v1
