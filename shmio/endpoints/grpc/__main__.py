@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import grp
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import msgspec
 
@@ -19,6 +19,8 @@ from shmio.endpoints.grpc.services import Services
 from shmio.errors import SegmentError, ShmioError
 from shmio.logs import fields
 from shmio.worker import BEAT_S, Worker
+
+CALLS_S: Final = 1.0
 
 
 def run(worker: Worker) -> None:
@@ -89,8 +91,15 @@ async def _serve(worker: Worker) -> None:
     feeds.stop()
     await services.stepper.stop()
     await server.stop()
+    await _calls_end()
     feeds.join()
     services.stepper.join()
+
+
+async def _calls_end() -> None:
+    """Wait for the calls that the server has told to end: the loop's own end would have each log a traceback."""
+    if calls := asyncio.all_tasks() - {asyncio.current_task()}:
+        await asyncio.wait(calls, timeout=CALLS_S)
 
 
 class _Place(NamedTuple):

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import logging
+import queue
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from types import SimpleNamespace
 from typing import Any
 
+import grpc
 import pytest
 
 from shmio.endpoints.grpc.__main__ import run
 from shmio.segment import Segment
+from shmio.testing.ports import reserved_port
+from shmio.wire import simlog_v1_pb2 as v1
+from shmio.wire import simlog_v2_pb2 as v2
+from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
+from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as SimlogV2Stub
 from tests.unit.endpoints.harness import TIMEOUT_S
+
+STREAMS = 20
 
 
 def test_it_beats_while_layouts_are_read(segment: Segment, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -48,3 +58,58 @@ def test_it_beats_while_layouts_are_read(segment: Segment, instance: str, monkey
         )
         run(worker)
     assert len(beats) >= 3
+
+
+def test_a_stop_with_open_streams_leaves_no_traceback(
+    segment: Segment, instance: str, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Streams of both versions, and a client that has not finished publishing."""
+    stops: list[Callable[[], object]] = []
+    ends: queue.SimpleQueue[grpc.StatusCode] = queue.SimpleQueue()
+    over = threading.Event()
+
+    def report(counters: tuple[int, ...]) -> None:
+        if counters[0] == 2 * STREAMS:
+            stops[0]()
+
+    def publishing() -> Iterator[v1.PubRequest]:
+        yield v1.PubRequest(topic=v1.TopicDescriptor(path="cell/secret"))
+        over.wait(TIMEOUT_S)
+
+    def read(stream: Any) -> None:
+        try:
+            for _ in stream:
+                pass
+        except grpc.RpcError:
+            ends.put(stream.code())
+
+    with Segment.open(instance, writable=True) as opened, reserved_port() as address, ExitStack() as stack:
+        channel = stack.enter_context(grpc.insecure_channel(str(address)))
+        first: Any = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
+        second: Any = SimlogV2Stub(channel)  # type: ignore[no-untyped-call]
+
+        def begin() -> None:
+            for number in range(STREAMS):
+                streams = (
+                    first.Subscribe(v1.TopicDescriptor(path="cell/step" + number % 2 * "/in"), timeout=TIMEOUT_S),
+                    second.CreateSubscriber(v2.Subscriber(name="test", uuid=str(number)), timeout=TIMEOUT_S),
+                )
+                for stream in streams:
+                    threading.Thread(target=read, args=(stream,)).start()
+            first.Publish.future(publishing(), timeout=TIMEOUT_S)
+
+        worker: Any = SimpleNamespace(
+            on_stop=stops.append,
+            config={"listen": [str(address)]},
+            slot=opened.processes.find("grpc"),
+            segment=opened,
+            log=logging.getLogger("test"),
+            running=begin,
+            report=report,
+        )
+        run(worker)
+        over.set()
+        codes = [ends.get(timeout=TIMEOUT_S) for _ in range(2 * STREAMS)]
+    assert set(codes) <= {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED}
+    assert "Traceback" not in capfd.readouterr().err
+    assert [record.message for record in caplog.records if record.levelno >= logging.ERROR] == []
