@@ -187,12 +187,15 @@ def test_a_block_ended_only_in_part_is_ended_by_the_successor(
         assert all(entry.retired for entry in successor._sections() if entry.name == "cell")
 
 
-def test_a_lost_bell_leaves_nobody_waiting(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Who waits without a time-out looks by itself, too."""
+@pytest.mark.parametrize("timeout_s", [None, 3600.0])
+def test_a_lost_bell_leaves_nobody_waiting(
+    segment: Segment, timeout_s: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Who waits for ever, or long, looks by itself, too."""
     monkeypatch.setattr("shmio.segment.segment.wake", lambda *_: None)
     with shmio.attach(segment.instance) as reader:
         held = reader.block("cell")
-        waiter = threading.Thread(target=held.cursor().next, daemon=True)
+        waiter = threading.Thread(target=held.cursor().next, args=(timeout_s,), daemon=True)
         waiter.start()
         segment.change(retire=["cell"])
         waiter.join(20)
