@@ -20,10 +20,9 @@ from shmio.segment.standing import StandingCell
 _ATTRIBUTES = msgspec.json.Decoder(Attributes)  # as in layout/document.py: built before there are threads
 
 
-def read_clock(shared: SharedObject, memory: memoryview, head: Header) -> ClockPage:
+def read_clock(shared: SharedObject, head: Header, entries: Sequence[SectionEntry]) -> ClockPage:
     """The clock page; FormatError."""
-    _, count = header.table_state(memory)
-    for entry in header.read_sections(memory, head, count, shared.name):
+    for entry in entries:
         if entry.kind == SectionKind.CLOCK:
             try:  # on memory of its own: what has been read is still judged by it when the segment is closed
                 own = memoryview(shared.map())

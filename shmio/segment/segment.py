@@ -30,7 +30,7 @@ class Segment:
         self.memory = memoryview(shared.map())
         self.header = Header.read(self.memory, shared.name)
         self.processes = ProcessTable(shared, self.memory, self.header)
-        self.clock = read_clock(shared, self.memory, self.header)
+        self.clock = read_clock(shared, self.header, self._sections())
         self._known: dict[int, Block] = {}  # by the section of its layout
         self.blocks = self._find_blocks()
 
