@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct, field
 
@@ -30,6 +30,7 @@ class Instance(Section):
     log_dir: Text = "logs"
     group: Text | None = None
     ring_mb: Annotated[float, Meta(gt=0, le=65536)] = 64.0
+    clock: Literal["wall", "stepped"] = "wall"
 
 
 class Source(Section):

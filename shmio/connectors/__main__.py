@@ -8,36 +8,41 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import NamedTuple
 
 from shmio import worker
 from shmio.connectors import registry
+from shmio.connectors.base import Connector
+from shmio.connectors.computed import Computed
 from shmio.connectors.injections import Owner
+from shmio.connectors.inputs import Inputs
 from shmio.connectors.loop import SourceLoop, WallClock
 from shmio.connectors.schedule import Schedule
+from shmio.connectors.stepped import PageClock, SteppedLoop
 from shmio.errors import ConnectorError
-from shmio.segment import Segment
+from shmio.layout.topic import parse_topic
+from shmio.segment import BlockWriter, Segment
 from shmio.worker import BEAT_S, Worker
 
 SWITCH_S = 0.0005  # the poll thread is not to wait Python's usual 5 ms for the others
 LAST_WORDS_S = 4.0  # less than a supervisor's patience with a process that is to stop
 HANG_MARGIN_S = 30.0  # beyond its time-outs: looking up a host name has none of ours
+COMPUTE_S = 1.0  # the time-out of what is computed
+
+
+class _Part(NamedTuple):
+    """A loop, how to stop it, and how long one of its hooks may take."""
+
+    loop: SourceLoop | SteppedLoop
+    stop: Callable[[], None]
+    timeout_s: float
 
 
 def run(worker: Worker) -> None:
     """Poll and take commands in threads of their own; this one reports. A device that blocks one holds up no other."""
     sys.setswitchinterval(SWITCH_S)
-    segment = worker.segment
-    writer = segment.writer(worker.name)
-    block = writer.block
-    connector_class = registry.load(worker.config["connector"])
-    options = registry.convert_options(worker.config["connector"], worker.config["options"])
-    connector = connector_class(options, block.layout)
-    schedule = Schedule(segment.header.started_ns, block.period_ns)
-    clock = WallClock()
-    loop = SourceLoop(
-        connector, writer, schedule, clock, worker.config["writable"],
-        armed=block.attributes.armed, owner_of=partial(_owner_of, segment),
-    )  # fmt: skip
+    part = _part(worker)
+    loop = part.loop
     thread = threading.Thread(target=_guarded, args=(loop.run,), name="poll", daemon=True)
     desk = threading.Thread(target=_guarded, args=(loop.desk.run,), name="commands", daemon=True)
     thread.start()
@@ -48,7 +53,7 @@ def run(worker: Worker) -> None:
         if not thread.is_alive() or not desk.is_alive():
             raise ConnectorError("the poll loop or the commands' thread ended by itself; its traceback is in the log")
         busy_s = _busy_s(loop.counters.busy_since_ns)
-        if busy_s > connector.timeout_s + HANG_MARGIN_S:
+        if busy_s > part.timeout_s + HANG_MARGIN_S:
             continue  # no beat: the supervisor replaces a process whose device call does not return
         counters = loop.counters
         worker.report(
@@ -62,9 +67,38 @@ def run(worker: Worker) -> None:
             ),
             note=loop.note,
         )
-    clock.stop()
-    thread.join(timeout=min(connector.timeout_s + 0.5, LAST_WORDS_S))
+    part.stop()
+    thread.join(timeout=min(part.timeout_s + 0.5, LAST_WORDS_S))
     desk.join(timeout=1.0)
+
+
+def _part(worker: Worker) -> _Part:
+    """What runs this source."""
+    segment, name = worker.segment, worker.config["connector"]
+    found = registry.load(name)
+    options = registry.convert_options(name, worker.config["options"])
+    source = found(options, segment.blocks[worker.name].layout)
+    writer = segment.writer(worker.name)  # after its source: one that cannot be as configured has begun nothing
+    schedule = Schedule(segment.header.started_ns, writer.block.period_ns)
+    owner_of = partial(_owner_of, segment)
+    writable = worker.config["writable"]
+    if isinstance(source, Connector):
+        clock = WallClock()
+        armed = writer.block.attributes.armed
+        loop = SourceLoop(source, writer, schedule, clock, writable, armed=armed, owner_of=owner_of)
+        return _Part(loop, clock.stop, source.timeout_s)
+    page_clock = PageClock(segment.clock, worker.slot.index)
+    stepped = SteppedLoop(
+        source, writer, schedule, page_clock, writable, inputs=_inputs(source, writer, segment), owner_of=owner_of
+    )
+    return _Part(stepped, page_clock.stop, COMPUTE_S)
+
+
+def _inputs(source: Computed, writer: BlockWriter, segment: Segment) -> Inputs | None:
+    """What reads a source's connections, on a mapping of its own."""
+    own, sources = writer.block.source, segment.blocks
+    topics = {path: parse_topic(topic, sources, own) for path, topic in source.connections.items()}
+    return Inputs(Segment.open(segment.instance), topics) if topics else None
 
 
 def _owner_of(segment: Segment, writer: int) -> Owner | None:

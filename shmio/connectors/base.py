@@ -47,9 +47,6 @@ class Connector(ABC):
     can_write: ClassVar[bool] = False
     """Whether :meth:`write` is implemented."""
 
-    prompt: ClassVar[bool] = False
-    """Whether writes need not wait for the next cycle: they are carried out and shown at once."""
-
     provenance: ClassVar[Provenance] = Provenance.LIVE
     """Where its values come from."""
 
@@ -73,9 +70,6 @@ class Connector(ABC):
     @abstractmethod
     def close(self) -> None:
         """Drop the connection; allowed at any time, more than once."""
-
-    def resume(self, image: bytes) -> None:  # noqa: B027  a device has its values itself
-        """The last image that the source's process before this one published; before the first :meth:`connect`."""
 
     def describe(self) -> str:
         """What was agreed with the device, for the log."""

@@ -63,6 +63,7 @@ class CommandDesk:
         self._most_bytes = MAX_WAITING_BLOCKS * layout.size
         self._injector = Injector(output, self._writable, self._cannot or ("" if armed else _UNARMED), owner_of)
         self._turn = threading.Lock()
+        self._verdict = threading.Lock()  # held from the word that items are accepted until they wait
         self._closed = "the source is not connected yet"
         self._items: list[Item] = []
         self._held: Command | None = None  # taken from its queue, but there is no room for it before the next cycle
@@ -81,6 +82,11 @@ class CommandDesk:
             items, self._items = self._items, []
         self._end(items, [(EventKind.EXPIRED, reason)] * len(items))
         self._make_room()
+
+    def settle(self) -> None:
+        """Wait until whatever somebody has been told is accepted is :attr:`waiting`, too."""
+        with self._verdict:
+            pass
 
     @property
     def waiting(self) -> bool:
@@ -206,13 +212,14 @@ class CommandDesk:
             self._held = command
             return False
         items = list(self._divert(command, layer))
-        for item in items:  # outside the lock, which the loop must never wait for long
-            for part in pieces(EventKind.ACCEPTED, command, item.place, item.parts(), layer):
-                self._writer.event(part)
-        with self._turn:
-            closed = self._closed
-            if not closed:
-                self._items += items
+        with self._verdict:
+            for item in items:  # outside the other lock, which the loop must never wait for long
+                for part in pieces(EventKind.ACCEPTED, command, item.place, item.parts(), layer):
+                    self._writer.event(part)
+            with self._turn:
+                closed = self._closed
+                if not closed:
+                    self._items += items
         if closed:
             self._end(items, [(EventKind.EXPIRED, closed)] * len(items))
         elif items:

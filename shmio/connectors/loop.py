@@ -6,33 +6,25 @@ bad frame when quality changes, the connection dropped on any error, back-off, r
 
 from __future__ import annotations
 
-import logging
-import re
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Callable, Iterable
 from typing import NamedTuple, Protocol, TypeVar
 
 from shmio.connectors.base import Connector
 from shmio.connectors.desk import CommandDesk
 from shmio.connectors.injector import OwnerOf
 from shmio.connectors.output import Image, Output
-from shmio.connectors.schedule import Backoff, Due, Schedule
+from shmio.connectors.schedule import Backoff, Schedule
+from shmio.connectors.telling import Condition, Counters
 from shmio.errors import ConnectorError
-from shmio.layout.write import Write
-from shmio.logs import fields
 from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
 
 STABLE_NS = 1_000_000_000
 """A connection that has lasted this long has put its failures behind it."""
 
-_MEASURES = re.compile(r"\b[0-9]+(?= (?:ms|s|bytes)\b)")  # what varies in a reason; codes and addresses do not
 _Result = TypeVar("_Result")
-
-log = logging.getLogger("shmio.source")
 
 
 class Clock(Protocol):
@@ -42,51 +34,26 @@ class Clock(Protocol):
         """CLOCK_MONOTONIC."""
 
     def wait_ns(self, duration_ns: int) -> bool:
-        """Wait, or shorter after :meth:`nudge`; True as soon as the loop is to stop."""
-
-    def nudge(self) -> None:
-        """End a wait, the present or the next one; from any thread."""
+        """Wait; True as soon as the loop is to stop."""
 
 
 class WallClock:
     """The loop's clock in a live instance."""
 
     def __init__(self) -> None:
-        self._stopped = False
-        self._nudged = threading.Event()
+        self._stopped = threading.Event()
 
     def now_ns(self) -> int:
         """CLOCK_MONOTONIC."""
         return time.monotonic_ns()
 
     def wait_ns(self, duration_ns: int) -> bool:
-        """Wait, or shorter after :meth:`nudge`; True as soon as the loop is to stop."""
-        if duration_ns > 0 and not self._stopped:
-            self._nudged.wait(duration_ns / 1e9)
-            self._nudged.clear()
-        return self._stopped
-
-    def nudge(self) -> None:
-        """End a wait."""
-        self._nudged.set()
+        """Wait; True as soon as the loop is to stop."""
+        return self._stopped.wait(max(0, duration_ns) / 1e9)
 
     def stop(self) -> None:
         """Make the loop stop; from any thread."""
-        self._stopped = True
-        self.nudge()
-
-
-@dataclass(slots=True)
-class Counters:
-    """What ``status`` shows of a source; one writer, the loop."""
-
-    polls: int = 0
-    overruns: int = 0
-    failures: int = 0
-    connects: int = 0
-    round_trip_us: int = 0
-    busy_since_ns: int = 0
-    """When the hook that runs now was called; 0 between hooks."""
+        self._stopped.set()
 
 
 class _Submitted(NamedTuple):
@@ -126,17 +93,18 @@ class SourceLoop:
             clock.now_ns,
             armed=armed or connector.provenance is not Provenance.LIVE,
             owner_of=owner_of,
-            accepted=clock.nudge if connector.prompt else lambda: None,
         )
         self._backoff = Backoff()
         self._connected_ns: int | None = None
         self._accepting = False
         self._under_way: deque[_Submitted] = deque()
-        self._state: tuple[Quality, str] | None = None  # as last told; the reason without its numbers
-        if self._output.source_ns:
-            connector.resume(self._output.raw)
+        self._condition = Condition(writer)
         self.counters = Counters()
-        self.note = ""
+
+    @property
+    def note(self) -> str:
+        """Why quality is not good; empty if it is."""
+        return self._condition.note
 
     def run(self) -> None:
         """Poll until the clock says stop; then tell the readers."""
@@ -144,7 +112,7 @@ class SourceLoop:
             while True:
                 due = self._schedule.next(self._clock.now_ns())
                 self.counters.overruns += due.skipped
-                if self._stops_before(due):
+                if self._clock.wait_ns(due.due_ns - self._clock.now_ns()):
                     break
                 if self._clock.now_ns() >= self._schedule.due_ns(due.cycle + 1):  # held up while it waited
                     self.counters.overruns += 1
@@ -157,19 +125,6 @@ class SourceLoop:
             self._disconnected(cycle, "the source was stopped")
             self._writer.event(Record(EventKind.STOPPED))
 
-    def _stops_before(self, due: Due) -> bool:
-        """Wait until a cycle is due, and carry out before then what need not wait for it; True: told to stop."""
-        until_ns = due.due_ns
-        while not self._clock.wait_ns(until_ns - self._clock.now_ns()):
-            if self._clock.now_ns() >= due.due_ns:
-                return False
-            until_ns = min(due.due_ns, self._output.next_ns) if self.desk.waiting else due.due_ns
-            if self.desk.waiting and self._clock.now_ns() >= until_ns:
-                if not self.poll(max(0, due.cycle - 1)):
-                    return True
-                until_ns = due.due_ns
-        return True
-
     def poll(self, cycle: int) -> bool:
         """One cycle: connect if need be, write, ask, publish what comes. False: told to stop while backing off."""
         self._writer.cycle = cycle
@@ -178,7 +133,7 @@ class SourceLoop:
                 self._connect()
             if self.desk.waiting:
                 self._drain()
-                self._call(lambda: self.desk.carry_out(partial(self._write, cycle)))
+                self._call(lambda: self.desk.carry_out(self._connector.write))
             if len(self._under_way) < self._connector.depth:
                 self._under_way.append(self._asked(cycle))
                 self._call(self._connector.submit)
@@ -188,13 +143,6 @@ class SourceLoop:
         except ConnectorError as error:
             return self._fail(cycle, str(error) or "the connector gave no reason")
         return True
-
-    def _write(self, cycle: int, writes: Sequence[Write]) -> list[str]:
-        """Hand over what is to be written; of a prompt connector the frame that shows it comes before the outcomes."""
-        refusals = self._connector.write(writes)
-        if self._connector.prompt:
-            self._publish(self._asked(cycle), self._connector.read())
-        return refusals
 
     def _asked(self, cycle: int) -> _Submitted:
         return _Submitted(cycle, self._clock.now_ns(), time.monotonic_ns(), time.time_ns())
@@ -225,7 +173,7 @@ class SourceLoop:
     def _publish(self, asked: _Submitted, raw: bytes) -> None:
         doubt = self._connector.doubt
         quality = Quality.UNCERTAIN if doubt else Quality.GOOD
-        self._tell(quality, doubt, asked.cycle)
+        self._condition.tell(quality, doubt, asked.cycle, f", connected {self._connector.describe()}")
         self._output.publish(
             Image(raw, asked.cycle, asked.utc_ns, quality, self._connector.provenance, doubt, asked.monotonic_ns)
         )
@@ -243,12 +191,7 @@ class SourceLoop:
         self._accepting = False
 
     def _call(self, hook: Callable[[], _Result]) -> _Result:
-        """Call a hook, and let the main thread see since when."""
-        self.counters.busy_since_ns = self._clock.now_ns()
-        try:
-            return hook()
-        finally:
-            self.counters.busy_since_ns = 0
+        return self.counters.watch(self._clock.now_ns, hook)
 
     def _fail(self, cycle: int, reason: str) -> bool:
         self.counters.failures += 1
@@ -263,21 +206,7 @@ class SourceLoop:
     def _disconnected(self, cycle: int, reason: str) -> None:
         """Publish one bad frame for each new reason, with the last bytes known; other measures are none."""
         self.desk.close(reason)
-        if self._tell(Quality.BAD, reason, cycle):
+        if self._condition.tell(Quality.BAD, reason, cycle):
             provenance = self._connector.provenance
             raw, source_ns = self._output.raw, self._output.source_ns
             self._output.publish(Image(raw, cycle, source_ns, Quality.BAD, provenance, reason))
-
-    def _tell(self, quality: Quality, reason: str, cycle: int) -> bool:
-        """Log and write down a change of quality or of its reason; whether it was one."""
-        self.note = reason
-        state = quality, _MEASURES.sub("#", reason)
-        if state == self._state:
-            return False
-        self._state = state
-        self._writer.event(Record(EventKind.QUALITY, reason), quality=quality)
-        if quality is Quality.GOOD:
-            log.info("quality good, connected %s", self._connector.describe(), extra=fields(cycle=cycle))
-        else:
-            log.warning("quality %s: %s", quality, reason, extra=fields(cycle=cycle))
-        return True

@@ -6,14 +6,13 @@ from collections.abc import Sequence
 
 import msgspec
 
-from shmio.connectors.base import Connector
+from shmio.connectors.computed import Computed
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
 from shmio.layout.write import Write, apply
-from shmio.segment import Provenance
 
 
-class MemoryConnector(Connector):
+class Memory(Computed):
     """``connector = "memory"``: begins with the initial values; what is written to ``/in`` is ``/out`` at once.
 
     A process that takes the place of another goes on with its values. For programs that publish signals of their own:
@@ -23,26 +22,16 @@ class MemoryConnector(Connector):
     class Options(msgspec.Struct, forbid_unknown_fields=True):
         """It has no keys of its own."""
 
-    can_write = True
     prompt = True
-    provenance = Provenance.SIMULATED
 
     def __init__(self, options: Options, layout: Layout) -> None:  # noqa: ARG002  it has none
         self._image, _ = initial_frame(layout)
-
-    @property
-    def timeout_s(self) -> float:
-        """Nothing here waits."""
-        return 1.0
 
     def resume(self, image: bytes) -> None:
         """Go on with the values of the process before this one."""
         self._image[:] = image
 
-    def connect(self) -> None:
-        """There is nobody to reach."""
-
-    def read(self) -> bytes:
+    def begin(self) -> bytes:
         """All registers."""
         return bytes(self._image)
 
@@ -52,5 +41,6 @@ class MemoryConnector(Connector):
             apply(write, self._image)
         return [""] * len(writes)
 
-    def close(self) -> None:
-        """Nothing to drop."""
+    def step(self, time_ns: int, dt_ns: int) -> bytes:  # noqa: ARG002  time changes nothing
+        """All registers."""
+        return bytes(self._image)

@@ -1,4 +1,7 @@
-"""Connectors by name: ours, and those that other packages offer as entry points (group ``shmio.connectors``)."""
+"""Connectors by name: ours, and those that other packages offer as entry points (group ``shmio.connectors``).
+
+Most reach a device; some are computed here, and live on the instance's clock.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +14,13 @@ import msgspec
 
 from shmio.config.wording import explain
 from shmio.connectors.base import Connector
+from shmio.connectors.computed import Computed
 from shmio.errors import ConfigError
 
 GROUP = "shmio.connectors"
 
 BUILT_IN = {
-    "memory": "shmio.connectors.memory:MemoryConnector",
+    "memory": "shmio.connectors.memory:Memory",
     "s7": "shmio.connectors.s7.connector:S7Connector",
 }
 
@@ -26,7 +30,7 @@ def names() -> list[str]:
     return sorted({*BUILT_IN, *(point.name for point in entry_points(group=GROUP))})
 
 
-def load(name: str) -> type[Connector]:
+def load(name: str) -> type[Connector] | type[Computed]:
     """Import a connector by name; ConfigError when there is none, or it cannot be imported."""
     if name in BUILT_IN:
         module, _, attribute = BUILT_IN[name].partition(":")
@@ -39,7 +43,7 @@ def load(name: str) -> type[Connector]:
             found = points[0].load()
         except Exception as error:
             raise ConfigError(f"connector {name!r} ({points[0].value}) cannot be imported: {error}") from error
-    if not (isinstance(found, type) and issubclass(found, Connector)):
+    if not (isinstance(found, type) and issubclass(found, Connector | Computed)):
         raise ConfigError(f"connector {name!r} is not a subclass of shmio.connectors.base.Connector")
     return found
 

@@ -15,7 +15,7 @@ from typing import Final
 
 from shmio.errors import SegmentError
 from shmio.segment import _atomics
-from shmio.segment.header import cut, text
+from shmio.segment.header import Header, cut, text
 
 STEP_SIZE_NS: Final = 50_000_000
 """The size of a step unless somebody has set another."""
@@ -99,13 +99,14 @@ class Bell:
 class ClockPage:
     """The section of one segment; several threads may use it, to write it is the owner of time's alone."""
 
-    def __init__(self, memory: memoryview, offset: int, size: int, started_ns: int, slots: int) -> None:
-        """``started_ns``: the clock's zero on CLOCK_MONOTONIC. ValueError: the section is none of this geometry."""
+    def __init__(self, memory: memoryview, offset: int, size: int, head: Header) -> None:
+        """``head``: the segment's. ValueError: the section is none of its geometry."""
+        slots = head.process_capacity
         if size < page_size(slots) or _word(memory, offset + _SLOTS_AT) != slots:
             raise ValueError("the clock page is too short, or has not a place for each process")
         self._memory = memory
         self._offset = offset
-        self._started_ns = started_ns
+        self._started_ns, self._started_utc_ns = head.started_ns, head.started_utc_ns
         self.bell = Bell(memory, offset + _BELL_AT)
         """Rung at every change of the page."""
         self.delivered_bell = Bell(memory, offset + _DELIVERED_BELL_AT)
@@ -141,6 +142,10 @@ class ClockPage:
     def monotonic_ns(self, time_ns: int) -> int:
         """A time of the instance's clock as one that is comparable to CLOCK_MONOTONIC."""
         return self._started_ns + time_ns
+
+    def utc_ns(self, monotonic_ns: int) -> int:
+        """Such a time as UTC."""
+        return self._started_utc_ns + monotonic_ns - self._started_ns
 
     def slot_bell(self, index: int) -> Bell:
         """The bell of the process in this slot of the table: rung when the page has something for it to do."""

@@ -81,12 +81,10 @@ class Coordinator:
             note = f"step {state.step} was not finished: who asked for it has ended" if state.stepping else state.note
             state = replace(state, owner=os.getpid(), playing=False, stepping=False, note=note)
             if not state.virtual:
-                # Who free-runs looks at the page before each cycle: none begins after this first write, so that no
-                # cycle of theirs is later than the present one, which is taken after it.
-                self._write(replace(state, mode=ClockMode.VIRTUAL))
-                now_ns = time.monotonic_ns() - self._segment.header.started_ns
-                step = max((self._cycle(block, now_ns) for block in self._participants()), default=0)
-                state = replace(state, mode=ClockMode.VIRTUAL, step=step, done=step, time_ns=now_ns)
+                # Who free-runs looks at the page before each cycle: none begins after this write, so that none of
+                # theirs is later than the present one, as it is found once more after it.
+                self._write(self._frozen(state))
+                state = self._frozen(state)
             self._write(state)
             for slot in self._segment.processes:
                 self._segment.clock.slot_bell(slot.index).ring()
@@ -161,6 +159,12 @@ class Coordinator:
 
     def _write(self, state: ClockState) -> None:
         self._segment.clock.write(state)
+
+    def _frozen(self, state: ClockState) -> ClockState:
+        """Virtual time that goes on from now."""
+        now_ns = self._segment.clock_ns(time.monotonic_ns())
+        step = max((self._cycle(block, now_ns) for block in self._participants()), default=0)
+        return replace(state, mode=ClockMode.VIRTUAL, step=step, done=step, time_ns=now_ns)
 
     def _participants(self) -> list[Block]:
         self._segment.refresh()

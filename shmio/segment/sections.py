@@ -26,7 +26,7 @@ def read_clock(shared: SharedObject, head: Header, entries: Sequence[SectionEntr
         if entry.kind == SectionKind.CLOCK:
             try:  # on memory of its own: what has been read is still judged by it when the segment is closed
                 own = memoryview(shared.map())
-                return ClockPage(own, entry.offset, entry.size, head.started_ns, head.process_capacity)
+                return ClockPage(own, entry.offset, entry.size, head)
             except ValueError as error:
                 raise FormatError(f"{shared.name}: {error}") from None
     raise FormatError(

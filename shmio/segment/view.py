@@ -111,7 +111,7 @@ def reading(block: Block, register: Register, frame: Frame | None) -> Reading:
     quality, reason = frame.assess(block.stale_ns, now_ns)
     known = frame.source_ns != 0
     value = codec(register, block.layout.byte_order).decode(frame.image) if known else None
-    if quality is not Quality.BAD and _holds_none(value):
+    if quality is not Quality.BAD and holds_none(value):
         quality, reason = Quality.BAD, f"the bytes are no {register.type}"
     source_time = frame.source_ns / 1e9 if known else None
     provenance = _provenance(block, register, frame)
@@ -128,6 +128,6 @@ def _provenance(block: Block, register: Register, frame: Frame) -> Provenance:
     return frame.provenance
 
 
-def _holds_none(value: Value) -> bool:
+def holds_none(value: Value) -> bool:
     """Whether a value, or an element of it, could not be decoded."""
-    return any(map(_holds_none, value)) if isinstance(value, list) else value is None
+    return any(map(holds_none, value)) if isinstance(value, list) else value is None

@@ -125,7 +125,13 @@ class Supervisor:
     def _create(self, path: str) -> Segment:
         plan = self._plan
         return Segment.create(
-            plan.instance, plan.blocks, plan.processes, mode=plan.mode, control=path, group=plan.group
+            plan.instance,
+            plan.blocks,
+            plan.processes,
+            mode=plan.mode,
+            control=path,
+            group=plan.group,
+            stepped=plan.stepped,
         )
 
     def _on_signal(self, number: int) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -89,6 +89,8 @@ class Plan:
     jobs: tuple[Job, ...]
     warnings: tuple[str, ...] = ()
     """What is odd about its configuration, a line each."""
+    stepped: bool = False
+    """Whether time stands from the start until somebody steps."""
 
     @property
     def processes(self) -> list[ProcessSpec]:
@@ -109,9 +111,11 @@ def make_plan(
     config_file: Path,
     mode: str = "live",
     warnings: Sequence[str] = (),
+    computed: Collection[str] = (),
 ) -> Plan:
     """Plan an instance. ``layouts``: of each source, by its name; ``emulated``: all blocks of each emulator.
 
+    ``computed``: the sources that live on the instance's clock.
     ConfigError: too many processes.
     """
     ring_bytes = round(config.instance.ring_mb * 1e6)
@@ -122,7 +126,7 @@ def make_plan(
             source.period_ns,
             source.stale_ns,
             ring_bytes,
-            Attributes(source.connector, tuple(source.writable), source.armed),
+            Attributes(source.connector, tuple(source.writable), source.armed, source.name in computed),
         )
         for source in config.source
     )
@@ -150,6 +154,7 @@ def make_plan(
         blocks=blocks,
         jobs=tuple(_job(name, kind, log_dir / f"{name}.log", section) for name, kind, section in sections),
         warnings=tuple(warnings),
+        stepped=config.instance.clock == "stepped",
     )
 
 

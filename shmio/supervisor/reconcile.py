@@ -87,6 +87,7 @@ def refusal(plan: Plan, running: Plan) -> str | None:
     fixed = {
         "instance.name": (running.instance, plan.instance),
         "instance.group": (running.group, plan.group),
+        "instance.clock": (_clock(running), _clock(plan)),
         "instance.log_dir": (running.log_dir, plan.log_dir),
     }
     for key, (old, new) in fixed.items():
@@ -96,6 +97,10 @@ def refusal(plan: Plan, running: Plan) -> str | None:
                 "nothing has changed: shmio-supervisor down and up take it"
             )
     return None
+
+
+def _clock(plan: Plan) -> str:
+    return "stepped" if plan.stepped else "wall"
 
 
 def _shown(value: object) -> str:

@@ -9,6 +9,7 @@ import msgspec
 from shmio.errors import NotRunningError, SegmentError
 from shmio.segment import Phase, ProcessSlot, Quality, Segment, running_instances
 from shmio.segment import State as InstanceState
+from shmio.segment.clock import ClockState
 from shmio.supervisor.policy import assess, complaint
 
 SILENT_S = 5.0
@@ -45,8 +46,20 @@ class SupervisorStatus(msgspec.Struct):
     uptime_s: float
 
 
+class ClockStatus(msgspec.Struct):
+    """The instance's clock. ``mode``: wall or virtual. ``note``: whom a step waits for, or why the last one failed."""
+
+    mode: str
+    time_s: float
+    step: int
+    step_size_ms: float
+    playing: bool
+    rate: float
+    note: str
+
+
 class InstanceStatus(msgspec.Struct):
-    """An instance. ``supervisor`` is null when it is dead, ``segment`` when there is none."""
+    """An instance. ``supervisor`` is null when it is dead, ``segment`` and ``clock`` when there is none."""
 
     instance: str | None
     mode: str | None = None
@@ -54,6 +67,7 @@ class InstanceStatus(msgspec.Struct):
     segment: str | None = None
     segment_bytes: int = 0
     supervisor: SupervisorStatus | None = None
+    clock: ClockStatus | None = None
     processes: list[SourceStatus | ProcessStatus] = []
     note: str = ""
 
@@ -90,6 +104,7 @@ def _read(segment: Segment, remedy: str) -> InstanceStatus:
         mode=segment.header.mode,
         segment=segment.shared.name,
         segment_bytes=segment.shared.size,
+        clock=clock_status(segment.clock.read()),
     )
     if not supervised:
         if not any(process.pid for process in processes):
@@ -104,6 +119,14 @@ def _read(segment: Segment, remedy: str) -> InstanceStatus:
             status.state, status.note = str(InstanceState.DEGRADED), silence
     status.processes = processes
     return status
+
+
+def clock_status(state: ClockState) -> ClockStatus:
+    """What the clock page says, in the units of a reader."""
+    return ClockStatus(
+        str(state.mode), state.present_ns / 1e9, state.step, state.step_size_ns / 1e6, state.playing, state.rate,
+        state.note,
+    )  # fmt: skip
 
 
 def supervisor_silence(segment: Segment) -> str | None:

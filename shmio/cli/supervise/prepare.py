@@ -49,12 +49,13 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
         check_host(config)
         check_listening(config)
         layouts = {source.name: _check_source(i, source, files) for i, source in enumerate(config.source)}
+        computed = [source.name for source in config.source if _is_computed(source)]
         emulated = {emulator.name: _check_emulator(i, emulator, files) for i, emulator in enumerate(config.emulator)}
         odd = [*_odd(config, layouts), *_not_served(config, layouts, emulated), *_unread(emulated)]
     except ConfigError as error:
         raise ConfigError(f"{file}: {named(str(error), msgspec.to_builtins(config))}") from None
     warnings = [*files.warnings, *(f"{file}: warning: {text}" for text in odd)]
-    plan = make_plan(config, layouts, emulated, config_file=file, mode=mode, warnings=warnings)
+    plan = make_plan(config, layouts, emulated, config_file=file, mode=mode, warnings=warnings, computed=computed)
     return Prepared(config, plan, layouts, emulated)
 
 
@@ -68,6 +69,7 @@ def _check_source(index: int, source: Source, files: LayoutFiles) -> Layout:
     """The source's layout; its ``options`` are complete and of their types from here on."""
     # Connectors are imported here: status and its like do without them.
     from shmio.connectors import registry  # noqa: PLC0415
+    from shmio.connectors.base import Connector  # noqa: PLC0415
 
     key = f"source[{index}]"
     try:
@@ -85,10 +87,20 @@ def _check_source(index: int, source: Source, files: LayoutFiles) -> Layout:
     source.options, source.texts = msgspec.to_builtins(options), {}
     layout = files.get(key, source, source.options.get("dbNumber"))
     try:
-        connector(options, layout).close()
+        made = connector(options, layout)
+        if isinstance(made, Connector):
+            made.close()
     except ConfigError as error:
         raise ConfigError(f"{key}.{error}") from None
     return layout
+
+
+def _is_computed(source: Source) -> bool:
+    """Whether a checked source lives on the instance's clock."""
+    from shmio.connectors import registry  # noqa: PLC0415
+    from shmio.connectors.computed import Computed  # noqa: PLC0415
+
+    return issubclass(registry.load(source.connector), Computed)
 
 
 def _check_emulator(index: int, emulator: Emulator, files: LayoutFiles) -> tuple[Layout, ...]:

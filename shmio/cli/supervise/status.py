@@ -10,7 +10,7 @@ import msgspec
 from shmio.cli.target import config_option, instance_name
 from shmio.errors import NotRunningError
 from shmio.logs import printable
-from shmio.supervisor.status import InstanceStatus, ProcessStatus, SourceStatus, read_status
+from shmio.supervisor.status import ClockStatus, InstanceStatus, ProcessStatus, SourceStatus, read_status
 
 _HEADINGS = ("NAME", "KIND", "STATE", "PID", "RESTARTS", "UPTIME", "")
 
@@ -38,12 +38,21 @@ def _table(status: InstanceStatus) -> list[str]:
     lines = [", ".join(facts)]
     if status.note:
         lines.append(status.note)
+    if status.clock and status.clock.mode != "wall":
+        lines.append(clock_line(status.clock))
     rows = [_HEADINGS, *(_row(process) for process in status.processes)]
     widths = [max(len(row[i]) for row in rows) for i in range(len(_HEADINGS) - 1)]
     for row in rows:
         cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=False)]
         lines.append("  ".join([*cells, row[-1]]).rstrip())
     return lines
+
+
+def clock_line(clock: ClockStatus) -> str:
+    """Virtual time in one line."""
+    how = f", playing at {clock.rate:g} times real time" if clock.playing else ""
+    note = f"; {clock.note}" if clock.note else ""
+    return f"virtual time {clock.time_s:.3f} s, step {clock.step}, steps of {clock.step_size_ms:g} ms{how}{note}"
 
 
 def _row(process: ProcessStatus) -> tuple[str, ...]:

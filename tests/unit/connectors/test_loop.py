@@ -10,7 +10,7 @@ import msgspec
 import pytest
 
 from shmio.connectors.base import Connector
-from shmio.connectors.loop import SourceLoop, WallClock
+from shmio.connectors.loop import SourceLoop
 from shmio.connectors.schedule import Schedule
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
@@ -29,9 +29,6 @@ class VirtualClock:
 
     def now_ns(self) -> int:
         return self.time_ns
-
-    def nudge(self) -> None:
-        """No wait of this clock is under way when another thread runs."""
 
     def wait_ns(self, duration_ns: int) -> bool:
         self.time_ns += max(0, duration_ns)
@@ -89,17 +86,6 @@ def run(segment: Segment, trouble: Callable[[str, int], None], cycles: int) -> t
     while (frame := cursor.poll()) is not None:
         frames.append(frame)
     return device, loop, frames
-
-
-def test_a_nudge_ends_one_wait() -> None:
-    clock = WallClock()
-    clock.nudge()
-    assert not clock.wait_ns(3600 * 10**9)
-    begun_ns = clock.now_ns()
-    assert not clock.wait_ns(PERIOD_NS)
-    assert clock.now_ns() - begun_ns >= PERIOD_NS, "the next one was ended, too"
-    clock.stop()
-    assert clock.wait_ns(3600 * 10**9)
 
 
 def test_every_cycle_is_one_frame_and_the_end_is_told(segment: Segment) -> None:

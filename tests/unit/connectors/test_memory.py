@@ -9,8 +9,9 @@ from contextlib import contextmanager
 import pytest
 
 from shmio.connectors import registry
-from shmio.connectors.loop import SourceLoop, WallClock
+from shmio.connectors.computed import Computed
 from shmio.connectors.schedule import Schedule
+from shmio.connectors.stepped import PageClock, SteppedLoop
 from shmio.errors import CommandError, ConfigError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.segment import Attributes, BlockSpec, EventKind, Frame, ProcessSpec, Provenance, Quality, Segment
@@ -31,7 +32,7 @@ WRITABLE = ("position", "lamps", "name")
 
 @pytest.fixture
 def segment(instance: str) -> Iterator[Segment]:
-    spec = BlockSpec("cell", LAYOUT, PERIOD_NS, 10 * PERIOD_NS, 1 << 20, Attributes("memory", WRITABLE))
+    spec = BlockSpec("cell", LAYOUT, PERIOD_NS, 10 * PERIOD_NS, 1 << 20, Attributes("memory", WRITABLE, stepped=True))
     with Segment.create(instance, [spec], [ProcessSpec("cell", "source")]) as segment:
         yield segment
         segment.unlink()
@@ -41,11 +42,12 @@ def segment(instance: str) -> Iterator[Segment]:
 def running(segment: Segment) -> Iterator[Commander]:
     """A process of the source, and a writer toward it."""
     options = registry.convert_options("memory", {})
-    connector = registry.load("memory")(options, LAYOUT)
-    clock = WallClock()
+    memory = registry.load("memory")(options, LAYOUT)
+    assert isinstance(memory, Computed)
+    clock = PageClock(segment.clock, 0)
     schedule = Schedule(segment.header.started_ns, PERIOD_NS)
     cursor = segment.blocks["cell"].cursor()
-    loop = SourceLoop(connector, segment.writer("cell"), schedule, clock, WRITABLE)
+    loop = SteppedLoop(memory, segment.writer("cell"), schedule, clock, WRITABLE)
     threads = [threading.Thread(target=run) for run in (loop.run, loop.desk.run)]
     for thread in threads:
         thread.start()
