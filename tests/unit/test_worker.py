@@ -30,8 +30,11 @@ def run(w):
         raise ConnectorError("the device is on fire")
     if what == "crash":
         raise ZeroDivisionError
+    told = []
+    if what == "reread":
+        w.on_reread(lambda: told.append("anew"))
     while not w.stopping.wait(0.01):
-        w.report((1, 2, 3), note="at work")
+        w.report((1, 2, 3), note=" ".join(["at work", *told]))
 
 raise SystemExit(worker.main(run))
 """
@@ -98,6 +101,23 @@ def test_it_takes_its_role_reports_beats_and_stops_when_told(segment: Segment, t
         assert worker.end() == (0, "")
     assert (slot.report.activity, slot.alive()) == (Activity.STOPPING, False)
     assert "stopped" in worker.log.read_text().splitlines()[-1]
+
+
+def test_it_reads_anew_as_often_as_it_is_told(segment: Segment, tmp_path: Path) -> None:
+    slot = segment.processes.find("cell")
+    with Started(segment, tmp_path, "reread") as worker:
+        for note in ("at work", "at work anew", "at work anew anew"):
+            until(lambda note=note: slot.report.note == note, note)  # type: ignore[misc]
+            worker.process.send_signal(signal.SIGHUP)
+        worker.process.terminate()
+        assert worker.end() == (0, "")
+    with Started(segment, tmp_path, "work") as worker:  # one that has nothing to read lives on
+        until(lambda: slot.report.pid == worker.process.pid and slot.report.note == "at work", "work")
+        worker.process.send_signal(signal.SIGHUP)
+        beat = slot.heartbeat_ns
+        until(lambda: slot.heartbeat_ns > beat, "a beat after SIGHUP")
+        worker.process.terminate()
+        assert worker.end() == (0, "")
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,11 @@ _SERVICES: Final[Mapping[str, Mapping[str, str]]] = {
         WRITE: "Publish Write PublishSynch",
         INJECT: "Inject",
     },
+    "shmio.v1.Shmio": {
+        READ: "GetLayouts GetStatus Read Subscribe ListInjections",
+        WRITE: "Write",
+        INJECT: "Inject Lift LiftAll",
+    },
     "com.ttsnetwork.simulator3.SimServerAPI": {
         READ: "subscribe",
         CONTROL: "step start stop pause",

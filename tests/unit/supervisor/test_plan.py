@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from shmio.config import Config, Emulator, Grpc, Instance, Recorder, Source
+from shmio.config import Config, Emulator, Grpc, Instance, Recorder, Source, Token
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout, Register
 from shmio.segment import Segment
-from shmio.supervisor.plan import MAX_PROCESSES, MODULES, RANKS, make_plan
+from shmio.supervisor.plan import MAX_PROCESSES, MODULES, RANKS, Job, make_plan
 
 LAYOUT = Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
 PLAYED = {"plc": [LAYOUT]}
@@ -50,6 +51,20 @@ def test_a_process_is_told_what_it_needs(tmp_path: Path) -> None:
     assert source["config"]["connector"] == "s7"
     assert [Layout.from_json(text.encode()) for text in emulator["config"]["layouts"]] == [LAYOUT]
     assert grpc["config"]["listen"] == ["127.0.0.1:0"]
+
+
+def test_tokens_and_clients_are_no_other_process(tmp_path: Path) -> None:
+    """So a reload does not restart the endpoint for them; what is started later gets them."""
+
+    def job(**changes: Any) -> Job:
+        changed = config(tmp_path)
+        changed.grpc = Grpc(listen=["127.0.0.1:0"], **changes)
+        return make_plan(changed, {"cell0": LAYOUT}, PLAYED, config_file=tmp_path / "s.toml").jobs[-1]
+
+    plain, guarded = job(), job(token=[Token(name="dash", roles=["read"], token_file="x")])
+    assert plain.identify("a50", 7) == guarded.identify("a50", 7) != job(insecure=True).identify("a50", 7)
+    assert plain.describe("a50", 7) != guarded.describe("a50", 7)
+    assert (plain.rules, "token" in json.loads(guarded.describe("a50", 7))["config"]) == ({}, True)
 
 
 def test_log_mode_records_and_serves_nothing(tmp_path: Path) -> None:

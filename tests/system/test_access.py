@@ -1,0 +1,100 @@
+"""A cell that asks who is there: on loopback, on a UNIX socket, through reloads and deaths of its endpoint."""
+
+from __future__ import annotations
+
+import grp
+import os
+import stat
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import grpc
+import pytest
+
+from shmio.testing.cell import CONFIG, PATIENCE_S, Cell, kill, until
+from shmio.wire.simlog_v1_pb2 import ROSMessage, TopicDescriptor
+
+ROOT = Path(__file__).parents[2]
+TOPIC = "cell/Robot_800/Axs1_Pos"
+DASH, OTHER = "dash-0123456789abcdefghij", "other-0123456789abcdefghi"
+GUARDED = (
+    CONFIG.replace('listen = ["{grpc}"]', 'listen = ["{grpc}", "unix:run/a50.sock"]').replace(
+        "[[source]]", f'group = "{grp.getgrgid(os.getegid()).gr_name}"\n[[source]]', 1
+    )
+    + '[[grpc.token]]\nname = "dash"\nroles = ["read"]\ntoken_file = "dash"\n'
+)
+MORE = '[[grpc.token]]\nname = "other"\nroles = ["read"]\ntoken_file = "other"\n'
+
+
+@pytest.fixture
+def guarded(make_cell: Callable[..., Cell]) -> Cell:
+    cell = make_cell(config=GUARDED)
+    (cell.folder / "run").mkdir()
+    for name, token in (("dash", DASH), ("other", OTHER)):
+        file = cell.folder / name
+        file.write_text(token + "\n")
+        file.chmod(0o600)
+    return cell
+
+
+def subscribe(cell: Cell, address: str, *options: str) -> subprocess.CompletedProcess[str]:
+    """The example, as its user runs it."""
+    command = [sys.executable, str(ROOT / "examples/subscribe.py"), "--count", "2", *options, address, TOPIC]
+    return subprocess.run(command, cwd=cell.folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+
+
+def test_tokens_come_and_go_with_reloads(guarded: Cell) -> None:
+    address = str(guarded.grpc)
+    guarded.up()
+    nobody = subscribe(guarded, address)
+    assert nobody.returncode == 1
+    assert "UNAUTHENTICATED: Subscribe needs the role read" in nobody.stderr
+    assert subscribe(guarded, address, "--token-file", "dash").returncode == 0
+    assert "none of [[grpc.token]]" in subscribe(guarded, address, "--token-file", "other").stderr
+    pid = guarded.processes()["grpc"]["pid"]
+    with grpc.insecure_channel(address) as channel:
+        stream = channel.unary_stream(
+            "/simulation.server.SimlogAPI/Subscribe", TopicDescriptor.SerializeToString, ROSMessage.FromString
+        )(TopicDescriptor(path=TOPIC), metadata=[("authorization", f"Bearer {DASH}")], timeout=PATIENCE_S)
+        assert next(stream).value
+        file = guarded.folder / "supervisor.toml"
+        before = file.read_text()
+        file.write_text(before + MORE)
+        reload = guarded.supervisor("reload")
+        assert (reload.returncode, "grpc: told to take its tokens and roles anew" in reload.stdout) == (0, True)
+        until(lambda: subscribe(guarded, address, "--token-file", "other").returncode == 0, "the new token taken")
+        assert next(stream).value, "the stream of a token that stays goes on"
+        (guarded.folder / "other").chmod(0o644)
+        refused = guarded.supervisor("reload")
+        assert (refused.returncode, "mode 0644 lets others in" in refused.stderr) == (1, True)
+        file.write_text(before.replace('token_file = "dash"', 'token_file = "other"'))
+        (guarded.folder / "other").chmod(0o600)
+        assert guarded.supervisor("reload").returncode == 0
+        with pytest.raises(grpc.RpcError) as caught:
+            for _ in stream:
+                pass
+        assert caught.value.code() is grpc.StatusCode.UNAUTHENTICATED
+    assert guarded.processes()["grpc"]["pid"] == pid
+    told = guarded.logs() + guarded.supervisor("status", "--json").stdout
+    assert "took tokens and roles anew" in told
+    assert DASH not in told
+    assert OTHER not in told
+
+
+def test_a_unix_socket_is_cleared_after_a_death_and_removed_at_the_end(guarded: Cell) -> None:
+    socket = guarded.folder / "run/a50.sock"
+    guarded.up()
+    assert stat.S_IMODE(socket.stat().st_mode) == 0o660
+    assert subscribe(guarded, "unix:run/a50.sock", "--token-file", "dash").returncode == 0
+    kill(guarded.processes()["grpc"]["pid"])
+    until(
+        lambda: subscribe(guarded, "unix:run/a50.sock", "--token-file", "dash").returncode == 0, "the endpoint is back"
+    )
+    guarded.down()
+    assert not socket.exists()
+    socket.write_text("precious")
+    refused = guarded.supervisor("up", "--detach")
+    assert (refused.returncode, "no socket: move it away" in refused.stderr) == (1, True)
+    assert socket.read_text() == "precious"
