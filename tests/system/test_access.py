@@ -57,7 +57,7 @@ def test_tokens_come_and_go_with_reloads(guarded: Cell) -> None:
     with grpc.insecure_channel(address) as channel:
         stream = channel.unary_stream(
             "/simulation.server.SimlogAPI/Subscribe", TopicDescriptor.SerializeToString, ROSMessage.FromString
-        )(TopicDescriptor(path=TOPIC), metadata=[("authorization", f"Bearer {DASH}")], timeout=PATIENCE_S)
+        )(TopicDescriptor(path=TOPIC), metadata=(("authorization", f"Bearer {DASH}"),), timeout=PATIENCE_S)
         assert next(stream).value
         file = guarded.folder / "supervisor.toml"
         before = file.read_text()
