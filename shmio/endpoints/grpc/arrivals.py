@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import grpc
+
+TURNS: Final = 3
+"""One of gRPC's threads may be held up by the machine with what it has received, while others go on."""
 
 
 class Arrivals:
@@ -19,7 +24,8 @@ class Arrivals:
         """Wait until handlers have been given what came before."""
         if self._channel is None:
             self._channel = grpc.aio.insecure_channel("unix:///dev/null")
-        await self._channel.wait_for_state_change(grpc.ChannelConnectivity.SHUTDOWN)
+        for _ in range(TURNS):
+            await self._channel.wait_for_state_change(grpc.ChannelConnectivity.SHUTDOWN)
 
     async def close(self) -> None:
         """Nothing is waited for any more."""
