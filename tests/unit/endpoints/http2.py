@@ -69,6 +69,15 @@ class Connection:
         self._writer.write(data)
         await self._writer.drain()
 
+    async def until_end(self, stream: int) -> None:
+        """Read on until a call has its status."""
+        async with asyncio.timeout(TIMEOUT_S):
+            while True:
+                head = await self.reader.readexactly(9)
+                await self.reader.readexactly(int.from_bytes(head[:3], "big"))
+                if int.from_bytes(head[5:], "big") == stream and head[3] == HEADERS and head[4] & END_STREAM:
+                    return
+
     async def drop(self, *, reset: bool) -> None:
         """Break off; with a reset, or having heard that the server has noticed the end."""
         if reset:

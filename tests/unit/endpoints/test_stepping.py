@@ -15,6 +15,7 @@ from shmio.segment.coordinator import Coordinator
 from shmio.wire import simlog_v1_pb2 as v1
 from shmio.wire import simlog_v2_pb2 as v2
 from shmio.wire import simserver_pb2 as sim
+from tests.unit.endpoints import http2
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, image, listening, message, refusal, serve
 from tests.unit.endpoints.stepped import Model, simulate
 from tests.unit.endpoints.test_simlog_v2 import write
@@ -23,6 +24,7 @@ from tests.unit.endpoints.test_subscribers import messages
 Status = grpc.StatusCode
 Models = dict[str, Model]
 MS = 1_000_000
+GOAL = v1.TopicDescriptor(path="sim/goal/in")
 
 
 async def step(served: Endpoint) -> int:
@@ -39,6 +41,10 @@ async def open_v1(served: Endpoint, path: str) -> Any:
 
 async def values(stream: Any, count: int) -> list[str]:
     return [(await asyncio.wait_for(stream.read(), TIMEOUT_S)).value for _ in range(count)]
+
+
+def prefixed(request: v1.PubRequest) -> bytes:
+    return http2.message(request.SerializeToString())
 
 
 async def drained(stream: Any) -> None:
@@ -176,9 +182,8 @@ def test_what_a_client_of_version_1_has_published_is_applied_before_its_step(ins
         expected = ["0"]
         for number in range(1, 40):
             for repeated in range(number % 7 + 1):
-                topic = v1.TopicDescriptor(path="sim/goal/in")
                 value = v1.ROSMessage(type="double", value=str(100 * number + repeated))
-                await publish.write(v1.PubRequest(topic=topic, data=value))
+                await publish.write(v1.PubRequest(topic=GOAL, data=value))
                 last = value.value
             assert await step(served) == 0
             expected.append(last)
@@ -187,6 +192,31 @@ def test_what_a_client_of_version_1_has_published_is_applied_before_its_step(ins
         assert (first.value, first.timeStamp.seq, first.timeStamp.stamp.nsec) == ("100", 0, 0)
         await publish.done_writing()
         await publish
+
+    simulate(instance, test)
+
+
+def test_what_came_in_one_piece_with_a_step_is_applied_before_it(instance: str) -> None:
+    """Values and step in the order of the wire, nothing between them: the endpoint reads them in different calls."""
+
+    async def test(served: Endpoint, models: Models) -> None:
+        goal = await open_v1(served, "sim/goal")
+        client = await http2.Connection.open(served.port)
+        await client.send(http2.headers("/simulation.server.SimlogAPI/Publish"))
+        expected = ["0"]
+        for number in range(1, 100):
+            expected.append(str(10 * number + number % 9))
+            values_of_step = [str(10 * number + i) for i in range(number % 9 + 1)]
+            await client.send(
+                b"".join(
+                    http2.frame(http2.DATA, 0, 1, prefixed(v1.PubRequest(topic=GOAL, data=v1.ROSMessage(value=value))))
+                    for value in values_of_step
+                )
+                + http2.call("/simulation.server.SimlogAPI/step", b"", 2 * number + 1)
+            )
+            await client.until_end(2 * number + 1)
+        assert await values(goal, len(expected)) == expected
+        await client.drop(reset=True)
 
     simulate(instance, test)
 
