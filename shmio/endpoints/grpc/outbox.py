@@ -23,7 +23,7 @@ EVENT_BOUND: Final = 2 * EVENT_SLOTS
 STEP_BOUND: Final = 16_384
 """Values that may wait of which none may be left out: what one step changes in all topics of a stream."""
 STEP_BOUND_BYTES: Final = 64 << 20
-"""The same in bytes. All streams share them."""
+"""The same in bytes."""
 
 Finish = Callable[[Any], bytes]
 
