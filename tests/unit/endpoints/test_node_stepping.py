@@ -19,8 +19,9 @@ STEPS = 60
 
 
 async def run(port: int) -> dict[str, Any]:
-    command = ["node", HERE / "stepping.js", f"127.0.0.1:{port}", PROTO, str(STEPS)]
-    process = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
+    process = await asyncio.create_subprocess_exec(
+        "node", HERE / "stepping.js", f"127.0.0.1:{port}", PROTO, str(STEPS), stdout=asyncio.subprocess.PIPE
+    )
     try:
         out, _ = await asyncio.wait_for(process.communicate(), TIMEOUT_S)
     except TimeoutError:
