@@ -19,6 +19,7 @@
     ├── ModelError         a simulation model is declared wrongly, or its code failed; names it, and the line
     ├── RecordingError     a recording cannot be written, or is none that this version can read
     ├── EndpointError      an address cannot be served
+    ├── RemoteError        an instance cannot be reached by gRPC, or does not answer as it should
     └── ControlError       the supervisor refused or did not answer
         └── UnreachableError     its socket cannot be connected to
 
@@ -110,6 +111,10 @@ class EndpointError(ShmioError):
 
 class ModelError(ShmioError):
     """A simulation model is declared wrongly, or its code failed; the message has the model's name, and the line."""
+
+
+class RemoteError(ShmioError):
+    """An instance's endpoint cannot be reached, does not let us in, or does not answer as it should; names it."""
 
 
 class RecordingError(ShmioError):

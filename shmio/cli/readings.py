@@ -7,10 +7,10 @@ from typing import Any
 
 from shmio.errors import PathError
 from shmio.layout.codec import Value
-from shmio.layout.glob import select
-from shmio.layout.model import Layout, Register
+from shmio.layout.glob import named
+from shmio.layout.model import Register
 from shmio.layout.text import json_value, to_text
-from shmio.layout.topic import Topic, look_up, parse_topic
+from shmio.layout.topic import parse_topic
 from shmio.logs import printable
 from shmio.segment.attach import Attachment
 from shmio.segment.block import Block
@@ -23,7 +23,7 @@ Selected = tuple[Block, Register]
 
 
 def choose(cell: Attachment, patterns: list[str]) -> list[Selected]:
-    """Registers that the patterns name, each once, in order: a path, an array's element, a structure, or a glob.
+    """Registers that the patterns name, each once, in order: a path, an array's element or slice, a structure, a glob.
 
     PathError when one of them names nothing.
     """
@@ -37,20 +37,11 @@ def choose(cell: Attachment, patterns: list[str]) -> list[Selected]:
         if topic.source not in sources:
             raise PathError(f"{pattern}: nothing is served under {topic.source} in this version")
         block = cell.block(topic.source)
-        registers = registers_at(block.layout, topic)
+        registers = named(block.layout, topic)
         if not registers:
             raise PathError(f"{pattern}: no register of {topic.source} has such a path")
         chosen |= {(topic.source, register.path): (block, register) for register in registers}
     return list(chosen.values())
-
-
-def registers_at(layout: Layout, topic: Topic) -> list[Register]:
-    """Registers of a topic's path, or of a glob, which may match none; all for an empty path. PathError."""
-    if not topic.path:
-        return list(layout.registers)
-    if "*" in topic.path or layout.members(topic.path):
-        return [layout.registers[i] for i in select(layout, [topic.path])]
-    return [look_up(layout, topic)]
 
 
 def topic_path(block: Block, register: Register) -> str:

@@ -13,8 +13,8 @@ from shmio.config.model import NAME_RULE, Name
 from shmio.config.read import read_tables
 from shmio.errors import ConfigError, ControlError, NotRunningError, UnreachableError
 from shmio.segment import Segment, running_instances
+from shmio.segment.status import supervisor_silence
 from shmio.supervisor import control
-from shmio.supervisor.status import supervisor_silence
 
 DEFAULT_CONFIG = Path("supervisor.toml")
 

@@ -14,6 +14,7 @@ from shmio.errors import SegmentError, ShmioError
 from shmio.logs import fields
 from shmio.segment import Quality, Segment
 from shmio.segment import State as InstanceState
+from shmio.segment.status import assess
 from shmio.supervisor import policy
 from shmio.supervisor.changer import Changer
 from shmio.supervisor.control import Answer, ControlServer, Reload, Request, Restart, Stop
@@ -278,7 +279,7 @@ class Supervisor:
                 for managed in self._fleet:
                     managed.listen()
             well = [m.life.state is State.RUNNING and not m.complaint for m in self._fleet]
-            state = policy.assess(well, self._qualities)
+            state = assess(well, self._qualities)
         self._segment.set_state(os.getpid(), state)
         self._notifier.beat(now_ns)
         if state is not self._state:

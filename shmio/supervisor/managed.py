@@ -6,6 +6,7 @@ import logging
 
 from shmio.logs import fields
 from shmio.segment import Activity, ProcessSlot
+from shmio.segment.status import complaint as complaint_of
 from shmio.supervisor import policy
 from shmio.supervisor.control import Answer
 from shmio.supervisor.plan import RANKS, Job
@@ -78,7 +79,7 @@ class Managed:
     def listen(self) -> None:
         """Take what it reports as wrong; the log tells the end of it, and what was lost by then."""
         running = self.life.state is State.RUNNING
-        complaint = policy.complaint(self.slot.kind, self.slot.report.note) if running else ""
+        complaint = complaint_of(self.slot.kind, self.slot.report.note) if running else ""
         missed = self.slot.counters.get("missed", 0) if running else 0  # a process counts from its start
         if self.complaint and running and not complaint:
             log.info("%s is well again; %d frames and events were lost", self.name, max(0, missed - self._missed))

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from shmio.segment import Quality
-from shmio.segment import State as InstanceState
 from shmio.supervisor.states import GRAPH, Action, Event, State
 
 REFUSED_STATUS = 2
@@ -211,17 +210,3 @@ def start_over(
     if not all(life.ran for _, life in processes):
         return False
     return None not in qualities or now_ns - since_ns >= limits.settle_s * 1e9
-
-
-def complaint(kind: str, note: str) -> str:
-    """What a running process reports as wrong though it runs: a recorder that is well names its file, ``to FILE``."""
-    return note if kind == "recorder" and not note.startswith("to ") else ""
-
-
-def assess(running: Sequence[bool], qualities: Sequence[Quality | None]) -> InstanceState:
-    """State of an instance after its start: degraded when a process is not running or a source is bad.
-
-    ``running``: of each process, whether it runs without a :func:`complaint`.
-    """
-    healthy = all(running) and not any(q in (None, Quality.BAD) for q in qualities)
-    return InstanceState.RUNNING if healthy else InstanceState.DEGRADED

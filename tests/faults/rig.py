@@ -17,7 +17,7 @@ from typing import Final, Self
 import shmio
 from shmio.config import Address
 from shmio.segment import Segment
-from shmio.supervisor.status import InstanceStatus, read_status
+from shmio.segment.status import InstanceStatus, read_status
 from shmio.testing.ports import reserved_port
 from shmio.testing.proxy import FaultProxy
 from tests.faults.checker import Description

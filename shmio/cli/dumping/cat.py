@@ -9,10 +9,11 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from shmio.cli.dumping.moments import MAX_NS, iso, local, lost, parse_time
-from shmio.cli.readings import registers_at, shown
+from shmio.cli.readings import shown
 from shmio.cli.run import dumps
 from shmio.errors import PathError, RecordingError
 from shmio.layout.codec import codec
+from shmio.layout.glob import named
 from shmio.layout.model import Layout, Register
 from shmio.layout.text import json_value
 from shmio.layout.topic import parse_topic
@@ -142,7 +143,7 @@ def _views(
             if channel.source != topic.source:
                 continue
             try:
-                registers = {register.path: register for register in registers_at(layout, topic)}
+                registers = {register.path: register for register in named(layout, topic)}
             except PathError as error:  # it may be in the layout that came after a change
                 problem = error
             else:

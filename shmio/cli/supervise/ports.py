@@ -14,8 +14,8 @@ from shmio.config import Address, Config, UnixAddress, parse_address
 from shmio.config.unixsocket import obstacle
 from shmio.errors import ConfigError, EndpointError, ShmioError
 from shmio.segment import instances
+from shmio.segment.status import read_status
 from shmio.supervisor.plan import Plan
-from shmio.supervisor.status import read_status
 
 # proc(5), /proc/net/tcp: addresses are 32-bit words in hexadecimal, each in the host's byte order.
 _MAPPED: Final = "0000000000000000FFFF0000"

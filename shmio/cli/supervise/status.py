@@ -10,7 +10,7 @@ import msgspec
 from shmio.cli.target import config_option, instance_name
 from shmio.errors import NotRunningError
 from shmio.logs import printable
-from shmio.supervisor.status import ClockStatus, InstanceStatus, ProcessStatus, SourceStatus, read_status
+from shmio.segment.status import ClockStatus, InstanceStatus, ProcessStatus, SourceStatus, read_status
 
 _HEADINGS = ("NAME", "KIND", "STATE", "PID", "RESTARTS", "UPTIME", "")
 

@@ -24,11 +24,11 @@ from shmio.errors import AlreadyRunningError, ConfigError, ControlError, ShmioEr
 from shmio.logs import printable
 from shmio.segment import PREFIX, Segment, State, instances, leftover
 from shmio.segment.segment import refuse_second
+from shmio.segment.status import InstanceStatus, SourceStatus, read_status
 from shmio.supervisor import control
 from shmio.supervisor.main import Supervisor
 from shmio.supervisor.plan import MODES, Job, Plan
 from shmio.supervisor.process import child_environment
-from shmio.supervisor.status import InstanceStatus, SourceStatus, read_status
 
 WHERE_S = 5.0
 DETACH_S = 120.0

@@ -81,7 +81,7 @@ async def _serve(worker: Worker) -> None:
         if not (feeds.alive and services.stepper.alive):
             raise RuntimeError("a thread ended that should not have; the endpoint starts anew")
         streams, dropped, published, refused = services.counters
-        worker.report((streams, feeds.messages, dropped, published, refused))
+        worker.report((streams, feeds.messages + services.updates, dropped, published, refused))
         try:
             await asyncio.wait_for(stopping.wait(), BEAT_S)
         except TimeoutError:

@@ -8,6 +8,7 @@ import grpc
 
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.hold import Hold
+from shmio.endpoints.grpc.native.service import NativeService
 from shmio.endpoints.grpc.outbox import Outboxes
 from shmio.endpoints.grpc.publish import Publisher
 from shmio.endpoints.grpc.simlog_v1 import SimlogV1
@@ -33,7 +34,9 @@ class Services:
         self._publisher = Publisher(topics)
         self.stepper = Stepper(segment, slot, hold, feeds, self._outboxes, self._publisher)
         """The instance's time."""
+        self._native = NativeService(topics, feeds, segment)
         self._services = (
+            self._native,
             SimlogV1(topics, self._publisher, self._outboxes, self.stepper),
             SimlogV2(topics, self._publisher, self._outboxes, self.stepper.marks),
             SimServer(self.stepper, self._outboxes),
@@ -47,7 +50,13 @@ class Services:
     @property
     def counters(self) -> tuple[int, int, int, int]:
         """Streams of subscribers open, messages dropped on slow ones, messages published, and refused."""
-        return len(self._outboxes), self._outboxes.dropped, self._publisher.published, self._publisher.refused
+        streams = len(self._outboxes) + self._native.streams
+        return streams, self._outboxes.dropped, self._publisher.published, self._publisher.refused
+
+    @property
+    def updates(self) -> int:
+        """Updates of our own service since the start; what feeds have made is counted there."""
+        return self._native.updates
 
     @property
     def waiting_bytes(self) -> int:

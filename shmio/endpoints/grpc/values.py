@@ -14,6 +14,7 @@ from google.protobuf.struct_pb2 import NULL_VALUE, ListValue
 from google.protobuf.struct_pb2 import Value as WireValue
 from google.protobuf.timestamp_pb2 import Timestamp
 
+from shmio.endpoints.grpc.encoding import delimited, varint
 from shmio.endpoints.grpc.hold import Moment
 from shmio.endpoints.grpc.subject import Picture, Subject
 from shmio.endpoints.grpc.topics import Mark
@@ -72,7 +73,7 @@ class Encoded:
     def under(self, path: bytes) -> bytes:
         """The whole message; ``path``: as :func:`path_field` has it."""
         header = self.stamp + path
-        return b"\x0a" + _varint(len(header)) + header + self.rest
+        return b"\x0a" + varint(len(header)) + header + self.rest
 
 
 def shape(layout: Layout, topic: Topic) -> Shape:
@@ -104,21 +105,21 @@ def encoder(found: Shape, layout: Layout) -> Callable[[Picture], Encoded | None]
 
     def encode(picture: Picture) -> Encoded | None:
         value = serialise(picture.image)
-        return None if value is None else Encoded(time_stamp(picture.clock_ns), head + _delimited(value))
+        return None if value is None else Encoded(time_stamp(picture.clock_ns), head + delimited(value))
 
     return encode
 
 
 def path_field(path: str) -> bytes:
     """The path in a header."""
-    return b"\x12" + _delimited(path.encode())
+    return b"\x12" + delimited(path.encode())
 
 
 @lru_cache(maxsize=64)  # a frame or two for each feed
 def time_stamp(clock_ns: int) -> bytes:
     """The time in a header, from ns of the instance's clock."""
     seconds, nanos = divmod(clock_ns, 1_000_000_000)
-    return b"\x0a" + _delimited(Timestamp(seconds=seconds, nanos=nanos).SerializeToString())
+    return b"\x0a" + delimited(Timestamp(seconds=seconds, nanos=nanos).SerializeToString())
 
 
 def nothing(stamp: bytes) -> Encoded:
@@ -135,7 +136,7 @@ def marked(mark: Mark, moment: Moment) -> Encoded:
 
 def repeated(messages: Iterable[bytes]) -> bytes:
     """A message whose field 1 is repeated."""
-    return b"".join(b"\x0a" + _delimited(message) for message in messages)
+    return b"".join(b"\x0a" + delimited(message) for message in messages)
 
 
 def to_wire(value: Value) -> WireValue:
@@ -185,7 +186,7 @@ def _numbers(register: Register, kind: np.dtype[Any]) -> Callable[[bytes], bytes
     """The same for a row of numbers: all at once, a hundred times as fast as one by one."""
     one = ListValue(values=[WireValue(number_value=0)]).SerializeToString()  # ends in its double
     size = register.count * len(one)
-    head = b"\x32" + _varint(size)
+    head = b"\x32" + varint(size)
     template = np.zeros(register.count, [("head", f"V{len(one) - 8}"), ("value", "<f8")])
     template["head"] = np.void(one[:-8])
 
@@ -250,16 +251,3 @@ def _put(item: Value, value: WireValue) -> None:
         values = value.list_value.values
         for inner in item:
             _put(inner, values.add())
-
-
-def _delimited(data: bytes) -> bytes:
-    return _varint(len(data)) + data
-
-
-def _varint(number: int) -> bytes:
-    data = bytearray()
-    while number > 0x7F:
-        data.append(number & 0x7F | 0x80)
-        number >>= 7
-    data.append(number)
-    return bytes(data)

@@ -18,8 +18,8 @@ from shmio.cli.supervise.prepare import prepare
 from shmio.cli.supervisor import main
 from shmio.config import load
 from shmio.layout.model import Layout, Register
-from shmio.segment import Activity, BlockSpec, ProcessSpec, Quality, Report, Segment, instances
-from shmio.supervisor import control, status
+from shmio.segment import Activity, BlockSpec, ProcessSpec, Quality, Report, Segment, instances, status
+from shmio.supervisor import control
 
 ROOT = Path(__file__).parents[3]
 SEED = ROOT / "tests" / "golden" / "layout" / "db201-as-printed.db"

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from shmio.segment import Segment, leftover
+from shmio.segment.status import InstanceStatus, ProcessStatus, read_status
 from shmio.supervisor import control
-from shmio.supervisor.status import InstanceStatus, ProcessStatus, read_status
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[2]

@@ -8,6 +8,7 @@ import pytest
 
 from shmio.segment import Quality
 from shmio.segment import State as InstanceState
+from shmio.segment.status import assess
 from shmio.supervisor import policy
 from shmio.supervisor.policy import Life, Limits
 from shmio.supervisor.states import GRAPH, Action, Event, State
@@ -294,4 +295,4 @@ def test_a_start_is_over_when_all_ran_and_the_sources_have_told() -> None:
     ],
 )
 def test_what_an_instance_is(running: list[bool], qualities: list[Quality | None], state: InstanceState) -> None:
-    assert policy.assess(running, qualities) is state
+    assert assess(running, qualities) is state

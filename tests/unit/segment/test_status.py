@@ -23,8 +23,8 @@ from shmio.segment import (
     State,
     Supervised,
 )
-from shmio.supervisor import status as status_module
-from shmio.supervisor.status import ProcessStatus, SourceStatus, read_status
+from shmio.segment import status as status_module
+from shmio.segment.status import ProcessStatus, SourceStatus, read_status
 
 LAYOUT = Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
 HOUR_NS = 3600 * 1_000_000_000

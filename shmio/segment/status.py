@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 
 import msgspec
 
 from shmio.errors import NotRunningError, SegmentError
-from shmio.segment import Phase, ProcessSlot, Quality, Segment, running_instances
-from shmio.segment import State as InstanceState
 from shmio.segment.clock import ClockState
-from shmio.supervisor.policy import assess, complaint
+from shmio.segment.frame import Quality
+from shmio.segment.header import State as InstanceState
+from shmio.segment.processes import Phase, ProcessSlot
+from shmio.segment.segment import Segment, running_instances
 
 SILENT_S = 5.0
 """A supervisor without a heartbeat for this long is stopped, or hangs."""
@@ -91,14 +93,20 @@ def read_status(instance: str, config: str | None = None) -> InstanceStatus:
         running = ", ".join(running_instances()) or "none"
         return InstanceStatus(instance, note=f"it is not running (running: {running}); start it with {up}")
     with segment:
-        return _read(segment, f"{up} takes them over, {down} stops them")
+        return status_of(segment, f"{up} takes them over, {down} stops them")
 
 
-def _read(segment: Segment, remedy: str) -> InstanceStatus:
+def status_of(segment: Segment, remedy: str, asking: str = "") -> InstanceStatus:
+    """The status of an instance whose segment is open. ``remedy``: what to say where its supervisor is dead.
+
+    ``asking``: kind of the process that asks, if it is one of the instance's: nobody sees a lock of his own.
+    """
     supervised = segment.supervised
     pid, state = segment.supervisor
     now_ns = time.monotonic_ns()
-    processes = [_process(segment, slot, supervised, now_ns) for slot in segment.processes]
+    processes = [
+        _process(segment, slot, slot.alive() or slot.kind == asking, supervised, now_ns) for slot in segment.processes
+    ]
     status = InstanceStatus(
         instance=segment.instance,
         mode=segment.header.mode,
@@ -150,8 +158,24 @@ def _state(told: InstanceState, processes: list[SourceStatus | ProcessStatus]) -
     return assess(running, [Quality[p.quality.upper()] for p in processes if isinstance(p, SourceStatus)])
 
 
-def _process(segment: Segment, slot: ProcessSlot, supervised: bool, now_ns: int) -> SourceStatus | ProcessStatus:
-    told, report, alive = slot.supervised, slot.report, slot.alive()
+def complaint(kind: str, note: str) -> str:
+    """What a running process reports as wrong though it runs: a recorder that is well names its file, ``to FILE``."""
+    return note if kind == "recorder" and not note.startswith("to ") else ""
+
+
+def assess(running: Sequence[bool], qualities: Sequence[Quality | None]) -> InstanceState:
+    """State of an instance after its start: degraded when a process is not running or a source is bad.
+
+    ``running``: of each process, whether it runs without a :func:`complaint`.
+    """
+    healthy = all(running) and not any(q in (None, Quality.BAD) for q in qualities)
+    return InstanceState.RUNNING if healthy else InstanceState.DEGRADED
+
+
+def _process(
+    segment: Segment, slot: ProcessSlot, alive: bool, supervised: bool, now_ns: int
+) -> SourceStatus | ProcessStatus:
+    told, report = slot.supervised, slot.report
     phase, note = told.phase, told.note
     if not supervised:
         phase = Phase.RUNNING if alive else Phase.STOPPED

@@ -1,0 +1,79 @@
+"""The client of ``shmio.v1``: registers of an instance on this host or another, as numpy arrays.
+
+Five lines::
+
+    from shmio.client import connect
+    with connect("127.0.0.1:8089") as cell:
+        print(cell["cell/Robot_800/Axs1_Pos"])
+        for update in cell.subscribe("cell/Robot_*/Axs*_Pos"):
+            print(update.cycle, update.quality, update["cell/Robot_800/Axs1_Pos"])
+
+For asyncio: ``async with connect_aio(…)``, with the same methods to be awaited.
+"""
+
+from __future__ import annotations
+
+from os import PathLike
+from pathlib import Path
+
+from shmio.client import aio
+from shmio.client.calls import Injection, Outcome, Target
+from shmio.client.layout import BlockLayout
+from shmio.client.sync import Client, Subscription
+from shmio.client.table import Change, Column, Register, Table
+from shmio.client.update import Provenance, Quality, Snapshot, Update
+
+__all__ = [
+    "BlockLayout",
+    "Change",
+    "Client",
+    "Column",
+    "Injection",
+    "Outcome",
+    "Provenance",
+    "Quality",
+    "Register",
+    "Snapshot",
+    "Subscription",
+    "Table",
+    "Target",
+    "Update",
+    "connect",
+    "connect_aio",
+]
+
+_File = str | PathLike[str] | None
+
+
+def connect(
+    address: str,
+    *,
+    ca: _File = None,
+    certificate: _File = None,
+    key: _File = None,
+    token: str | None = None,
+    timeout_s: float = 10.0,
+) -> Client:
+    """A client of the endpoint at ``HOST:PORT`` or ``unix:PATH``; the first call connects.
+
+    ``ca``: PEM file of the authority to trust, which means TLS; ``certificate``, ``key``: our own. ``token``: what the
+    endpoint knows us by. ``timeout_s``: of calls that are answered at once. OSError: a file cannot be read.
+    """
+    return Client(Target(address, _path(ca), _path(certificate), _path(key), token), timeout_s)
+
+
+def connect_aio(
+    address: str,
+    *,
+    ca: _File = None,
+    certificate: _File = None,
+    key: _File = None,
+    token: str | None = None,
+    timeout_s: float = 10.0,
+) -> aio.Client:
+    """The same for asyncio."""
+    return aio.Client(Target(address, _path(ca), _path(certificate), _path(key), token), timeout_s)
+
+
+def _path(file: _File) -> Path | None:
+    return None if file is None else Path(file)

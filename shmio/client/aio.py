@@ -1,0 +1,138 @@
+"""The client for asyncio."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from typing import Any, Self
+
+import grpc
+
+from shmio.client import calls
+from shmio.client.arrays import ReadResponse, SubscribeResponse
+from shmio.client.calls import Injection, Outcome, Target
+from shmio.client.layout import BlockLayout, layouts
+from shmio.client.update import Snapshot, Tables, Update
+from shmio.wire import shmio_v1_pb2 as wire
+from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
+
+
+class Client:
+    """As :class:`shmio.client.Client`, to be made and used within an event loop. Close it, or use ``async with``."""
+
+    def __init__(self, target: Target, timeout_s: float = 10.0) -> None:
+        """``timeout_s``: of calls that are answered at once."""
+        self.target = target
+        self._timeout_s = timeout_s
+        credentials = target.credentials
+        self._channel = (
+            grpc.aio.insecure_channel(target.address, calls.OPTIONS)
+            if credentials is None
+            else grpc.aio.secure_channel(target.address, credentials, calls.OPTIONS)
+        )
+        self._stub: Any = ShmioStub(self._channel)  # type: ignore[no-untyped-call]
+        self._read = self._channel.unary_unary(
+            f"/{calls.SERVICE}/Read", wire.ReadRequest.SerializeToString, ReadResponse.FromString
+        )
+        self._subscribe = self._channel.unary_stream(
+            f"/{calls.SERVICE}/Subscribe", wire.SubscribeRequest.SerializeToString, SubscribeResponse.FromString
+        )
+
+    async def layouts(self, *sources: str) -> dict[str, BlockLayout]:
+        """The blocks of these sources, or of all, by source. PathError: no such source."""
+        call = self._stub.GetLayouts(
+            wire.GetLayoutsRequest(sources=sources), timeout=self._timeout_s, metadata=self.target.metadata
+        )
+        try:
+            parts = [part async for part in call]
+        except grpc.RpcError as error:
+            self.target.fail(error)
+        return {block.source: block for block in layouts(parts)}
+
+    async def status(self) -> dict[str, Any]:
+        """How the instance and its processes are, as ``shmio-supervisor status --json`` has it."""
+        return calls.status(await self._call(self._stub.GetStatus, wire.GetStatusRequest()))
+
+    async def read(self, *patterns: str, originals: bool = False) -> Snapshot:
+        """As :meth:`shmio.client.Client.read`."""
+        tables = Tables()
+        request = calls.read_request(patterns, originals=originals, tables=())
+        return Snapshot(tables.updates(await self._call(self._read, request)))
+
+    def subscribe(
+        self,
+        *patterns: str,
+        every_frame: bool = False,
+        frames: bool = False,
+        max_rate_hz: float = 0.0,
+        deadband: float = 0.0,
+    ) -> Subscription:
+        """As :meth:`shmio.client.Client.subscribe`."""
+        request = calls.subscribe_request(
+            patterns, every_frame=every_frame, frames=frames, max_rate_hz=max_rate_hz, deadband=deadband
+        )
+        return Subscription(self._subscribe(request, metadata=self.target.metadata), self.target)
+
+    async def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
+        """As :meth:`shmio.client.Client.write`."""
+        request = calls.write_request(values, timeout_s)
+        answer = await self._call(self._stub.Write, request, (timeout_s or 0) + calls.WRITE_PATIENCE_S)
+        return calls.outcomes(values, answer.outcomes)
+
+    async def injections(self, *sources: str) -> list[Injection]:
+        """What stands at present, on these sources or all; of each the innermost first."""
+        request = wire.ListInjectionsRequest(sources=sources)
+        return calls.injections(await self._call(self._stub.ListInjections, request))
+
+    async def _call(self, method: Callable[..., Any], request: Any, timeout_s: float | None = None) -> Any:
+        try:
+            return await method(request, timeout=timeout_s or self._timeout_s, metadata=self.target.metadata)
+        except grpc.RpcError as error:
+            self.target.fail(error)
+
+    async def close(self) -> None:
+        """End all calls, and the connection."""
+        await self._channel.close()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+
+class Subscription(AsyncIterator[Update]):
+    """Updates as they come; ends when it, or its client, is closed."""
+
+    def __init__(self, call: Any, target: Target) -> None:
+        self._call = call
+        self._target = target
+        self._tables = Tables()
+        self._waiting: Iterator[Update] = iter(())
+
+    async def __anext__(self) -> Update:
+        """As that of :class:`shmio.client.Subscription`."""
+        while True:
+            for update in self._waiting:
+                return update
+            try:
+                message = await self._call.read()
+            except grpc.RpcError as error:
+                self._target.fail(error)
+            except asyncio.CancelledError:
+                if self._call.cancelled():
+                    raise StopAsyncIteration from None
+                raise
+            if message is grpc.aio.EOF:
+                raise StopAsyncIteration
+            self._waiting = self._tables.all_of(message)
+
+    def close(self) -> None:
+        """End it."""
+        self._call.cancel()
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,220 @@
+"""What the two clients share: requests from arguments, results from answers, errors from statuses. No I/O."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, NoReturn
+
+import grpc
+import numpy as np
+
+from shmio.errors import CommandError, EndpointError, PathError, RemoteError, ShmioError, ValueRangeError
+from shmio.wire import shmio_v1_pb2 as wire
+
+SERVICE: Final = wire.DESCRIPTOR.services_by_name["Shmio"].full_name
+WRITE_PATIENCE_S: Final = 30.0
+"""Beyond its own time-out a write is given so long to be answered: a slow source has its cycles."""
+OPTIONS: Final = [("grpc.max_receive_message_length", 64 << 20), ("grpc.keepalive_time_ms", 20_000)]
+
+_ERRORS: Final[Mapping[grpc.StatusCode, type[ShmioError]]] = {
+    grpc.StatusCode.NOT_FOUND: PathError,
+    grpc.StatusCode.INVALID_ARGUMENT: ValueRangeError,
+    grpc.StatusCode.FAILED_PRECONDITION: CommandError,
+    grpc.StatusCode.RESOURCE_EXHAUSTED: EndpointError,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """Where an endpoint is, and how to get in.
+
+    ``address``: ``HOST:PORT``, or ``unix:PATH``. ``ca``: PEM file of the authority to trust, which means TLS;
+    ``certificate``, ``key``: our own, where the endpoint asks for them. ``token``: what it knows us by.
+    """
+
+    address: str
+    ca: Path | None = None
+    certificate: Path | None = None
+    key: Path | None = None
+    token: str | None = None
+
+    @property
+    def credentials(self) -> grpc.ChannelCredentials | None:
+        """For a channel by TLS; None: plain text. OSError: a file cannot be read."""
+        if self.ca is None:
+            return None
+        ca, key, certificate = (
+            None if file is None else file.read_bytes() for file in (self.ca, self.key, self.certificate)
+        )
+        return grpc.ssl_channel_credentials(ca, key, certificate)
+
+    @property
+    def metadata(self) -> tuple[tuple[str, str], ...]:
+        """What goes with every call."""
+        return () if self.token is None else (("authorization", f"Bearer {self.token}"),)
+
+    def error(self, error: Any) -> ShmioError:
+        """What the end of a call means."""
+        code, details = error.code(), error.details() or ""
+        if kind := _ERRORS.get(code):
+            return kind(details)
+        return RemoteError(f"{self.address}: {_MEANING.get(code, code.name)}{f': {details}' if details else ''}")
+
+    def fail(self, error: Any) -> NoReturn:
+        """Raise that."""
+        raise self.error(error) from None
+
+
+_MEANING: Final = {
+    grpc.StatusCode.UNAVAILABLE: "no instance serves there, or it has ended",
+    grpc.StatusCode.DEADLINE_EXCEEDED: "it did not answer in time",
+    grpc.StatusCode.UNAUTHENTICATED: "it does not know us",
+    grpc.StatusCode.PERMISSION_DENIED: "it does not let us",
+    grpc.StatusCode.UNIMPLEMENTED: "it does not serve shmio.v1, it is older than this client",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of one value. ``kind``: written, taken, rejected, refused, expired, unknown or shadowed.
+
+    ``text``: the reason, if there is one to give.
+    """
+
+    path: str
+    kind: str
+    text: str = ""
+
+    @property
+    def done(self) -> bool:
+        """Whether it has gone where it was meant to."""
+        return self.kind in ("written", "taken", "shadowed")
+
+
+def read_request(patterns: Iterable[str], *, originals: bool, tables: Iterable[int]) -> Any:
+    """For Read."""
+    return wire.ReadRequest(patterns=patterns, originals=originals, tables=tables)
+
+
+def subscribe_request(
+    patterns: Iterable[str], *, every_frame: bool, frames: bool, max_rate_hz: float, deadband: float
+) -> Any:
+    """For Subscribe."""
+    return wire.SubscribeRequest(
+        patterns=patterns,
+        mode=wire.MODE_EVERY_FRAME if every_frame else wire.MODE_LATEST,
+        format=wire.FORMAT_FRAMES if frames else wire.FORMAT_VALUES,
+        max_rate_hz=max_rate_hz,
+        deadband=deadband,
+    )
+
+
+def write_request(values: Mapping[str, object], timeout_s: float | None) -> Any:
+    """For Write; ValueRangeError: a value of no kind that goes by wire."""
+    return wire.WriteRequest(values=assignments(values), timeout_ms=round(1000 * (timeout_s or 0)))
+
+
+def assignments(values: Mapping[str, object]) -> list[Any]:
+    """Values by path; ValueRangeError."""
+    return [wire.Assignment(path=path, value=to_wire(value, path)) for path, value in values.items()]
+
+
+def to_wire(value: object, path: str) -> Any:
+    """A value of Python or numpy; ValueRangeError."""
+    if isinstance(value, (np.ndarray, np.generic)):
+        value = value.tolist()
+    if isinstance(value, bool):
+        return wire.Value(boolean=value)
+    if isinstance(value, int):
+        if -(1 << 63) <= value < 1 << 63:
+            return wire.Value(integer=value)
+        if 0 <= value < 1 << 64:
+            return wire.Value(unsigned=value)
+        raise ValueRangeError(f"{path}: {value} has more than 64 bits")
+    if isinstance(value, float):
+        return wire.Value(number=value)
+    if isinstance(value, str):
+        return wire.Value(text=value)
+    if isinstance(value, (list, tuple)):
+        return wire.Value(list=wire.List(values=[to_wire(item, path) for item in value]))
+    raise ValueRangeError(f"{path}: a {type(value).__name__} is no value of a register")
+
+
+def outcomes(paths: Iterable[str], found: Any) -> list[Outcome]:
+    """Of an answer, in the order of the paths."""
+    ends = list(found)
+    paths = list(paths)
+    if len(ends) == 1:
+        ends *= len(paths)
+    return [Outcome(path, _kind(end.kind), end.reason) for path, end in zip(paths, ends, strict=True)]
+
+
+def _kind(kind: int) -> str:
+    known = wire.Outcome.Kind.values()
+    return wire.Outcome.Kind.Name(kind).removeprefix("KIND_").lower() if kind in known else "unknown"
+
+
+@dataclass(frozen=True, slots=True)
+class Injection:
+    """An injection that stands. ``direction``: out or in; ``ranges``: (offset, size, mask) of what it covers."""
+
+    source: str
+    number: int
+    direction: str
+    priority: int
+    keep: bool
+    name: str
+    pid: int
+    ranges: tuple[tuple[int, int, int], ...]
+
+
+def injections(found: Any) -> list[Injection]:
+    """Of a list's answer."""
+    return [
+        Injection(
+            one.source, one.number, "in" if one.direction == wire.DIRECTION_IN else "out", one.priority, one.keep,
+            one.name, one.pid, tuple((part.offset, part.size, part.mask) for part in one.ranges),
+        )
+        for one in found.injections
+    ]  # fmt: skip
+
+
+def status(found: Any) -> dict[str, Any]:
+    """Of an answer, as ``shmio-supervisor status --json`` has it."""
+    return {
+        "instance": found.instance,
+        "mode": found.mode,
+        "state": found.state,
+        "segment": found.segment,
+        "segment_bytes": found.segment_bytes,
+        "supervisor": {"pid": found.supervisor.pid, "uptime_s": found.supervisor.uptime_s}
+        if found.HasField("supervisor")
+        else None,
+        "processes": list(map(_process, found.processes)),
+        "note": found.note,
+    }
+
+
+def _process(found: Any) -> dict[str, Any]:
+    process: dict[str, Any] = {
+        "name": found.name,
+        "kind": found.kind,
+        "pid": found.pid if found.HasField("pid") else None,
+        "state": found.state,
+        "restarts": found.restarts,
+        "uptime_s": found.uptime_s,
+        "note": found.note,
+        "counters": dict(found.counters),
+    }
+    if found.HasField("source"):
+        source = found.source
+        process |= {
+            "quality": source.quality,
+            "reason": source.reason,
+            "cycle": source.cycle if source.HasField("cycle") else None,
+            "rate_hz": source.rate_hz,
+            "overruns": source.overruns,
+        }
+    return process

@@ -1,0 +1,115 @@
+"""Layouts as an endpoint tells them, and raw frames decoded by them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+
+from shmio.client.table import Array, Register
+from shmio.errors import PathError, RemoteError
+
+_NUMBERS: Final = {
+    "BYTE": "u1", "WORD": "u2", "DWORD": "u4", "LWORD": "u8", "USINT": "u1", "UINT": "u2", "UDINT": "u4", "ULINT": "u8",
+    "SINT": "i1", "INT": "i2", "DINT": "i4", "LINT": "i8", "REAL": "f4", "LREAL": "f8", "TIME": "i4", "LTIME": "i8",
+    "TIME_OF_DAY": "u4", "LTOD": "u8", "CHAR": "S1",
+}  # fmt: skip
+MAX_REGISTERS: Final = 1 << 20
+
+
+@dataclass(frozen=True)
+class BlockLayout:
+    """A source's block. ``writable``: patterns; ``stale_ns``: age from which a frame is bad; ``size`` in bytes."""
+
+    source: str
+    section: int
+    name: str
+    number: int | None
+    size: int
+    big_endian: bool
+    hash: bytes
+    period_ns: int
+    stale_ns: int
+    writable: tuple[str, ...]
+    armed: bool
+    optimized: bool
+    registers: tuple[Register, ...]
+
+    @cached_property
+    def places(self) -> Mapping[str, int]:
+        """Place of each register, by its path without the source."""
+        return {register.path: place for place, register in enumerate(self.registers)}
+
+    def array(self, image: bytes) -> Array:
+        """A raw frame as a record of numpy, a field for each register, named by its path; nothing is copied.
+
+        Numbers are in the source's own byte order. A BOOL is the byte that holds it (:meth:`value` gives the bit);
+        arrays of BOOLs, texts and dates are bytes. ValueError: an image of another size.
+        """
+        if len(image) != self.size:
+            raise ValueError(f"{self.source}: a frame has {self.size} bytes, this has {len(image)}")
+        return np.frombuffer(image, self._dtype)[0]  # type: ignore[no-any-return]
+
+    def value(self, image: bytes, path: str) -> Any:
+        """One register of a raw frame as :meth:`array` has it, a BOOL and arrays of them as bools. PathError."""
+        place = self.places.get(path.removeprefix(f"{self.source}/"), self.places.get(path))
+        if place is None:
+            raise PathError(f"{path}: no such register in {self.source}")
+        register = self.registers[place]
+        if register.type != "BOOL":
+            return self.array(image)[register.path]
+        if not register.dims:
+            return bool(image[register.offset] >> (register.bit or 0) & 1)
+        *rows, length = register.shape
+        packed = np.frombuffer(image, np.uint8, register.size, register.offset).reshape(*rows, -(-length // 8))
+        return np.unpackbits(packed, axis=-1, count=length, bitorder="little").astype(bool)
+
+    @cached_property
+    def _dtype(self) -> np.dtype[Any]:
+        order = ">" if self.big_endian else "<"
+        formats = []
+        for register in self.registers:
+            kind = _NUMBERS.get(register.type)
+            if kind is None or register.size != register.count * np.dtype(kind).itemsize:
+                formats.append("u1" if register.bit is not None and not register.dims else f"V{register.size}")
+            else:
+                formats.append((order + kind, register.shape) if register.dims else order + kind)  # type: ignore[arg-type]
+        return np.dtype(
+            {
+                "names": [register.path for register in self.registers],
+                "formats": formats,
+                "offsets": [register.offset for register in self.registers],
+                "itemsize": self.size,
+            }
+        )
+
+
+def layouts(parts: Iterable[Any]) -> Iterator[BlockLayout]:
+    """The blocks of GetLayouts' messages. RemoteError: they make no sense."""
+    registers: list[Register] = []
+    for part in parts:
+        registers += map(Register.of, part.registers)
+        if len(registers) > MAX_REGISTERS:
+            raise RemoteError(f"source {part.source}: a layout of more than {MAX_REGISTERS} registers")
+        if part.last:
+            if any(register.offset + register.size > part.size for register in registers):
+                raise RemoteError(f"source {part.source}: registers that are not in its {part.size} bytes")
+            yield BlockLayout(
+                part.source,
+                part.section,
+                part.name,
+                part.number if part.HasField("number") else None,
+                part.size,
+                part.big_endian,
+                part.hash,
+                part.period_ns,
+                part.stale_ns,
+                tuple(part.writable),
+                part.armed,
+                part.optimized,
+                tuple(registers),
+            )
+            registers = []

@@ -1,0 +1,157 @@
+"""The client for programs with threads: every call waits."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Self
+
+import grpc
+
+from shmio.client import calls
+from shmio.client.arrays import ReadResponse, SubscribeResponse
+from shmio.client.calls import Injection, Outcome, Target
+from shmio.client.layout import BlockLayout, layouts
+from shmio.client.update import Snapshot, Tables, Update
+from shmio.wire import shmio_v1_pb2 as wire
+from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
+
+
+class Client:
+    """An instance at the other end of a connection. Several threads may use it. Close it, or use ``with``.
+
+    Errors are those of a local program: PathError, ValueRangeError, CommandError, QualityError; EndpointError: more
+    than the endpoint gives to one client, or all; RemoteError: it cannot be reached, or does not let us.
+    """
+
+    def __init__(self, target: Target, timeout_s: float = 10.0) -> None:
+        """``timeout_s``: of calls that are answered at once."""
+        self.target = target
+        self._timeout_s = timeout_s
+        credentials = target.credentials
+        self._channel = (
+            grpc.insecure_channel(target.address, calls.OPTIONS)
+            if credentials is None
+            else grpc.secure_channel(target.address, credentials, calls.OPTIONS)
+        )
+        self._stub: Any = ShmioStub(self._channel)  # type: ignore[no-untyped-call]
+        self._read = self._channel.unary_unary(
+            f"/{calls.SERVICE}/Read", wire.ReadRequest.SerializeToString, ReadResponse.FromString
+        )
+        self._subscribe = self._channel.unary_stream(
+            f"/{calls.SERVICE}/Subscribe", wire.SubscribeRequest.SerializeToString, SubscribeResponse.FromString
+        )
+
+    def layouts(self, *sources: str) -> dict[str, BlockLayout]:
+        """The blocks of these sources, or of all, by source. PathError: no such source."""
+        call = self._stub.GetLayouts(
+            wire.GetLayoutsRequest(sources=sources), timeout=self._timeout_s, metadata=self.target.metadata
+        )
+        try:
+            return {block.source: block for block in layouts(call)}
+        except grpc.RpcError as error:
+            self.target.fail(error)
+
+    def status(self) -> dict[str, Any]:
+        """How the instance and its processes are, as ``shmio-supervisor status --json`` has it."""
+        return calls.status(self._call(self._stub.GetStatus, wire.GetStatusRequest()))
+
+    def read(self, *patterns: str, originals: bool = False) -> Snapshot:
+        """Registers as of now: paths, elements, slices, structures, globs, or a source; of each source one frame.
+
+        ``originals``: what the source delivered, too, where an injection shows something else. PathError,
+        ValueRangeError: too much for one call.
+        """
+        tables = Tables()
+        request = calls.read_request(patterns, originals=originals, tables=())
+        return Snapshot(tables.updates(self._call(self._read, request)))
+
+    def __getitem__(self, path: str) -> Any:
+        """A register's good value; PathError, and QualityError with the reason when there is none."""
+        return self.read(path)[path]
+
+    def subscribe(
+        self,
+        *patterns: str,
+        every_frame: bool = False,
+        frames: bool = False,
+        max_rate_hz: float = 0.0,
+        deadband: float = 0.0,
+    ) -> Subscription:
+        """The present values of all, then what changes: see :class:`Update`. PathError comes with the first one.
+
+        ``every_frame``: all frames in order, losses counted; else the newest, at most ``max_rate_hz`` a second of
+        each source, and of numbers only what differs from what came before by more than ``deadband``. ``frames``: raw
+        frames of the sources instead of values.
+        """
+        request = calls.subscribe_request(
+            patterns, every_frame=every_frame, frames=frames, max_rate_hz=max_rate_hz, deadband=deadband
+        )
+        return Subscription(self._subscribe(request, metadata=self.target.metadata), self.target)
+
+    def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
+        """Write registers, arrays or elements of one source, all or none; what became of each, by the source.
+
+        ``timeout_s``: how long the source may take until it begins; default: 2 s, or three of its cycles. PathError,
+        ValueRangeError, CommandError: nothing has been sent.
+        """
+        request = calls.write_request(values, timeout_s)
+        answer = self._call(self._stub.Write, request, (timeout_s or 0) + calls.WRITE_PATIENCE_S)
+        return calls.outcomes(values, answer.outcomes)
+
+    def injections(self, *sources: str) -> list[Injection]:
+        """What stands at present, on these sources or all; of each the innermost first."""
+        return calls.injections(self._call(self._stub.ListInjections, wire.ListInjectionsRequest(sources=sources)))
+
+    def _call(self, method: Callable[..., Any], request: Any, timeout_s: float | None = None) -> Any:
+        try:
+            return method(request, timeout=timeout_s or self._timeout_s, metadata=self.target.metadata)
+        except grpc.RpcError as error:
+            self.target.fail(error)
+
+    def close(self) -> None:
+        """End all calls, and the connection."""
+        self._channel.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Subscription(Iterator[Update]):
+    """Updates as they come; ends when it, or its client, is closed. For one thread, :meth:`close` for any."""
+
+    def __init__(self, call: Any, target: Target) -> None:
+        self._call = call
+        self._target = target
+        self._tables = Tables()
+        self._waiting: Iterator[Update] = iter(())
+        self._closed = threading.Event()
+
+    def __next__(self) -> Update:
+        """The next one, waited for. The arrays of its table change with the one after it.
+
+        RemoteError: the instance has ended; PathError, ValueRangeError, EndpointError: it refuses.
+        """
+        while True:
+            for update in self._waiting:
+                return update
+            try:
+                self._waiting = self._tables.all_of(next(self._call))
+            except grpc.RpcError as error:
+                if self._closed.is_set() or self._call.cancelled():
+                    raise StopIteration from None
+                self._target.fail(error)
+
+    def close(self) -> None:
+        """End it."""
+        self._closed.set()
+        self._call.cancel()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,223 @@
+"""What a table of registers means, and the values that it has by now, as numpy arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from shmio.errors import PathError, RemoteError
+
+Array = np.ndarray[Any, np.dtype[Any]]
+
+
+class Column(IntEnum):
+    """Where the values of a type are."""
+
+    BOOL = 1
+    INT32 = 2
+    INT64 = 3
+    UINT64 = 4
+    FLOAT = 5
+    DOUBLE = 6
+    TEXT = 7
+
+
+DTYPES: Final[Mapping[Column, np.dtype[Any]]] = {
+    Column.BOOL: np.dtype("?"),
+    Column.INT32: np.dtype("<i4"),
+    Column.INT64: np.dtype("<i8"),
+    Column.UINT64: np.dtype("<u8"),
+    Column.FLOAT: np.dtype("<f4"),
+    Column.DOUBLE: np.dtype("<f8"),
+    Column.TEXT: np.dtype(object),
+}
+_FIELDS: Final = {
+    Column.BOOL: "bools",
+    Column.INT32: "int32s",
+    Column.INT64: "int64s",
+    Column.UINT64: "uint64s",
+    Column.FLOAT: "floats",
+    Column.DOUBLE: "doubles",
+    Column.TEXT: "texts",
+}
+MAX_SLOTS: Final = 1 << 22
+"""A table with more is none of ours."""
+
+
+@dataclass(frozen=True, slots=True)
+class Register:
+    """A register, or an array's element; ``path`` is without its source. ``slot``: its first in its column.
+
+    ``bit`` is None but for BOOLs. ``comment`` and ``initial`` are there with layouts only.
+    """
+
+    path: str
+    type: str
+    dims: tuple[tuple[int, int], ...]
+    offset: int
+    bit: int | None
+    size: int
+    count: int
+    column: Column
+    slot: int
+    comment: str = ""
+    initial: str | None = None
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of elements in each dimension."""
+        return tuple(high - low + 1 for low, high in self.dims)
+
+    @classmethod
+    def of(cls, found: Any) -> Register:
+        """From the wire; RemoteError: it makes no sense."""
+        try:
+            return cls(
+                found.path,
+                found.type,
+                tuple((bounds.low, bounds.high) for bounds in found.dims),
+                found.offset,
+                found.bit if found.HasField("bit") else None,
+                found.size,
+                found.count,
+                Column(found.column),
+                found.slot,
+                found.comment,
+                found.initial if found.HasField("initial") else None,
+            )
+        except ValueError as error:
+            raise RemoteError(f"{found.path}: {error}") from None
+
+
+class Change(NamedTuple):
+    """Elements of a column as they came: ``values[i]`` is that of ``slots[i]``. The arrays cannot be written to."""
+
+    column: Column
+    slots: Array
+    values: Array
+
+
+class Table:
+    """Registers of one source, and their values by now: one array for each type, an element or more a register."""
+
+    def __init__(self, found: Any) -> None:
+        """From the wire; RemoteError: it makes no sense."""
+        self.number: int = found.number
+        self.source: str = found.source
+        self.section: int = found.section
+        """Which of the blocks that the source has had: a reload may give it another."""
+        self.size: int = found.size
+        """Of a frame, in bytes."""
+        self.hash: bytes = found.hash
+        self.registers = tuple(map(Register.of, found.registers))
+        sizes = dict(zip(Column, found.slots[1:], strict=False))
+        if sum(sizes.values()) > MAX_SLOTS:
+            raise RemoteError(f"source {self.source}: a table of {sum(sizes.values())} elements")
+        for register in self.registers:
+            count = int(np.prod(register.shape, dtype=object)) if register.dims else 1
+            if count != register.count or register.slot + count > sizes.get(register.column, 0):
+                raise RemoteError(f"{self.source}/{register.path}: its elements are not in the table")
+        self.arrays: dict[Column, Array] = {
+            column: np.zeros(size, DTYPES[column]) for column, size in sizes.items() if size
+        }
+        """The values by now, by column; the next update writes into them."""
+        if Column.TEXT in self.arrays:
+            self.arrays[Column.TEXT][:] = ""
+        self.invalid = np.zeros(len(self.registers), bool)
+        """Registers, by their place, whose bytes are no value of their type."""
+        self.injected = np.zeros(len(self.registers), bool)
+        """Registers, by their place, of which an injection shows something else."""
+        self._everything = {column: np.arange(len(array), dtype=np.uint32) for column, array in self.arrays.items()}
+
+    @cached_property
+    def places(self) -> Mapping[str, int]:
+        """Place of each register, by its path without the source."""
+        return {register.path: place for place, register in enumerate(self.registers)}
+
+    @property
+    def paths(self) -> list[str]:
+        """Paths of the registers, with the source."""
+        return [f"{self.source}/{register.path}" for register in self.registers]
+
+    def place(self, path: str) -> int:
+        """Place of a register, by its path with or without the source. PathError."""
+        found = self.places.get(path)
+        if found is None:
+            found = self.places.get(path.removeprefix(f"{self.source}/"))
+        if found is None:
+            raise PathError(f"{path}: not among the registers of {self.source} that were asked for")
+        return found
+
+    def value(self, place: int, arrays: Mapping[Column, Array] | None = None) -> Any:
+        """A register's value: a scalar of numpy, an array of its shape, or text; None if its bytes are no value."""
+        register = self.registers[place]
+        array = (self.arrays if arrays is None else arrays)[register.column]
+        if register.dims:
+            return array[register.slot : register.slot + register.count].reshape(register.shape).copy()
+        return None if self.invalid[place] else array[register.slot]
+
+    def changed(self, changes: tuple[Change, ...]) -> list[int]:
+        """Places of the registers that changes are about, ascending."""
+        found: set[int] = set()
+        for change in changes:
+            slots, places = self._starts[change.column]
+            found.update(places[np.unique(np.searchsorted(slots, change.slots, "right") - 1)].tolist())
+        return sorted(found)
+
+    @cached_property
+    def _starts(self) -> Mapping[Column, tuple[Array, Array]]:
+        """First slots of the registers of each column, ascending, and their places."""
+        found: dict[Column, list[tuple[int, int]]] = {}
+        for place, register in enumerate(self.registers):
+            found.setdefault(register.column, []).append((register.slot, place))
+        return {
+            column: (np.array([slot for slot, _ in sorted(pairs)]), np.array([place for _, place in sorted(pairs)]))
+            for column, pairs in found.items()
+        }
+
+    def apply(self, values: Any) -> tuple[Change, ...]:
+        """Take a message's values over into the arrays; what they were. RemoteError: they make no sense."""
+        try:
+            changes = self.read(values)
+            for column, slots, news in changes:
+                if len(slots) == len(self.arrays[column]):
+                    self.arrays[column][:] = news
+                else:
+                    self.arrays[column][slots] = news
+        except (IndexError, ValueError, KeyError) as error:
+            raise RemoteError(f"source {self.source}: an update that makes no sense: {error}") from None
+        return changes
+
+    def read(self, values: Any) -> tuple[Change, ...]:
+        """A message's values as they are. RemoteError: they make no sense."""
+        try:
+            return tuple(self._read(values))
+        except (ValueError, KeyError) as error:
+            raise RemoteError(f"source {self.source}: an update that makes no sense: {error}") from None
+
+    def _read(self, values: Any) -> Iterator[Change]:
+        for column, name in _FIELDS.items():
+            if values.HasField(name):
+                part = getattr(values, name)
+                if column is Column.TEXT:
+                    news = np.array(list(part.values), dtype=object)
+                else:
+                    news = np.frombuffer(part.values, DTYPES[column])
+                slots = np.frombuffer(part.slots, np.uint32) if part.slots else self._everything[column]
+                if len(slots) != len(news):
+                    raise ValueError(f"{len(news)} values for {len(slots)} elements")
+                yield Change(column, slots, news)
+
+    def mark(self, marks: Any, into: Array) -> None:
+        """Take a message's marks over. RemoteError."""
+        places = np.frombuffer(marks.registers, np.uint32)
+        into[:] = False
+        try:
+            into[places] = True
+        except IndexError as error:
+            raise RemoteError(f"source {self.source}: an update that makes no sense: {error}") from None

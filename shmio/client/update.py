@@ -1,0 +1,182 @@
+"""Updates: what came of one block's frame, and the tables that they refer to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from enum import IntEnum
+from typing import Any
+
+from shmio.client.arrays import SubscribeResponse
+from shmio.client.table import Array, Change, Column, Table
+from shmio.errors import PathError, QualityError, RemoteError
+
+
+class Quality(IntEnum):
+    """Trust in a value."""
+
+    BAD = 0
+    UNCERTAIN = 1
+    GOOD = 2
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
+class Provenance(IntEnum):
+    """Where values come from."""
+
+    LIVE = 0
+    SIMULATED = 1
+    REPLAYED = 2
+    INJECTED = 3
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+
+class Update:
+    """One frame of a source, or what has become of the one before.
+
+    ``changes`` has what came, ``table.arrays`` all values by now; ``update[path]`` is the value of a register by now.
+    Times in ns: ``clock_ns`` since the instance's start, ``source_ns`` UTC of the values, 0 if there never were any.
+    ``missed``: with every frame, frames lost between the update before and this one. ``ended``: a reload has taken
+    away the source, or all that was asked of it. ``image``, ``raw``: with raw frames, as consumers see
+    them, and as the source delivered them. ``age_ns``: with reads.
+    """
+
+    __slots__ = (
+        "_originals", "age_ns", "changes", "clock_ns", "cycle", "ended", "frame", "image", "incarnation", "missed",
+        "provenance", "quality", "raw", "reason", "source_ns", "table", "whole",
+    )  # fmt: skip
+
+    def __init__(self, table: Table, found: Any) -> None:
+        """From the wire; takes the values over into the table. RemoteError."""
+        self.table = table
+        self.frame: int = found.frame
+        self.cycle: int = found.cycle
+        self.incarnation: int = found.incarnation
+        self.clock_ns: int = found.clock_ns
+        self.source_ns: int = found.source_ns
+        self.quality = _QUALITIES.get(found.quality, Quality.BAD)
+        self.reason: str = found.reason
+        self.provenance = _PROVENANCES.get(found.provenance, Provenance.SIMULATED)
+        self.missed: int = found.missed
+        self.whole: bool = found.whole
+        self.image: bytes = found.image
+        self.raw: bytes = found.original or found.image
+        self.age_ns: int = found.age_ns
+        self.ended = False
+        self.changes: tuple[Change, ...] = table.apply(found.values) if found.HasField("values") else ()
+        if found.HasField("invalid"):
+            table.mark(found.invalid, table.invalid)
+        if found.HasField("injected"):
+            table.mark(found.injected, table.injected)
+        self._originals: Mapping[Column, Array] | None = None
+        if found.HasField("originals"):
+            self._originals = {change.column: change.values for change in table.read(found.originals)}
+
+    @property
+    def source(self) -> str:
+        """Name of the source."""
+        return self.table.source
+
+    @property
+    def changed(self) -> list[str]:
+        """Paths of the registers that this update is about, with the source."""
+        registers = self.table.registers
+        return [f"{self.source}/{registers[place].path}" for place in self.table.changed(self.changes)]
+
+    def __getitem__(self, path: str) -> Any:
+        """A register's value by now, whatever the quality; see :meth:`Table.value`. PathError."""
+        return self.table.value(self.table.place(path))
+
+    def good(self, path: str) -> Any:
+        """A register's value if it is good, or uncertain; QualityError with the reason, PathError."""
+        quality, reason = self.quality_of(path)
+        if quality is Quality.BAD:
+            raise QualityError(f"{self.source}/{path.removeprefix(f'{self.source}/')}: {reason}")
+        return self[path]
+
+    def original(self, path: str) -> Any:
+        """What the source delivered, whatever an injection shows; of reads with ``originals``. PathError."""
+        return self.table.value(self.table.place(path), self._originals)
+
+    def quality_of(self, path: str) -> tuple[Quality, str]:
+        """Quality of one register, and the reason if it is not good. PathError."""
+        place = self.table.place(path)
+        if self.quality is not Quality.BAD and self.table.invalid[place]:
+            return Quality.BAD, f"the bytes are no {self.table.registers[place].type}"
+        return self.quality, self.reason
+
+    def provenance_of(self, path: str) -> Provenance:
+        """Where one register's value comes from. PathError."""
+        return Provenance.INJECTED if self.table.injected[self.table.place(path)] else self.provenance
+
+
+def end_of(table: Table, reason: str) -> Update:
+    """The last update of a source that is not there any more."""
+    update = Update(table, _NOTHING)
+    update.reason, update.ended = reason, True
+    return update
+
+
+_NOTHING = SubscribeResponse.FromString(b"\x12\x00").updates[0]
+_QUALITIES = {int(quality): quality for quality in Quality}
+_PROVENANCES = {int(provenance): provenance for provenance in Provenance}
+
+
+class Tables:
+    """Those of one stream, or of reads, by their numbers."""
+
+    def __init__(self) -> None:
+        self.known: dict[int, Table] = {}
+
+    def updates(self, found: Any) -> Iterator[Update]:
+        """The updates of a message that may bring tables, too. RemoteError: it makes no sense.
+
+        Take one after the other: each changes its table's arrays.
+        """
+        for one in found.tables:
+            news = Table(one)
+            self.known = {number: old for number, old in self.known.items() if old.source != news.source}
+            self.known[news.number] = news
+        for update in found.updates:
+            table = self.known.get(update.table)
+            if table is None:
+                raise RemoteError(f"an update of table {update.table}, which was not sent")
+            yield Update(table, update)
+
+    def all_of(self, found: Any) -> Iterator[Update]:
+        """Both, of a stream's message."""
+        yield from self.updates(found)
+        yield from self.ended(found)
+
+    def ended(self, found: Any) -> Iterator[Update]:
+        """What a message says of sources that are not there any more."""
+        for end in found.ended:
+            for table in [table for table in self.known.values() if table.source == end.source]:
+                yield end_of(table, end.reason)
+
+
+class Snapshot:
+    """What one read gave: of each source one update. Registers by their paths with the source."""
+
+    def __init__(self, updates: Iterable[Update]) -> None:
+        self.updates = {update.source: update for update in updates}
+
+    def __iter__(self) -> Iterator[str]:
+        for update in self.updates.values():
+            yield from update.table.paths
+
+    def of(self, path: str) -> Update:
+        """The update that has this register; the source may be left out if there is only one. PathError."""
+        update = self.updates.get(path.partition("/")[0])
+        if update is None and len(self.updates) == 1:
+            (update,) = self.updates.values()
+        if update is None:
+            raise PathError(f"{path}: not among what was read")
+        return update
+
+    def __getitem__(self, path: str) -> Any:
+        """A register's good value; QualityError, PathError."""
+        return self.of(path).good(path)

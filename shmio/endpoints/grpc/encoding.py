@@ -1,0 +1,31 @@
+"""Protobuf's wire format, for messages that are put together of parts which many share.
+
+Serialised fields may be concatenated: together they are a message (protobuf.dev, "Encoding").
+"""
+
+from __future__ import annotations
+
+
+def varint(number: int) -> bytes:
+    """A number from 0 on."""
+    data = bytearray()
+    while number > 0x7F:
+        data.append(number & 0x7F | 0x80)
+        number >>= 7
+    data.append(number)
+    return bytes(data)
+
+
+def delimited(data: bytes) -> bytes:
+    """Bytes behind their length."""
+    return varint(len(data)) + data
+
+
+def field(field_number: int, data: bytes) -> bytes:
+    """A field of this number that is bytes, text, a message, or packed numbers."""
+    return varint(field_number << 3 | 2) + varint(len(data)) + data
+
+
+def number(field_number: int, value: int) -> bytes:
+    """A field of this number that is a whole number from 0 on, or an enum's."""
+    return varint(field_number << 3) + varint(value)

@@ -1,0 +1,234 @@
+"""From images of a block to packed arrays by type, with numpy; and which elements differ between two images."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from shmio.endpoints.grpc.encoding import field
+from shmio.layout.model import ByteOrder, Register, element_position
+from shmio.layout.moment import Buffer
+from shmio.layout.scalar import Scalar, scalar_codec
+from shmio.layout.types import ElementType
+
+Array = np.ndarray[Any, np.dtype[Any]]
+
+
+class Column(IntEnum):
+    """As ``Column`` of the wire. The columns' fields in ``Values`` have the same numbers."""
+
+    BOOL = 1
+    INT32 = 2
+    INT64 = 3
+    UINT64 = 4
+    FLOAT = 5
+    DOUBLE = 6
+    TEXT = 7
+
+
+_COLUMNS: Final = {
+    **dict.fromkeys("bBhHi", Column.INT32),
+    **dict.fromkeys("Iq", Column.INT64),
+    "Q": Column.UINT64,
+    "f": Column.FLOAT,
+    "d": Column.DOUBLE,
+}
+_BY_BASE: Final = {
+    "BOOL": Column.BOOL, "TIME_OF_DAY": Column.INT32, "S5TIME": Column.INT32, "LTOD": Column.INT64,
+}  # fmt: skip
+KINDS: Final[Mapping[Column, np.dtype[Any]]] = {
+    Column.BOOL: np.dtype("u1"),
+    Column.INT32: np.dtype("<i4"),
+    Column.INT64: np.dtype("<i8"),
+    Column.UINT64: np.dtype("<u8"),
+    Column.FLOAT: np.dtype("<f4"),
+    Column.DOUBLE: np.dtype("<f8"),
+}
+"""How the elements of a column lie in its packed field."""
+_BITS: Final = {column: np.dtype(f"<u{kind.itemsize}") for column, kind in KINDS.items()}
+
+
+def column_of(element: ElementType) -> Column:
+    """Where values of a type go."""
+    return _BY_BASE.get(element.base) or _COLUMNS.get(scalar_codec(element).plain, Column.TEXT)
+
+
+class Decoded(NamedTuple):
+    """All elements of an image. ``invalid``: places of the registers of which some bytes are no value."""
+
+    arrays: Mapping[Column, Array]
+    texts: tuple[str, ...]
+    invalid: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Numbers:
+    """Elements of one type: ``bytes`` says, by element, where its bytes are, the least significant first."""
+
+    slots: slice
+    bytes: Array
+    kind: np.dtype[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class _Other:
+    """An element that is not just a number; ``register``: its place."""
+
+    column: Column
+    slot: int
+    register: int
+    decode: Callable[[Buffer, int], Scalar]
+    offset: int
+
+
+class Columns:
+    """How registers lie in columns; built once. Decoding remembers what does not change, and is for one thread."""
+
+    def __init__(self, registers: Sequence[Register], order: ByteOrder) -> None:
+        self.places: list[tuple[Column, int]] = [(Column.TEXT, 0)] * len(registers)
+        """Column and first slot of each register."""
+        self.sizes = dict.fromkeys(Column, 0)
+        """Slots of each column."""
+        self._numbers: list[tuple[Column, _Numbers]] = []
+        self._others: list[_Other] = []
+        groups: dict[tuple[Column, str], list[int]] = {}
+        for place, register in enumerate(registers):
+            column = column_of(register.element)
+            code = "" if column is Column.BOOL else scalar_codec(register.element).plain
+            groups.setdefault((column, code), []).append(place)
+        for (column, code), members in groups.items():
+            first = self.sizes[column]
+            for place in members:
+                self.places[place] = column, self.sizes[column]
+                self.sizes[column] += registers[place].count
+            chosen = [registers[place] for place in members]
+            if column is Column.BOOL:
+                self._bits = _bits(chosen)
+            elif code:
+                where = slice(first, self.sizes[column])
+                self._numbers.append((column, _numbers(chosen, code, order, where)))
+            else:
+                self._others += self._others_of(members, chosen, order)
+        starts = {(other.offset, registers[other.register].element.size) for other in self._others}
+        self._watched = np.array([at for start, size in starts for at in range(start, start + size)], np.intp)
+        self._seen: tuple[bytes, dict[Column, list[tuple[int, Any]]], tuple[str, ...], tuple[int, ...]] | None = None
+
+    def _others_of(self, members: Sequence[int], registers: Sequence[Register], order: ByteOrder) -> Iterable[_Other]:
+        for place, register in zip(members, registers, strict=True):
+            column, first = self.places[place]
+            decode = scalar_codec(register.element, order).decode
+            for flat in range(register.count):
+                yield _Other(column, first + flat, place, decode, register.offset + flat * register.element.stride)
+
+    def decode(self, image: bytes) -> Decoded:
+        """All elements of an image of the block."""
+        data = np.frombuffer(image, np.uint8)
+        arrays = {column: np.zeros(self.sizes[column], kind) for column, kind in KINDS.items() if self.sizes[column]}
+        if Column.BOOL in arrays:
+            where, shifts = self._bits
+            np.bitwise_and(data[where] >> shifts, 1, out=arrays[Column.BOOL])
+        for column, part in self._numbers:
+            arrays[column][part.slots] = data[part.bytes].view(part.kind)[:, 0]
+        if not self._others:
+            return Decoded(arrays, (), ())
+        numbers, texts, invalid = self._rest(image, data)
+        for column, found in numbers.items():
+            for slot, value in found:
+                arrays[column][slot] = value
+        return Decoded(arrays, texts, invalid)
+
+    def _rest(
+        self, image: bytes, data: Array
+    ) -> tuple[dict[Column, list[tuple[int, Any]]], tuple[str, ...], tuple[int, ...]]:
+        """What is decoded one by one; not again while its bytes stay the same."""
+        watched = data[self._watched].tobytes()
+        if self._seen is not None and self._seen[0] == watched:
+            return self._seen[1:]
+        numbers: dict[Column, list[tuple[int, Any]]] = {}
+        texts = [""] * self.sizes[Column.TEXT]
+        invalid: dict[int, None] = {}
+        for other in self._others:
+            value = other.decode(image, other.offset)
+            if value is None:
+                invalid[other.register] = None
+            elif other.column is Column.TEXT:
+                texts[other.slot] = str(value)
+            else:
+                numbers.setdefault(other.column, []).append((other.slot, value))
+        self._seen = watched, numbers, tuple(texts), tuple(sorted(invalid))
+        return self._seen[1:]
+
+
+def pack(new: Decoded, old: Decoded | None = None, deadband: float = 0.0) -> bytes:
+    """A serialised ``Values`` of what differs, by its bits; of all without an ``old``; empty: nothing does.
+
+    ``deadband``: numbers that differ by no more are left out.
+    """
+    parts = []
+    for column, values in new.arrays.items():
+        if old is None:
+            parts.append(field(column, field(2, values.tobytes())))
+            continue
+        slots = _differing(column, old.arrays[column], values, deadband)
+        if len(slots) == len(values):
+            parts.append(field(column, field(2, values.tobytes())))
+        elif len(slots):
+            parts.append(field(column, field(1, slots.astype("<u4").tobytes()) + field(2, values[slots].tobytes())))
+    if old is None and new.texts:
+        parts.append(field(Column.TEXT, _texts(new.texts)))
+    elif old is not None and new.texts is not old.texts:
+        pairs = enumerate(zip(new.texts, old.texts, strict=True))
+        changed = [slot for slot, (now, before) in pairs if now != before]
+        if changed:
+            where = field(1, np.array(changed, "<u4").tobytes())
+            parts.append(field(Column.TEXT, where + _texts(new.texts[slot] for slot in changed)))
+    return b"".join(parts)
+
+
+def merge(new: Decoded, old: Decoded, deadband: float) -> Decoded:
+    """What somebody has after :func:`pack`: of a number that was left out, the old one."""
+    arrays = {}
+    for column, values in new.arrays.items():
+        slots = _differing(column, old.arrays[column], values, deadband)
+        arrays[column] = old.arrays[column].copy()
+        arrays[column][slots] = values[slots]
+    return Decoded(arrays, new.texts, new.invalid)
+
+
+def _differing(column: Column, old: Array, new: Array, deadband: float) -> Array:
+    """Slots that differ: compared by bits, for a NaN that stays has not changed, and 0.0 that becomes -0.0 has."""
+    differs = old.view(_BITS[column]) != new.view(_BITS[column])
+    if deadband and column is not Column.BOOL:
+        with np.errstate(invalid="ignore", over="ignore"):
+            distance = np.abs(new.astype(np.float64) - old.astype(np.float64))
+        differs &= ~(distance <= deadband)  # a NaN is never within it
+    return np.flatnonzero(differs)
+
+
+def _texts(texts: Iterable[str]) -> bytes:
+    return b"".join(field(2, text.encode()) for text in texts)
+
+
+def _numbers(registers: Sequence[Register], code: str, order: ByteOrder, slots: slice) -> _Numbers:
+    kind = np.dtype(f"<{code}")
+    starts = [register.offset + np.arange(register.count) * register.element.stride for register in registers]
+    within = np.arange(kind.itemsize)
+    where = np.concatenate(starts)[:, None] + (within[::-1] if order == "big" else within)
+    return _Numbers(slots, where.astype(np.intp), kind)
+
+
+def _bits(registers: Sequence[Register]) -> tuple[Array, Array]:
+    """Byte and shift of each bit."""
+    places = []
+    for register in registers:
+        if register.dims:
+            found = (element_position(register.element, register.shape, flat) for flat in range(register.count))
+            places += [(register.offset + byte, bit or 0) for byte, bit in found]
+        else:
+            places.append((register.offset, register.bit or 0))
+    where, shifts = zip(*places, strict=True)
+    return np.array(where, np.intp), np.array(shifts, np.uint8)

@@ -1,0 +1,152 @@
+"""What the patterns of a call name: a view of each block, made once for all clients who name the same."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from typing import Final
+from weakref import WeakValueDictionary
+
+from shmio.endpoints.grpc.native.views import Frames, Selection, View
+from shmio.endpoints.grpc.topics import Topics
+from shmio.errors import EndpointError, PathError, ValueRangeError
+from shmio.layout.glob import named
+from shmio.layout.model import Register
+from shmio.layout.topic import Topic, shorten
+from shmio.segment import Block
+
+MAX_PATTERNS: Final = 256
+MAX_REGISTERS: Final = 16_384
+MAX_ELEMENTS: Final = 262_144
+"""Of one call."""
+MAX_MATCHES: Final = 1_000_000
+"""Patterns with a star times registers that they are held against, in one call: some seconds."""
+MAX_ALL_ELEMENTS: Final = 1 << 22
+"""Of what all clients have open; equal patterns count once."""
+KEPT: Final = 16
+"""Views that are kept though nobody has them, for who reads the same again and again."""
+
+Wanted = Mapping[str, Sequence[Topic]]
+"""Topics by their source."""
+
+_Key = tuple[int, tuple[str, ...]]
+
+
+class Selections:
+    """Those that clients have at present."""
+
+    def __init__(self, topics: Topics) -> None:
+        self._topics = topics
+        self._numbers = itertools.count(1)
+        self._known: WeakValueDictionary[_Key, View] = WeakValueDictionary()
+        self._kept: OrderedDict[_Key, View] = OrderedDict()
+        self._turn = asyncio.Lock()
+
+    def resolve(self, patterns: Sequence[str]) -> Wanted:
+        """What a call's patterns say. PathError, ValueRangeError."""
+        if not patterns:
+            raise ValueRangeError("no pattern is given: a path, structure, glob, or a source's name for all it has")
+        if len(patterns) > MAX_PATTERNS:
+            raise ValueRangeError(f"{len(patterns)} patterns, {MAX_PATTERNS} are the most: use stars, or structures")
+        wanted: dict[str, dict[Topic, None]] = {}
+        for pattern in patterns:
+            topic = self._topics.topic(pattern)
+            if topic.direction == "in":
+                raise PathError(f"{shorten(pattern)}: what goes into a source is not read here; leave out /in")
+            wanted.setdefault(topic.source, {})[topic] = None
+        return {source: tuple(topics) for source, topics in wanted.items()}
+
+    async def select(self, wanted: Wanted, *, frames: bool = False) -> list[View]:
+        """One for each source, in this order.
+
+        PathError: no such register; ValueRangeError: too much for one call; EndpointError: for all clients together.
+        """
+        views = []
+        budget = _Budget()
+        for source, topics in wanted.items():
+            views.append(view := await self._view(source, () if frames else topics, budget))
+            budget.take(view)
+        return views
+
+    async def _view(self, source: str, topics: Sequence[Topic], budget: _Budget) -> View:
+        """``topics``: none for raw frames."""
+        block = self._topics.feed(source).block
+        key = block.section, tuple(topic.path for topic in topics)
+        if (view := self._known.get(key)) is None:
+            async with self._turn:  # one at a time, and not on the loop: a large layout and its patterns take seconds
+                view = self._known.get(key)
+                if view is None:
+                    view = self._known[key] = await self._make(block, topics, budget)
+        self._kept[key] = view
+        self._kept.move_to_end(key)
+        while len(self._kept) > KEPT:
+            self._kept.popitem(last=False)
+        return view
+
+    async def _make(self, block: Block, topics: Sequence[Topic], budget: _Budget) -> View:
+        number = next(self._numbers)
+        if not topics:
+            return Frames(number, block)
+        view = await asyncio.to_thread(_select, number, block, topics, budget)
+        if self._elements + view.elements > MAX_ALL_ELEMENTS:
+            self._kept.clear()
+        if self._elements + view.elements > MAX_ALL_ELEMENTS:
+            raise EndpointError(
+                f"all clients together have {self._elements} elements open, {MAX_ALL_ELEMENTS} are the most: name "
+                "less, or take raw frames"
+            )
+        return view
+
+    @property
+    def _elements(self) -> int:
+        return sum(view.elements for view in self._known.values())
+
+
+class _Budget:
+    """What is left of a call's limits."""
+
+    def __init__(self) -> None:
+        self.registers, self.elements, self.matches = MAX_REGISTERS, MAX_ELEMENTS, MAX_MATCHES
+
+    def take(self, view: View) -> None:
+        if isinstance(view, Selection):
+            self.check(len(view.registers), view.elements)
+            self.registers -= len(view.registers)
+            self.elements -= view.elements
+
+    def check(self, registers: int, elements: int) -> None:
+        """ValueRangeError: too many."""
+        if registers > self.registers or elements > self.elements:
+            raise ValueRangeError(
+                f"the patterns name more than {MAX_REGISTERS} registers or {MAX_ELEMENTS} elements, the most of one "
+                "call: name less, make several calls, or take raw frames"
+            )
+
+    def match(self, registers: int) -> None:
+        """ValueRangeError: too many patterns with a star for so large a block."""
+        self.matches -= registers
+        if self.matches < 0:
+            raise ValueRangeError(
+                f"patterns with a star times registers are more than {MAX_MATCHES}: use fewer of them, or structures"
+            )
+
+
+def _select(number: int, block: Block, topics: Sequence[Topic], budget: _Budget) -> Selection:
+    chosen: dict[str, Register] = {}
+    elements = 0
+    for topic in topics:
+        if "*" in topic.path:
+            budget.match(len(block.layout.registers))
+        found = named(block.layout, topic)
+        if not found:
+            raise PathError(f"{shorten(str(topic))}: no register of {block.source} has such a path")
+        for register in found:
+            if register.path not in chosen:
+                chosen[register.path] = register
+                elements += register.count
+        budget.check(len(chosen), elements)
+    selection = Selection(number, block, list(chosen.values()))
+    _ = selection.table
+    return selection

@@ -1,0 +1,146 @@
+"""The service ``shmio.v1.Shmio`` (docs/reference/shmio-v1.md)."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Collection, Mapping
+from typing import Any, Final, NoReturn
+
+import grpc
+
+from shmio.endpoints.grpc.encoding import field, number
+from shmio.endpoints.grpc.feed import Feed
+from shmio.endpoints.grpc.native import describe
+from shmio.endpoints.grpc.native.bells import Bells
+from shmio.endpoints.grpc.native.follow import aged
+from shmio.endpoints.grpc.native.selection import Selections
+from shmio.endpoints.grpc.native.subscribe import Subscription
+from shmio.endpoints.grpc.native.views import AGE_NS, ORIGINALS, Selection, View
+from shmio.endpoints.grpc.topics import Topics
+from shmio.errors import CommandError, EndpointError, PathError, SegmentError, ShmioError, ValueRangeError
+from shmio.segment import Segment
+from shmio.wire import shmio_v1_pb2 as wire
+
+SERVICE: Final = wire.DESCRIPTOR.services_by_name["Shmio"].full_name
+MAX_STREAMS: Final = 256
+"""Subscribe calls that may be open at once."""
+
+Context = grpc.aio.ServicerContext[Any, Any]
+
+_STATUS: Final[Mapping[type[ShmioError], grpc.StatusCode]] = {
+    PathError: grpc.StatusCode.NOT_FOUND,
+    ValueRangeError: grpc.StatusCode.INVALID_ARGUMENT,
+    CommandError: grpc.StatusCode.FAILED_PRECONDITION,
+    EndpointError: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    SegmentError: grpc.StatusCode.UNAVAILABLE,
+}
+
+
+class NativeService:
+    """Serves the registers of all sources typed and packed."""
+
+    name = SERVICE
+
+    def __init__(self, topics: Topics, feeds: Mapping[str, Feed], segment: Segment) -> None:
+        self._feeds = feeds
+        self._segment = segment
+        self._selections = Selections(topics)
+        self._bells = Bells()
+        self._open: set[Subscription] = set()
+        self._ended_updates = 0
+
+    @property
+    def streams(self) -> int:
+        """Subscribe calls that are open."""
+        return len(self._open)
+
+    @property
+    def updates(self) -> int:
+        """Updates sent on them since the start."""
+        return self._ended_updates + sum(subscription.updates for subscription in self._open)
+
+    def handlers(self) -> grpc.GenericRpcHandler:
+        """The service's calls, for a server. Values are serialised where they are made, and once."""
+        unary, streaming = grpc.unary_unary_rpc_method_handler, grpc.unary_stream_rpc_method_handler
+        calls: dict[str, grpc.RpcMethodHandler[Any, Any]] = {
+            "GetLayouts": streaming(
+                self.get_layouts, wire.GetLayoutsRequest.FromString, wire.LayoutPart.SerializeToString
+            ),
+            "GetStatus": unary(self.get_status, wire.GetStatusRequest.FromString, wire.Status.SerializeToString),
+            "Read": unary(self.read, wire.ReadRequest.FromString),
+            "Subscribe": streaming(self.subscribe, wire.SubscribeRequest.FromString),
+        }
+        return grpc.method_handlers_generic_handler(SERVICE, calls)
+
+    async def get_layouts(self, request: wire.GetLayoutsRequest, context: Context) -> AsyncIterator[wire.LayoutPart]:
+        """The layouts of these sources, or of all. NOT_FOUND: no such source."""
+        for source in request.sources or list(self._feeds):
+            if source not in self._feeds:
+                await _refuse(context, PathError(f"no source {source!r}; there are: {', '.join(self._feeds)}"))
+            for part in describe.layout_parts(self._feeds[source].block):
+                yield part
+
+    async def get_status(self, _: wire.GetStatusRequest, __: Context) -> wire.Status:
+        """As ``shmio-supervisor status --json`` has it."""
+        return describe.status(self._segment)
+
+    async def read(self, request: wire.ReadRequest, context: Context) -> bytes:
+        """The present values, those of one source from one frame.
+
+        NOT_FOUND: no such register, INVALID_ARGUMENT: too many, RESOURCE_EXHAUSTED: too many of all clients together.
+        """
+        try:
+            views = await self._selections.select(self._selections.resolve(request.patterns))
+            known = set(request.tables)
+            tables = [field(1, view.table) for view in views if view.number not in known]
+            return b"".join(tables + [field(2, _reading(view, originals=request.originals)) for view in views])
+        except ShmioError as error:
+            await _refuse(context, error)
+
+    async def subscribe(self, request: wire.SubscribeRequest, context: Context) -> AsyncIterator[bytes]:
+        """The present values, then what changes, or every frame.
+
+        NOT_FOUND: no such register, INVALID_ARGUMENT: too many, or options that are none; RESOURCE_EXHAUSTED: too many
+        streams, or registers of all clients together.
+        """
+        try:
+            if len(self._open) >= MAX_STREAMS:
+                raise EndpointError(
+                    f"{MAX_STREAMS} calls of Subscribe are open, the most there may be: one takes many patterns"
+                )
+            subscription = Subscription(self._selections, self._bells, request)
+        except ShmioError as error:
+            await _refuse(context, error)
+        self._open.add(subscription)
+        try:
+            yield await subscription.open()
+            async for message in subscription.messages():
+                yield message
+        except ShmioError as error:
+            await _refuse(context, error)
+        finally:
+            self._open.discard(subscription)
+            self._ended_updates += subscription.updates
+            subscription.close()
+
+    def move(self, sources: Collection[str]) -> None:
+        """Have the streams of these sources go over to the blocks that there are by now."""
+        for subscription in self._open:
+            subscription.move(sources)
+
+
+def _reading(view: View, *, originals: bool) -> bytes:
+    """A serialised ``Update`` of the newest frame."""
+    frame = view.block.latest()
+    if frame is None:
+        return wire.Update(table=view.number, reason="no data yet", whole=True).SerializeToString()
+    update = b"".join(view.update(frame)) + aged(view.block, frame)
+    if originals and isinstance(view, Selection) and frame.effective is not None and frame.source_ns:
+        update += field(ORIGINALS, view.originals(frame))
+    return update + number(AGE_NS, max(0, frame.age_ns()))
+
+
+async def _refuse(context: Context, error: ShmioError) -> NoReturn:
+    """End a call with what its error means to the client."""
+    codes = (code for kind, code in _STATUS.items() if isinstance(error, kind))
+    await context.abort(next(codes, grpc.StatusCode.INTERNAL), str(error))
+    raise error  # abort never returns

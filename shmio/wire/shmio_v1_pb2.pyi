@@ -1,0 +1,605 @@
+from google.protobuf.internal import containers as _containers
+from google.protobuf.internal import enum_type_wrapper as _enum_type_wrapper
+from google.protobuf import descriptor as _descriptor
+from google.protobuf import message as _message
+from collections.abc import Iterable as _Iterable, Mapping as _Mapping
+from typing import ClassVar as _ClassVar, Optional as _Optional, Union as _Union
+
+DESCRIPTOR: _descriptor.FileDescriptor
+
+class Column(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    COLUMN_UNSPECIFIED: _ClassVar[Column]
+    COLUMN_BOOL: _ClassVar[Column]
+    COLUMN_INT32: _ClassVar[Column]
+    COLUMN_INT64: _ClassVar[Column]
+    COLUMN_UINT64: _ClassVar[Column]
+    COLUMN_FLOAT: _ClassVar[Column]
+    COLUMN_DOUBLE: _ClassVar[Column]
+    COLUMN_TEXT: _ClassVar[Column]
+
+class Quality(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    QUALITY_BAD: _ClassVar[Quality]
+    QUALITY_UNCERTAIN: _ClassVar[Quality]
+    QUALITY_GOOD: _ClassVar[Quality]
+
+class Provenance(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    PROVENANCE_LIVE: _ClassVar[Provenance]
+    PROVENANCE_SIMULATED: _ClassVar[Provenance]
+    PROVENANCE_REPLAYED: _ClassVar[Provenance]
+    PROVENANCE_INJECTED: _ClassVar[Provenance]
+
+class Mode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    MODE_LATEST: _ClassVar[Mode]
+    MODE_EVERY_FRAME: _ClassVar[Mode]
+
+class Format(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    FORMAT_VALUES: _ClassVar[Format]
+    FORMAT_FRAMES: _ClassVar[Format]
+
+class Direction(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    DIRECTION_OUT: _ClassVar[Direction]
+    DIRECTION_IN: _ClassVar[Direction]
+COLUMN_UNSPECIFIED: Column
+COLUMN_BOOL: Column
+COLUMN_INT32: Column
+COLUMN_INT64: Column
+COLUMN_UINT64: Column
+COLUMN_FLOAT: Column
+COLUMN_DOUBLE: Column
+COLUMN_TEXT: Column
+QUALITY_BAD: Quality
+QUALITY_UNCERTAIN: Quality
+QUALITY_GOOD: Quality
+PROVENANCE_LIVE: Provenance
+PROVENANCE_SIMULATED: Provenance
+PROVENANCE_REPLAYED: Provenance
+PROVENANCE_INJECTED: Provenance
+MODE_LATEST: Mode
+MODE_EVERY_FRAME: Mode
+FORMAT_VALUES: Format
+FORMAT_FRAMES: Format
+DIRECTION_OUT: Direction
+DIRECTION_IN: Direction
+
+class GetLayoutsRequest(_message.Message):
+    __slots__ = ("sources",)
+    SOURCES_FIELD_NUMBER: _ClassVar[int]
+    sources: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, sources: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class LayoutPart(_message.Message):
+    __slots__ = ("source", "section", "name", "number", "size", "big_endian", "hash", "period_ns", "stale_ns", "writable", "armed", "optimized", "registers", "last")
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    SECTION_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    SIZE_FIELD_NUMBER: _ClassVar[int]
+    BIG_ENDIAN_FIELD_NUMBER: _ClassVar[int]
+    HASH_FIELD_NUMBER: _ClassVar[int]
+    PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
+    STALE_NS_FIELD_NUMBER: _ClassVar[int]
+    WRITABLE_FIELD_NUMBER: _ClassVar[int]
+    ARMED_FIELD_NUMBER: _ClassVar[int]
+    OPTIMIZED_FIELD_NUMBER: _ClassVar[int]
+    REGISTERS_FIELD_NUMBER: _ClassVar[int]
+    LAST_FIELD_NUMBER: _ClassVar[int]
+    source: str
+    section: int
+    name: str
+    number: int
+    size: int
+    big_endian: bool
+    hash: bytes
+    period_ns: int
+    stale_ns: int
+    writable: _containers.RepeatedScalarFieldContainer[str]
+    armed: bool
+    optimized: bool
+    registers: _containers.RepeatedCompositeFieldContainer[Register]
+    last: bool
+    def __init__(self, source: _Optional[str] = ..., section: _Optional[int] = ..., name: _Optional[str] = ..., number: _Optional[int] = ..., size: _Optional[int] = ..., big_endian: bool = ..., hash: _Optional[bytes] = ..., period_ns: _Optional[int] = ..., stale_ns: _Optional[int] = ..., writable: _Optional[_Iterable[str]] = ..., armed: bool = ..., optimized: bool = ..., registers: _Optional[_Iterable[_Union[Register, _Mapping]]] = ..., last: bool = ...) -> None: ...
+
+class Register(_message.Message):
+    __slots__ = ("path", "type", "dims", "offset", "bit", "size", "count", "column", "slot", "comment", "initial")
+    PATH_FIELD_NUMBER: _ClassVar[int]
+    TYPE_FIELD_NUMBER: _ClassVar[int]
+    DIMS_FIELD_NUMBER: _ClassVar[int]
+    OFFSET_FIELD_NUMBER: _ClassVar[int]
+    BIT_FIELD_NUMBER: _ClassVar[int]
+    SIZE_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    COLUMN_FIELD_NUMBER: _ClassVar[int]
+    SLOT_FIELD_NUMBER: _ClassVar[int]
+    COMMENT_FIELD_NUMBER: _ClassVar[int]
+    INITIAL_FIELD_NUMBER: _ClassVar[int]
+    path: str
+    type: str
+    dims: _containers.RepeatedCompositeFieldContainer[Bounds]
+    offset: int
+    bit: int
+    size: int
+    count: int
+    column: Column
+    slot: int
+    comment: str
+    initial: str
+    def __init__(self, path: _Optional[str] = ..., type: _Optional[str] = ..., dims: _Optional[_Iterable[_Union[Bounds, _Mapping]]] = ..., offset: _Optional[int] = ..., bit: _Optional[int] = ..., size: _Optional[int] = ..., count: _Optional[int] = ..., column: _Optional[_Union[Column, str]] = ..., slot: _Optional[int] = ..., comment: _Optional[str] = ..., initial: _Optional[str] = ...) -> None: ...
+
+class Bounds(_message.Message):
+    __slots__ = ("low", "high")
+    LOW_FIELD_NUMBER: _ClassVar[int]
+    HIGH_FIELD_NUMBER: _ClassVar[int]
+    low: int
+    high: int
+    def __init__(self, low: _Optional[int] = ..., high: _Optional[int] = ...) -> None: ...
+
+class Table(_message.Message):
+    __slots__ = ("number", "source", "section", "hash", "size", "registers", "slots")
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    SECTION_FIELD_NUMBER: _ClassVar[int]
+    HASH_FIELD_NUMBER: _ClassVar[int]
+    SIZE_FIELD_NUMBER: _ClassVar[int]
+    REGISTERS_FIELD_NUMBER: _ClassVar[int]
+    SLOTS_FIELD_NUMBER: _ClassVar[int]
+    number: int
+    source: str
+    section: int
+    hash: bytes
+    size: int
+    registers: _containers.RepeatedCompositeFieldContainer[Register]
+    slots: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, number: _Optional[int] = ..., source: _Optional[str] = ..., section: _Optional[int] = ..., hash: _Optional[bytes] = ..., size: _Optional[int] = ..., registers: _Optional[_Iterable[_Union[Register, _Mapping]]] = ..., slots: _Optional[_Iterable[int]] = ...) -> None: ...
+
+class Values(_message.Message):
+    __slots__ = ("bools", "int32s", "int64s", "uint64s", "floats", "doubles", "texts")
+    BOOLS_FIELD_NUMBER: _ClassVar[int]
+    INT32S_FIELD_NUMBER: _ClassVar[int]
+    INT64S_FIELD_NUMBER: _ClassVar[int]
+    UINT64S_FIELD_NUMBER: _ClassVar[int]
+    FLOATS_FIELD_NUMBER: _ClassVar[int]
+    DOUBLES_FIELD_NUMBER: _ClassVar[int]
+    TEXTS_FIELD_NUMBER: _ClassVar[int]
+    bools: Bools
+    int32s: Int32s
+    int64s: Int64s
+    uint64s: Uint64s
+    floats: Floats
+    doubles: Doubles
+    texts: Texts
+    def __init__(self, bools: _Optional[_Union[Bools, _Mapping]] = ..., int32s: _Optional[_Union[Int32s, _Mapping]] = ..., int64s: _Optional[_Union[Int64s, _Mapping]] = ..., uint64s: _Optional[_Union[Uint64s, _Mapping]] = ..., floats: _Optional[_Union[Floats, _Mapping]] = ..., doubles: _Optional[_Union[Doubles, _Mapping]] = ..., texts: _Optional[_Union[Texts, _Mapping]] = ...) -> None: ...
+
+class Bools(_message.Message):
+    __slots__ = ("slots", "values")
+    SLOTS_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    slots: _containers.RepeatedScalarFieldContainer[int]
+    values: _containers.RepeatedScalarFieldContainer[bool]
+    def __init__(self, slots: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[bool]] = ...) -> None: ...
+
+class Int32s(_message.Message):
+    __slots__ = ("slots", "values")
+    SLOTS_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    slots: _containers.RepeatedScalarFieldContainer[int]
+    values: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, slots: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[int]] = ...) -> None: ...
+
+class Int64s(_message.Message):
+    __slots__ = ("slots", "values")
+    SLOTS_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    slots: _containers.RepeatedScalarFieldContainer[int]
+    values: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, slots: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[int]] = ...) -> None: ...
+
+class Uint64s(_message.Message):
+    __slots__ = ("slots", "values")
+    SLOTS_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    slots: _containers.RepeatedScalarFieldContainer[int]
+    values: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, slots: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[int]] = ...) -> None: ...
+
+class Floats(_message.Message):
+    __slots__ = ("slots", "values")
+    SLOTS_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    slots: _containers.RepeatedScalarFieldContainer[int]
+    values: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, slots: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class Doubles(_message.Message):
+    __slots__ = ("slots", "values")
+    SLOTS_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    slots: _containers.RepeatedScalarFieldContainer[int]
+    values: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, slots: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[float]] = ...) -> None: ...
+
+class Texts(_message.Message):
+    __slots__ = ("slots", "values")
+    SLOTS_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    slots: _containers.RepeatedScalarFieldContainer[int]
+    values: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, slots: _Optional[_Iterable[int]] = ..., values: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class Marks(_message.Message):
+    __slots__ = ("registers",)
+    REGISTERS_FIELD_NUMBER: _ClassVar[int]
+    registers: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, registers: _Optional[_Iterable[int]] = ...) -> None: ...
+
+class Update(_message.Message):
+    __slots__ = ("table", "frame", "cycle", "incarnation", "clock_ns", "source_ns", "quality", "reason", "provenance", "missed", "whole", "values", "originals", "invalid", "injected", "image", "original", "age_ns")
+    TABLE_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    CYCLE_FIELD_NUMBER: _ClassVar[int]
+    INCARNATION_FIELD_NUMBER: _ClassVar[int]
+    CLOCK_NS_FIELD_NUMBER: _ClassVar[int]
+    SOURCE_NS_FIELD_NUMBER: _ClassVar[int]
+    QUALITY_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    PROVENANCE_FIELD_NUMBER: _ClassVar[int]
+    MISSED_FIELD_NUMBER: _ClassVar[int]
+    WHOLE_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    ORIGINALS_FIELD_NUMBER: _ClassVar[int]
+    INVALID_FIELD_NUMBER: _ClassVar[int]
+    INJECTED_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_FIELD_NUMBER: _ClassVar[int]
+    ORIGINAL_FIELD_NUMBER: _ClassVar[int]
+    AGE_NS_FIELD_NUMBER: _ClassVar[int]
+    table: int
+    frame: int
+    cycle: int
+    incarnation: int
+    clock_ns: int
+    source_ns: int
+    quality: Quality
+    reason: str
+    provenance: Provenance
+    missed: int
+    whole: bool
+    values: Values
+    originals: Values
+    invalid: Marks
+    injected: Marks
+    image: bytes
+    original: bytes
+    age_ns: int
+    def __init__(self, table: _Optional[int] = ..., frame: _Optional[int] = ..., cycle: _Optional[int] = ..., incarnation: _Optional[int] = ..., clock_ns: _Optional[int] = ..., source_ns: _Optional[int] = ..., quality: _Optional[_Union[Quality, str]] = ..., reason: _Optional[str] = ..., provenance: _Optional[_Union[Provenance, str]] = ..., missed: _Optional[int] = ..., whole: bool = ..., values: _Optional[_Union[Values, _Mapping]] = ..., originals: _Optional[_Union[Values, _Mapping]] = ..., invalid: _Optional[_Union[Marks, _Mapping]] = ..., injected: _Optional[_Union[Marks, _Mapping]] = ..., image: _Optional[bytes] = ..., original: _Optional[bytes] = ..., age_ns: _Optional[int] = ...) -> None: ...
+
+class ReadRequest(_message.Message):
+    __slots__ = ("patterns", "originals", "tables")
+    PATTERNS_FIELD_NUMBER: _ClassVar[int]
+    ORIGINALS_FIELD_NUMBER: _ClassVar[int]
+    TABLES_FIELD_NUMBER: _ClassVar[int]
+    patterns: _containers.RepeatedScalarFieldContainer[str]
+    originals: bool
+    tables: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, patterns: _Optional[_Iterable[str]] = ..., originals: bool = ..., tables: _Optional[_Iterable[int]] = ...) -> None: ...
+
+class ReadResponse(_message.Message):
+    __slots__ = ("tables", "updates")
+    TABLES_FIELD_NUMBER: _ClassVar[int]
+    UPDATES_FIELD_NUMBER: _ClassVar[int]
+    tables: _containers.RepeatedCompositeFieldContainer[Table]
+    updates: _containers.RepeatedCompositeFieldContainer[Update]
+    def __init__(self, tables: _Optional[_Iterable[_Union[Table, _Mapping]]] = ..., updates: _Optional[_Iterable[_Union[Update, _Mapping]]] = ...) -> None: ...
+
+class SubscribeRequest(_message.Message):
+    __slots__ = ("patterns", "mode", "format", "max_rate_hz", "deadband")
+    PATTERNS_FIELD_NUMBER: _ClassVar[int]
+    MODE_FIELD_NUMBER: _ClassVar[int]
+    FORMAT_FIELD_NUMBER: _ClassVar[int]
+    MAX_RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    DEADBAND_FIELD_NUMBER: _ClassVar[int]
+    patterns: _containers.RepeatedScalarFieldContainer[str]
+    mode: Mode
+    format: Format
+    max_rate_hz: float
+    deadband: float
+    def __init__(self, patterns: _Optional[_Iterable[str]] = ..., mode: _Optional[_Union[Mode, str]] = ..., format: _Optional[_Union[Format, str]] = ..., max_rate_hz: _Optional[float] = ..., deadband: _Optional[float] = ...) -> None: ...
+
+class SubscribeResponse(_message.Message):
+    __slots__ = ("tables", "updates", "ended")
+    TABLES_FIELD_NUMBER: _ClassVar[int]
+    UPDATES_FIELD_NUMBER: _ClassVar[int]
+    ENDED_FIELD_NUMBER: _ClassVar[int]
+    tables: _containers.RepeatedCompositeFieldContainer[Table]
+    updates: _containers.RepeatedCompositeFieldContainer[Update]
+    ended: _containers.RepeatedCompositeFieldContainer[Ended]
+    def __init__(self, tables: _Optional[_Iterable[_Union[Table, _Mapping]]] = ..., updates: _Optional[_Iterable[_Union[Update, _Mapping]]] = ..., ended: _Optional[_Iterable[_Union[Ended, _Mapping]]] = ...) -> None: ...
+
+class Ended(_message.Message):
+    __slots__ = ("source", "reason")
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    source: str
+    reason: str
+    def __init__(self, source: _Optional[str] = ..., reason: _Optional[str] = ...) -> None: ...
+
+class Value(_message.Message):
+    __slots__ = ("boolean", "integer", "unsigned", "number", "text", "list")
+    BOOLEAN_FIELD_NUMBER: _ClassVar[int]
+    INTEGER_FIELD_NUMBER: _ClassVar[int]
+    UNSIGNED_FIELD_NUMBER: _ClassVar[int]
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    LIST_FIELD_NUMBER: _ClassVar[int]
+    boolean: bool
+    integer: int
+    unsigned: int
+    number: float
+    text: str
+    list: List
+    def __init__(self, boolean: bool = ..., integer: _Optional[int] = ..., unsigned: _Optional[int] = ..., number: _Optional[float] = ..., text: _Optional[str] = ..., list: _Optional[_Union[List, _Mapping]] = ...) -> None: ...
+
+class List(_message.Message):
+    __slots__ = ("values",)
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    values: _containers.RepeatedCompositeFieldContainer[Value]
+    def __init__(self, values: _Optional[_Iterable[_Union[Value, _Mapping]]] = ...) -> None: ...
+
+class Assignment(_message.Message):
+    __slots__ = ("path", "value")
+    PATH_FIELD_NUMBER: _ClassVar[int]
+    VALUE_FIELD_NUMBER: _ClassVar[int]
+    path: str
+    value: Value
+    def __init__(self, path: _Optional[str] = ..., value: _Optional[_Union[Value, _Mapping]] = ...) -> None: ...
+
+class WriteRequest(_message.Message):
+    __slots__ = ("values", "timeout_ms")
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    TIMEOUT_MS_FIELD_NUMBER: _ClassVar[int]
+    values: _containers.RepeatedCompositeFieldContainer[Assignment]
+    timeout_ms: int
+    def __init__(self, values: _Optional[_Iterable[_Union[Assignment, _Mapping]]] = ..., timeout_ms: _Optional[int] = ...) -> None: ...
+
+class WriteResponse(_message.Message):
+    __slots__ = ("outcomes",)
+    OUTCOMES_FIELD_NUMBER: _ClassVar[int]
+    outcomes: _containers.RepeatedCompositeFieldContainer[Outcome]
+    def __init__(self, outcomes: _Optional[_Iterable[_Union[Outcome, _Mapping]]] = ...) -> None: ...
+
+class Outcome(_message.Message):
+    __slots__ = ("kind", "reason")
+    class Kind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+        __slots__ = ()
+        KIND_UNKNOWN: _ClassVar[Outcome.Kind]
+        KIND_WRITTEN: _ClassVar[Outcome.Kind]
+        KIND_TAKEN: _ClassVar[Outcome.Kind]
+        KIND_REJECTED: _ClassVar[Outcome.Kind]
+        KIND_REFUSED: _ClassVar[Outcome.Kind]
+        KIND_EXPIRED: _ClassVar[Outcome.Kind]
+        KIND_SHADOWED: _ClassVar[Outcome.Kind]
+    KIND_UNKNOWN: Outcome.Kind
+    KIND_WRITTEN: Outcome.Kind
+    KIND_TAKEN: Outcome.Kind
+    KIND_REJECTED: Outcome.Kind
+    KIND_REFUSED: Outcome.Kind
+    KIND_EXPIRED: Outcome.Kind
+    KIND_SHADOWED: Outcome.Kind
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    kind: Outcome.Kind
+    reason: str
+    def __init__(self, kind: _Optional[_Union[Outcome.Kind, str]] = ..., reason: _Optional[str] = ...) -> None: ...
+
+class InjectRequest(_message.Message):
+    __slots__ = ("lay", "shadow")
+    LAY_FIELD_NUMBER: _ClassVar[int]
+    SHADOW_FIELD_NUMBER: _ClassVar[int]
+    lay: Lay
+    shadow: Shadow
+    def __init__(self, lay: _Optional[_Union[Lay, _Mapping]] = ..., shadow: _Optional[_Union[Shadow, _Mapping]] = ...) -> None: ...
+
+class Lay(_message.Message):
+    __slots__ = ("patterns", "priority", "name", "keep", "lifetime_ms", "quiet")
+    PATTERNS_FIELD_NUMBER: _ClassVar[int]
+    PRIORITY_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    KEEP_FIELD_NUMBER: _ClassVar[int]
+    LIFETIME_MS_FIELD_NUMBER: _ClassVar[int]
+    QUIET_FIELD_NUMBER: _ClassVar[int]
+    patterns: _containers.RepeatedScalarFieldContainer[str]
+    priority: int
+    name: str
+    keep: bool
+    lifetime_ms: int
+    quiet: bool
+    def __init__(self, patterns: _Optional[_Iterable[str]] = ..., priority: _Optional[int] = ..., name: _Optional[str] = ..., keep: bool = ..., lifetime_ms: _Optional[int] = ..., quiet: bool = ...) -> None: ...
+
+class Shadow(_message.Message):
+    __slots__ = ("sequence", "values", "assignments")
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    ASSIGNMENTS_FIELD_NUMBER: _ClassVar[int]
+    sequence: int
+    values: Values
+    assignments: _containers.RepeatedCompositeFieldContainer[Assignment]
+    def __init__(self, sequence: _Optional[int] = ..., values: _Optional[_Union[Values, _Mapping]] = ..., assignments: _Optional[_Iterable[_Union[Assignment, _Mapping]]] = ...) -> None: ...
+
+class InjectResponse(_message.Message):
+    __slots__ = ("laid", "originals", "answers")
+    LAID_FIELD_NUMBER: _ClassVar[int]
+    ORIGINALS_FIELD_NUMBER: _ClassVar[int]
+    ANSWERS_FIELD_NUMBER: _ClassVar[int]
+    laid: Laid
+    originals: _containers.RepeatedCompositeFieldContainer[Update]
+    answers: _containers.RepeatedCompositeFieldContainer[Answer]
+    def __init__(self, laid: _Optional[_Union[Laid, _Mapping]] = ..., originals: _Optional[_Iterable[_Union[Update, _Mapping]]] = ..., answers: _Optional[_Iterable[_Union[Answer, _Mapping]]] = ...) -> None: ...
+
+class Laid(_message.Message):
+    __slots__ = ("number", "table")
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    TABLE_FIELD_NUMBER: _ClassVar[int]
+    number: int
+    table: Table
+    def __init__(self, number: _Optional[int] = ..., table: _Optional[_Union[Table, _Mapping]] = ...) -> None: ...
+
+class Answer(_message.Message):
+    __slots__ = ("sequence", "outcomes")
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    OUTCOMES_FIELD_NUMBER: _ClassVar[int]
+    sequence: int
+    outcomes: _containers.RepeatedCompositeFieldContainer[Outcome]
+    def __init__(self, sequence: _Optional[int] = ..., outcomes: _Optional[_Iterable[_Union[Outcome, _Mapping]]] = ...) -> None: ...
+
+class ListInjectionsRequest(_message.Message):
+    __slots__ = ("sources",)
+    SOURCES_FIELD_NUMBER: _ClassVar[int]
+    sources: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, sources: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class ListInjectionsResponse(_message.Message):
+    __slots__ = ("injections",)
+    INJECTIONS_FIELD_NUMBER: _ClassVar[int]
+    injections: _containers.RepeatedCompositeFieldContainer[Injection]
+    def __init__(self, injections: _Optional[_Iterable[_Union[Injection, _Mapping]]] = ...) -> None: ...
+
+class Injection(_message.Message):
+    __slots__ = ("source", "number", "direction", "priority", "keep", "name", "pid", "ranges")
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    DIRECTION_FIELD_NUMBER: _ClassVar[int]
+    PRIORITY_FIELD_NUMBER: _ClassVar[int]
+    KEEP_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    PID_FIELD_NUMBER: _ClassVar[int]
+    RANGES_FIELD_NUMBER: _ClassVar[int]
+    source: str
+    number: int
+    direction: Direction
+    priority: int
+    keep: bool
+    name: str
+    pid: int
+    ranges: _containers.RepeatedCompositeFieldContainer[Range]
+    def __init__(self, source: _Optional[str] = ..., number: _Optional[int] = ..., direction: _Optional[_Union[Direction, str]] = ..., priority: _Optional[int] = ..., keep: bool = ..., name: _Optional[str] = ..., pid: _Optional[int] = ..., ranges: _Optional[_Iterable[_Union[Range, _Mapping]]] = ...) -> None: ...
+
+class Range(_message.Message):
+    __slots__ = ("offset", "size", "mask")
+    OFFSET_FIELD_NUMBER: _ClassVar[int]
+    SIZE_FIELD_NUMBER: _ClassVar[int]
+    MASK_FIELD_NUMBER: _ClassVar[int]
+    offset: int
+    size: int
+    mask: int
+    def __init__(self, offset: _Optional[int] = ..., size: _Optional[int] = ..., mask: _Optional[int] = ...) -> None: ...
+
+class LiftRequest(_message.Message):
+    __slots__ = ("source", "number")
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    source: str
+    number: int
+    def __init__(self, source: _Optional[str] = ..., number: _Optional[int] = ...) -> None: ...
+
+class LiftAllRequest(_message.Message):
+    __slots__ = ("sources",)
+    SOURCES_FIELD_NUMBER: _ClassVar[int]
+    sources: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, sources: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class LiftResponse(_message.Message):
+    __slots__ = ("lifted",)
+    LIFTED_FIELD_NUMBER: _ClassVar[int]
+    lifted: _containers.RepeatedCompositeFieldContainer[Lifted]
+    def __init__(self, lifted: _Optional[_Iterable[_Union[Lifted, _Mapping]]] = ...) -> None: ...
+
+class Lifted(_message.Message):
+    __slots__ = ("source", "number", "name", "failure")
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    FAILURE_FIELD_NUMBER: _ClassVar[int]
+    source: str
+    number: int
+    name: str
+    failure: str
+    def __init__(self, source: _Optional[str] = ..., number: _Optional[int] = ..., name: _Optional[str] = ..., failure: _Optional[str] = ...) -> None: ...
+
+class GetStatusRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class Status(_message.Message):
+    __slots__ = ("instance", "mode", "state", "segment", "segment_bytes", "supervisor", "processes", "note")
+    INSTANCE_FIELD_NUMBER: _ClassVar[int]
+    MODE_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    SEGMENT_FIELD_NUMBER: _ClassVar[int]
+    SEGMENT_BYTES_FIELD_NUMBER: _ClassVar[int]
+    SUPERVISOR_FIELD_NUMBER: _ClassVar[int]
+    PROCESSES_FIELD_NUMBER: _ClassVar[int]
+    NOTE_FIELD_NUMBER: _ClassVar[int]
+    instance: str
+    mode: str
+    state: str
+    segment: str
+    segment_bytes: int
+    supervisor: Supervisor
+    processes: _containers.RepeatedCompositeFieldContainer[Process]
+    note: str
+    def __init__(self, instance: _Optional[str] = ..., mode: _Optional[str] = ..., state: _Optional[str] = ..., segment: _Optional[str] = ..., segment_bytes: _Optional[int] = ..., supervisor: _Optional[_Union[Supervisor, _Mapping]] = ..., processes: _Optional[_Iterable[_Union[Process, _Mapping]]] = ..., note: _Optional[str] = ...) -> None: ...
+
+class Supervisor(_message.Message):
+    __slots__ = ("pid", "uptime_s")
+    PID_FIELD_NUMBER: _ClassVar[int]
+    UPTIME_S_FIELD_NUMBER: _ClassVar[int]
+    pid: int
+    uptime_s: float
+    def __init__(self, pid: _Optional[int] = ..., uptime_s: _Optional[float] = ...) -> None: ...
+
+class Process(_message.Message):
+    __slots__ = ("name", "kind", "pid", "state", "restarts", "uptime_s", "note", "counters", "source")
+    class CountersEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: int
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[int] = ...) -> None: ...
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    PID_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    RESTARTS_FIELD_NUMBER: _ClassVar[int]
+    UPTIME_S_FIELD_NUMBER: _ClassVar[int]
+    NOTE_FIELD_NUMBER: _ClassVar[int]
+    COUNTERS_FIELD_NUMBER: _ClassVar[int]
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    kind: str
+    pid: int
+    state: str
+    restarts: int
+    uptime_s: float
+    note: str
+    counters: _containers.ScalarMap[str, int]
+    source: SourceState
+    def __init__(self, name: _Optional[str] = ..., kind: _Optional[str] = ..., pid: _Optional[int] = ..., state: _Optional[str] = ..., restarts: _Optional[int] = ..., uptime_s: _Optional[float] = ..., note: _Optional[str] = ..., counters: _Optional[_Mapping[str, int]] = ..., source: _Optional[_Union[SourceState, _Mapping]] = ...) -> None: ...
+
+class SourceState(_message.Message):
+    __slots__ = ("quality", "reason", "cycle", "rate_hz", "overruns")
+    QUALITY_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    CYCLE_FIELD_NUMBER: _ClassVar[int]
+    RATE_HZ_FIELD_NUMBER: _ClassVar[int]
+    OVERRUNS_FIELD_NUMBER: _ClassVar[int]
+    quality: str
+    reason: str
+    cycle: int
+    rate_hz: float
+    overruns: int
+    def __init__(self, quality: _Optional[str] = ..., reason: _Optional[str] = ..., cycle: _Optional[int] = ..., rate_hz: _Optional[float] = ..., overruns: _Optional[int] = ...) -> None: ...
