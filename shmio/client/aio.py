@@ -120,9 +120,9 @@ class Subscription(AsyncIterator[Update]):
             except grpc.RpcError as error:
                 self._target.fail(error)
             except asyncio.CancelledError:
-                if self._call.cancelled():
-                    raise StopAsyncIteration from None
-                raise
+                if (task := asyncio.current_task()) is not None and task.cancelling():
+                    raise
+                raise StopAsyncIteration from None  # it was the call that was cancelled: by close
             if message is grpc.aio.EOF:
                 raise StopAsyncIteration
             self._waiting = self._tables.all_of(message)

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from shmio.errors import PathError
 from shmio.layout.compiler import Source, compile_sources
-from shmio.layout.glob import MAX_PATTERN, Glob, select
+from shmio.layout.glob import MAX_PATTERN, Glob, named, select
+from shmio.layout.topic import Topic
 
 
 @pytest.mark.parametrize(
@@ -95,3 +96,34 @@ def test_select() -> None:
     assert select(layout, ["%52%31/y"]) == (2,)
     assert select(layout, ["**"]) == (0, 1, 2, 3)
     assert select(layout, ["nothing", "Inputs/5"]) == ()
+
+
+LISTS = compile_sources(
+    [Source("x.db", b'DATA_BLOCK "b" STRUCT a : Array[-2..3] of Int; s : Struct x : Int; y : Array[0..1, 0..1] of Int; '
+                    b'END_STRUCT; z : Int; END_STRUCT; BEGIN END_DATA_BLOCK')]
+).layouts[0]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("path", "paths"),
+    [
+        ("", ["a", "s/x", "s/y", "z"]),
+        ("z", ["z"]),
+        ("s", ["s/x", "s/y"]),
+        ("*", ["a", "s/x", "s/y", "z"]),
+        ("q*", []),
+        ("a/-2", ["a/-2"]),
+        ("a/-1..1", ["a/-1", "a/0", "a/1"]),
+        ("a/3..3", ["a/3"]),
+    ],
+)
+def test_what_a_path_names(path: str, paths: list[str]) -> None:
+    assert [register.path for register in named(LISTS, Topic("cell", path))] == paths
+
+
+@pytest.mark.parametrize(
+    "path", ["q", "a/4", "a/2..4", "a/1..0", "z/0..1", "s/0..1", "s/y/0..1", "a/1..", "a/..", "q/0..1"]
+)
+def test_what_a_path_does_not_name(path: str) -> None:
+    with pytest.raises(PathError):
+        named(LISTS, Topic("cell", path))

@@ -7,7 +7,7 @@ from typing import Protocol
 
 from shmio.endpoints.grpc.encoding import field, number
 from shmio.endpoints.grpc.native.columns import Decoded
-from shmio.endpoints.grpc.native.views import MISSED, QUALITY, REASON, Message, Selection, View, assess, head
+from shmio.endpoints.grpc.native.views import MISSED, QUALITY, REASON, Message, Selection, View, head
 from shmio.errors import SegmentError
 from shmio.segment import Block, Frame, Quality
 
@@ -126,7 +126,7 @@ def aged(block: Block, frame: Frame) -> bytes:
     """What to add to the update of a frame that was good, or uncertain, and is too old by now; else nothing."""
     if frame.quality is Quality.BAD:
         return b""
-    quality, reason = assess(block, frame)
+    quality, reason = block.assess(frame)
     return _QUALITY_BAD + field(REASON, reason.encode()) if quality is Quality.BAD else b""
 
 

@@ -136,7 +136,7 @@ def _reading(view: View, *, originals: bool) -> bytes:
     update = b"".join(view.update(frame)) + aged(view.block, frame)
     if originals and isinstance(view, Selection) and frame.effective is not None and frame.source_ns:
         update += field(ORIGINALS, view.originals(frame))
-    return update + number(AGE_NS, max(0, frame.age_ns()))
+    return update + number(AGE_NS, max(0, frame.age_ns(view.block.now_ns())))
 
 
 async def _refuse(context: Context, error: ShmioError) -> NoReturn:

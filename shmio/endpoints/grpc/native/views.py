@@ -12,7 +12,7 @@ import numpy as np
 from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.native.columns import Column, Columns, Decoded, column_of, merge, pack
 from shmio.layout.model import Register
-from shmio.segment import Block, Frame, Quality
+from shmio.segment import Block, Frame
 from shmio.wire import shmio_v1_pb2 as wire
 
 VALUES, ORIGINALS, INVALID, INJECTED, IMAGE, ORIGINAL, QUALITY, REASON, MISSED, AGE_NS = (
@@ -189,11 +189,6 @@ def head(table: int, frame: Frame, *, whole: bool = False) -> bytes:
         provenance=int(frame.provenance),  # type: ignore[arg-type]
         whole=whole,
     ).SerializeToString()
-
-
-def assess(block: Block, frame: Frame) -> tuple[Quality, str]:
-    """Quality of a block's frame as of now, and its reason."""
-    return frame.assess(block.stale_ns)
 
 
 def describe(register: Register, found: wire.Register, column: Column | None = None, slot: int = 0) -> None:
