@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Final, Literal, NamedTuple
 
 from shmio.errors import ValueRangeError
-from shmio.layout.model import Layout, Register
+from shmio.layout.model import Register
 from shmio.layout.types import INTEGERS
 
 Elementary = Literal["float", "uint32", "uint64", "string"]
@@ -122,14 +122,13 @@ Found = Mapping[str, "Register | Found | Sequence[Found]"]
 """What there is of a shape's members, by the shape's names: a register, a structure, or structures in their order."""
 
 
-def recognise(layout: Layout, path: str) -> tuple[str, Found] | None:
-    """The shape that the structure at a path has, and its members; None: none of those in ``CONTENTS``.
+def recognise(path: str, registers: Sequence[Register]) -> tuple[str, Found] | None:
+    """The shape that a structure of these registers has, and its members; None: none of those in ``CONTENTS``.
 
     All needed members are there, with types that fit, and no others.
     """
     start = len(path) + 1
-    below = [layout.registers[index] for index in layout.members(path)]
-    parts = [(register.path[start:].lower().split("/"), register) for register in below]
+    parts = [(register.path[start:].lower().split("/"), register) for register in registers]
     for shape in CONTENTS:
         if parts and (found := _match(shape, parts)):
             return shape, found

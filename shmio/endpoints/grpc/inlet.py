@@ -6,13 +6,14 @@ import asyncio
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
 from shmio.endpoints.grpc.echo import Echo, Message
 from shmio.errors import CommandError
 from shmio.layout.model import Register
+from shmio.layout.topic import find
 from shmio.segment import DONE, ENDS, Block, Event, EventKind
 from shmio.segment.commander import PATIENCE_S, Commander
 from shmio.segment.events import EVENT_DATA_SIZE
@@ -39,9 +40,11 @@ class _Pending:
     until_ns: int
     record_bytes: int
     events: int
+    items: int  # whose end has not come
     done: Done
     accepted: Callable[[], None] | None
     taken: bool = False
+    failure: tuple[EventKind, str] | None = None  # the first
 
 
 class Inlet:
@@ -103,26 +106,25 @@ class Inlet:
         """Wait until the thread has ended."""
         self._thread.join()
 
-    def ready(self, register: Register) -> bool:
+    def ready(self, values: Mapping[str, object]) -> bool:
         """Whether :meth:`send` would not have to wait."""
-        return self._prepared and not self._turn.locked() and self._has_room(register)
+        return self._prepared and not self._turn.locked() and self._has_room(*self._cost(values))
 
-    async def writable(self, register: Register) -> bool:
-        """Whether the configuration lets it be written."""
+    async def writable(self, registers: Iterable[Register]) -> bool:
+        """Whether the configuration lets all of them be written."""
         await self._prepare()
-        return self._commander.is_writable(register)
+        return all(map(self._commander.is_writable, registers))
 
-    async def send(
-        self, register: Register, value: object, done: Done, accepted: Callable[[], None] | None = None
-    ) -> None:
-        """Send a value as soon as there is room; ``done`` is called when its end is known, a bounded time later.
+    async def send(self, values: Mapping[str, object], done: Done, accepted: Callable[[], None] | None = None) -> None:
+        """Send values of registers, by path, as one command as soon as there is room.
 
-        ``accepted``: called before, if the source accepts it. CommandError: it is not writable, or the source takes
-        nothing at present; ValueRangeError. Neither is called then.
+        ``done`` is called once, when the end of all is known, a bounded time later; ``accepted`` before, if the source
+        accepts them. CommandError: one is not writable, or the source is silent; ValueRangeError: neither is called.
         """
         async with self._turn:
             await self._prepare()
-            while not self._has_room(register):
+            record_bytes, events = self._cost(values)
+            while not self._has_room(record_bytes, events):
                 self._freed = self._loop.create_future()
                 await self._freed
             if self.block.retired:
@@ -131,10 +133,9 @@ class Inlet:
                 raise CommandError(
                     f"source {self.block.source} does not answer; shmio-supervisor status says how it fares"
                 )
-            ticket = self._commander.submit({register.path: value})
-            record_bytes, events = _cost(register)
+            ticket = self._commander.submit(values)
             self._pending[ticket.number] = _Pending(
-                ticket.incarnation, ticket.until_ns, record_bytes, events, done, accepted
+                ticket.incarnation, ticket.until_ns, record_bytes, events, len(values), done, accepted
             )
             self._untaken_bytes += record_bytes
             self._open_events += events
@@ -158,12 +159,14 @@ class Inlet:
                 await asyncio.to_thread(self._commander.prepare)
                 self._prepared = True
 
-    def _has_room(self, register: Register) -> bool:
-        if self._silent or not self._pending:
-            return True
-        record_bytes, events = _cost(register)
+    def _cost(self, values: Mapping[str, object]) -> tuple[int, int]:
+        """At most so many bytes in the queue, and events until the end, have writes of these; PathError."""
+        sizes = [find(self.block.layout, path).size for path in values]
+        return 64 + sum(24 + size for size in sizes), sum(2 + size // EVENT_DATA_SIZE for size in sizes)
+
+    def _has_room(self, record_bytes: int, events: int) -> bool:
         fits = self._untaken_bytes + record_bytes <= self.block.commands.capacity
-        return fits and self._open_events + events <= MAX_OPEN
+        return self._silent or not self._pending or (fits and self._open_events + events <= MAX_OPEN)
 
     # ---- what the source says --------------------------------------------------------------------------------
 
@@ -185,9 +188,14 @@ class Inlet:
             self._untaken_bytes -= pending.record_bytes
             if event.kind == EventKind.ACCEPTED and pending.accepted is not None:
                 pending.accepted()
-        if event.kind in ENDS:  # of the one item there is
-            kind = EventKind(event.kind)
-            self._end(event.command, kind, "" if kind in DONE else f"{kind}: {event.text}")
+        if event.kind not in ENDS:
+            return
+        pending.items -= event.items
+        kind = EventKind(event.kind)
+        if kind not in DONE and pending.failure is None:
+            pending.failure = kind, f"{kind}: {event.text}"
+        if pending.items <= 0:
+            self._end(event.command, *(pending.failure or (kind, "")))
 
     def _restarted(self, event: Event) -> None:
         """A successor rejects what its predecessor had not taken; of what it had taken nobody knows."""
@@ -289,8 +297,3 @@ class Inlet:
 def _set(future: asyncio.Future[None]) -> None:
     if not future.done():
         future.set_result(None)
-
-
-def _cost(register: Register) -> tuple[int, int]:
-    """At most so many bytes in the queue, and events until the end, has a write of the register."""
-    return 88 + register.size, 2 + register.size // EVENT_DATA_SIZE

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from contextlib import suppress
 from functools import partial
 from typing import Final, NamedTuple
@@ -14,21 +14,23 @@ from google.protobuf.message import DecodeError
 from shmio.endpoints.grpc.arrivals import Arrivals
 from shmio.endpoints.grpc.inlet import Done, Inlet
 from shmio.endpoints.grpc.refusals import Refusals
+from shmio.endpoints.grpc.shape import Shape, shape
 from shmio.endpoints.grpc.topics import Topics
-from shmio.errors import CommandError, ShmioError
-from shmio.layout.model import Register
+from shmio.errors import CommandError, ShmioError, ValueRangeError
 from shmio.layout.topic import shorten
 from shmio.segment import DONE, EventKind
 
 SETTLE_S: Final = 5.0
 """So long a step waits for what its client has sent before it, and goes on sending."""
+MAX_VALUES: Final = 256
+"""Registers that one structure may write at once; a cycle of the source takes as many."""
 
 
 class Request(NamedTuple):
-    """One value for one topic; ``read`` makes it a register's, or raises ValueRangeError."""
+    """One value for one topic; ``read`` says what it is for each register, by path, or raises ValueRangeError."""
 
     path: str
-    read: Callable[[Register], object]
+    read: Callable[[Shape], Mapping[str, object]]
 
 
 Parse = Callable[[bytes], Request]
@@ -128,7 +130,7 @@ class Publisher:
         try:
             request = parse(message)
             path = request.path
-            inlet, register, wanted = self._read(request)
+            inlet, values = self._read(request)
         except DecodeError:
             self._refusals.add(f"{len(message)} bytes are no PubRequest", path, peer)
             return
@@ -136,8 +138,8 @@ class Publisher:
             self._refusals.add(str(error), path, peer)
             return
         value = _Value(stream)
-        sending = self._send(inlet, register, wanted, partial(self._ended, value, path, peer), value.hear)
-        if inlet.ready(register):
+        sending = self._send(inlet, values, partial(self._ended, value, path, peer), value.hear)
+        if inlet.ready(values):
             await sending
         else:  # meanwhile nothing is read: the client is slowed down by the flow control of its stream
             await asyncio.shield(self._keep(sending))
@@ -179,26 +181,29 @@ class Publisher:
                 answer.set_result((kind, reason))
 
         try:
-            inlet, register, value = self._read(request)
-            await inlet.send(register, value, ended, accepted)
+            inlet, values = self._read(request)
+            await inlet.send(values, ended, accepted)
         except ShmioError:
             self._refusals.count += 1
             raise
         return await answer
 
-    def _read(self, request: Request) -> tuple[Inlet, Register, object]:
+    def _read(self, request: Request) -> tuple[Inlet, Mapping[str, object]]:
         """What is to be written where; PathError, ValueRangeError, CommandError."""
         topic = self._topics.topic(request.path)
-        register = self._topics.register(topic)
+        found = shape(self._topics.layout(topic), topic)
         if topic.direction == "out":
             raise CommandError(f"{shorten(request.path)}: what comes out of a source is not published to; use /in")
-        return self._topics.feed(topic.source).inlet, register, request.read(register)
+        values = request.read(found)
+        if len(values) > MAX_VALUES:
+            raise ValueRangeError(
+                f"{shorten(request.path)}: {len(values)} registers are too many at once, at most {MAX_VALUES}"
+            )
+        return self._topics.feed(topic.source).inlet, values
 
-    async def _send(
-        self, inlet: Inlet, register: Register, value: object, done: Done, accepted: Callable[[], None]
-    ) -> None:
+    async def _send(self, inlet: Inlet, values: Mapping[str, object], done: Done, accepted: Callable[[], None]) -> None:
         try:
-            await inlet.send(register, value, done, accepted)
+            await inlet.send(values, done, accepted)
         except ShmioError as error:
             done(EventKind.REJECTED, str(error))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import AsyncIterator, Collection
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any, Final
 
 import grpc
@@ -13,14 +13,13 @@ from google.protobuf.empty_pb2 import Empty
 from shmio.endpoints.grpc.hold import Moment
 from shmio.endpoints.grpc.outbox import EventLane, Lane, Outbox, Outboxes, StateLane
 from shmio.endpoints.grpc.publish import Publisher, Request
+from shmio.endpoints.grpc.rosmessage import encoder, message_type, read, time_stamp
+from shmio.endpoints.grpc.shape import Shape, shape
 from shmio.endpoints.grpc.stepper import Stepper
-from shmio.endpoints.grpc.subject import Encode, Picture, Subject
+from shmio.endpoints.grpc.subject import Subject
 from shmio.endpoints.grpc.topics import Mark, Topics
 from shmio.errors import PathError, ShmioError, TimeError, ValueRangeError
-from shmio.layout.codec import Value, codec
-from shmio.layout.model import Layout, Register
-from shmio.layout.text import from_text, to_text, wire_type
-from shmio.layout.topic import Topic, find, shorten
+from shmio.layout.topic import Topic, shorten
 from shmio.logs import fields
 from shmio.wire import simlog_v1_pb2 as wire
 
@@ -86,11 +85,11 @@ class SimlogV1:
         return wire.StepResponse(code=0)
 
     async def get_topic(self, request: wire.TopicDescriptor, context: Context) -> wire.TopicDescriptor:
-        """Tell a topic's type; NOT_FOUND, INVALID_ARGUMENT for a structure."""
+        """Tell a topic's type; NOT_FOUND, INVALID_ARGUMENT for a structure that there is no message for."""
         if mark := await self._mark(request.path, context):
             return wire.TopicDescriptor(path=request.path, msgType=_MARK_TYPES[mark])
-        _, register = await self._resolve(request.path, context)
-        return wire.TopicDescriptor(path=request.path, msgType=wire_type(register))
+        _, found = await self._resolve(request.path, context)
+        return wire.TopicDescriptor(path=request.path, msgType=message_type(found))
 
     async def subscribe(self, request: wire.TopicDescriptor, context: Context) -> AsyncIterator[bytes]:
         """Stream a topic's values: the current one if it is good, then every change; of ``/in``, what is written to it.
@@ -104,7 +103,7 @@ class SimlogV1:
             async for moment in self._follow(mark, context):
                 yield moment
             return
-        topic, register = await self._resolve(request.path, context)
+        topic, found = await self._resolve(request.path, context)
         told = False
         with self._outboxes.opened() as outbox:
             lane: Lane = StateLane(outbox)
@@ -114,8 +113,8 @@ class SimlogV1:
             try:
                 while True:
                     feed = self._topics.feed(topic.source)
-                    encode = encoder(register, feed.block.layout)
-                    leave = lane.join(feed, Subject("v1", register.path, (register,), encode))
+                    encode = encoder(found, feed.block.layout)
+                    leave = lane.join(feed, Subject("v1", found.path, found.registers, encode))
                     try:
                         if not told:
                             await context.send_initial_metadata(())  # who waits for it misses nothing from then on
@@ -126,7 +125,7 @@ class SimlogV1:
                         leave()
                     if outbox.failure:
                         await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, outbox.failure)
-                    register = await self._find_again(topic, context)
+                    found = await self._find_again(topic, context)
             finally:
                 del self._streams[outbox]
 
@@ -148,13 +147,21 @@ class SimlogV1:
             if source in sources:
                 outbox.end()
 
-    async def _find_again(self, topic: Topic, context: Context) -> Register:
-        """The register of a stream after a reload; NOT_FOUND."""
+    async def _find_again(self, topic: Topic, context: Context) -> Shape:
+        """What a stream shows after a reload; NOT_FOUND."""
         try:
-            return find(self._topics.layout(topic), topic.path)
-        except PathError as error:
+            return self._find(topic)
+        except (PathError, ValueRangeError) as error:
             await context.abort(grpc.StatusCode.NOT_FOUND, str(error))
             raise  # abort never returns
+
+    def _find(self, topic: Topic) -> Shape:
+        """What a topic names; PathError, ValueRangeError: a structure that there is no message for."""
+        if not topic.path:
+            raise ValueRangeError(f"{topic}: a source; version 1 serves what is in it")
+        found = shape(self._topics.layout(topic), topic)
+        message_type(found)
+        return found
 
     async def publish(self, messages: AsyncIterator[bytes], context: Context) -> Empty:
         """Write the values of a stream, in its order, and answer when it has ended and all of them have."""
@@ -168,56 +175,24 @@ class SimlogV1:
             await context.abort(grpc.StatusCode.NOT_FOUND, str(error))
             raise  # abort never returns
 
-    async def _resolve(self, path: str, context: Context) -> tuple[Topic, Register]:
+    async def _resolve(self, path: str, context: Context) -> tuple[Topic, Shape]:
         try:
             topic = self._topics.topic(path)
-            if self._topics.layout(topic).members(topic.path) or not topic.path:
-                await context.abort(
-                    grpc.StatusCode.INVALID_ARGUMENT, f"{shorten(path)}: a structure; version 1 serves single registers"
-                )
-            return topic, self._topics.register(topic)
+            return topic, self._find(topic)
+        except ValueRangeError as error:
+            await context.abort(grpc.StatusCode.INVALID_ARGUMENT, str(error))
+            raise  # abort never returns
         except PathError as error:
             await context.abort(grpc.StatusCode.NOT_FOUND, str(error))
-            raise  # abort never returns
+            raise
 
 
 def _parse(message: bytes) -> Request:
     request = wire.PubRequest.FromString(message)
-    return Request(request.topic.path, partial(_read, request.data))
-
-
-def _read(data: wire.ROSMessage, register: Register) -> Value:
-    content = data.WhichOneof("content")
-    if content not in (None, "timeStamp"):
-        raise ValueRangeError(f"a {content}; no register takes a structure")
-    return from_text(data.value, register)
-
-
-def encoder(register: Register, layout: Layout) -> Encode:
-    """A function from a frame to the register's ROSMessage, serialised; None where the bytes hold no value.
-
-    Fields of a protobuf message may be concatenated: what never changes is encoded once, the time once a frame.
-    """
-    kind = wire.ROSMessage(type=wire_type(register)).SerializeToString()
-    decode = codec(register, layout.byte_order).decode
-
-    def encode(frame: Picture) -> bytes | None:
-        value = decode(frame.image)
-        if value is None:
-            return None
-        text = wire.ROSMessage(value=to_text(value, register)).SerializeToString()
-        return kind + text + _time_stamp(frame.number, frame.clock_ns)
-
-    return encode
+    return Request(request.topic.path, partial(read, request.data))
 
 
 def _marked(mark: Mark, moment: Moment) -> bytes:
     """The message of a topic of time; the clock has it where a client looks for it, and no value."""
     value = str(moment.number) if mark is Mark.STEP else ""
-    return wire.ROSMessage(type=_MARK_TYPES[mark], value=value).SerializeToString() + _time_stamp(*moment)
-
-
-@lru_cache(maxsize=64)  # a frame or two for each feed
-def _time_stamp(number: int, clock_ns: int) -> bytes:
-    stamp = wire.time(sec=clock_ns // 1_000_000_000, nsec=clock_ns)
-    return wire.ROSMessage(timeStamp=wire.Header(seq=number & 0xFFFFFFFF, stamp=stamp)).SerializeToString()
+    return wire.ROSMessage(type=_MARK_TYPES[mark], value=value).SerializeToString() + time_stamp(*moment)

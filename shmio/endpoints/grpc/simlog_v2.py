@@ -12,19 +12,19 @@ from google.protobuf.empty_pb2 import Empty
 from shmio.endpoints.grpc.marks import Marks
 from shmio.endpoints.grpc.outbox import Outboxes
 from shmio.endpoints.grpc.publish import Publisher, Request
+from shmio.endpoints.grpc.shape import Shape, shape
 from shmio.endpoints.grpc.subscribers import Subscribers
 from shmio.endpoints.grpc.topics import Topics
 from shmio.endpoints.grpc.values import (
     MAX_ELEMENTS,
     MAX_MEMBERS,
-    Shape,
     encoder,
     from_wire,
     nothing,
     path_field,
     repeated,
-    shape,
     time_stamp,
+    value_type,
 )
 from shmio.errors import CommandError, EndpointError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import Topic, shorten
@@ -84,7 +84,7 @@ class SimlogV2:
             direction = await self._direction(topic, found)
         except PathError:
             return wire.TopicInfo(path=request.path)
-        return wire.TopicInfo(path=request.path, type=found.type, direction=direction, exists=True)
+        return wire.TopicInfo(path=request.path, type=value_type(found), direction=direction, exists=True)
 
     async def create_subscriber(self, request: wire.Subscriber, context: Context) -> AsyncIterator[bytes]:
         """Stream the values of all topics that are subscribed for this uuid, in the order of the frames.
@@ -169,7 +169,7 @@ class SimlogV2:
         if topic.direction is not None:
             return wire.IN if topic.direction == "in" else wire.OUT
         inlet = self._topics.feed(topic.source).inlet
-        return wire.INOUT if found.whole and await inlet.writable(found.registers[0]) else wire.OUT
+        return wire.INOUT if await inlet.writable(found.registers) else wire.OUT
 
     def _read(self, paths: Iterable[str]) -> list[bytes]:
         """Serialised messages; PathError, ValueRangeError."""

@@ -12,8 +12,9 @@ from typing import Final
 
 from shmio.endpoints.grpc.marks import Marks
 from shmio.endpoints.grpc.outbox import EventLane, Lane, Outbox, StateLane
+from shmio.endpoints.grpc.shape import shape
 from shmio.endpoints.grpc.topics import Mark, Topics
-from shmio.endpoints.grpc.values import Encoded, marked, path_field, shape, subject
+from shmio.endpoints.grpc.values import Encoded, marked, path_field, subject
 from shmio.errors import EndpointError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import Topic, shorten
 from shmio.logs import fields

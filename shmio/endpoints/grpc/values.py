@@ -5,9 +5,9 @@ A message is put together of serialised fields, which may be concatenated: what 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from google.protobuf.struct_pb2 import NULL_VALUE, ListValue
@@ -16,6 +16,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from shmio.endpoints.grpc.encoding import delimited, varint
 from shmio.endpoints.grpc.hold import Moment
+from shmio.endpoints.grpc.shape import Shape
 from shmio.endpoints.grpc.subject import Picture, Subject
 from shmio.endpoints.grpc.topics import Mark
 from shmio.errors import ValueRangeError
@@ -23,7 +24,7 @@ from shmio.layout.codec import Value, codec
 from shmio.layout.model import Layout, Register
 from shmio.layout.scalar import scalar_codec
 from shmio.layout.text import from_text, wire_type
-from shmio.layout.topic import Topic, decode_segment, look_up, shorten
+from shmio.layout.topic import decode_segment, encode_segment, shorten
 from shmio.wire import simlog_v2_pb2 as wire
 
 MAX_ELEMENTS: Final = 1 << 16
@@ -34,28 +35,6 @@ MAX_LEVELS: Final = 24
 """Structures within each other: the messages that hold them are three times as deep, and readers stop at 100."""
 
 _TYPES: Final = {"bool": wire.BOOL, "double": wire.NUMBER, "int": wire.NUMBER, "string": wire.STRING}
-
-
-class Shape(NamedTuple):
-    """What a path names: one register, or all below a structure."""
-
-    path: str
-    registers: tuple[Register, ...]
-    whole: bool
-    """Whether it is a register, or an array's element, as a whole; else a structure."""
-
-    @property
-    def type(self) -> wire.ValueType:
-        """The type of its values."""
-        if not self.whole:
-            return wire.STRUCT
-        (register,) = self.registers
-        return wire.LIST if register.dims else _TYPES[wire_type(register)]
-
-    @property
-    def elements(self) -> int:
-        """Numbers, bits and texts in it."""
-        return sum(register.count for register in self.registers)
 
 
 class Encoded:
@@ -76,12 +55,12 @@ class Encoded:
         return b"\x0a" + varint(len(header)) + header + self.rest
 
 
-def shape(layout: Layout, topic: Topic) -> Shape:
-    """What a topic names in a layout; PathError."""
-    below = layout.members(topic.path)
-    if below:
-        return Shape(topic.path, tuple(layout.registers[index] for index in below), whole=False)
-    return Shape(topic.path, (look_up(layout, topic),), whole=True)
+def value_type(found: Shape) -> wire.ValueType:
+    """The type of its values."""
+    if not found.whole:
+        return wire.STRUCT
+    (register,) = found.registers
+    return wire.LIST if register.dims else _TYPES[wire_type(register)]
 
 
 def subject(found: Shape, layout: Layout) -> Subject:
@@ -100,7 +79,7 @@ def encoder(found: Shape, layout: Layout) -> Callable[[Picture], Encoded | None]
             f"{shorten(found.path)}: {members} registers with {elements} elements are too much for one value, "
             f"{MAX_MEMBERS} with {MAX_ELEMENTS} are the most; its members are topics, too"
         )
-    head = wire.SimlogMessage(type=found.type).SerializeToString() + b"\x1a"
+    head = wire.SimlogMessage(type=value_type(found)).SerializeToString() + b"\x1a"
     serialise = _whole(found.registers[0], layout) if found.whole else _structure(found, layout)
 
     def encode(picture: Picture) -> Encoded | None:
@@ -146,11 +125,37 @@ def to_wire(value: Value) -> WireValue:
     return found
 
 
-def from_wire(value: WireValue, register: Register) -> object:
-    """What a client sent for a register; ValueRangeError.
+def from_wire(value: WireValue, found: Shape) -> dict[str, object]:
+    """What a client sent, by the registers' paths; of a structure, for the members that it names. ValueRangeError.
 
     A text for what is none is read as in version 1: so all digits of a number of 64 bits arrive.
     """
+    if found.whole:
+        (register,) = found.registers
+        return {register.path: _read(value, register)}
+    values: dict[str, object] = {}
+    by_path = {register.path: register for register in found.registers}
+    _read_members(value, found.path, by_path, values)
+    if not values:
+        raise ValueRangeError(f"{found.path}: expected a structure with some of its members, found none")
+    return values
+
+
+def _read_members(value: WireValue, path: str, by_path: Mapping[str, Register], values: dict[str, object]) -> None:
+    """Collect what a structure gives; no deeper than the registers' paths are."""
+    if value.WhichOneof("kind") != "struct_value":
+        raise ValueRangeError(f"{path}: expected a structure")
+    for name, member in value.struct_value.fields.items():
+        inner = f"{path}/{encode_segment(name)}"
+        if inner in by_path:
+            values[inner] = _read(member, by_path[inner])
+        elif any(other.startswith(f"{inner}/") for other in by_path):
+            _read_members(member, inner, by_path, values)
+        else:
+            raise ValueRangeError(f"{shorten(inner)}: the structure has no such member")
+
+
+def _read(value: WireValue, register: Register) -> object:
     kind = value.WhichOneof("kind")
     if kind == "string_value" and (register.dims or wire_type(register) != "string"):
         return from_text(value.string_value, register)

@@ -10,7 +10,6 @@ from shmio.connectors.desk import CommandDesk
 from shmio.connectors.output import Output
 from shmio.errors import ConnectorError
 from shmio.segment import BlockWriter, Write
-from tests.unit.endpoints.harness import LAYOUT, WRITABLE
 
 
 class Plant:
@@ -18,11 +17,11 @@ class Plant:
 
     def __init__(self, writer: BlockWriter) -> None:
         self.writer = writer
-        self.memory = bytearray(LAYOUT.size)
+        self.memory = bytearray(writer.block.layout.size)
         self.written: list[Write] = []
         self.refusal = ""
         self.lost = False
-        self.desk = CommandDesk(Output(writer), WRITABLE, time.monotonic_ns)
+        self.desk = CommandDesk(Output(writer), writer.block.attributes.writable, time.monotonic_ns)
         self.desk.open()
         self._cycles = 0
         self._stop = threading.Event()

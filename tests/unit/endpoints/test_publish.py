@@ -132,7 +132,7 @@ WRONG = [
     (message("cell/nothing", "1"), "no such register"),
     (message("nowhere://step", "1"), "no source of this name"),
     (message("model/clock", "1"), "it can be subscribed to, and nothing else"),
-    (message("cell/axis", "1"), "a structure, not a register"),
+    (message("cell/axis", "1"), "a structure that version 1 has no message for"),
     (message("cell/inputs/2", "1"), "index [2] is outside [0..1]"),
     (message("cell/step/out", "1"), "use /in"),
     (message("cell/secret", "1"), "not writable; the configuration has to name it in the source's `writable`"),
@@ -145,9 +145,9 @@ WRONG = [
     (message("cell/inputs", "[1]"), "expected a list of 2"),
     (message("cell/inputs", "[" * 10_000), "expected a JSON array"),
     (message("cell/name", "longer than eight"), "do not fit"),
-    (message("cell/step", point=wire.Point(x=1)), "a point; no register takes a structure"),
-    (message("cell/step", "1", joint_trajectory=wire.JointTrajectory()), "a joint_trajectory; no register"),
-    (message("cell/step", safety_zone=wire.SafetyZone(zone="Z1")), "a safety_zone; no register"),
+    (message("cell/step", point=wire.Point(x=1)), "expected a text, found a point"),
+    (message("cell/step", "1", joint_trajectory=wire.JointTrajectory()), "expected a text, found a joint_trajectory"),
+    (message("cell/step", safety_zone=wire.SafetyZone(zone="Z1")), "expected a text, found a safety_zone"),
 ]
 
 
@@ -262,7 +262,7 @@ def test_a_client_that_leaves_while_it_is_slowed_down_loses_nothing_that_was_rec
             await call.write(message("cell/step", str(number)).SerializeToString())
 
         async def slowed() -> bool:
-            return not served.feeds["cell"].inlet.ready(served.feeds["cell"].block.layout.registers[4])
+            return not served.feeds["cell"].inlet.ready({"step": 1})
 
         await served.until(slowed)
         under_way = len(served.feeds["cell"].inlet._pending)

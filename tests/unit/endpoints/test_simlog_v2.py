@@ -52,7 +52,7 @@ async def read(served: Endpoint, *paths: str) -> list[tuple[int, str, Any]]:
         ("cell/bits/9/out", v2.BOOL, v2.OUT),
         ("cell/secret", v2.NUMBER, v2.OUT),
         ("cell/secret/in", v2.NUMBER, v2.IN),
-        ("cell/axis", v2.STRUCT, v2.OUT),
+        ("cell/axis", v2.STRUCT, v2.INOUT),
         ("cell/axis/in", v2.STRUCT, v2.IN),
     ],
 )
@@ -167,7 +167,10 @@ def test_lists_are_arrays(segment: Segment) -> None:
 REFUSED = [
     (request("cell/step/out", 1), Status.FAILED_PRECONDITION, "use /in"),
     (request("cell/secret", 1), Status.FAILED_PRECONDITION, "the configuration has to name it"),
-    (request("cell/axis", {"position": 1}), Status.NOT_FOUND, "a structure, not a register"),
+    (request("cell/axis", 1), Status.INVALID_ARGUMENT, "axis: expected a structure"),
+    (request("cell/axis", {}), Status.INVALID_ARGUMENT, "with some of its members, found none"),
+    (request("cell/axis", {"position": 1, "torque": 1}), Status.INVALID_ARGUMENT, "axis/torque: the structure has no"),
+    (request("cell/axis", {"position": {"x": 1}}), Status.INVALID_ARGUMENT, "axis/position: expected a value"),
     (request("cell/step", 1.5), Status.INVALID_ARGUMENT, "expected a whole number"),
     (request("cell/step", 40_000), Status.INVALID_ARGUMENT, "out of range"),
     (request("cell/step", "seven"), Status.INVALID_ARGUMENT, "expected a number"),

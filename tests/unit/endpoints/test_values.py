@@ -8,7 +8,8 @@ from typing import Any
 import pytest
 from google.protobuf.struct_pb2 import Value
 
-from shmio.endpoints.grpc.values import MAX_LEVELS, encoder, from_wire, path_field, shape, time_stamp, to_wire
+from shmio.endpoints.grpc.shape import Shape, shape
+from shmio.endpoints.grpc.values import MAX_LEVELS, encoder, from_wire, path_field, time_stamp, to_wire
 from shmio.errors import ValueRangeError
 from shmio.layout.codec import codec
 from shmio.layout.model import ByteOrder, Layout, Register, array_size
@@ -134,6 +135,6 @@ def test_time_is_ns_since_the_start(clock_ns: int) -> None:
 
 
 def test_a_text_has_all_digits_of_a_long_number() -> None:
-    register = Register("counter", "LINT", (), 0, None, 8, 1)
-    assert from_wire(Value(string_value=str(2**63 - 1)), register) == 2**63 - 1
-    assert from_wire(Value(number_value=2**53), register) == 2**53
+    counter = Shape("counter", (Register("counter", "LINT", (), 0, None, 8, 1),), whole=True)
+    assert from_wire(Value(string_value=str(2**63 - 1)), counter) == {"counter": 2**63 - 1}
+    assert from_wire(Value(number_value=2**53), counter) == {"counter": 2**53}

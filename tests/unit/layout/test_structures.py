@@ -1,30 +1,33 @@
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import pytest
 
 from shmio.errors import LayoutError, ValueRangeError
 from shmio.layout.compiler import Source, compile_sources
-from shmio.layout.model import Layout
+from shmio.layout.model import Register
 from shmio.layout.structures import CONTENTS, members, recognise
 from shmio.layout.tagplace import place_tags
 
 LENGTHS = {"JointTrajectoryPoint": "[6]", "JointTrajectory": "[6, 3]"}
 
 
-def block(body: str) -> Layout:
+def block(body: str) -> Sequence[Register]:
     source = f"DATA_BLOCK DB1 STRUCT z : Struct {body} END_STRUCT; END_STRUCT; BEGIN END_DATA_BLOCK"
     (layout,) = compile_sources([Source("x.db", source.encode())]).layouts
-    return layout
+    registers: Sequence[Register] = layout.registers
+    return registers
 
 
 @pytest.mark.parametrize("shape", CONTENTS)
 def test_every_shape_is_a_type_of_tag_tables_and_recognised(shape: str) -> None:
     layout = place_tags("t", {"zones/Z1": f"{shape}{LENGTHS.get(shape, '')}"})
     assert layout.registers
-    found = recognise(layout, "zones/Z1")
+    found = recognise("zones/Z1", layout.registers)
     assert found is not None
     assert found[0] == shape
-    assert recognise(layout, "zones") is None
+    assert recognise("zones", layout.registers) is None
 
 
 def test_a_trajectory_has_as_many_joints_and_points_as_it_says() -> None:
@@ -60,7 +63,7 @@ def test_others_are_no_structures(text: str) -> None:
 
 def test_a_data_block_may_have_them_in_any_order_and_case() -> None:
     body = "Zone : String; LEVEL : LReal; Object2 : String[8]; object1 : WString;"
-    found = recognise(block(body), "z")
+    found = recognise("z", block(body))
     assert found is not None
     assert found[0] == "SafetyZone"
     assert list(found[1]) == ["zone", "level", "object1", "object2"]
@@ -80,13 +83,13 @@ def test_a_data_block_may_have_them_in_any_order_and_case() -> None:
     ],
 )
 def test_what_lacks_a_member_or_has_another_is_none(body: str) -> None:
-    assert recognise(block(body), "z") is None
+    assert recognise("z", block(body)) is None
 
 
 def test_arrays_of_structures_come_in_their_order() -> None:
     points = "Array[8..11] of Struct positions : Array[1..2] of Real; END_STRUCT"
     body = f"joint_names : Array[1..2] of String; points : {points};"
-    found = recognise(block(body), "z")
+    found = recognise("z", block(body))
     assert found is not None
     inside = found[1]["points"]
     assert isinstance(inside, list)
