@@ -6,10 +6,12 @@ import argparse
 import signal
 import threading
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from shmio.cli.campaign import run_campaign
 from shmio.cli.run import dumps
 from shmio.cli.set import Pairs, read_value, seconds
 from shmio.errors import CommandError, PathError, ValueRangeError
@@ -28,6 +30,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         "VALUE is JSON or an S7 literal. Without any PATH: what is injected at present."
     )
     parser.add_argument("pairs", nargs="*", action=Pairs, metavar="PATH VALUE", help="register or array element")
+    parser.add_argument("--file", type=Path, metavar="CAMPAIGN.toml", help="lay the injections that a file declares")
+    parser.add_argument("--seed", type=_seed, metavar="N", help="of those of the file that have none")
+    parser.add_argument("--from-now", action="store_true", help="times in the file count from now, not from the start")
+    parser.add_argument("--list", action="store_true", help="what is injected at present, as without any PATH")
     parser.add_argument("--for", dest="for_s", type=seconds, metavar="S", help="lift after so many seconds")
     parser.add_argument("--priority", type=int, default=0, metavar="N", help="the highest is outermost (default: 0)")
     parser.add_argument("--name", default="", help="what it is called in the list")
@@ -40,7 +46,11 @@ def execute(cell: Attachment, options: argparse.Namespace) -> int:
     """Lay, list, or lift. PathError, ValueRangeError, CommandError."""
     if options.lift_all or options.lift is not None:
         return _lift(cell, options)
-    if not options.pairs:
+    if options.file is not None:
+        if options.pairs:
+            raise CommandError("give --file, or PATH VALUE, not both")
+        return run_campaign(cell, options)
+    if options.list or not options.pairs:
         _list(cell, as_json=options.json)
         return 0
     wanted: dict[tuple[str, str], dict[str, Value]] = {}
@@ -59,6 +69,13 @@ def execute(cell: Attachment, options: argparse.Namespace) -> int:
         if not options.keep:
             _wait(options.for_s)
     return 0
+
+
+def _seed(text: str) -> int:
+    """An argument's type."""
+    if not text.isascii() or not text.isdecimal() or len(text) > 19 or int(text) >= 2**63:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0 to {2**63 - 1}")
+    return int(text)
 
 
 def _read(cell: Attachment, path: str, text: str) -> tuple[Topic, Value]:
@@ -102,7 +119,7 @@ def _list(cell: Attachment, *, as_json: bool) -> None:
     for source, standing in cell.injections().items():
         layout = cell.block(source).layout
         for one in standing:
-            over = [f"{source}/{register.path}" for register in layout.registers if one.covers(register)]
+            over = [f"{source}/{register.path}" for register in layout.registers if one.reaches(register)]
             fields = msgspec.to_builtins(one)
             found.append({"source": source, **{k: v for k, v in fields.items() if k != "ranges"}, "registers": over})
     if as_json:
@@ -112,7 +129,17 @@ def _list(cell: Attachment, *, as_json: bool) -> None:
         paths = one_found["registers"]
         more = f" and {len(paths) - 3} more" if paths[3:] else ""
         keep = ", kept" if one_found["keep"] else ""
+        by = f"pid {one_found['pid']}" if one_found["pid"] else "supervisor.toml"
         print(
             f"{one_found['id']}  {', '.join(map(printable, paths[:3]))}{more} /{one_found['direction']}, "
-            f"priority {one_found['priority']}, pid {one_found['pid']}{keep}  {printable(one_found['name'])}".rstrip()
+            f"priority {one_found['priority']}, {by}{keep}{_running(one_found.get('running'))}  "
+            f"{printable(one_found['name'])}".rstrip()
         )
+
+
+def _running(running: dict[str, Any] | None) -> str:
+    """How a declared one is."""
+    if running is None:
+        return ""
+    times = f", the {running['runs']}. time, since cycle {running['cycle']}" if running["state"] == "active" else ""
+    return f", {running['declaration']['operation']}, seed {running['seed']}: {running['state']}{times}"

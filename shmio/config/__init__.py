@@ -1,13 +1,14 @@
 """``supervisor.toml``: read, checked, resolved (architecture: *Config*)."""
 
 from shmio.config.address import Address, UnixAddress, parse_address
-from shmio.config.model import Config, Emulator, Grpc, Instance, Recorder, Source, Tls, Token
+from shmio.config.model import Config, Declaration, Emulator, Grpc, Instance, Recorder, Source, Tls, Token
 from shmio.config.read import RESERVED_SOURCES, load
 
 __all__ = [
     "RESERVED_SOURCES",
     "Address",
     "Config",
+    "Declaration",
     "Emulator",
     "Grpc",
     "Instance",

@@ -14,6 +14,9 @@ Milliseconds = Annotated[float, Meta(gt=0, le=3_600_000)]
 Text = Annotated[str, Meta(min_length=1)]
 Texts = Annotated[list[Text], Meta(min_length=1)]
 DbNumber = Annotated[int, Meta(ge=1, le=65535)]
+Seconds = Annotated[float, Meta(ge=0, le=1e9)]
+Operand = bool | int | float | str | list[Any]
+OperationName = Literal["set", "offset", "scale", "clamp", "noise", "random", "freeze", "delay", "drop", "flip"]
 
 ROLES = ("read", "write", "inject", "control")
 """What a client of the gRPC endpoint may be allowed."""
@@ -160,12 +163,41 @@ class Recorder(Section):
         return round(self.buffer_mb * 1e6)
 
 
+class Declaration(Section, omit_defaults=True):
+    """``[[injection]]``: an injection that the source's process runs by itself; docs/reference/injections.md.
+
+    Which operation takes which keys, and what they must be, is in ``declaration``.
+    """
+
+    name: Name
+    target: Text | Texts
+    operation: OperationName
+    value: Operand | None = None
+    values: Annotated[list[Any], Meta(min_length=1, max_length=256)] | None = None
+    min: float | None = None
+    max: float | None = None
+    amplitude: Annotated[float, Meta(gt=0)] | None = None
+    distribution: Literal["uniform", "gaussian"] | None = None
+    delay_ms: Milliseconds | None = None
+    delay_cycles: Annotated[int, Meta(ge=1)] | None = None
+    bits: Annotated[list[Annotated[int, Meta(ge=0)]], Meta(min_length=1, max_length=64)] | None = None
+    probability: Annotated[float, Meta(gt=0, le=1)] | None = None
+    start_s: Seconds | None = None
+    end_s: Seconds | None = None
+    when: Text | None = None
+    for_s: Annotated[float, Meta(gt=0, le=1e9)] | None = None
+    times: Annotated[int, Meta(ge=1)] | None = None
+    priority: Annotated[int, Meta(ge=-(2**31), lt=2**31)] = 0
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] | None = None
+
+
 class Config(Section):
     """The whole file, with the folder that its paths are relative to."""
 
     instance: Instance
     source: list[Source] = []
     emulator: list[Emulator] = []
+    injection: list[Declaration] = []
     grpc: Grpc | None = None
     recorder: Recorder | None = None
     folder: str = "."

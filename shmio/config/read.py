@@ -6,14 +6,16 @@ import difflib
 import re
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
+from shmio.config.declaration import check_declarations
 from shmio.config.listening import check_listening, resolve
 from shmio.config.model import (
     Client,
     Config,
+    Declaration,
     Emulator,
     Grpc,
     Instance,
@@ -33,10 +35,10 @@ SECTION_PROCESSES = frozenset({"grpc", "mqtt", "recorder", "supervisor", "web"})
 MAX_FILE_BYTES = 1 << 20
 
 _TABLES: dict[str, type[Section]] = {
-    "": Config,
     "instance": Instance,
     "source": Source,
     "emulator": Emulator,
+    "injection": Declaration,
     "grpc": Grpc,
     "grpc.tls": Tls,
     "grpc.token": Token,
@@ -46,6 +48,7 @@ _TABLES: dict[str, type[Section]] = {
 }
 _OF_GRPC = ("token", "client", "address")
 _DERIVED = ("folder", "options", "texts")  # fields that are no keys of the file
+_Table = TypeVar("_Table", bound=Section)
 
 
 def load(file: Path) -> Config:
@@ -86,16 +89,22 @@ def _resolve(tables: dict[str, Any], folder: Path) -> Config:
     if "folder" in tables:
         raise ConfigError(_unknown("folder", ""))
     grpc = tables.get("grpc")
-    for name, table in [("source", tables), ("emulator", tables), *((f"grpc.{n}", grpc) for n in _OF_GRPC)]:
+    for name, table in [
+        ("source", tables),
+        ("emulator", tables),
+        ("injection", tables),
+        *((f"grpc.{n}", grpc) for n in _OF_GRPC),
+    ]:
         if isinstance(table, dict) and isinstance(table.get(name.removeprefix("grpc.")), dict):
             raise ConfigError(f"{name}: write [[{name}]], in two brackets: there can be several")
-    _check_text(tables, "")
+    check_text(tables, "")
     sources = tables.get("source", [])
     if isinstance(sources, list):
         tables = {**tables, "source": [_with_options(source, i, folder) for i, source in enumerate(sources)]}
-    config = _convert({**tables, "folder": str(folder)})
+    config = convert({**tables, "folder": str(folder)}, Config)
     _check_names(config)
     _check_times(config)
+    check_declarations(config.injection)
     check_listening(config)
     if config.grpc:
         resolve(config.grpc, config)
@@ -114,20 +123,21 @@ def _with_options(source: Any, index: int, folder: Path) -> Any:
     return {key: source[key] for key in source if key in common} | {"options": inline, "texts": texts}
 
 
-def _convert(tables: dict[str, Any]) -> Config:
+def convert(tables: dict[str, Any], kind: type[_Table]) -> _Table:
+    """The tables as this type; ConfigError names what is unknown or of a wrong type by its full key."""
     try:
-        return msgspec.convert(tables, Config)
+        return msgspec.convert(tables, kind)
     except msgspec.ValidationError as error:
         text, _, at = str(error).partition(" - at `$")
         path = at.rstrip("`").lstrip(".")
         unknown = re.search(r"unknown field `([^`]*)`", text)
         if unknown is None:
             raise ConfigError(explain(error)) from None
-        raise ConfigError(_unknown(f"{path}.{unknown[1]}" if path else unknown[1], path)) from None
+        raise ConfigError(_unknown(f"{path}.{unknown[1]}" if path else unknown[1], path, kind)) from None
 
 
-def _unknown(key: str, table: str) -> str:
-    known = _TABLES.get(re.sub(r"\[[^]]*\]", "", table))
+def _unknown(key: str, table: str, whole: type[Section] = Config) -> str:
+    known = whole if not table else _TABLES.get(re.sub(r"\[[^]]*\]", "", table))
     names = [name for name in known.__struct_fields__ if name not in _DERIVED] if known else []
     hint = _hint(key.rpartition(".")[2], names, f"known here: {', '.join(names)}")
     return f"{key}: unknown key; {hint}"
@@ -145,16 +155,16 @@ def _hint(key: str, names: list[str], otherwise: str) -> str:
     return f"did you mean {near[0]}?" if near else otherwise
 
 
-def _check_text(value: Any, key: str) -> None:
+def check_text(value: Any, key: str) -> None:
     """No control characters: no file name or terminal takes them. (Not a pattern: msgspec 0.22 crashes at exit.)."""
     if isinstance(value, str) and any(char < " " or char == "\x7f" for char in value):
         raise ConfigError(f"{key}: must not hold control characters")
     if isinstance(value, dict):
         for name, item in value.items():
-            _check_text(item, f"{key}.{name}".lstrip("."))
+            check_text(item, f"{key}.{name}".lstrip("."))
     elif isinstance(value, list):
         for index, item in enumerate(value):
-            _check_text(item, f"{key}[{index}]")
+            check_text(item, f"{key}[{index}]")
 
 
 def _check_names(config: Config) -> None:

@@ -70,8 +70,8 @@ def _slip(message: str, line: str, column: int) -> str:
 
 
 def named(message: str, tables: Mapping[str, Any]) -> str:
-    """The message, with the name of the source or emulator that its key tells by number."""
-    key = re.match(r"(source|emulator)\[(\d+)\](?!\.name:)", message)
+    """The message, with the name of the source, emulator or injection that its key tells by number."""
+    key = re.match(r"(source|emulator|injection)\[(\d+)\](?!\.name:)", message)
     if key is None:
         return message
     try:

@@ -6,7 +6,7 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ from shmio.connectors.schedule import Schedule
 from shmio.connectors.stepped import PageClock, SteppedLoop
 from shmio.errors import ConnectorError
 from shmio.layout.topic import parse_topic
-from shmio.segment import BlockWriter, Segment
+from shmio.segment import Block, BlockWriter, Segment
 from shmio.worker import BEAT_S, Worker
 
 SWITCH_S = 0.0005  # the poll thread is not to wait Python's usual 5 ms for the others
@@ -80,16 +80,17 @@ def _part(worker: Worker) -> _Part:
     source = found(options, segment.blocks[worker.name].layout)
     writer = segment.writer(worker.name)  # after its source: one that cannot be as configured has begun nothing
     schedule = Schedule(segment.header.started_ns, writer.block.period_ns)
-    owner_of = partial(_owner_of, segment)
+    owner_of, blocks = partial(_owner_of, segment), partial(_blocks, segment)
     writable = worker.config["writable"]
     if isinstance(source, Connector):
         clock = WallClock()
         armed = writer.block.attributes.armed
-        loop = SourceLoop(source, writer, schedule, clock, writable, armed=armed, owner_of=owner_of)
+        loop = SourceLoop(source, writer, schedule, clock, writable, armed=armed, owner_of=owner_of, blocks=blocks)
         return _Part(loop, clock.stop, source.timeout_s)
     page_clock = PageClock(segment.clock, worker.slot.index)
+    inputs = _inputs(source, writer, segment)
     stepped = SteppedLoop(
-        source, writer, schedule, page_clock, writable, inputs=_inputs(source, writer, segment), owner_of=owner_of
+        source, writer, schedule, page_clock, writable, inputs=inputs, owner_of=owner_of, blocks=blocks
     )
     return _Part(stepped, page_clock.stop, COMPUTE_S)
 
@@ -108,6 +109,12 @@ def _owner_of(segment: Segment, writer: int) -> Owner | None:
         if slot.writer == writer and slot.alive():
             return Owner(writer, slot.report.pid)
     return None
+
+
+def _blocks(segment: Segment) -> Mapping[str, Block]:
+    """All sources' blocks as of now."""
+    segment.refresh()
+    return segment.blocks
 
 
 def _guarded(run: Callable[[], None]) -> None:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import groupby
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 from shmio.connectors.base import Lost
+from shmio.errors import ConnectorError
 from shmio.layout.write import Write, apply, merge
-from shmio.segment import Command, EventKind
+from shmio.segment import Command, EventKind, Record
 
 End = tuple[EventKind, str]
 """What became of an item, and why."""
+
+_Outcome = TypeVar("_Outcome", str, str | Lost)
 
 _SUPERSEDED: Final = "superseded by a later write of the same cycle"
 
@@ -23,11 +26,14 @@ class Item(NamedTuple):
     place: int
     bits: bytes | None = None
     """Which of the write's bits are for the device, if injections took others."""
+    data: bytes | None = None
+    """Its values, if injections have changed some."""
 
     @property
     def write(self) -> Write:
-        """The write itself."""
-        return self.command.writes[self.place]
+        """What it writes."""
+        write = self.command.writes[self.place]
+        return write if self.data is None else write._replace(data=self.data)
 
     def parts(self) -> list[Write]:
         """What of it is for the device."""
@@ -105,3 +111,37 @@ def _share_bits(one: Write, other: Write) -> bool:
     if one.mask and other.mask and one.mask != other.mask:
         return False
     return other.offset < one.offset + len(one.data) and one.offset < other.offset + len(other.data)
+
+
+def one_each(outcomes: Sequence[_Outcome], writes: Sequence[Write]) -> Sequence[_Outcome]:
+    """What a connector says became of its writes; ConnectorError: it does not say it of each."""
+    if len(outcomes) != len(writes):
+        raise ConnectorError(f"the connector tells {len(outcomes)} outcomes of {len(writes)} writes")
+    return outcomes
+
+
+def records(items: Sequence[Item], ends: Sequence[End]) -> Iterator[Record]:
+    """The events that tell what became of items: one for neighbours in a command that ended alike."""
+    both = zip(items, ends, strict=True)
+    for (_, (kind, text)), group in groupby(both, key=lambda pair: (id(pair[0].command), pair[1])):
+        for first, count in _runs([item for item, _ in group]):
+            yield _record(kind, first, count, text)
+
+
+def _record(kind: EventKind, item: Item, count: int, text: str = "") -> Record:
+    command, write = item.command, item.write
+    return Record(
+        kind, text, command.writer, command.id, item.place, count, write.offset, write.mask, len(write.data)
+    )  # fmt: skip
+
+
+def _runs(items: Sequence[Item]) -> Iterator[tuple[Item, int]]:
+    """Consecutive places of one command as (first, count)."""
+    first, count = items[0], 1
+    for item in items[1:]:
+        if item.place == first.place + count:
+            count += 1
+        else:
+            yield first, count
+            first, count = item, 1
+    yield first, count

@@ -9,29 +9,29 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from itertools import groupby
-from typing import Final, TypeVar
+from collections.abc import Callable, Iterable, Sequence
+from typing import Final
 
 from shmio.connectors.base import Lost, WriteLostError
-from shmio.connectors.batch import End, Item, coalesce, ends
+from shmio.connectors.batch import End, Item, coalesce, ends, one_each, records
+from shmio.connectors.campaign import Blocks
+from shmio.connectors.chain import meet, pieces
 from shmio.connectors.injections import Injection, uncovered
-from shmio.connectors.injector import Injector, OwnerOf, pieces
+from shmio.connectors.injector import Injector, OwnerOf
 from shmio.connectors.output import Output
-from shmio.errors import ConnectorError
 from shmio.layout.write import Write, cover
-from shmio.segment import Command, CommandKind, EventKind, Record
+from shmio.segment import NO_WRITER, Command, CommandKind, EventKind, Record
 
 MAX_WAITING: Final = 256
 """Items that wait for the next cycle; what comes beyond stays in its queue. A command alone may have more."""
 MAX_WAITING_BLOCKS: Final = 4
 """The same in bytes, as a multiple of the block's."""
+FAR_NS: Final = 1 << 62
+"""The deadline of what a delay has held: the next cycle writes it, or nobody does."""
 TELL_NS: Final = 1_000_000_000
 """How often a writer that sends garbage is told."""
 
 _UNARMED: Final = "an injection toward a device needs `armed = true` in the source's configuration"
-
-_Outcome = TypeVar("_Outcome", str, str | Lost)
 
 log = logging.getLogger("shmio.source")
 
@@ -47,11 +47,13 @@ class CommandDesk:
         *,
         armed: bool = False,
         owner_of: OwnerOf = lambda _: None,
+        blocks: Blocks | None = None,
         accepted: Callable[[], None] = lambda: None,
     ) -> None:
         """``writable``: patterns; None: the device cannot be written at all. ``armed``: injections may reach it.
 
-        ``owner_of``: which process has a command queue. ``accepted``: called when items wait.
+        ``owner_of``: which process has a command queue. ``blocks``: of all sources, for the conditions of declared
+        injections; default: this one. ``accepted``: called when items wait.
         """
         self._writer = output.writer
         self._output = output
@@ -61,7 +63,9 @@ class CommandDesk:
         layout = self._writer.block.layout
         self._writable = cover(layout, writable or ())
         self._most_bytes = MAX_WAITING_BLOCKS * layout.size
-        self._injector = Injector(output, self._writable, self._cannot or ("" if armed else _UNARMED), owner_of)
+        refuse_in = self._cannot or ("" if armed else _UNARMED)
+        blocks = blocks or (lambda: {output.writer.block.source: output.writer.block})
+        self._injector = Injector(output, self._writable, refuse_in, owner_of, blocks)
         self._turn = threading.Lock()
         self._verdict = threading.Lock()  # held from the word that items are accepted until they wait
         self._closed = "the source is not connected yet"
@@ -81,12 +85,19 @@ class CommandDesk:
             self._closed = f"the source is not connected: {reason}"
             items, self._items = self._items, []
         self._end(items, [(EventKind.EXPIRED, reason)] * len(items))
+        self._injector.campaign.forget(reason)
         self._make_room()
 
     def settle(self) -> None:
         """Wait until whatever somebody has been told is accepted is :attr:`waiting`, too."""
         with self._verdict:
             pass
+
+    def release(self, cycle: int) -> None:
+        """Send on what delays over ``/in`` have held for their time; before the cycle carries out what waits."""
+        for layer, write in self._injector.campaign.release(cycle):
+            command = Command(NO_WRITER, layer.id, self._writer.incarnation, FAR_NS, (write,))
+            self._accept(command, layer)
 
     @property
     def waiting(self) -> bool:
@@ -115,10 +126,10 @@ class CommandDesk:
         outcomes: Sequence[str | Lost] = [Lost.UNKNOWN] * len(writes)
         error = ""
         try:
-            outcomes = _one_each(write(writes), writes)
+            outcomes = one_each(write(writes), writes)
         except WriteLostError as lost:
             error = str(lost)
-            outcomes = _one_each(lost.outcomes, writes)
+            outcomes = one_each(lost.outcomes, writes)
             raise
         except BaseException as unforeseen:
             error = str(unforeseen)
@@ -202,6 +213,8 @@ class CommandDesk:
             reason = uncovered(layer, command.writes)
         if not reason:
             reason = self._unwritable(command) if write else self._injector.take(command)
+        if not reason and write:
+            reason = self._injector.campaign.crowded
         if reason:
             self._writer.event(
                 Record(EventKind.REJECTED, reason, command.writer, command.id, 0, max(1, len(command.writes)))
@@ -211,10 +224,17 @@ class CommandDesk:
         if not self._has_room(command):
             self._held = command
             return False
-        items = list(self._divert(command, layer))
+        self._accept(command, layer)
+        return True
+
+    def _accept(self, command: Command, layer: Injection | None) -> None:
+        """Let a command meet the injections below ``layer``, and have what they leave of it wait for the cycle."""
+        left, taken = meet(self._output, command, layer)
+        self._end(taken, [(EventKind.TAKEN, "")] * len(taken))  # now all that injections get of it has been told
+        items = [item for item, _ in left]
         with self._verdict:
-            for item in items:  # outside the other lock, which the loop must never wait for long
-                for part in pieces(EventKind.ACCEPTED, command, item.place, item.parts(), layer):
+            for item, source in left:  # outside the other lock, which the loop must never wait for long
+                for part in pieces(EventKind.ACCEPTED, command, item.place, item.parts(), source):
                     self._writer.event(part)
             with self._turn:
                 closed = self._closed
@@ -224,23 +244,6 @@ class CommandDesk:
             self._end(items, [(EventKind.EXPIRED, closed)] * len(items))
         elif items:
             self._accepted()
-        return True
-
-    def _divert(self, command: Command, above: Injection | None) -> Iterator[Item]:
-        """Hand over what injections take of a command, and give what they leave for the device."""
-        ended: list[Item] = []
-        for place, write in enumerate(command.writes):
-            taken, bits = self._injector.injections.divert(write, above)
-            for layer, parts in taken:
-                for record in pieces(EventKind.DIVERTED, command, place, parts, layer):
-                    self._writer.event(record)
-            if not taken:
-                yield Item(command, place)
-            elif any(bits):
-                yield Item(command, place, bits)
-            else:
-                ended.append(Item(command, place))
-        self._end(ended, [(EventKind.TAKEN, "")] * len(ended))  # now all that injections get of it has been told
 
     def _has_room(self, command: Command) -> bool:
         with self._turn:
@@ -276,33 +279,5 @@ class CommandDesk:
 
     def _end(self, items: Sequence[Item], ends: Sequence[End]) -> None:
         """Tell what became of accepted items: one event for neighbours in a command that ended alike."""
-        both = zip(items, ends, strict=True)
-        for (_, (kind, text)), group in groupby(both, key=lambda pair: (id(pair[0].command), pair[1])):
-            for first, count in _runs([item for item, _ in group]):
-                self._writer.event(_record(kind, first, count, text))
-
-
-def _one_each(outcomes: Sequence[_Outcome], writes: Sequence[Write]) -> Sequence[_Outcome]:
-    """What a connector says became of its writes; ConnectorError: it does not say it of each."""
-    if len(outcomes) != len(writes):
-        raise ConnectorError(f"the connector tells {len(outcomes)} outcomes of {len(writes)} writes")
-    return outcomes
-
-
-def _record(kind: EventKind, item: Item, count: int, text: str = "") -> Record:
-    command, write = item.command, item.write
-    return Record(
-        kind, text, command.writer, command.id, item.place, count, write.offset, write.mask, len(write.data)
-    )  # fmt: skip
-
-
-def _runs(items: Sequence[Item]) -> Iterator[tuple[Item, int]]:
-    """Consecutive places of one command as (first, count)."""
-    first, count = items[0], 1
-    for item in items[1:]:
-        if item.place == first.place + count:
-            count += 1
-        else:
-            yield first, count
-            first, count = item, 1
-    yield first, count
+        for record in records(items, ends):
+            self._writer.event(record)

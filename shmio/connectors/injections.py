@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -29,6 +29,14 @@ class Owner:
     pid: int
 
 
+class Now(NamedTuple):
+    """The image published last: its cycle, the instance's clock of that, and what the device delivered."""
+
+    cycle: int
+    time_ns: int
+    raw: bytes
+
+
 @dataclass
 class Injection:
     """One layer. ``cover``: an image of the block in which the bits that it stands over are set."""
@@ -43,6 +51,40 @@ class Injection:
     values: Bits
     """What consumers get for the covered bits of ``/out``."""
 
+    @property
+    def given(self) -> bool:
+        """Whether it lies over ``/out`` and a client gives it values, who is told those that come from further in."""
+        return self.direction is Direction.OUT
+
+    @property
+    def active(self) -> bool:
+        """Whether it changes what it covers at present."""
+        return True
+
+    def show(self, image: Bits, now: Now) -> None:  # noqa: ARG002  what its client gave last holds at any time
+        """Put into an image what consumers get for the covered bits of ``/out``."""
+        image ^= (image ^ self.values) & self.cover
+
+    def meet(self, write: Write, bits: Bits, now: Now) -> bytes | None:  # noqa: ARG002
+        """What becomes of these bits of a write toward the device: its data, the same object if unchanged.
+
+        None: they go no further.
+        """
+        return None
+
+
+class Passage(NamedTuple):
+    """What became of a write on its way to the device."""
+
+    met: list[tuple[Injection, list[Write]]]
+    """What came to injections that took it, or made something else of it."""
+    left: bytes
+    """Which of its bits go to the device,"""
+    data: bytes
+    """with which values,"""
+    by: Injection | None
+    """and the last injection that has changed some of these."""
+
 
 @dataclass
 class Injections:
@@ -50,6 +92,7 @@ class Injections:
 
     size: int
     layers: list[Injection] = field(default_factory=list)
+    now: Now = field(default_factory=lambda: Now(-1, 0, b""))
 
     def lay(self, injection: Injection) -> str:
         """Add a layer; why not, or empty."""
@@ -72,26 +115,31 @@ class Injections:
         return lifted
 
     def effective(self, raw: bytes) -> bytes | None:
-        """What consumers see of an image; None: the image itself."""
-        layers = [layer for layer in self.layers if layer.direction is Direction.OUT]
+        """What consumers see of an image, that of ``now``; None: the image itself."""
+        layers = [layer for layer in self.layers if layer.direction is Direction.OUT and layer.active]
         return self.seen(raw, layers).tobytes() if layers else None
 
     def seen(self, raw: bytes, inner: Iterable[Injection]) -> Bits:
         """What these layers over ``/out`` make of an image."""
         image = np.frombuffer(raw, np.uint8).copy()
         for layer in inner:
-            image ^= (image ^ layer.values) & layer.cover
+            layer.show(image, self.now)
         return image
 
+    def before(self, raw: bytes, layer: Injection) -> Bits:
+        """What consumers would see of an image without a layer and those further out."""
+        inner = self.layers[: self.layers.index(layer)]
+        return self.seen(raw, [other for other in inner if other.direction is Direction.OUT and other.active])
+
     def inner(self, layer: Injection) -> list[Injection]:
-        """The layers over ``/out`` that are further in than one of them."""
-        return [other for other in self.layers[: self.layers.index(layer)] if other.direction is Direction.OUT]
+        """The layers over ``/out`` that are further in than one of them, and that clients give values to."""
+        return [other for other in self.layers[: self.layers.index(layer)] if other.given]
 
     def outer(self, layer: Injection) -> list[Injection]:
         """Those that are further out; of one over ``/in`` none."""
         if layer.direction is Direction.IN:
             return []
-        return [other for other in self.layers[self.layers.index(layer) + 1 :] if other.direction is Direction.OUT]
+        return [other for other in self.layers[self.layers.index(layer) + 1 :] if other.given]
 
     def beneath(self, raw: bytes, layer: Injection) -> list[Write]:
         """What a layer over ``/out`` gets from those further in; the rest of its bits come from the device."""
@@ -108,24 +156,35 @@ class Injections:
         for other in self.outer(layer):
             hit = bits & other.cover[write.offset : write.offset + len(write.data)]
             if hit.any():
-                taken.append((other, _writes(write, hit)))
+                taken.append((other, parts_of(write, hit)))
                 bits &= ~hit
         return taken
 
-    def divert(self, write: Write, above: Injection | None) -> tuple[list[tuple[Injection, list[Write]]], bytes]:
-        """What of a write goes to injections on its way to the device, and which of its bits are left for that.
+    def divert(self, write: Write, above: Injection | None) -> Passage:
+        """Let a write meet the injections on its way to the device.
 
-        ``above``: the injection whose values these are; only what stands below it is on their way.
+        ``above``: the injection whose values these are; only what stands below it, if it still does, is on their way.
         """
-        taken: list[tuple[Injection, list[Write]]] = []
+        met: list[tuple[Injection, list[Write]]] = []
+        by = None
         span = slice(write.offset, write.offset + len(write.data))
         bits = np.full(len(write.data), write.mask or 0xFF, np.uint8)
-        below = self.layers if above is None else self.layers[: self.layers.index(above)]
-        for layer in reversed(below):
-            if layer.direction is Direction.IN and (hit := bits & layer.cover[span]).any():
-                taken.append((layer, _writes(write, hit)))
+        place = next((place for place, layer in enumerate(self.layers) if layer is above), None)
+        for layer in reversed(self.layers[:place]):
+            if layer.direction is not Direction.IN or not layer.active:
+                continue
+            hit = bits & layer.cover[span]
+            if not hit.any():
+                continue
+            data = layer.meet(write, hit, self.now)
+            if data is write.data:
+                continue
+            met.append((layer, parts_of(write, hit)))
+            if data is None:
                 bits &= ~hit
-        return taken, bits.tobytes()
+            else:
+                write, by = write._replace(data=data), layer
+        return Passage(met, bits.tobytes(), write.data, by)
 
 
 def shadow(injection: Injection, writes: Sequence[Write]) -> str:
@@ -157,7 +216,7 @@ def covering(size: int, writes: Sequence[Write]) -> Bits:
     return cover
 
 
-def _writes(write: Write, bits: Bits) -> list[Write]:
+def parts_of(write: Write, bits: Bits) -> list[Write]:
     """The part of a write that these of its bits are."""
     return [
         Write(write.offset + part.offset, part.mask, part.data)

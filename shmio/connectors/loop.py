@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple, Protocol, TypeVar
 
 from shmio.connectors.base import Connector
+from shmio.connectors.campaign import Blocks
 from shmio.connectors.desk import CommandDesk
 from shmio.connectors.injector import OwnerOf
 from shmio.connectors.output import Image, Output
@@ -80,8 +81,9 @@ class SourceLoop:
         *,
         armed: bool = False,
         owner_of: OwnerOf = lambda _: None,
+        blocks: Blocks | None = None,
     ) -> None:
-        """``writable``: patterns of what commands may write. ``armed``, ``owner_of``: see :class:`CommandDesk`."""
+        """``writable``: patterns of what commands may write. The rest: see :class:`CommandDesk`."""
         self._connector = connector
         self._writer = writer
         self._schedule = schedule
@@ -93,6 +95,7 @@ class SourceLoop:
             clock.now_ns,
             armed=armed or connector.provenance is not Provenance.LIVE,
             owner_of=owner_of,
+            blocks=blocks,
         )
         self._backoff = Backoff()
         self._connected_ns: int | None = None
@@ -131,6 +134,7 @@ class SourceLoop:
         try:
             if self._connected_ns is None:
                 self._connect()
+            self.desk.release(cycle)
             if self.desk.waiting:
                 self._drain()
                 self._call(lambda: self.desk.carry_out(self._connector.write))

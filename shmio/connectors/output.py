@@ -37,6 +37,8 @@ class Output:
         self.injections = Injections(writer.block.layout.size)
         """To be changed, and :meth:`show` called then, with ``turn`` held."""
         self.turn = threading.Lock()
+        self.advance: Callable[[Image], Iterable[Record]] | None = None
+        """Called with each next image before it is published; what it returns is told after it."""
         self._now_ns = now_ns
         self._gap_ns = writer.block.period_ns // EXTRA_FRAMES
         self._next_ns = 0
@@ -57,6 +59,11 @@ class Output:
         return bytes(self.writer.block.layout.size) if self._last is None else self._last.raw
 
     @property
+    def cycle(self) -> int:
+        """The cycle of that image; -1: there is none."""
+        return -1 if self._last is None else self._last.cycle
+
+    @property
     def source_ns(self) -> int:
         """When the device had that image, ns since 1970; 0: none has come from it yet."""
         return 0 if self._last is None else self._last.source_ns
@@ -75,6 +82,8 @@ class Output:
         """Publish the next image."""
         with self.turn:
             self._last = image
+            if self.advance is not None:
+                self._owed += self.advance(image)
             self._publish()
 
     def show(self, records: Iterable[Record]) -> None:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterable, Sequence
 from typing import Final, Protocol
 
+from shmio.connectors.campaign import Blocks
 from shmio.connectors.computed import Computed
 from shmio.connectors.desk import CommandDesk
 from shmio.connectors.injector import OwnerOf
@@ -81,6 +82,7 @@ class SteppedLoop:
         *,
         inputs: Inputs | None = None,
         owner_of: OwnerOf = lambda _: None,
+        blocks: Blocks | None = None,
     ) -> None:
         """``writable``: patterns of what commands may write. ``inputs``: of the source's connections, if it has any."""
         self._source = source
@@ -92,7 +94,7 @@ class SteppedLoop:
         self._output = Output(writer, clock.now_ns)
         # Whatever is injected here reaches no plant, so that no arming is needed.
         self.desk = CommandDesk(
-            self._output, writable, clock.now_ns, armed=True, owner_of=owner_of, accepted=clock.nudge
+            self._output, writable, clock.now_ns, armed=True, owner_of=owner_of, blocks=blocks, accepted=clock.nudge
         )
         self._condition = Condition(writer)
         self._handled = 0  # the last step computed, or passed over
@@ -196,6 +198,7 @@ class SteppedLoop:
         """One cycle, or one step."""
         self._writer.cycle = cycle
         self._published = False
+        self.desk.release(cycle)
         self._carry_out()
         if self._published:
             return  # a source that shows at once what is written has no more to say

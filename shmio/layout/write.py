@@ -55,24 +55,30 @@ def cover(layout: Layout, patterns: Iterable[str]) -> bytes:
     """An image of the layout's size in which the bits of all that the patterns name are set; PathError."""
     mask = bytearray(layout.size)
     for pattern in patterns:
-        if "*" not in pattern:
-            try:
-                _add(mask, find(layout, pattern))
-                continue
-            except PathError:  # a structure: what is below it
-                pass
-        glob = Glob(pattern)
-        for register in layout.registers:
-            if glob.matches(register.path):
-                _add(mask, register)
-            elif register.dims and glob.reaches(register.path):
-                for element in _elements(layout, register):
-                    if glob.matches(element.path):
-                        _add(mask, element)
+        for register in chosen(layout, pattern):
+            _add(mask, register)
     for register in layout.registers:
         if register.type == "BOOL" and register.dims:
             _fill_rows(mask, register)
     return bytes(mask)
+
+
+def chosen(layout: Layout, pattern: str) -> Iterator[Register]:
+    """The registers, and of arrays the elements, that a path, a structure's or a pattern names; PathError."""
+    if "*" not in pattern:
+        try:
+            register = find(layout, pattern)
+        except PathError:  # a structure: what is below it
+            pass
+        else:
+            yield register
+            return
+    glob = Glob(pattern)
+    for register in layout.registers:
+        if glob.matches(register.path):
+            yield register
+        elif register.dims and glob.reaches(register.path):
+            yield from (element for element in _elements(layout, register) if glob.matches(element.path))
 
 
 def merge(image: bytes | bytearray, mask: bytes | bytearray, ranges: Iterable[tuple[int, int]]) -> list[Write]:

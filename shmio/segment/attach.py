@@ -17,14 +17,16 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 
+from shmio.config import Declaration
 from shmio.errors import CommandError, NotRunningError, PathError, QualityError, SegmentError
 from shmio.layout.codec import Value
 from shmio.layout.model import Register
 from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.segment.block import Block
+from shmio.segment.campaign import Laid, declare
 from shmio.segment.commander import Commander, Outcome
 from shmio.segment.commands import Direction
 from shmio.segment.cursor import Cursor, Entry
@@ -206,6 +208,14 @@ class Attachment:
         )
         return Shadow(commander, number, direction, events, partial(self._next, block), keep=keep)
 
+    def declare(self, declarations: Sequence[Declaration], *, keep: bool = False) -> list[Laid]:
+        """Lay injections that their sources run by themselves, all or none; see docs/reference/injections.md.
+
+        Each goes when it is over or lifted, or, unless ``keep``, with this program. The attachment must be
+        ``writable``. ConfigError; CommandError: a source refuses, or does not answer.
+        """
+        return declare(declarations, self._blocks(), self._commander, keep=keep)
+
     def injections(self) -> dict[str, tuple[Standing, ...]]:
         """What stands at present, by source; the innermost first."""
         return {source: block.standing.read() for source, block in self._blocks().items()}
@@ -219,7 +229,7 @@ class Attachment:
 
         All are tried, and at once. CommandError: some still stand, and why.
         """
-        standing = [(source, one) for source, ones in self.injections().items() for one in ones]
+        standing = [(source, one) for source, ones in self.injections().items() for one in ones if not one.lifted]
         lift_all([(self._commander(self.block(source)), one.id) for source, one in standing])
         return standing
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from shmio.segment._atomics import FrameTuple
     from shmio.segment.clock import ClockPage
     from shmio.segment.commands import CommandQueues
-    from shmio.segment.standing import StandingCell
+    from shmio.segment.standing import DeclaredCell, StandingCell
 
 Bytes = bytes | bytearray | memoryview
 
@@ -80,6 +80,7 @@ class Block:
         events: Ring,
         commands: CommandQueues,
         standing: StandingCell,
+        declared: DeclaredCell,
         attributes: Attributes,
         retired: Callable[[], bool],
         section: int,
@@ -94,6 +95,8 @@ class Block:
         self.commands = commands
         self.standing = standing
         """The injections that stand on it at present."""
+        self.declared = declared
+        """Those that the configuration has for it."""
         self.attributes = attributes
         self.clock = clock
         self._retired = retired

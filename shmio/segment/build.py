@@ -24,7 +24,7 @@ from shmio.segment.shm import SharedObject
 from shmio.segment.standing import CELL_SIZE
 
 RING_SECONDS = 8
-SECTIONS_PER_BLOCK = 6
+SECTIONS_PER_BLOCK = 7
 SPARE_SECTIONS = 40 * SECTIONS_PER_BLOCK
 OWN_SECTIONS = 1  # that are no block's: the clock page
 SPARE_PROCESSES = 16 + GUESTS
@@ -44,6 +44,8 @@ class BlockSpec:
     ring_bytes: int
     """The most memory its frame ring may take."""
     attributes: Attributes = field(default_factory=Attributes)
+    declared: bytes = b""
+    """The injections that the configuration declares: a document of at most STANDING_SIZE bytes."""
 
     @property
     def slot_bytes(self) -> int:
@@ -81,6 +83,7 @@ class BlockSpec:
             (SectionKind.COMMANDS, commands.section_size(self.layout.size), queues),
             (SectionKind.SOURCE, len(attributes), attributes),
             (SectionKind.STANDING, CELL_SIZE, b""),
+            (SectionKind.DECLARED, CELL_SIZE, bytes(8) + self.declared),
         ]
 
 

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Final, Unpack
 
+import msgspec
+
+from shmio.config import Declaration
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
@@ -125,6 +128,16 @@ class Commander:
     def lay(self, bits: bytes, timeout_s: float | None = None, **laid: Unpack[Laid]) -> Ticket:
         """Ask for an injection over these bits, whose number is the ticket's. CommandError: not sent. Never waits."""
         return self._send(("",), merge(bits, bits, [(0, len(bits))]), timeout_s, CommandKind.INJECT, **laid)
+
+    def declare(self, declaration: Declaration, timeout_s: float | None = None, *, keep: bool = False) -> int:
+        """Lay an injection that the source runs by itself; its number. It goes with this process, unless ``keep``.
+
+        The declaration is checked by the source. CommandError: it refuses, and says why, or does not answer.
+        """
+        writes = [Write(0, 0, msgspec.json.encode(declaration))]
+        ticket = self._send(("",), writes, timeout_s, CommandKind.DECLARE, keep=keep, name=declaration.name)
+        self._expect(ticket, EventKind.INJECTED)
+        return ticket.number
 
     def lift(self, injection: int, timeout_s: float | None = None) -> None:
         """Lift an injection, whoever laid it. CommandError: there is none, or the source does not answer."""

@@ -49,6 +49,8 @@ class CommandKind(IntEnum):
     """An injection gives values: to consumers if it lies over ``/out``, to the device if over ``/in``."""
     LIFT = 4
     """An injection is lifted; there are no items."""
+    DECLARE = 5
+    """An injection is laid that the source runs by itself: its declaration, as JSON, is the one item's data."""
 
 
 class Direction(IntEnum):

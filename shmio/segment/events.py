@@ -49,11 +49,18 @@ class EventKind(IntEnum):
     TAKEN = 11
     """The end of an item of which nothing was left for the device: an injection took it."""
     INJECTED = 12
-    """An injection was laid; the end of the command that asked for it, whose number is its own."""
+    """An injection was laid; the end of the command that asked for it, whose number is its own.
+
+    One that was declared has its declaration as data, JSON in parts, with the seed that it runs with.
+    """
     LIFTED = 13
     """An injection was lifted, with the reason; the end of the command that asked for it, if one did."""
     SHADOWED = 14
     """An injection gave values, with data, that consumers see since the frame before."""
+    ACTIVATED = 15
+    """A declared injection became active: over ``/out`` in the frame before; ``item`` counts its activations."""
+    DEACTIVATED = 16
+    """It is no longer."""
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -83,8 +90,8 @@ class Event(NamedTuple):
     ``frame``: number of the last frame before it. ``kind`` is a plain number where this version does not know it.
     ``writer``: the command ring it is about, or NO_WRITER; ``command``: the writer's number of the command. It tells
     of ``items`` of its items from ``item`` on; ``offset``, ``mask``, ``size``: what the first of them writes (mask 0:
-    whole bytes); ``data``: these bytes, with ACCEPTED, DIVERTED and SHADOWED only. ``text``: the reason, or the name of
-    ``injection``, the one it is about (0: none).
+    whole bytes); ``data``: these bytes, with ACCEPTED, DIVERTED, SHADOWED and INJECTED only. ``text``: the reason, or
+    the name of ``injection``, the one it is about (0: none).
     """
 
     number: int

@@ -57,6 +57,7 @@ class SectionKind(IntEnum):
     SOURCE = 5
     STANDING = 6
     CLOCK = 7
+    DECLARED = 8
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from shmio.segment.commands import CommandQueues
 from shmio.segment.events import EVENT_SIZE
 from shmio.segment.header import Header, SectionEntry, SectionKind
 from shmio.segment.shm import SharedObject
-from shmio.segment.standing import StandingCell
+from shmio.segment.standing import declared_cell, standing_cell
 
 _ATTRIBUTES = msgspec.json.Decoder(Attributes)  # as in layout/document.py: built before there are threads
 
@@ -55,12 +55,13 @@ def read_block(
         frames = _atomics.Ring(memory, *part(SectionKind.FRAMES))
         events = _atomics.Ring(memory, *part(SectionKind.EVENTS))
         queues = CommandQueues(memory, *part(SectionKind.COMMANDS))
-        standing = StandingCell(memory, *part(SectionKind.STANDING))
+        standing = standing_cell(memory, *part(SectionKind.STANDING))
+        declared = declared_cell(memory, *part(SectionKind.DECLARED))
     except (LayoutError, ValueError, msgspec.MsgspecError) as error:
         raise FormatError(f"{name}: block {described.name}: {error}") from None
     if frames.frame_size != layout.size or events.frame_size != EVENT_SIZE:
         raise FormatError(f"{name}: block {described.name}: rings and layout differ in size")
     return Block(
-        described.name, layout, frames, events, queues, standing, attributes,
+        described.name, layout, frames, events, queues, standing, declared, attributes,
         lambda: header.retired(memory, head, layout_at), layout_at, clock,
     )  # fmt: skip

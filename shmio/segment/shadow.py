@@ -127,7 +127,11 @@ def lift_all(injections: Iterable[tuple[Commander, int]]) -> None:
             commander.expect_lifted(ticket)
         except CommandError as error:
             reasons[str(error)] = None
-    left = [number for commander, number in chosen if any(one.id == number for one in commander.block.standing.read())]
+    left = [
+        number
+        for commander, number in chosen
+        if any(one.id == number and not one.lifted for one in commander.block.standing.read())
+    ]
     if left:
         raise CommandError(f"{len(left)} of {len(chosen)} injections still stand: {'; '.join(reasons)}")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from shmio.segment import Segment
+from shmio.segment import Block, Segment
 from shmio.supervisor import policy
 from shmio.supervisor.fleet import Fleet
 from shmio.supervisor.plan import Job, Plan
@@ -25,6 +25,7 @@ class Change:
         self._segment = segment
         self._jobs = {job.name: job for job in plan.jobs}
         self._stopped = False
+        self._injections: list[str] = []
         segment.processes.require(len(self.changes.started) - len(self.changes.stopped))
         segment.reserve(self.changes.add)  # the last to fail: what it takes is not given back
         self._told = [name for name in self.changes.kept if self._fleet.named(name).keep(self._jobs[name])]
@@ -69,14 +70,26 @@ class Change:
         """Between the old and the new."""
         if self.changes.add or self.changes.retire:
             self._segment.change(self.changes.add, self.changes.retire)
+        for spec in self.plan.blocks:  # new ones have theirs; the others' processes follow without a restart
+            self._declare(self._segment.blocks[spec.source], spec.declared)
         for name in self.changes.stopped:
             self._fleet.drop(name)
         for job in self._coming:
             self._fleet.assign(job)
 
+    def _declare(self, block: Block, declared: bytes) -> None:
+        before = {declaration.name: declaration for declaration in block.declared.read()}
+        block.declared.write(declared)
+        block.commands.wake()
+        after = {declaration.name: declaration for declaration in block.declared.read()}
+        for name in {**before, **after}:
+            if before.get(name) != after.get(name):
+                what = "laid" if name not in before else "changed" if name in after else "lifted"
+                self._injections.append(f"injection {name}: {what} at {block.source}")
+
     def outcome(self) -> tuple[list[str], list[str]]:
         """What was done, and what came out badly, a line each."""
-        done = [f"{name}: stopped" for name in self.changes.stopped]
+        done = [*(f"{name}: stopped" for name in self.changes.stopped), *self._injections]
         done += [f"{name}: told to take its tokens and roles anew" for name in self._told]
         problems = []
         for job in self._coming:

@@ -110,12 +110,14 @@ def make_plan(
     *,
     config_file: Path,
     mode: str = "live",
+    declared: Mapping[str, bytes] | None = None,
     warnings: Sequence[str] = (),
     computed: Collection[str] = (),
 ) -> Plan:
     """Plan an instance. ``layouts``: of each source, by its name; ``emulated``: all blocks of each emulator.
 
-    ``computed``: the sources that live on the instance's clock.
+    ``computed``: the sources that live on the instance's clock. ``declared``: what the sources' processes get of the
+    declared injections, by the source's name.
     ConfigError: too many processes.
     """
     ring_bytes = round(config.instance.ring_mb * 1e6)
@@ -127,6 +129,7 @@ def make_plan(
             source.stale_ns,
             ring_bytes,
             Attributes(source.connector, tuple(source.writable), source.armed, source.name in computed),
+            (declared or {}).get(source.name, b""),
         )
         for source in config.source
     )

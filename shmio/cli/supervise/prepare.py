@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 
 from shmio.cli.supervise.host import check_host
+from shmio.cli.supervise.injections import check_injections
 from shmio.cli.supervise.layouts import LayoutFiles
 from shmio.cli.supervise.ports import check_listening
 from shmio.config import Address, Config, Emulator, Source, load
@@ -51,11 +52,14 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
         layouts = {source.name: _check_source(i, source, files) for i, source in enumerate(config.source)}
         computed = [source.name for source in config.source if _is_computed(source)]
         emulated = {emulator.name: _check_emulator(i, emulator, files) for i, emulator in enumerate(config.emulator)}
+        declared = check_injections(config, layouts)
         odd = [*_odd(config, layouts), *_not_served(config, layouts, emulated), *_unread(emulated)]
     except ConfigError as error:
         raise ConfigError(f"{file}: {named(str(error), msgspec.to_builtins(config))}") from None
     warnings = [*files.warnings, *(f"{file}: warning: {text}" for text in odd)]
-    plan = make_plan(config, layouts, emulated, config_file=file, mode=mode, warnings=warnings, computed=computed)
+    plan = make_plan(
+        config, layouts, emulated, config_file=file, mode=mode, declared=declared, warnings=warnings, computed=computed
+    )
     return Prepared(config, plan, layouts, emulated)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import msgspec
 import pytest
 
 import shmio
@@ -135,7 +136,7 @@ def test_all_injections_are_lifted_at_once_whoever_laid_them(rig: Rig, local: At
 
 def test_what_cannot_be_lifted_is_named(rig: Rig, local: Attachment) -> None:
     one = Standing(5, "out", 0, keep=True, name="", writer=0, pid=0, ranges=())
-    rig.block.standing.write(encode([one]))  # of which the source knows nothing
+    rig.block.standing.write(encode([msgspec.json.encode(one)]))  # of which the source knows nothing
     with pytest.raises(CommandError, match="1 of 1 injections still stand: cell: there is no injection 5"):
         local.lift_all()
     rig.block.standing.write(encode([]))

@@ -76,13 +76,13 @@ def test_a_write_goes_to_the_outermost_injection_on_its_way() -> None:
     inner = layer(1, whole(0, 4), direction=Direction.IN)
     outer = layer(2, whole(2, 1), bit(6, 1), direction=Direction.IN, priority=1)
     injections = laid(inner, outer, layer(3, whole(0, 8)))
-    taken, left = injections.divert(Write(1, 0, b"abcde"), None)
+    taken, left, data, by = injections.divert(Write(1, 0, b"abcde"), None)
     assert taken == [(outer, [Write(2, 0, b"b")]), (inner, [Write(1, 0, b"a"), Write(3, 0, b"c")])]
-    assert left == b"\0\0\0\xff\xff"
-    assert injections.divert(Write(2, 0, b"x"), outer) == ([(inner, [Write(2, 0, b"x")])], b"\0")
-    assert injections.divert(Write(2, 0, b"x"), inner) == ([], b"\xff")
-    assert injections.divert(Write(6, 2, b"\2"), None) == ([(outer, [Write(6, 2, b"\2")])], b"\0")
-    assert injections.divert(Write(6, 4, b"\4"), None) == ([], b"\4")
+    assert (left, data, by) == (b"\0\0\0\xff\xff", b"abcde", None)
+    assert injections.divert(Write(2, 0, b"x"), outer)[:2] == ([(inner, [Write(2, 0, b"x")])], b"\0")
+    assert injections.divert(Write(2, 0, b"x"), inner)[:2] == ([], b"\xff")
+    assert injections.divert(Write(6, 2, b"\2"), None)[:2] == ([(outer, [Write(6, 2, b"\2")])], b"\0")
+    assert injections.divert(Write(6, 4, b"\4"), None)[:2] == ([], b"\4")
 
 
 def test_what_cannot_be_is_refused() -> None:
@@ -117,7 +117,7 @@ def test_each_bit_is_of_the_outermost_layer_over_it(
         )
     )
     effective = injections.effective(raw) or raw
-    taken, left = injections.divert(Write(0, 0, data), None)
+    taken, left, _, _ = injections.divert(Write(0, 0, data), None)
     got = {one.id: parts for one, parts in taken}
     order = sorted(range(len(layers)), key=lambda number: (layers[number][2], number))
     for at in range(SIZE):

@@ -1,0 +1,95 @@
+"""``shmio inject --file``: lay a campaign, tell what happens in it, and lift it at the end."""
+
+from __future__ import annotations
+
+import argparse
+import secrets
+import signal
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from typing import Final
+
+import msgspec
+
+from shmio.cli.run import dumps
+from shmio.config import Declaration
+from shmio.config.campaign import read_campaign
+from shmio.errors import CommandError
+from shmio.logs import printable
+from shmio.segment import Cursor, Event, EventKind
+from shmio.segment.attach import Attachment
+
+TURN_S: Final = 0.2
+"""How often it is told what has happened: the bells of several sources cannot be waited for at once."""
+SEED_BITS: Final = 32
+
+_TOLD: Final = frozenset({EventKind.INJECTED, EventKind.ACTIVATED, EventKind.DEACTIVATED, EventKind.LIFTED})
+
+
+def run_campaign(cell: Attachment, options: argparse.Namespace) -> int:
+    """Until all of it is over, the time is up, or Ctrl-C; with ``keep`` until it is laid.
+
+    ConfigError, CommandError: nothing was laid.
+    """
+    declarations = _with_seed(read_campaign(options.file), options)
+    if options.from_now:
+        now_s = cell.block(cell.sources[0]).clock.read().present_ns / 1e9
+        declarations = [_shifted(declaration, now_s) for declaration in declarations]
+    cursors = {source: cell.block(source).events.cursor() for source in cell.sources}
+    over = threading.Event()
+    for sign in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(sign, lambda *_: over.set())
+    laid = {one.number: one for one in cell.declare(declarations, keep=options.keep)}
+    deadline_s = None if options.for_s is None else time.monotonic() + options.for_s
+    try:
+        while True:
+            ended = over.is_set() or options.keep or (deadline_s is not None and time.monotonic() > deadline_s)
+            for source, event in _news(cursors, laid):
+                _print(source, event, as_json=options.json)
+                if event.kind == EventKind.LIFTED:
+                    del laid[event.injection]
+            if ended or not laid:
+                return 0
+            over.wait(TURN_S)
+    finally:
+        for one in () if options.keep else laid.values():
+            with suppress(CommandError):  # it was over, or somebody else has lifted it
+                one.lift()
+
+
+def _with_seed(declarations: Sequence[Declaration], options: argparse.Namespace) -> list[Declaration]:
+    """Those that have no seed of their own get one that the user is told, or has told."""
+    if all(declaration.seed is not None for declaration in declarations):
+        return list(declarations)
+    seed = secrets.randbits(SEED_BITS) if options.seed is None else options.seed
+    print(dumps({"seed": seed}) if options.json else f"seed {seed}: --seed {seed} does the same again", flush=True)
+    return [
+        msgspec.structs.replace(declaration, seed=seed if declaration.seed is None else declaration.seed)
+        for declaration in declarations
+    ]
+
+
+def _shifted(declaration: Declaration, now_s: float) -> Declaration:
+    """With times that count from now."""
+    end_s = None if declaration.end_s is None else declaration.end_s + now_s
+    return msgspec.structs.replace(declaration, start_s=(declaration.start_s or 0) + now_s, end_s=end_s)
+
+
+def _news(cursors: Mapping[str, Cursor[Event]], laid: Mapping[int, object]) -> Iterator[tuple[str, Event]]:
+    for source, cursor in cursors.items():
+        while (event := cursor.next(0)) is not None:
+            if event.kind in _TOLD and event.injection in laid and event.offset == 0:  # of parts the first
+                yield source, event
+
+
+def _print(source: str, event: Event, *, as_json: bool) -> None:
+    """A line: the instance's clock, the cycle, what happened to which."""
+    kind = EventKind(event.kind)
+    time_s = event.clock_ns / 1e9
+    if as_json:
+        told = {"time_s": time_s, "cycle": event.cycle, "source": source, "id": event.injection, "what": str(kind)}
+        print(dumps({**told, "text": event.text}), flush=True)
+        return
+    print(printable(f"{time_s:11.3f} s  cycle {event.cycle}  {event.injection} {kind}: {event.text}"), flush=True)

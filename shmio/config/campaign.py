@@ -1,0 +1,37 @@
+"""Files of declared injections that are not a configuration: campaigns for ``shmio inject --file``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from shmio.config.declaration import check_declarations
+from shmio.config.model import Declaration, Section
+from shmio.config.read import check_text, convert, read_tables
+from shmio.config.wording import named
+from shmio.errors import ConfigError
+
+
+class Campaign(Section):
+    """The whole file."""
+
+    injection: list[Declaration]
+
+
+def read_campaign(file: Path) -> list[Declaration]:
+    """The ``[[injection]]`` sections of a file that has nothing else; ConfigError names file, key and remedy."""
+    tables = read_tables(file)
+    try:
+        return parse_campaign(tables)
+    except ConfigError as error:
+        raise ConfigError(f"{file}: {named(str(error), tables)}") from None
+
+
+def parse_campaign(tables: dict[str, Any]) -> list[Declaration]:
+    """The same of tables that are read already, such as ``{"injection": [{"name": …}]}``."""
+    if isinstance(tables.get("injection"), dict):
+        raise ConfigError("injection: write [[injection]], in two brackets: there can be several")
+    check_text(tables, "")
+    campaign = convert(tables, Campaign)
+    check_declarations(campaign.injection)
+    return campaign.injection

@@ -1,0 +1,102 @@
+"""What holds for declared injections wherever they come from, and files of nothing but these."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from shmio.config.model import Declaration
+from shmio.errors import ConfigError
+
+MAX_DECLARATIONS: Final = 256
+"""In one file."""
+MAX_DIMENSIONS: Final = 6  # of an array, as in layout/model.py, which imports from here
+
+
+@dataclass(frozen=True)
+class Keys:
+    """Which keys an operation has: ``needed``, and ``choice``: sets of which exactly one is there, ``free`` ones."""
+
+    needed: tuple[str, ...] = ()
+    choice: tuple[tuple[str, ...], ...] = ()
+    free: tuple[str, ...] = ()
+
+    @property
+    def known(self) -> set[str]:
+        """All of them."""
+        return {*self.needed, *self.free, *(key for keys in self.choice for key in keys)}
+
+
+KEYS: Final[Mapping[str, Keys]] = {
+    "set": Keys(("value",), free=("probability",)),
+    "offset": Keys(("value",), free=("probability",)),
+    "scale": Keys(("value",), free=("probability",)),
+    "clamp": Keys(free=("min", "max", "probability")),
+    "noise": Keys(("amplitude",), free=("distribution", "probability")),
+    "random": Keys(choice=(("values",), ("min", "max")), free=("probability",)),
+    "freeze": Keys(),
+    "delay": Keys(choice=(("delay_ms",), ("delay_cycles",))),
+    "drop": Keys(free=("probability",)),
+    "flip": Keys(free=("bits", "probability")),
+}
+_OPERANDS: Final = tuple(dict.fromkeys(key for keys in KEYS.values() for key in sorted(keys.known)))
+
+
+def check_declarations(declarations: Sequence[Declaration]) -> None:
+    """Refuse what no layout could make right; ConfigError with the key ``injection[…]….``."""
+    if len(declarations) > MAX_DECLARATIONS:
+        raise ConfigError(f"injection: {len(declarations)} of them; at most {MAX_DECLARATIONS}")
+    seen: dict[str, int] = {}
+    for index, declaration in enumerate(declarations):
+        first = seen.setdefault(declaration.name, index)
+        if first != index:
+            raise ConfigError(
+                f"injection[{index}].name: {declaration.name!r} is already the name of injection[{first}]"
+            )
+        for complaint in complaints(declaration):
+            raise ConfigError(f"injection[{index}].{complaint}")
+
+
+def complaints(declaration: Declaration) -> Iterator[str]:
+    """What contradicts itself in a declaration; each begins with the key."""
+    operation = declaration.operation
+    keys = KEYS[operation]
+    given = {key for key in _OPERANDS if getattr(declaration, key) is not None}
+    for key in sorted(given - keys.known):
+        takers = ", ".join(name for name, other in KEYS.items() if key in other.known)
+        yield f"{key}: operation {operation!r} has no such key; it is for {takers}"
+    for key in keys.needed:
+        if key not in given:
+            yield f"{key}: this key is needed for operation {operation!r}"
+    begun = [choice for choice in keys.choice if given & set(choice)]
+    if keys.choice and (len(begun) != 1 or not given.issuperset(begun[0])):
+        ways = ", or ".join(" and ".join(choice) for choice in keys.choice)
+        yield f"{keys.choice[0][0]}: operation {operation!r} needs {ways}"
+    if operation == "clamp" and not given & {"min", "max"}:
+        yield "min: operation 'clamp' needs min, max, or both"
+    for key in sorted(given):
+        if fault := _fault(getattr(declaration, key)):
+            yield f"{key}: {fault}"
+    if declaration.min is not None and declaration.max is not None and declaration.min > declaration.max:
+        yield f"min: {declaration.min:g} is above max, {declaration.max:g}"
+    if declaration.end_s is not None and declaration.end_s <= (declaration.start_s or 0):
+        yield f"end_s: {declaration.end_s:g} is not after start_s, {declaration.start_s or 0:g}"
+    if declaration.times is not None and declaration.when is None:
+        yield "times: how often it is active is for one with a condition, in `when`"
+
+
+def _fault(value: Any, depth: int = 0) -> str:
+    """Why a value is none that can be sent and compared; empty if it is."""
+    if isinstance(value, list):
+        if depth > MAX_DIMENSIONS:
+            return f"lists within more than {MAX_DIMENSIONS} others"
+        return next((fault for item in value if (fault := _fault(item, depth + 1))), "")
+    if isinstance(value, bool | str):
+        return ""
+    if isinstance(value, float) and not math.isfinite(value):
+        return f'{value} is no number; for a REAL write it as text, "NaN" or "Infinity"'
+    if isinstance(value, int) and not -(2**63) <= value < 2**64:
+        return "a number of more than 64 bits"
+    return "" if isinstance(value, int | float) else "expected numbers, text, true or false, or lists of them"

@@ -1,0 +1,78 @@
+"""Random numbers that follow from a seed and from what they are for, whenever and however often they are drawn.
+
+They are counter-based: there is no state that an extra frame or a restarted process could shift. The mixing function
+is that of SplitMix64 (Steele, Lea, Flood: "Fast splittable pseudorandom number generators", OOPSLA 2014).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+import numpy.typing as npt
+
+Words = npt.NDArray[np.uint64]
+Floats = npt.NDArray[np.float64]
+
+_MASK: Final = (1 << 64) - 1
+_GOLDEN: Final = 0x9E3779B97F4A7C15
+_FIRST, _SECOND = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
+
+
+class Purpose(IntEnum):
+    """What numbers are for; each has its own."""
+
+    CHANCE = 0
+    VALUE = 1
+    ANGLE = 2
+
+
+class Draw:
+    """The numbers of one injection: of the activation ``run`` and, in it, of the cycle or write ``place``."""
+
+    def __init__(self, seed: int, name: str) -> None:
+        """``name`` keeps injections with one seed apart."""
+        self._key = int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8], "little")
+
+    def words(self, run: int, place: int, purpose: Purpose, count: int) -> Words:
+        """``count`` words of 64 random bits."""
+        base = _mix(_mix(_mix(self._key + run & _MASK) + place & _MASK) + purpose & _MASK)
+        counter = np.arange(1, count + 1, dtype=np.uint64)
+        return _mix_all(counter * np.uint64(_GOLDEN) + np.full(count, base, np.uint64))
+
+    def uniform(self, run: int, place: int, count: int, purpose: Purpose = Purpose.VALUE) -> Floats:
+        """Numbers from 0 to below 1."""
+        return (self.words(run, place, purpose, count) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+
+    def gaussian(self, run: int, place: int, count: int) -> Floats:
+        """Numbers of mean 0 and standard deviation 1 (Box and Muller, 1958)."""
+        radius = np.sqrt(-2 * np.log(1 - self.uniform(run, place, count)))
+        angle = self.uniform(run, place, count, Purpose.ANGLE)
+        normal: Floats = radius * np.cos(2 * math.pi * angle)
+        return normal
+
+    def below(self, limit: int, run: int, place: int, count: int) -> npt.NDArray[np.intp]:
+        """Whole numbers from 0 to below a limit of at most 2^32."""
+        high = self.words(run, place, Purpose.VALUE, count) >> np.uint64(32)
+        return (high * np.uint64(limit) >> np.uint64(32)).astype(np.intp)
+
+    def happens(self, probability: float, run: int, place: int) -> bool:
+        """Whether something of this probability does, there."""
+        return probability >= 1 or bool(self.uniform(run, place, 1, Purpose.CHANCE)[0] < probability)
+
+
+def _mix(word: int) -> int:
+    word = (word + _GOLDEN) & _MASK
+    word = (word ^ word >> 30) * _FIRST & _MASK
+    word = (word ^ word >> 27) * _SECOND & _MASK
+    return word ^ word >> 31
+
+
+def _mix_all(words: Words) -> Words:
+    words = (words ^ words >> np.uint64(30)) * np.uint64(_FIRST)
+    words = (words ^ words >> np.uint64(27)) * np.uint64(_SECOND)
+    mixed: Words = words ^ words >> np.uint64(31)
+    return mixed

@@ -1,0 +1,298 @@
+"""Conditions: a small language over registers, read by our own parser, evaluated without ``eval``.
+
+::
+
+    cell/Inputs/12 > 500 and not cell/Outputs/13.%X0
+    rising("cell/Robot 800/Axs1_Pos" >= 90) or abs(cell/R3.L2) > 1.5e-3
+
+    expression = conjunction {"or" conjunction}
+    conjunction = negation {"and" negation}
+    negation = {"not"} comparison
+    comparison = sum [("==" | "=" | "!=" | "<>" | "<" | "<=" | ">" | ">=") sum]
+    sum = product {("+" | "-") product}
+    product = factor {("*" | "/" | "mod") factor}
+    factor = "-" factor | number | "true" | "false" | register | "(" expression ")"
+           | ("abs" | "rising" | "falling" | "changed") "(" expression ")"
+
+A register is a path, in quotes where it has other characters than letters, digits and ``_ . / % :``; as a path may hold
+``/``, a division has blanks around its own. Numbers are as in S7: ``16#FF``, ``2#1010``, ``1.5e3``.
+"""
+
+from __future__ import annotations
+
+import operator
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+from shmio.errors import ConfigError
+
+Number = bool | int | float
+
+MAX_LENGTH: Final = 1000
+MAX_NODES: Final = 200
+MAX_DEPTH: Final = 24
+MAX_DIGITS: Final = 40
+
+_TOKEN: Final = re.compile(
+    r"""\s*(?:(?P<number>(?:16\#[0-9A-Fa-f_]+|2\#[01_]+|[0-9][0-9_]*(?:\.[0-9]+)?(?:[eE][+-]?[0-9]{1,3})?)(?![\w.\#]))
+    |(?P<word>[^\W\d][\w./%:]*)
+    |(?P<quoted>"[^"]*"|'[^']*')
+    |(?P<sign><=|>=|==|!=|<>|[-+*/()<>=]))""",
+    re.VERBOSE,
+)
+_KEYWORDS: Final = frozenset({"and", "or", "not", "mod", "true", "false", "abs", "rising", "falling", "changed"})
+_COMPARISONS: Final[dict[str, Callable[[Number, Number], Number]]] = {
+    "==": operator.eq,
+    "=": operator.eq,
+    "!=": operator.ne,
+    "<>": operator.ne,
+    "<": operator.lt,
+    "<=": operator.le,
+    ">": operator.gt,
+    ">=": operator.ge,
+}
+_SUMS: Final[dict[str, Callable[[Number, Number], Number]]] = {"+": operator.add, "-": operator.sub}
+_PRODUCTS: Final[dict[str, Callable[[Number, Number], Number]]] = {
+    "*": operator.mul,
+    "/": operator.truediv,
+    "mod": operator.mod,
+}
+_EDGES: Final[dict[str, Callable[[Number, Number], bool]]] = {
+    "rising": lambda before, now: not before and bool(now),
+    "falling": lambda before, now: bool(before) and not now,
+    "changed": lambda before, now: before != now,
+}
+
+_Stack = list[Number]
+_Seen = dict[int, Number]
+"""What each edge saw last, by its place in the program."""
+_Step = Callable[[_Stack, Sequence[Number], _Seen], None]
+
+
+@dataclass
+class Memory:
+    """What the edges of one expression saw last; empty: nothing yet, or not everything was known."""
+
+    seen: _Seen = field(default_factory=dict)
+
+
+class Expression(NamedTuple):
+    """A program for a stack machine; every part of it is evaluated each time, so that no edge is missed."""
+
+    steps: tuple[_Step, ...]
+    references: tuple[str, ...]
+    """The registers it reads, as written."""
+
+    def holds(self, values: Sequence[Number | None], memory: Memory) -> bool:
+        """Whether it is true of these values, one for each reference; None: it is not known.
+
+        An expression of which anything is not known, or that divides by zero, is not true.
+        """
+        known = [value for value in values if value is not None]
+        stack: _Stack = []
+        try:
+            if len(known) == len(values):
+                for step in self.steps:
+                    step(stack, known, memory.seen)
+                return bool(stack[-1])
+        except ArithmeticError:
+            pass
+        memory.seen.clear()
+        return False
+
+
+def parse(text: str) -> Expression:
+    """Read an expression; ConfigError says where it goes wrong."""
+    if len(text) > MAX_LENGTH:
+        raise ConfigError(f"a condition is at most {MAX_LENGTH} characters long, this has {len(text)}")
+    return _Parser(text).whole()
+
+
+class _Parser:
+    """One pass over the tokens, from the loosest binding to the closest."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+        self._at = 0
+        self._depth = 0
+        self._steps: list[_Step] = []
+        self._references: dict[str, int] = {}
+        self._advance()
+
+    def whole(self) -> Expression:
+        self._either()
+        if self._kind:
+            raise self._expected("and, or, or its end")
+        return Expression(tuple(self._steps), tuple(self._references))
+
+    def _advance(self) -> None:
+        """Read the next token: its kind (empty at the end) and its text, keywords in lower case."""
+        self._start = self._at
+        rest = self._text[self._at :]
+        if not rest.strip():
+            self._kind, self._word, self._start = "", "", len(self._text)
+            return
+        match = _TOKEN.match(self._text, self._at)
+        self._start += len(rest) - len(rest.lstrip())
+        if match is None:
+            self._word = self._text[self._start]
+            raise self._expected("a register, a number or an operator")
+        self._kind, self._at = str(match.lastgroup), match.end()
+        self._word = match[self._kind]
+        if self._kind == "word" and self._word.lower() in _KEYWORDS:
+            self._kind, self._word = "keyword", self._word.lower()
+
+    def _expected(self, what: str) -> ConfigError:
+        found = repr(self._word) if self._word else "the end"
+        return ConfigError(f"at character {self._start + 1}: expected {what}, found {found}")
+
+    def _is(self, *words: str) -> bool:
+        return self._kind in ("keyword", "sign") and self._word in words
+
+    def _emit(self, step: _Step) -> None:
+        if len(self._steps) == MAX_NODES:
+            raise ConfigError(f"a condition has at most {MAX_NODES} parts")
+        self._steps.append(step)
+
+    def _either(self) -> None:
+        self._both()
+        while self._is("or"):
+            self._advance()
+            self._both()
+            self._emit(_two(_or))
+
+    def _both(self) -> None:
+        self._negation()
+        while self._is("and"):
+            self._advance()
+            self._negation()
+            self._emit(_two(_and))
+
+    def _negation(self) -> None:
+        if not self._is("not"):
+            self._comparison()
+            return
+        self._advance()
+        self._nested(self._negation)
+        self._emit(_one(operator.not_))
+
+    def _comparison(self) -> None:
+        self._sum()
+        if self._is(*_COMPARISONS):
+            compare = _COMPARISONS[self._word]
+            self._advance()
+            self._sum()
+            self._emit(_two(compare))
+
+    def _sum(self) -> None:
+        self._product()
+        while self._is(*_SUMS):
+            step = _SUMS[self._word]
+            self._advance()
+            self._product()
+            self._emit(_two(step))
+
+    def _product(self) -> None:
+        self._factor()
+        while self._is(*_PRODUCTS):
+            step = _PRODUCTS[self._word]
+            self._advance()
+            self._factor()
+            self._emit(_two(step))
+
+    def _nested(self, read: Callable[[], None]) -> None:
+        if self._depth == MAX_DEPTH:
+            raise ConfigError(f"at character {self._start + 1}: more than {MAX_DEPTH} levels within each other")
+        self._depth += 1
+        read()
+        self._depth -= 1
+
+    def _factor(self) -> None:
+        if self._is("-"):
+            self._advance()
+            self._nested(self._factor)
+            self._emit(_one(operator.neg))
+        elif self._is("("):
+            self._parentheses()
+        elif self._is("true", "false"):
+            self._emit(_push(self._word == "true"))
+            self._advance()
+        elif self._is("abs", *_EDGES):
+            function = self._word
+            self._advance()
+            if not self._is("("):
+                raise self._expected(f"'(' behind {function}")
+            self._parentheses()
+            self._emit(_one(abs) if function == "abs" else _edge(_EDGES[function], len(self._steps)))
+        elif self._kind == "number":
+            self._emit(_push(self._number()))
+            self._advance()
+        elif self._kind in ("word", "quoted"):
+            path = self._word[1:-1] if self._kind == "quoted" else self._word
+            self._emit(_load(self._references.setdefault(path, len(self._references))))
+            self._advance()
+        else:
+            raise self._expected("a register or a number")
+
+    def _parentheses(self) -> None:
+        self._advance()
+        self._nested(self._either)
+        if not self._is(")"):
+            raise self._expected("')'")
+        self._advance()
+
+    def _number(self) -> Number:
+        digits = self._word.replace("_", "")
+        if len(digits) > MAX_DIGITS:
+            raise ConfigError(f"at character {self._start + 1}: a number has at most {MAX_DIGITS} digits")
+        base, sharp, rest = digits.partition("#")
+        if sharp:
+            if not rest:
+                raise self._expected("digits behind the '#'")
+            return int(rest, int(base))
+        return float(digits) if set(digits) & set(".eE") else int(digits)
+
+
+# -- what a step does with the stack ---------------------------------------------------------------------------------
+
+
+def _push(number: Number) -> _Step:
+    return lambda stack, _values, _seen: stack.append(number)
+
+
+def _load(place: int) -> _Step:
+    return lambda stack, values, _seen: stack.append(values[place])
+
+
+def _one(function: Callable[[Number], Number]) -> _Step:
+    def step(stack: _Stack, _values: Sequence[Number], _seen: _Seen) -> None:
+        stack[-1] = function(stack[-1])
+
+    return step
+
+
+def _two(function: Callable[[Number, Number], Number]) -> _Step:
+    def step(stack: _Stack, _values: Sequence[Number], _seen: _Seen) -> None:
+        right = stack.pop()
+        stack[-1] = function(stack[-1], right)
+
+    return step
+
+
+def _edge(function: Callable[[Number, Number], bool], place: int) -> _Step:
+    def step(stack: _Stack, _values: Sequence[Number], seen: _Seen) -> None:
+        now, before = stack[-1], seen.get(place)
+        stack[-1] = before is not None and function(before, now)
+        seen[place] = now
+
+    return step
+
+
+def _or(left: Number, right: Number) -> bool:
+    return bool(left) or bool(right)
+
+
+def _and(left: Number, right: Number) -> bool:
+    return bool(left) and bool(right)

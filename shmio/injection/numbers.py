@@ -1,0 +1,110 @@
+"""The numbers and bits of an image at the places of some registers, all of a type at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from shmio.layout.model import ByteOrder, Register, element_position
+from shmio.layout.scalar import REAL_MAX, scalar_codec
+from shmio.layout.types import ElementType
+
+Bytes = npt.NDArray[np.uint8]
+Values = npt.NDArray[Any]
+
+MAX_ELEMENTS: Final = 4096
+"""Single values in one injection; more would be felt by the loop that polls."""
+
+_REAL_LIMIT: Final = float(np.float32(REAL_MAX))
+
+
+@dataclass(frozen=True)
+class Places:
+    """All single values of one type. ``first``: number of the first among those of the injection."""
+
+    element: ElementType
+    first: int
+    index: npt.NDArray[np.intp]
+    """(n, size) places of their bytes in the block; of bits (n,)."""
+    shifts: Bytes
+    """Of bits (n,): which of the byte."""
+    dtype: np.dtype[Any]
+    """As the controller has it; of kind V if it is no number."""
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    def numbers(self, image: Bytes) -> Values:
+        """Their values; those of 64 bits, of which a double would lose some, as long doubles."""
+        exact = np.longdouble if self.dtype.kind in "iu" and self.dtype.itemsize == 8 else np.float64
+        return np.ascontiguousarray(image[self.index]).view(self.dtype)[:, 0].astype(exact)
+
+    def put_numbers(self, image: Bytes, values: Values) -> None:
+        """Change them; whole numbers are rounded, and what is beyond the type's range is its limit."""
+        if self.dtype.kind == "f":
+            most = _REAL_LIMIT if self.dtype.itemsize == 4 else np.finfo(np.float64).max
+            fitting = np.clip(values, -most, most)
+        else:
+            limits = np.iinfo(self.dtype)
+            if self.dtype.itemsize == 8:  # the limits of 64 bits are no doubles
+                values = values.astype(np.longdouble)
+            fitting = np.clip(np.rint(values), values.dtype.type(limits.min), values.dtype.type(limits.max))
+        image[self.index] = np.ascontiguousarray(fitting.astype(self.dtype)).view(np.uint8).reshape(self.index.shape)
+
+    def put(self, image: Bytes, table: Bytes, choice: npt.NDArray[np.intp]) -> None:
+        """Give each the one of a table's (k, size) values that is chosen (n,) for it; of bits, values are 0 or 1."""
+        if self.element.base != "BOOL":
+            image[self.index] = table[choice]
+            return
+        on, off = self._masks(table[choice, 0] != 0)
+        np.bitwise_or.at(image, self.index, on)
+        np.bitwise_and.at(image, self.index, ~off)
+
+    def _masks(self, set_bits: npt.NDArray[np.bool_]) -> tuple[Bytes, Bytes]:
+        bits = (np.uint8(1) << self.shifts).astype(np.uint8)
+        return np.where(set_bits, bits, np.uint8(0)), np.where(set_bits, np.uint8(0), bits)
+
+
+def places(registers: Iterable[Register], byte_order: ByteOrder) -> list[Places]:
+    """The single values of registers and arrays, by type. ValueError: there are more than MAX_ELEMENTS."""
+    found: dict[ElementType, list[tuple[int, int]]] = {}
+    count = 0
+    for register in registers:
+        count += register.count
+        if count > MAX_ELEMENTS:
+            raise ValueError(f"more than {MAX_ELEMENTS} single values: name fewer")
+        element, into = register.element, found.setdefault(register.element, [])
+        if not register.dims:
+            into.append((register.offset, register.bit or 0))
+            continue
+        for flat in range(register.count):
+            byte, bit = element_position(element, register.shape, flat)
+            into.append((register.offset + byte, bit or 0))
+    groups = []
+    first = 0
+    for element, at in found.items():
+        starts = np.array([byte for byte, _ in at], dtype=np.intp)
+        shifts = np.array([bit for _, bit in at], dtype=np.uint8)
+        index = starts if element.base == "BOOL" else starts[:, None] + np.arange(element.size)
+        groups.append(Places(element, first, index, shifts, number_type(element, byte_order)))
+        first += len(at)
+    return groups
+
+
+def number_type(element: ElementType, byte_order: ByteOrder) -> np.dtype[Any]:
+    """The numpy type of a number as the controller has it; of kind V: the type is none, or has values that are none."""
+    plain = "" if element.base == "BOOL" else scalar_codec(element, byte_order).plain
+    kind = _NUMPY.get(plain, f"V{element.size}")
+    return np.dtype(("<" if byte_order == "little" else ">") + kind)
+
+
+_NUMPY: Final = {
+    "b": "i1", "B": "u1", "h": "i2", "H": "u2", "i": "i4", "I": "u4", "q": "i8", "Q": "u8", "f": "f4", "d": "f8",
+}  # fmt: skip
+
+Change = Callable[[Places, Values], Values]
+"""From the values of places to what they become."""

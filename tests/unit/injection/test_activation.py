@@ -1,0 +1,86 @@
+"""When a declared injection is active, over sequences of times and conditions."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmio.injection.activation import Activation, State, Window
+
+A, W, O = State.ACTIVE, State.WAITING, State.OVER  # noqa: E741
+
+
+def states(window: Window, conditions: str, step_ns: int = 10) -> list[State]:
+    """The state after each look, at times 0, 10, …; ``conditions``: ``#`` where it holds."""
+    activation = Activation(window)
+    found = []
+    for cycle, mark in enumerate(conditions):
+        activation.advance(cycle * step_ns, cycle, holds=mark == "#")
+        found.append(activation.state)
+    return found
+
+
+def test_between_two_times() -> None:
+    assert states(Window(20, 40), "######") == [W, W, A, A, O, O]
+    assert states(Window(), "###") == [A, A, A]
+
+
+def test_while_a_condition_holds() -> None:
+    assert states(Window(), ".##.#.") == [W, A, A, W, A, W]
+    assert states(Window(20, 50), "###.###") == [W, W, A, W, A, O, O]
+
+
+def test_for_a_limited_time_after_it_came_true() -> None:
+    assert states(Window(for_ns=20), ".#....#####") == [W, A, A, W, W, W, A, A, W, W, W]
+    assert states(Window(for_ns=20), "#..#.") == [A, A, W, A, A]
+    assert states(Window(0, 30, for_ns=100), "######") == [A, A, A, O, O, O]
+
+
+def test_so_many_times() -> None:
+    assert states(Window(times=2), "#.#.#.") == [A, W, A, O, O, O]
+    assert states(Window(for_ns=10, times=1), "##.#") == [A, O, O, O]
+
+
+def test_one_that_goes_on_for_another_process_does_not_begin_anew() -> None:
+    activation = Activation(Window(for_ns=20), State.WAITING, runs=1)
+    activation.advance(100, 10, holds=True)
+    assert activation.state is W
+    activation.advance(110, 11, holds=False)
+    activation.advance(120, 12, holds=True)
+    assert (activation.state, activation.runs, activation.cycle, activation.time_ns) == (A, 2, 12, 120)
+    activation = Activation(Window(for_ns=20), State.ACTIVE, 2, 12, 120)
+    activation.advance(139, 14, holds=False)
+    assert activation.state is A
+    activation.advance(140, 15, holds=False)
+    assert activation.state is W
+
+
+times = st.none() | st.integers(0, 300)
+
+
+@given(
+    st.integers(0, 200),
+    times,
+    st.none() | st.integers(1, 80),
+    st.none() | st.integers(1, 3),
+    st.text("#.", max_size=40),
+)
+def test_what_always_holds(start: int, end: int | None, for_ns: int | None, most: int | None, marks: str) -> None:
+    window = Window(start, end, for_ns, most)
+    activation = Activation(window)
+    before = activation.state
+    for cycle, mark in enumerate(marks):
+        time_ns = 10 * cycle
+        changed = activation.advance(time_ns, cycle, holds=mark == "#")
+        assert changed == (activation.state is not before)
+        if activation.state is State.ACTIVE:
+            assert start <= time_ns
+            assert end is None or time_ns < end
+            if for_ns is None:
+                assert mark == "#"
+            else:
+                assert time_ns < activation.time_ns + for_ns
+        if before is State.OVER:
+            assert activation.state is State.OVER
+        assert most is None or activation.runs <= most
+        before = activation.state

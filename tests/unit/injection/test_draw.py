@@ -1,0 +1,61 @@
+"""Random numbers that follow from a seed and a place."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmio.injection.draw import Draw, Purpose
+
+places = st.integers(0, 2**40)
+
+
+def test_the_numbers_are_these_for_ever() -> None:
+    """A campaign recorded with one version repeats with the next."""
+    words = Draw(7, "drift").words(1, 12, Purpose.VALUE, 3)
+    assert [f"{word:016x}" for word in words.tolist()] == ["c5b32a2bd6d0f3ce", "20657407695298c2", "a78378d3780506af"]
+
+
+@given(st.integers(0, 2**63 - 1), places, places)
+def test_the_same_place_has_the_same_numbers_in_any_order(seed: int, run: int, place: int) -> None:
+    one, other = Draw(seed, "a"), Draw(seed, "a")
+    later = other.uniform(run, place + 1, 4)
+    assert one.uniform(run, place, 8).tolist() == other.uniform(run, place, 8).tolist()
+    assert one.uniform(run, place, 8)[:3].tolist() == other.uniform(run, place, 3).tolist()
+    assert one.uniform(run, place + 1, 4).tolist() == later.tolist()
+
+
+def test_seed_name_activation_place_and_purpose_tell_numbers_apart() -> None:
+    found = [
+        Draw(seed, name).words(run, place, purpose, 1)[0]
+        for seed in (0, 1) for name in ("a", "b") for run in (1, 2) for place in (0, 1) for purpose in Purpose
+    ]  # fmt: skip
+    assert len(set(found)) == len(found)
+
+
+@given(st.integers(0, 2**32), places)
+def test_ranges(seed: int, place: int) -> None:
+    draw = Draw(seed, "x")
+    uniform = draw.uniform(1, place, 50)
+    assert ((uniform >= 0) & (uniform < 1)).all()
+    assert np.isfinite(draw.gaussian(1, place, 50)).all()
+    below = draw.below(3, 1, place, 50)
+    assert ((below >= 0) & (below < 3)).all()
+    assert draw.happens(1, 1, place)
+
+
+def test_distributions_are_as_they_are_called() -> None:
+    draw = Draw(1, "x")
+    uniform = np.concatenate([draw.uniform(1, place, 100) for place in range(1000)])
+    assert uniform.mean() == pytest.approx(0.5, abs=0.005)
+    assert uniform.var() == pytest.approx(1 / 12, abs=0.002)
+    normal = np.concatenate([draw.gaussian(1, place, 100) for place in range(1000)])
+    assert normal.mean() == pytest.approx(0, abs=0.02)
+    assert normal.std() == pytest.approx(1, abs=0.01)
+    assert np.mean(np.abs(normal) < 1) == pytest.approx(0.6827, abs=0.005)
+    assert np.corrcoef(normal[:-1], normal[1:])[0, 1] == pytest.approx(0, abs=0.02)
+    assert np.mean([draw.happens(0.25, 1, place) for place in range(10_000)]) == pytest.approx(0.25, abs=0.015)
+    counts = np.bincount(np.concatenate([draw.below(4, 1, place, 50) for place in range(1000)]))
+    assert counts == pytest.approx(12_500, rel=0.05)
