@@ -50,6 +50,10 @@ listen = "{plc}"
 """
 
 
+def _prioritised(priority: int | None) -> str:
+    return "" if priority is None else f"realtime_priority = {priority}\n"
+
+
 @dataclass(frozen=True)
 class Polled:
     """A source: what it polls, and how often."""
@@ -59,6 +63,8 @@ class Polled:
     period_ms: float
     layout: Path = DB201
     writable: Sequence[str] = ()
+    priority: int | None = None
+    """Real-time."""
 
     def text(self) -> str:
         """Its part of the configuration."""
@@ -68,7 +74,7 @@ class Polled:
             plc=self.plc,
             period_ms=self.period_ms,
             writable=json.dumps(list(self.writable)),
-        )
+        ) + _prioritised(self.priority)
 
 
 @dataclass(frozen=True)
@@ -82,14 +88,14 @@ class Instance:
 
 
 @contextmanager
-def instance(period_ms: float, *, more: str = "") -> Iterator[Instance]:
+def instance(period_ms: float, *, more: str = "", priority: int | None = None) -> Iterator[Instance]:
     """Run a source ``cell`` that polls an emulated controller of the instance's own, with the program of the A50 cell.
 
-    ``more``: further sections of the configuration.
+    ``more``: further sections of the configuration. ``priority``: real-time, of both.
     """
     with reserved_port() as plc:
-        emulator = _EMULATOR.format(layout=DB201, plc=plc)
-        with started([Polled("cell", plc, period_ms)], more=emulator + more) as running:
+        emulator = _EMULATOR.format(layout=DB201, plc=plc) + _prioritised(priority)
+        with started([Polled("cell", plc, period_ms, priority=priority)], more=emulator + more) as running:
             yield running
 
 

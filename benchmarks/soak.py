@@ -99,11 +99,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--for", dest="duration_s", type=float, default=1800.0, help="seconds (default: half an hour)")
     parser.add_argument("--quick", action="store_true", help="10 s: does it work")
+    parser.add_argument("--priority", type=int, help="real-time, of the source and its emulated controller")
     arguments = parser.parse_args()
     duration_s = 10.0 if arguments.quick else arguments.duration_s
-    print(f"# Soak: DB201 at 50 Hz, 5 subscribers, a recorder, {duration_s:g} s\n{machine()}")
+    rank = f", real-time priority {arguments.priority}" if arguments.priority else ""
+    print(f"# Soak: DB201 at 50 Hz{rank}, 5 subscribers, a recorder, {duration_s:g} s\n{machine()}")
     with tempfile.TemporaryDirectory() as folder:
-        with instance(PERIOD_MS, more=f'[recorder]\ndirectory = "{folder}"\n') as running:
+        recorder = f'[recorder]\ndirectory = "{folder}"\n'
+        with instance(PERIOD_MS, more=recorder, priority=arguments.priority) as running:
             problems = soak(running, duration_s)
         problems += recorded(Path(folder))
     for problem in problems:

@@ -22,7 +22,7 @@ def main() -> None:
     period_s = late_limit_s / LOOKS
     os.sched_setaffinity(0, {int(sys.argv[2])})
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))
     except PermissionError:
         first = False
     else:

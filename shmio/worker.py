@@ -17,7 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from shmio import logs
+from shmio import logs, realtime
 from shmio.errors import ConfigError, LayoutError, SegmentError, ShmioError
 from shmio.segment import Activity, Report, Segment
 
@@ -126,6 +126,8 @@ def main(run: Callable[[Worker], None]) -> int:
     worker = None
     try:
         worker = Worker(_read_spec())
+        if priority := worker.config.get("realtime_priority"):
+            realtime.prioritise(priority)
         run(worker)
         worker.report(activity=Activity.STOPPING)
         worker.log.info("stopped")

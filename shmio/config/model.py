@@ -17,6 +17,8 @@ DbNumber = Annotated[int, Meta(ge=1, le=65535)]
 Seconds = Annotated[float, Meta(ge=0, le=1e9)]
 Operand = bool | int | float | str | list[Any]
 OperationName = Literal["set", "offset", "scale", "clamp", "noise", "random", "freeze", "delay", "drop", "flip"]
+RealtimePriority = Annotated[int, Meta(ge=1, le=99)]
+"""Of SCHED_FIFO, sched(7)."""
 
 ROLES = ("read", "write", "inject", "control")
 """What a client of the gRPC endpoint may be allowed."""
@@ -52,6 +54,7 @@ class Source(Section):
     stale_ms: Milliseconds | None = None
     writable: list[Text] = []
     armed: bool = False
+    realtime_priority: RealtimePriority | None = None
     options: dict[str, Any] = {}
     texts: dict[str, str] = {}
 
@@ -77,6 +80,7 @@ class Emulator(Section):
     block: Text | None = None
     dbNumber: DbNumber | None = None  # noqa: N815 - named as the source's
     insecure: bool = False
+    realtime_priority: RealtimePriority | None = None
 
 
 class Tls(Section):

@@ -6,6 +6,7 @@ import grp
 import os
 from pathlib import Path
 
+from shmio import realtime
 from shmio.config import Config
 from shmio.config.tls import read_tls
 from shmio.config.tokens import read_tokens
@@ -13,8 +14,12 @@ from shmio.errors import ConfigError
 
 
 def check_host(config: Config) -> None:
-    """Group, folders of log files and recordings, TLS files, tokens; ConfigError. Nothing is made."""
+    """Group, priorities, folders of log files and recordings, TLS files, tokens; ConfigError. Nothing is made."""
     _check_group(config.instance.group)
+    for index, source in enumerate(config.source):
+        _check_priority(f"source[{index}]", source.realtime_priority)
+    for index, emulator in enumerate(config.emulator):
+        _check_priority(f"emulator[{index}]", emulator.realtime_priority)
     _check_folder("instance.log_dir", config.log_dir)
     if config.recorder:
         _check_folder("recorder.directory", config.path(config.recorder.directory))
@@ -33,6 +38,14 @@ def _check_group(name: str | None) -> None:
         raise ConfigError(f"instance.group: this host has no group {name!r}") from None
     if os.geteuid() != 0 and gid not in (os.getegid(), *os.getgroups()):
         raise ConfigError(f"instance.group: this user is not in group {name!r}, and so cannot give it the segment")
+
+
+def _check_priority(key: str, priority: int | None) -> None:
+    try:
+        if priority is not None:
+            realtime.check(priority)
+    except ConfigError as error:
+        raise ConfigError(f"{key}.{error}") from None
 
 
 def _check_folder(key: str, folder: Path) -> None:

@@ -238,6 +238,20 @@ def test_check_tells_what_the_instance_takes(example: Edit, instance: str, capsy
     assert instance not in instances()
 
 
+def test_check_says_that_a_priority_is_not_allowed(
+    example: Edit, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    example('kind = "s7"', 'kind = "s7"\nrealtime_priority = 10')
+    assert main(["check"]) == 1
+    assert "emulator[0].realtime_priority: this user may not have 10 (Operation not permitted); allow it" in (
+        capsys.readouterr().err
+    )
+
+
 TAKEN = "is the port of emulator[0].listen (127.0.0.1:1102) already; choose another"
 
 
@@ -253,6 +267,7 @@ TAKEN = "is the port of emulator[0].listen (127.0.0.1:1102) already; choose anot
         ("period_ms = 20", "options = {}", "source[0].options: unknown key"),
         ('program = "a50"', 'program = "a50"\nblock = "b"', "emulator[0].block: no data block 'b'; there are: DB201"),
         ('connector = "s7"', 'connector = "s7"\nstale_ms = 20', "source[0].stale_ms: 20 is less than two periods"),
+        ('connector = "s7"', 'connector = "s7"\nrealtime_priority = 100', "source[0].realtime_priority: expected "),
         ('name = "a50"', 'name = "a50"\ngroup = "no such"', "instance.group: this host has no group 'no such'"),
         ('name = "a50"', 'name = "a50"\nlog_dir = "db201.db"', "instance.log_dir: "),
         ('name = "a50"', 'name = "a50"\nlog_dir = "db201.db/logs"', "instance.log_dir: "),
@@ -409,7 +424,8 @@ def test_a_supervisor_that_does_not_answer(
         silent.bind(path)
         silent.listen()
         assert main([*verb, "--instance", instance]) == 1
-        assert f"supervisor pid {os.getpid()} has shown no sign of life for 0 s" in capsys.readouterr().err
+        told = rf"supervisor pid {os.getpid()} has shown no sign of life for \d+ s"
+        assert re.search(told, capsys.readouterr().err)
         segment.unlink()
 
 
