@@ -7,6 +7,7 @@ from contextlib import suppress
 from typing import Any
 
 import grpc
+import msgspec
 import pytest
 
 from shmio.endpoints.grpc.native import describe, selection
@@ -108,7 +109,7 @@ def test_injected_registers_are_marked_and_their_originals_told(segment: Segment
     async def test(served: Endpoint) -> None:
         block = segment.blocks["cell"]
         ranges = ((0, 4, 0xFF), (8, 1, 1 << 3))
-        block.standing.write(encode([Standing(7, "out", 0, False, "x", 0, 1, ranges)]))
+        block.standing.write(encode([msgspec.json.encode(Standing(7, "out", 0, False, "x", 0, 1, ranges))]))
         served.writer.publish(image(1.0, 2.0), cycle=1, effective=image(9.0, 2.0, True))
         answer = await read(served, "cell/axis", "cell/running", "cell/step", originals=True)
         registers, update = answer.tables[0].registers, answer.updates[0]
