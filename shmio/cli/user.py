@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from shmio import __version__
-from shmio.cli import get, inject, registers, watch
+from shmio.cli import get, inject, registers, step, watch
 from shmio.cli import set as set_verb
 from shmio.cli.run import run
 from shmio.cli.target import instance_name
@@ -40,8 +40,9 @@ def _parser() -> argparse.ArgumentParser:
     common.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
     common.add_argument("--json", action="store_true", help="print JSON")
     verbs = parser.add_subparsers(required=True, metavar="VERB")
-    for name, module in (("list", registers), ("get", get), ("watch", watch), ("set", set_verb), ("inject", inject)):
+    modules = {"list": registers, "get": get, "watch": watch, "set": set_verb, "inject": inject, "step": step}
+    for name, module in modules.items():
         sub = verbs.add_parser(name, parents=[common], help=module.HELP, description=module.HELP)
         module.arguments(sub)
-        sub.set_defaults(verb=module.execute, writable=module in (set_verb, inject))
+        sub.set_defaults(verb=module.execute, writable=module in (set_verb, inject, step))
     return parser

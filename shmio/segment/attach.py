@@ -14,7 +14,6 @@ writes, too, takes a guest's place.
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -31,21 +30,22 @@ from shmio.segment.commander import Commander, Outcome
 from shmio.segment.commands import Direction
 from shmio.segment.cursor import Cursor, Entry
 from shmio.segment.frame import Frame, Quality
-from shmio.segment.processes import Activity, Report
+from shmio.segment.guest import take_guest
 from shmio.segment.segment import Segment, running_instances
 from shmio.segment.shadow import Shadow, lift_all
 from shmio.segment.standing import Standing
+from shmio.segment.timekeeper import Timed
 from shmio.segment.view import Reading, View, reading
 
 TURN_S = 1.0
 """How often a waiting reader looks whether the instance still is."""
 
 
-class Attachment:
+class Attachment(Timed):
     """A running instance as a local program sees it. Use as a context manager, or :meth:`close`."""
 
     def __init__(self, segment: Segment) -> None:
-        self._segment = segment
+        super().__init__(segment)
         self._turn = threading.Lock()
         self._guest: int | None = None
         self._commanders: dict[str, Commander] = {}
@@ -259,27 +259,17 @@ class Attachment:
             return known
 
     def close(self) -> None:
-        """Detach."""
-        self._segment.close()
+        """Detach. TimeError: a step failed while time was played."""
+        try:
+            self._time.close()
+        finally:
+            self._segment.close()
 
     def __enter__(self) -> Attachment:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def take_guest(segment: Segment) -> int:
-    """Take a free guest's place for life; the number of its command queue. SegmentError: none is free."""
-    places = segment.processes.guests
-    for slot in places:
-        if slot.writer is not None and slot.take():
-            slot.report = Report(os.getpid(), Activity.RUNNING, time.monotonic_ns())
-            return slot.writer
-    pids = ", ".join(str(slot.report.pid) for slot in places)
-    raise SegmentError(
-        f"instance {segment.instance!r} has places for {len(places)} writing programs; end one of pids {pids}"
-    )
 
 
 def attach(instance: str | None = None, *, writable: bool = False) -> Attachment:

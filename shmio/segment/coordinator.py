@@ -19,11 +19,14 @@ from shmio.segment.segment import Segment
 
 MIN_STEP_NS: Final = 1_000
 MAX_STEP_NS: Final = 3_600_000_000_000
+TURN_NS: Final = 100_000_000
+"""Who waits for an owner of time looks by itself, too: the bell of one that dies is silent."""
 MAX_RATE: Final = 1000.0
 DISPATCHERS: Final = frozenset({"grpc", "mqtt", "recorder"})
 """Kinds of processes that a step may wait for until they have delivered it."""
 
 log = logging.getLogger("shmio.time")
+log.addHandler(logging.NullHandler())  # a program that asks for no log gets none
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,15 +70,17 @@ class Coordinator:
         """The clock page as it is now."""
         return self._segment.clock.read()
 
-    def take_over(self) -> None:
-        """From now on only steps move time. TimeError: another living process owns it."""
+    def take_over(self, patience_s: float = 0.0) -> None:
+        """From now on only steps move time. TimeError: another living process owns it, and plays, or goes on owning it.
+
+        ``patience_s``: how long to wait for one that does not play.
+        """
         with self._turn:
             if self._owns:
                 return
             if not self._segment.shared.writable:
                 raise TimeError("this attachment only reads: attach with writable=True")
-            if not self._segment.shared.try_lock(self._lock_byte):
-                raise TimeError(f"the time of instance {self._segment.instance!r} is moved by {self._owner()} already")
+            self._take_lock(time.monotonic_ns() + round(patience_s * 1e9))
             self._owns = True
             state = self.read()
             note = f"step {state.step} was not finished: who asked for it has ended" if state.stepping else state.note
@@ -156,9 +161,24 @@ class Coordinator:
             self._write(replace(self.read(), owner=0, playing=False))
             self._segment.shared.unlock(self._lock_byte)
             self._owns = False
+            self._segment.clock.bell.ring()  # once more: who waits for the lock
 
     def _write(self, state: ClockState) -> None:
         self._segment.clock.write(state)
+
+    def _take_lock(self, until_ns: int) -> None:
+        bell = self._segment.clock.bell
+        while True:
+            seen = bell.value()
+            if self._segment.shared.try_lock(self._lock_byte):
+                return
+            rest_ns = until_ns - time.monotonic_ns()
+            state = self.read()
+            if rest_ns <= 0 or state.playing:
+                name = self._segment.instance
+                how = ", which plays it" if state.playing else ""
+                raise TimeError(f"the time of instance {name!r} is moved by {self._owner(state.owner)}{how}")
+            bell.wait(seen, min(rest_ns, TURN_NS))
 
     def _frozen(self, state: ClockState) -> ClockState:
         """Virtual time that goes on from now."""
@@ -197,11 +217,12 @@ class Coordinator:
                 continue
             passed_ns = time.monotonic_ns() - begun_ns
             if passed_ns >= self._hard_ns:
-                silent = [self._silence(block) for block in waiting if _answer(block, number) is None]
-                return "; ".join([*problems, *silent])
+                problems += [self._silence(block) for block in waiting if _answer(block, number) is None]
+                return "; ".join(problems)
             if passed_ns >= self._soft_ns and not told:
                 told = True
-                note = f"step {number} waits for {', '.join(block.source for block in waiting)}"
+                silent = [block.source for block in waiting if _answer(block, number) is None]
+                note = f"step {number} waits for {', '.join(silent)}"
                 log.warning(note)
                 self._write(replace(asked, note=note))
             block.ring.wait(seen, (self._hard_ns if told else min(self._soft_ns, self._hard_ns)) - passed_ns)
@@ -243,9 +264,8 @@ class Coordinator:
                 return f"{what}: its process does not run ({told.phase}{told.note and f': {told.note}'})"
         return what
 
-    def _owner(self) -> str:
+    def _owner(self, pid: int) -> str:
         """Who owns time, as far as the page and the process table tell."""
-        pid = self.read().owner
         names = [slot.name for slot in self._segment.processes if pid and slot.report.pid == pid and slot.alive()]
         return f"{names[0]} (pid {pid})" if names else f"another program (pid {pid})"
 

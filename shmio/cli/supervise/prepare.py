@@ -12,8 +12,8 @@ from shmio.cli.supervise.host import check_host
 from shmio.cli.supervise.injections import check_injections
 from shmio.cli.supervise.layouts import LayoutFiles
 from shmio.cli.supervise.ports import check_listening
+from shmio.cli.supervise.sources import check_sources
 from shmio.config import Address, Config, Emulator, Source, load
-from shmio.config.read import unknown_option
 from shmio.config.wording import named
 from shmio.errors import ConfigError, PathError
 from shmio.layout.glob import Glob
@@ -49,8 +49,7 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
     try:
         check_host(config)
         check_listening(config)
-        layouts = {source.name: _check_source(i, source, files) for i, source in enumerate(config.source)}
-        computed = [source.name for source in config.source if _is_computed(source)]
+        layouts, computed = check_sources(config, files)
         emulated = {emulator.name: _check_emulator(i, emulator, files) for i, emulator in enumerate(config.emulator)}
         declared = check_injections(config, layouts)
         odd = [*_odd(config, layouts), *_not_served(config, layouts, emulated), *_unread(emulated)]
@@ -67,44 +66,6 @@ def peer(source: Source) -> str:
     """The device of a checked source, as host:port where it has such; empty if not."""
     host, port = source.options.get("host"), source.options.get("port")
     return str(Address(host, port)) if host and port else str(host or "")
-
-
-def _check_source(index: int, source: Source, files: LayoutFiles) -> Layout:
-    """The source's layout; its ``options`` are complete and of their types from here on."""
-    # Connectors are imported here: status and its like do without them.
-    from shmio.connectors import registry  # noqa: PLC0415
-    from shmio.connectors.base import Connector  # noqa: PLC0415
-
-    key = f"source[{index}]"
-    try:
-        connector = registry.load(source.connector)
-    except ConfigError as error:
-        raise ConfigError(f"{key}.connector: {error}") from None
-    known = [field.encode_name for field in msgspec.structs.fields(connector.Options)]
-    for option in (*source.options, *source.texts):
-        if option not in known:
-            raise ConfigError(unknown_option(index, option, known))
-    try:
-        options = registry.convert_options(source.connector, source.options, source.texts)
-    except ConfigError as error:
-        raise ConfigError(f"{key}.{error}") from None
-    source.options, source.texts = msgspec.to_builtins(options), {}
-    layout = files.get(key, source, source.options.get("dbNumber"))
-    try:
-        made = connector(options, layout)
-        if isinstance(made, Connector):
-            made.close()
-    except ConfigError as error:
-        raise ConfigError(f"{key}.{error}") from None
-    return layout
-
-
-def _is_computed(source: Source) -> bool:
-    """Whether a checked source lives on the instance's clock."""
-    from shmio.connectors import registry  # noqa: PLC0415
-    from shmio.connectors.computed import Computed  # noqa: PLC0415
-
-    return issubclass(registry.load(source.connector), Computed)
 
 
 def _check_emulator(index: int, emulator: Emulator, files: LayoutFiles) -> tuple[Layout, ...]:

@@ -1,0 +1,68 @@
+"""``shmio step``: moves the time of an instance."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import signal
+import threading
+
+import msgspec
+
+from shmio.cli.run import at_least, dumps
+from shmio.cli.supervise.status import clock_line
+from shmio.segment.attach import Attachment
+from shmio.segment.status import clock_status
+
+HELP = "Step the instance's time: from the first step on nothing else moves it."
+LOOK_S = 0.2
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's own arguments."""
+    parser.add_argument("--dt-ms", type=_above_zero, metavar="N", help="by how much (default: the step size, 50)")
+    parser.add_argument("--count", type=at_least(1), default=1, metavar="N", help="so many steps (default: 1)")
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument(
+        "--play",
+        type=_above_zero,
+        nargs="?",
+        const=1.0,
+        metavar="RATE",
+        help="step at RATE times real time (default: 1) until Ctrl-C; then time stands",
+    )
+    how.add_argument("--pause", action="store_true", help="have time stand, and do no step")
+
+
+def execute(cell: Attachment, options: argparse.Namespace) -> int:
+    """Step, play or pause, and tell the time then. TimeError, ValueRangeError."""
+    if options.play is not None:
+        _play(cell, options.play, options.dt_ms)
+    elif options.pause:
+        cell.pause()
+    else:
+        for _ in range(options.count):
+            cell.step(options.dt_ms)
+    clock = clock_status(cell.clock)
+    print(dumps(msgspec.to_builtins(clock)) if options.json else clock_line(clock))
+    return 0
+
+
+def _play(cell: Attachment, rate: float, dt_ms: float | None) -> None:
+    over = threading.Event()
+    for sign in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(sign, lambda *_: over.set())
+    cell.play(rate, dt_ms)
+    while not over.wait(LOOK_S) and cell.clock.playing:
+        pass  # until it is told to stop, or a step fails
+    cell.pause()
+
+
+def _above_zero(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return value

@@ -1,0 +1,80 @@
+"""The sources of a configuration: their connectors asked whether all goes together, their layouts found.
+
+Connectors are imported here, and only when they are asked: status and its like do without them.
+"""
+
+from __future__ import annotations
+
+import msgspec
+
+from shmio.cli.supervise.layouts import LayoutFiles
+from shmio.config import Config, Source
+from shmio.config.read import unknown_option
+from shmio.errors import ConfigError
+from shmio.layout.model import Layout
+
+
+def check_sources(config: Config, files: LayoutFiles) -> tuple[dict[str, Layout], list[str]]:
+    """The layout of each source, by its name, and which of them live on the instance's clock.
+
+    Their ``options`` are complete and of their types from here on. ConfigError, LayoutError.
+    """
+    from shmio.connectors import registry  # noqa: PLC0415
+    from shmio.connectors.computed import Computed  # noqa: PLC0415
+
+    layouts: dict[str, Layout] = {}
+    inputs: dict[int, tuple[str, ...]] = {}
+    computed = []
+    for index, source in enumerate(config.source):
+        key = f"source[{index}]"
+        options = _options(index, source)
+        found = registry.load(source.connector)
+        if issubclass(found, Computed):
+            computed.append(source.name)
+        if source.connector == "simulation":
+            layouts[source.name], inputs[index] = _model(key, source, config, files)
+            continue
+        layout = layouts[source.name] = files.get(key, source, source.options.get("dbNumber"))
+        try:
+            made = found(options, layout)
+        except ConfigError as error:
+            raise ConfigError(f"{key}.{error}") from None
+        if not isinstance(made, Computed):
+            made.close()
+    for index, paths in inputs.items():
+        from shmio.cli.supervise.models import check_connections  # noqa: PLC0415
+
+        source = config.source[index]
+        check_connections(f"source[{index}]", source.name, source.options["connections"], paths, layouts)
+    return layouts, computed
+
+
+def _options(index: int, source: Source) -> msgspec.Struct:
+    """The connector's own keys, checked; ConfigError."""
+    from shmio.connectors import registry  # noqa: PLC0415
+
+    key = f"source[{index}]"
+    try:
+        connector = registry.load(source.connector)
+    except ConfigError as error:
+        raise ConfigError(f"{key}.connector: {error}") from None
+    known = [field.encode_name for field in msgspec.structs.fields(connector.Options)]
+    for option in (*source.options, *source.texts):
+        if option not in known:
+            raise ConfigError(unknown_option(index, option, known))
+    try:
+        options = registry.convert_options(source.connector, source.options, source.texts)
+    except ConfigError as error:
+        raise ConfigError(f"{key}.{error}") from None
+    source.options, source.texts = msgspec.to_builtins(options), {}
+    return options
+
+
+def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tuple[Layout, tuple[str, ...]]:
+    """The layout and the inputs of a simulation: those of its files, if it has any, else what its model declares."""
+    from shmio.cli.supervise.models import describe  # noqa: PLC0415
+    from shmio.connectors.simulation import Simulation  # noqa: PLC0415
+
+    source.options["folder"] = str(config.path(source.options["folder"]))
+    layout = None if source.layout is None else files.get(key, source, None)
+    return describe(key, msgspec.convert(source.options, Simulation.Options), layout)

@@ -1,0 +1,275 @@
+"""Virtual time in a whole instance: models as a user writes them, stepped by commands and programs, and killed."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import shmio
+from shmio.errors import TimeError
+from shmio.segment import Segment
+from shmio.segment.attach import Attachment
+from shmio.segment.coordinator import Coordinator
+from shmio.testing.cell import BIN, PATIENCE_S, Cell, kill, until
+
+CONFIG = """
+[instance]
+name = "{instance}"
+clock = "CLOCK"
+
+[[source]]
+name = "belt"
+connector = "simulation"
+model = "line:Belt"
+parameters = {{ gain = 2.0 }}
+writable = ["speed"]
+
+[[source]]
+name = "gate"
+connector = "simulation"
+model = "line:Gate"
+writable = ["**"]
+[source.connections]
+position = "belt/position"
+limit = "panel/limit"
+
+[[source]]
+name = "panel"
+connector = "memory"
+layout = "panel.toml"
+writable = ["**"]
+
+[grpc]
+listen = ["{grpc}"]
+"""
+MODELS = '''
+import time
+
+from shmio.simulation import Input, Model, Output, Parameter
+
+
+class Belt(Model):
+    """Moves at its speed."""
+
+    gain = Parameter("LREAL", 1.0)
+    speed = Input("LREAL", 1.0)
+    position = Output("LREAL")
+
+    def step(self, time_s, dt_s):
+        if self.speed < 0:
+            raise ValueError("the belt cannot run backward")
+        if self.speed > 1000:
+            time.sleep(3600)
+        self.position += self.gain * self.speed * dt_s
+
+
+class Gate(Model):
+    """Closed while the belt was beyond the limit a step ago."""
+
+    position = Input("LREAL")
+    limit = Input("LREAL", 1e9)
+    closed = Output("BOOL")
+
+    def step(self, time_s, dt_s):
+        self.closed = self.position > self.limit
+'''
+
+
+@pytest.fixture
+def make_line(make_cell: Callable[..., Cell], tmp_path: Path) -> Callable[[str], Cell]:
+    """An instance with two models and a memory, running."""
+    (tmp_path / "line.py").write_text(MODELS)
+    (tmp_path / "panel.toml").write_text('[registers]\nlimit = { type = "LREAL", initial = 0.25 }\n')
+
+    def make(clock: str) -> Cell:
+        cell = make_cell(config=CONFIG.replace("CLOCK", clock))
+        cell.up()
+        until(
+            lambda: all(cell.processes()[name]["quality"] == "good" for name in ("belt", "gate", "panel")),
+            "good quality",
+        )
+        return cell
+
+    return make
+
+
+@pytest.fixture
+def line(make_line: Callable[[str], Cell]) -> Cell:
+    """One whose time stands at 0."""
+    return make_line("stepped")
+
+
+def step(cell: Cell, *arguments: str) -> dict[str, Any]:
+    done = cell.run("shmio", "step", "--json", *arguments)
+    assert done.returncode == 0, done.stderr
+    clock: dict[str, Any] = json.loads(done.stdout)
+    return clock
+
+
+def get(cell: Cell, *paths: str) -> list[Any]:
+    shown = json.loads(cell.run("shmio", "get", "--json", *paths).stdout)
+    assert {reading["quality"] for reading in shown.values()} == {"good"}, shown
+    return [shown[path]["value"] for path in paths]
+
+
+def test_the_command_steps_and_tells_the_time(line: Cell) -> None:
+    assert get(line, "belt/position", "gate/closed") == [0.0, False]
+    clock = step(line)
+    assert (clock["mode"], clock["step"], clock["time_s"], clock["step_size_ms"]) == ("virtual", 1, 0.05, 50)
+    assert get(line, "belt/position", "gate/closed") == [0.1, False]
+    assert step(line, "--dt-ms", "100")["time_s"] == 0.15
+    assert get(line, "belt/position", "gate/closed") == [pytest.approx(0.3), False], "the gate sees the step before"
+    step(line)
+    assert get(line, "belt/position", "gate/closed") == [pytest.approx(0.4), True]
+    assert line.run("shmio", "set", "belt/speed", "0.5", "panel/limit", "3").returncode == 0
+    assert get(line, "panel/limit") == [3.0]
+    assert step(line, "--count", "3")["step"] == 6
+    assert get(line, "belt/position", "gate/closed") == [pytest.approx(0.55), False]
+    assert line.run("shmio", "step").stdout == "virtual time 0.400 s, step 7, steps of 50 ms\n"
+    assert "virtual time 0.400 s, step 7, steps of 50 ms" in line.supervisor("status").stdout
+    assert line.status()["clock"]["time_s"] == 0.4
+
+
+def test_wall_time_goes_on_until_it_is_taken_over(make_line: Callable[[str], Cell]) -> None:
+    line = make_line("wall")
+    assert line.status()["clock"]["mode"] == "wall"
+    first = line.processes()["belt"]["cycle"]
+    until(lambda: line.processes()["belt"]["cycle"] > first + 5, "it runs")
+    clock = step(line, "--pause")
+    assert clock["mode"] == "virtual"
+    before = get(line, "belt/position")
+    assert step(line)["step"] == clock["step"] + 1
+    assert get(line, "belt/position") == [pytest.approx(before[0] + 0.1)]
+
+
+def test_it_plays_until_it_is_interrupted(line: Cell) -> None:
+    with subprocess.Popen([BIN / "shmio", "step", "--play", "10"], cwd=line.folder, stdout=subprocess.PIPE) as player:
+        try:
+            until(lambda: line.status()["clock"]["time_s"] > 1, "time runs")
+            refused = line.run("shmio", "step")
+            assert refused.returncode == 1
+            assert f"another program (pid {player.pid}), which plays it" in refused.stderr
+            player.send_signal(signal.SIGINT)
+            assert player.wait(PATIENCE_S) == 0
+        finally:
+            player.kill()
+    clock = line.status()["clock"]
+    assert not clock["playing"]
+    assert step(line)["step"] == clock["step"] + 1
+
+
+def test_a_program_steps_and_plays(line: Cell) -> None:
+    with shmio.attach(line.instance, writable=True) as cell:
+        assert not cell.clock.playing
+        made = cell.step(dt_ms=20)
+        assert (made.number, made.time_ns) == (1, 20_000_000)
+        cell.play(50)
+        with pytest.raises(TimeError, match="pause it"):
+            cell.step()
+        while cell.clock.time_ns < 500_000_000:
+            cell.wait("belt", timeout_s=PATIENCE_S)
+        cell.pause()
+        stands = cell.clock
+        assert not stands.playing
+        assert cell.step().number == stands.step + 1
+    with shmio.attach(line.instance) as reader, pytest.raises(TimeError, match="writable=True"):
+        reader.step()
+
+
+def test_a_model_that_raises_fails_the_step_with_its_line(line: Cell) -> None:
+    step(line)
+    line.run("shmio", "set", "belt/speed", "-1")
+    failed = line.run("shmio", "step")
+    assert failed.returncode == 1
+    assert failed.stderr == (
+        "step 2: belt: model line:Belt: ValueError: the belt cannot run backward (line.py, line 16)\n"
+    )
+    belt = line.processes()["belt"]
+    assert (belt["quality"], belt["cycle"]) == ("bad", 2)
+    assert "the belt cannot run backward" in belt["reason"]
+    assert "step 2 failed: belt: " in line.status()["clock"]["note"]
+    line.run("shmio", "set", "belt/speed", "1")
+    assert step(line)["step"] == 3
+    assert get(line, "belt/position") == [pytest.approx(0.2)]
+
+
+def test_a_model_that_is_killed_within_a_step_fails_it_and_goes_on_with_the_next(line: Cell) -> None:
+    step(line)
+    with Attachment(Segment.open(line.instance, writable=True)) as cell:
+        cell.write({"belt/speed": 5000.0})
+        pid = line.processes()["belt"]["pid"]
+        with subprocess.Popen([BIN / "shmio", "step"], cwd=line.folder, stderr=subprocess.PIPE, text=True) as command:
+            until(lambda: "waits for belt" in cell.clock.note, "the step waits")
+            kill(pid)
+            _, error = command.communicate(timeout=PATIENCE_S)
+        assert command.returncode == 1
+        assert error == ("step 2: belt: its process was started anew within this step; it goes on with the next one\n")
+        cell.write({"belt/speed": 1.0})
+        assert cell.step().number == 3
+        assert cell["belt/position"] == pytest.approx(0.2)
+
+
+def test_a_model_that_is_stopped_is_named_after_the_hard_time_out(line: Cell) -> None:
+    pid = line.processes()["gate"]["pid"]
+    with Segment.open(line.instance, writable=True) as segment:
+        coordinator = Coordinator(segment, soft_s=0.05, hard_s=0.1)
+        kill(pid, signal.SIGSTOP)
+        try:
+            with pytest.raises(TimeError, match=rf"^step 1: gate: no answer within 0.1 s from pid {pid}$"):
+                coordinator.step()
+        finally:
+            kill(pid, signal.SIGCONT)
+        coordinator.close()
+    assert step(line)["step"] == 2
+    assert get(line, "belt/position") == [pytest.approx(0.2)]
+
+
+def test_a_killed_program_that_played_leaves_time_standing(line: Cell) -> None:
+    playing = "import shmio, sys, time; cell = shmio.attach(sys.argv[1], writable=True); cell.play(); time.sleep(3600)"
+    with subprocess.Popen([sys.executable, "-c", playing, line.instance]) as player:
+        until(lambda: line.status()["clock"]["step"] > 3, "it plays")
+        player.kill()
+    stands = line.status()["clock"]
+    clock = step(line)
+    assert clock["step"] in (stands["step"] + 1, stands["step"] + 2), "it may have been killed within a step"
+    assert not clock["playing"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ('model = "nowhere:Belt"', "there is no module nowhere"),
+        ('model = "line:Bolt"', "line has no Bolt; its models are: Belt, Gate"),
+        ('model = "line:time"', "line:time is no subclass of shmio.simulation.Model"),
+        ('model = "broken:Belt"', "broken cannot be imported: ZeroDivisionError: division by zero (broken.py, line 2)"),
+        ('model = "ends:Belt"', "the process that imports ends:Belt ended with status 7"),
+        ('model = "line:Belt"\nspeed = 3', "unknown key"),
+        ('model = "line:Belt"\nparameters = { weight = 3 }', "parameters.weight: model Belt has no such parameter"),
+        ('model = "line:Belt"\nconnections = { position = "gate/closed" }', "the model has no such input"),
+        ('model = "line:Belt"\nconnections = { speed = "gate/closed" }', "BOOL, which does not fit an input of LREAL"),
+        ('model = "line:Belt"\nconnections = { speed = "plc/speed" }', "plc"),
+        ('model = "line:Belt"\nconnections = { speed = "panel/limits" }', "near: limit"),
+        ('model = "line:Belt"\nlayout = "panel.toml"', "layout: model line:Belt needs a register speed"),
+    ],
+)
+def test_what_is_wrong_with_a_model_is_said_by_check(
+    make_cell: Callable[..., Cell], tmp_path: Path, wrong: str, message: str
+) -> None:
+    (tmp_path / "line.py").write_text(MODELS)
+    (tmp_path / "broken.py").write_text("x = 1\ny = 1 / 0\n")
+    (tmp_path / "ends.py").write_text("import os\nos._exit(7)\n")
+    (tmp_path / "panel.toml").write_text('[registers]\nlimit = "LREAL"\n')
+    text = CONFIG.replace("CLOCK", "stepped").replace("parameters = {{ gain = 2.0 }}\n", "")
+    cell = make_cell(config=text.replace('model = "line:Belt"', wrong.replace("{", "{{").replace("}", "}}"), 1))
+    done = cell.supervisor("check")
+    assert done.returncode == 1
+    assert "source" in done.stderr
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
