@@ -150,7 +150,8 @@ class Child:
     def __init__(self, script: str, *arguments: object, packages: Path | None = None) -> None:
         """``packages``: a folder whose packages come before the installed ones."""
         self._script = script
-        command = [sys.executable, str(HERE / script), *map(str, arguments)]
+        runner = "node" if script.endswith(".js") else sys.executable
+        command = [runner, str(HERE / script), *map(str, arguments)]
         environment = None if packages is None else os.environ | {"PYTHONPATH": str(packages)}
         self._process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment

@@ -95,8 +95,16 @@ class Server:
         return port
 
     def _server(self, gate: Gate) -> grpc.aio.Server:
-        # More than all calls at once no connection is told to have room for.
-        options: list[tuple[str, Any]] = [*OPTIONS, ("grpc.max_concurrent_streams", self.calls.limits.calls)]
+        # No connection is told to have room for more than all calls. When 1000 wait to be looked at, gRPC breaks off
+        # some at random: clients that begin with thousands of subscriptions at once would lose some.
+        most = self.calls.limits.calls
+        pending = "grpc.server.max_pending_requests"
+        options: list[tuple[str, Any]] = [
+            *OPTIONS,
+            ("grpc.max_concurrent_streams", most),
+            (pending, 4 * most),
+            (f"{pending}_hard_limit", 8 * most),
+        ]
         server = grpc.aio.server(options=options, interceptors=(gate,))
         server.add_generic_rpc_handlers(self._services.handlers())
         health_pb2_grpc.add_HealthServicer_to_server(self._health, server)

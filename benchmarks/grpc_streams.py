@@ -1,0 +1,152 @@
+"""gRPC streams: updates a second, beside a bare grpc.aio server that sends ready bytes; latency at 1 kHz.
+
+Clients are those of @grpc/grpc-js, one process with a connection for each stream. Version 1 has one register a stream,
+the same for all; a subscriber of version 2 has 100. Frames come as fast as the bare server could send what they change,
+or a little faster. The source that publishes them is one process more than the bare server has beside it: where cores
+are short, the server's CPU time for an update says more than the rate.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import shutil
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any, Final
+
+from common import ROOT, Child, CpuTime, begin, interleave, quantiles, table
+from frames import REGISTERS
+from google.protobuf.message import Message
+
+from shmio.wire import simlog_v1_pb2 as v1
+from shmio.wire import simlog_v2_pb2 as v2
+
+V1, V2 = "/simulation.server.SimlogAPI/", "/simlog.server.SimlogAPI/"
+MESSAGE_BYTES: Final = 40
+"""Of an update of version 1; one of version 2 has as many."""
+WARM_UP_S = 0.5
+OFFERED = 1.05
+"""Updates, of those that the bare server sends."""
+
+
+def call(method: str, request: Message) -> dict[str, Any]:
+    return {"method": method, "request": base64.b64encode(request.SerializeToString()).decode(), "then": []}
+
+
+def first(count: int) -> list[dict[str, Any]]:
+    """Streams of version 1."""
+    return [call(V1 + "Subscribe", v1.TopicDescriptor(path="cell/r0"))] * count
+
+
+def second(count: int, topics: int) -> list[dict[str, Any]]:
+    """Subscribers of version 2."""
+    streams = []
+    for number in range(count):
+        stream = call(V2 + "CreateSubscriber", v2.Subscriber(name="bench", uuid=f"bench {number}"))
+        stream["then"] = [
+            call(V2 + "Subscribe", v2.SubscriptionRequest(path=f"cell/r{topic}", subscriberUUID=f"bench {number}"))
+            for topic in range(topics)
+        ]
+        streams.append(stream)
+    return streams
+
+
+@contextmanager
+def clients(address: str, streams: list[dict[str, Any]], started_ns: int = 0, **stamps: Any) -> Iterator[Child]:
+    """A process with these streams, each of which has had a message."""
+    with Child("streams.js", address, started_ns) as child:
+        child.ask(json.dumps({"streams": streams, "stamps": None} | stamps))
+        yield child
+
+
+class Contender:
+    """A server under one load: updates a second, and what each of them costs it."""
+
+    def __init__(self, address: str, pid: int, streams: list[dict[str, Any]], work: Callable[[float], object]) -> None:
+        """``work``: what goes on for so many seconds."""
+        self._server = address, pid
+        self._streams = streams
+        self._work = work
+        self.cost_us: list[float] = []
+
+    def sample(self, duration_s: float) -> float:
+        """Updates a second."""
+        address, pid = self._server
+        with clients(address, self._streams) as client:
+            self._work(WARM_UP_S)
+            client.ask("")
+            cpu, begun_s = CpuTime.of(pid), time.monotonic()
+            self._work(duration_s)
+            used, taken_s = CpuTime.of(pid).since(cpu), time.monotonic() - begun_s
+            count: int = client.ask("")["messages"]
+        self.cost_us.append(1e6 * (used.user_s + used.system_s) / count)
+        return count / taken_s
+
+
+def measure_throughput(rounds: int, duration_s: float) -> None:
+    """Print a table for each number of streams."""
+    with Child("bare.py", MESSAGE_BYTES) as bare, Child("frames.py") as source:
+
+        def publish(hz: float, seconds: float) -> None:
+            source.ask(json.dumps({"hz": hz, "seconds": seconds}))
+
+        ours = source.hello["address"], source.hello["pid"]
+        for count in (1, 10, 50):
+            limit = Contender(bare.hello, bare.pid, first(count), time.sleep)
+            hz = OFFERED * limit.sample(duration_s) / count
+            contenders = {
+                "version 1": Contender(*ours, first(count), partial(publish, hz)),
+                "version 2": Contender(*ours, second(count, REGISTERS), partial(publish, hz / REGISTERS)),
+                "bare grpc.aio, ready bytes": limit,
+            }
+            samples = interleave({name: partial(c.sample, duration_s) for name, c in contenders.items()}, rounds)
+            rates = {name: statistics.median(values) for name, values in samples.items()}
+            costs = {name: statistics.median(contender.cost_us) for name, contender in contenders.items()}
+            most, least = rates["bare grpc.aio, ready bytes"], costs["bare grpc.aio, ready bytes"]
+            table(
+                [f"{count} streams", "updates/s", "of bare", "server's CPU, us each", "of bare"],
+                [
+                    [name, f"{rates[name]:.0f}", f"{rates[name] / most:.2f}", f"{cost:.1f}", f"{cost / least:.2f}"]
+                    for name, cost in costs.items()
+                ],
+            )
+
+
+def measure_latency(duration_s: float) -> None:
+    rows = []
+    with Child("frames.py") as source:
+        of_first = {"stamps": [9, 2, 2]}
+        of_second = {"stamps": [1, 1], "seconds": True}
+        for count in (1, 50):
+            for name, streams, stamps in (
+                ("version 1", first(count), of_first),
+                ("version 2", second(count, 1), of_second),
+            ):
+                with clients(source.hello["address"], streams, source.hello["started_ns"], **stamps) as client:
+                    source.ask(json.dumps({"hz": 1000, "seconds": WARM_UP_S}))
+                    client.ask("")
+                    cpu, begun_s = CpuTime.of(source.hello["pid"]), time.monotonic()
+                    frames = source.ask(json.dumps({"hz": 1000, "seconds": duration_s}))
+                    used, taken_s = CpuTime.of(source.hello["pid"]).since(cpu), time.monotonic() - begun_s
+                    latencies = client.ask("")["latencies"]
+                cells = [f"{cut / 1000:.2f}" for cut in quantiles(latencies)]
+                share = 100 * (used.user_s + used.system_s) / taken_s
+                came = 100 * len(latencies) / (frames * count)
+                rows.append([f"{name}, {count} subscribers", *cells, f"{came:.1f}", f"{share:.0f}"])
+    table(["frame published to client at 1 kHz, ms", "median", "p90", "p99", "came, %", "endpoint's CPU, %"], rows)
+
+
+def main() -> None:
+    quick = begin("gRPC streams: updates a second, and latency")
+    if shutil.which("node") is None or not (ROOT / "tests/unit/endpoints/node/node_modules").exists():
+        raise SystemExit("needs Node and its packages: npm ci --prefix tests/unit/endpoints/node")
+    measure_throughput(1 if quick else 5, 0.5 if quick else 3.0)
+    measure_latency(1.0 if quick else 10.0)
+
+
+if __name__ == "__main__":
+    main()
