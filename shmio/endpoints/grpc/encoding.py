@@ -5,9 +5,15 @@ Serialised fields may be concatenated: together they are a message (protobuf.dev
 
 from __future__ import annotations
 
+from typing import Final
+
+_SMALL: Final = tuple(bytes((number,)) for number in range(0x80))
+
 
 def varint(number: int) -> bytes:
     """A number from 0 on."""
+    if number < 0x80:
+        return _SMALL[number]
     data = bytearray()
     while number > 0x7F:
         data.append(number & 0x7F | 0x80)

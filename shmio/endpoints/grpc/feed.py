@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sized
 from typing import NamedTuple
 
 from shmio.endpoints.grpc.channel import Channel, Listener
+from shmio.endpoints.grpc.courier import Courier
 from shmio.endpoints.grpc.hold import Hold, Moment, Still
 from shmio.endpoints.grpc.inlet import Inlet
 from shmio.endpoints.grpc.subject import Subject
@@ -57,6 +58,7 @@ class Feed:
         self._shown: Frame | Still | None = None  # what listeners have seen; None while quality is bad
         self._good = False  # as last told
         self._loop = loop
+        self._courier = Courier(loop)
         self._on_quality = on_quality
         self._channels: dict[Subject, Channel] = {}
         self._free: list[int] = []  # slots
@@ -233,7 +235,7 @@ class Feed:
         if shown is not None and (stale or (frame is not None and not good)):
             since = shown.number + 1 if frame is None else frame.number
             shown = self._shown = None
-            self._loop.call_soon_threadsafe(self._turn_bad, since)
+            self._courier.post(self._turn_bad, since)
             self._tell(good=False)
         if frame is not None and good:
             self._tell(good=True)
@@ -245,12 +247,12 @@ class Feed:
         if frame is not None:
             self._tell(good=frame.quality is not Quality.BAD)
             if not self._stepped and self._shown is None:
-                self._loop.call_soon_threadsafe(self._adopt, frame)
+                self._courier.post(self._adopt, frame)
 
     def _tell(self, *, good: bool) -> None:
         if good != self._good:
             self._good = good
-            self._loop.call_soon_threadsafe(self._on_quality, self.block.source, good)
+            self._courier.post(self._on_quality, self.block.source, good)
 
     def _show(self, shown: Frame | Still | None, frame: Frame) -> None:
         """Encode what has changed since the frame shown before; everything, if there is none."""
@@ -258,7 +260,7 @@ class Feed:
         batch = [(channel, message) for channel in news if (message := channel.encode(frame)) is not None]
         if batch or self._owed:
             self.messages += len(batch)
-            self._loop.call_soon_threadsafe(self._deliver, frame.number, batch)
+            self._courier.post(self._deliver, frame.number, batch)
 
     def _news(self, shown: Frame | Still | None, frame: Frame) -> list[Channel]:
         """The channels whose bytes have changed since then; all, if nothing was shown."""

@@ -12,6 +12,7 @@ from typing import Any, Final
 
 from google.protobuf.message import Message
 
+from shmio.endpoints.grpc.encoding import delimited, varint
 from shmio.endpoints.grpc.shape import Shape
 from shmio.endpoints.grpc.subject import Encode, Picture
 from shmio.errors import ValueRangeError
@@ -74,8 +75,8 @@ def _text(register: Register, layout: Layout) -> Encode:
         value = decode(frame.image)
         if value is None:
             return None
-        text = wire.ROSMessage(value=to_text(value, register)).SerializeToString()
-        return kind + text + time_stamp(frame.number, frame.clock_ns)
+        text = to_text(value, register).encode()
+        return kind + (b"\x12" + delimited(text) if text else b"") + time_stamp(frame.number, frame.clock_ns)
 
     return encode
 
@@ -83,8 +84,9 @@ def _text(register: Register, layout: Layout) -> Encode:
 @lru_cache(maxsize=64)  # a frame or two for each feed
 def time_stamp(number: int, clock_ns: int) -> bytes:
     """The content of a message without one: the number of its frame or step, and the instance's clock."""
-    stamp = wire.time(sec=clock_ns // 1_000_000_000, nsec=clock_ns)
-    return wire.ROSMessage(timeStamp=wire.Header(seq=number & 0xFFFFFFFF, stamp=stamp)).SerializeToString()
+    seconds = clock_ns // 1_000_000_000
+    stamp = (b"\x08" + varint(seconds) if seconds else b"") + b"\x10" + varint(clock_ns)
+    return b"\x4a" + delimited(b"\x08" + varint(number & 0xFFFFFFFF) + b"\x12" + delimited(stamp))
 
 
 def _structure(found: Shape, layout: Layout) -> Encode:

@@ -5,6 +5,7 @@ A message is put together of serialised fields, which may be concatenated: what 
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterable, Mapping
 from functools import lru_cache
 from typing import Any, Final
@@ -12,7 +13,6 @@ from typing import Any, Final
 import numpy as np
 from google.protobuf.struct_pb2 import NULL_VALUE, ListValue
 from google.protobuf.struct_pb2 import Value as WireValue
-from google.protobuf.timestamp_pb2 import Timestamp
 
 from shmio.endpoints.grpc.encoding import delimited, varint
 from shmio.endpoints.grpc.hold import Moment
@@ -34,25 +34,31 @@ MAX_MEMBERS: Final = 4096
 MAX_LEVELS: Final = 24
 """Structures within each other: the messages that hold them are three times as deep, and readers stop at 100."""
 
+_DOUBLE: Final = struct.Struct("<Bd")
 _TYPES: Final = {"bool": wire.BOOL, "double": wire.NUMBER, "int": wire.NUMBER, "string": wire.STRING}
 
 
 class Encoded:
     """A SimlogMessage without its path: the time stamp of its header, and the fields after that."""
 
-    __slots__ = ("rest", "stamp")
+    __slots__ = ("_last", "rest", "stamp")
 
     def __init__(self, stamp: bytes, rest: bytes) -> None:
         self.stamp = stamp
         self.rest = rest
+        self._last: tuple[bytes | None, bytes] = None, b""
 
     def __len__(self) -> int:
         return len(self.stamp) + len(self.rest)
 
     def under(self, path: bytes) -> bytes:
         """The whole message; ``path``: as :func:`path_field` has it."""
-        header = self.stamp + path
-        return b"\x0a" + varint(len(header)) + header + self.rest
+        last, whole = self._last
+        if last != path:  # most who listen say it in the same way
+            header = self.stamp + path
+            whole = b"\x0a" + varint(len(header)) + header + self.rest
+            self._last = path, whole
+        return whole
 
 
 def value_type(found: Shape) -> wire.ValueType:
@@ -98,7 +104,8 @@ def path_field(path: str) -> bytes:
 def time_stamp(clock_ns: int) -> bytes:
     """The time in a header, from ns of the instance's clock."""
     seconds, nanos = divmod(clock_ns, 1_000_000_000)
-    return b"\x0a" + delimited(Timestamp(seconds=seconds, nanos=nanos).SerializeToString())
+    whole = b"\x08" + varint(seconds) if seconds else b""
+    return b"\x0a" + delimited(whole + b"\x10" + varint(nanos) if nanos else whole)
 
 
 def nothing(stamp: bytes) -> Encoded:
@@ -179,6 +186,8 @@ def _whole(register: Register, layout: Layout) -> Callable[[bytes], bytes | None
     if code and len(register.dims) == 1:
         return _numbers(register, np.dtype(code).newbyteorder(order))
     decode = codec(register, order).decode
+    if code and not register.dims:
+        return lambda image: _DOUBLE.pack(0x11, decode(image))  # field 1 of a Value
 
     def serialise(image: bytes) -> bytes | None:
         value = decode(image)

@@ -8,13 +8,15 @@ from typing import Any
 import pytest
 from google.protobuf.struct_pb2 import Value
 
+from shmio.endpoints.grpc.rosmessage import time_stamp as time_stamp_v1
 from shmio.endpoints.grpc.shape import Shape, shape
-from shmio.endpoints.grpc.values import MAX_LEVELS, encoder, from_wire, path_field, time_stamp, to_wire
+from shmio.endpoints.grpc.values import MAX_LEVELS, Encoded, encoder, from_wire, path_field, time_stamp, to_wire
 from shmio.errors import ValueRangeError
 from shmio.layout.codec import codec
 from shmio.layout.model import ByteOrder, Layout, Register, array_size
 from shmio.layout.topic import Topic
 from shmio.layout.types import element_type
+from shmio.wire import simlog_v1_pb2 as v1
 from shmio.wire import simlog_v2_pb2 as v2
 from tests.unit.endpoints.harness import plain
 
@@ -138,3 +140,19 @@ def test_a_text_has_all_digits_of_a_long_number() -> None:
     counter = Shape("counter", (Register("counter", "LINT", (), 0, None, 8, 1),), whole=True)
     assert from_wire(Value(string_value=str(2**63 - 1)), counter) == {"counter": 2**63 - 1}
     assert from_wire(Value(number_value=2**53), counter) == {"counter": 2**53}
+
+
+@pytest.mark.parametrize("clock_ns", [0, 1, 999_999_999, 1_000_000_000, 3_000_000_007, 2**62])
+def test_times_are_as_protobuf_writes_them(clock_ns: int) -> None:
+    seconds, nanos = divmod(clock_ns, 1_000_000_000)
+    header = v2.SimlogMessage.FromString(Encoded(time_stamp(clock_ns), b"").under(b"")).header
+    assert (header.timestamp.seconds, header.timestamp.nanos) == (seconds, nanos)
+    stamp = v1.ROSMessage.FromString(time_stamp_v1(2**32 + 5, clock_ns)).timeStamp
+    assert (stamp.seq, stamp.stamp.sec, stamp.stamp.nsec) == (5, seconds, clock_ns)
+
+
+def test_one_value_is_sent_under_each_of_its_paths() -> None:
+    encoded = Encoded(time_stamp(5), b"")
+    paths = ["cell/a", "CELL://a", "cell/a", ""]
+    found = [v2.SimlogMessage.FromString(encoded.under(path_field(path))).header.path for path in paths]
+    assert found == paths
