@@ -6,6 +6,8 @@ import asyncio
 import threading
 from typing import Any
 
+import pytest
+
 from shmio.endpoints.grpc.courier import Courier
 from tests.unit.endpoints.harness import TIMEOUT_S
 
@@ -44,7 +46,7 @@ def test_a_call_that_fails_does_not_take_others_with_it() -> None:
     asyncio.run(test())
 
 
-def test_a_busy_loop_is_woken_once() -> None:
+def test_a_busy_loop_is_woken_once(monkeypatch: pytest.MonkeyPatch) -> None:
     async def test() -> None:
         loop, done, calls = asyncio.get_running_loop(), asyncio.Event(), list[object]()
         wake = loop.call_soon_threadsafe
@@ -53,7 +55,7 @@ def test_a_busy_loop_is_woken_once() -> None:
             calls.append(arguments)
             return wake(*arguments)
 
-        loop.call_soon_threadsafe = count  # type: ignore[method-assign]
+        monkeypatch.setattr(loop, "call_soon_threadsafe", count)
         courier = Courier(loop)
         for _ in range(100):
             courier.post(int)
