@@ -99,7 +99,7 @@ class Coordinator:
 
         ValueRangeError: not within 1 us and 1 h; TimeError.
         """
-        _check(dt_ns)
+        check_step(dt_ns)
         with self._turn:
             self.take_over()
             self._write(replace(self.read(), step_size_ns=dt_ns))
@@ -126,7 +126,7 @@ class Coordinator:
             self.take_over()
             before = self.read()
             dt_ns = before.step_size_ns if dt_ns is None else dt_ns
-            _check(dt_ns)
+            check_step(dt_ns)
             step = Step(before.step + 1, before.time_ns + dt_ns, dt_ns)
             participants = self._participants()
             asked = replace(before, step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
@@ -283,6 +283,7 @@ def _answer(block: Block, number: int) -> str | None:
     return frame.reason or "it gave no reason" if frame.quality is Quality.BAD else ""
 
 
-def _check(dt_ns: int) -> None:
+def check_step(dt_ns: float) -> None:
+    """ValueRangeError: it is no length of a step."""
     if not MIN_STEP_NS <= dt_ns <= MAX_STEP_NS:
         raise ValueRangeError(f"a step is from 1 us to 1 h, not {dt_ns / 1e6:g} ms")

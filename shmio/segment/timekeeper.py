@@ -8,7 +8,7 @@ from typing import Final
 
 from shmio.errors import NotRunningError, ShmioError, TimeError
 from shmio.segment.clock import ClockState
-from shmio.segment.coordinator import Coordinator, Step
+from shmio.segment.coordinator import Coordinator, Step, check_step
 from shmio.segment.segment import Segment
 
 PATIENCE_S: Final = 2.0
@@ -37,6 +37,8 @@ class Timekeeper:
 
     def play(self, rate: float = 1.0, dt_ns: int | None = None) -> None:
         """Step from now on by itself, ``rate`` times as fast as real time. TimeError, ValueRangeError."""
+        if dt_ns is not None:
+            check_step(dt_ns)
         self.pause()
         self._coordinator.set_playing(True, rate)
         self._paused.clear()
@@ -101,12 +103,20 @@ class Timed:
         until it detaches. The attachment must be ``writable``. TimeError: another program owns time, or the step
         failed: who did not answer or failed, and why; ValueRangeError: not within 1 us and 1 h.
         """
-        return self._time.step(None if dt_ms is None else round(dt_ms * 1e6))
+        return self._time.step(_ns(dt_ms))
 
     def play(self, rate: float = 1.0, dt_ms: float | None = None) -> None:
         """Step from now on ``rate`` times as fast as real time, until :meth:`pause`. TimeError, ValueRangeError."""
-        self._time.play(rate, None if dt_ms is None else round(dt_ms * 1e6))
+        self._time.play(rate, _ns(dt_ms))
 
     def pause(self) -> None:
         """Have time stand. TimeError: another program owns it, or a step failed while it was played."""
         self._time.pause()
+
+
+def _ns(dt_ms: float | None) -> int | None:
+    """The length of a step; ValueRangeError."""
+    if dt_ms is None:
+        return None
+    check_step(dt_ms * 1e6)  # before it is made a whole number: infinity is none
+    return round(dt_ms * 1e6)
