@@ -86,10 +86,10 @@ def _registers(text: str, layouts: Mapping[str, Layout]) -> Iterator[tuple[str, 
     if match is None:
         count = 0
         for register in chosen(layout, topic.path or "**"):
+            yield topic.source, direction, register
             count += 1
             if count > MAX_REGISTERS:  # resolve() says so
                 return
-            yield topic.source, direction, register
         if not count:
             look_up(layout, topic)  # its error tells what is near
             raise PathError(f"{text} names no register")

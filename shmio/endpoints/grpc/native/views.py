@@ -122,7 +122,7 @@ class Selection:
     def _under_injections(self) -> Marks:
         cover = np.zeros(self.block.layout.size, np.uint8)
         for standing in self.block.standing.read():
-            if standing.direction == "out":
+            if standing.direction == "out" and standing.active:
                 for offset, size, mask in standing.ranges:
                     cover[offset : offset + size] |= mask
         starts, stops, masks = self._extents
