@@ -126,7 +126,7 @@ def _list(cell: Attachment, *, as_json: bool) -> None:
         print(dumps(found))
         return
     for one_found in found:
-        paths = one_found["registers"]
+        paths = _targets(one_found)
         more = f" and {len(paths) - 3} more" if paths[3:] else ""
         keep = ", kept" if one_found["keep"] else ""
         by = f"pid {one_found['pid']}" if one_found["pid"] else "supervisor.toml"
@@ -135,6 +135,16 @@ def _list(cell: Attachment, *, as_json: bool) -> None:
             f"priority {one_found['priority']}, {by}{keep}{_running(one_found.get('running'))}  "
             f"{printable(one_found['name'])}".rstrip()
         )
+
+
+def _targets(one_found: dict[str, Any]) -> list[str]:
+    """What it is over: of a declared one as that says it."""
+    running = one_found.get("running")
+    if running is None:
+        return list(one_found["registers"])
+    target = running["declaration"]["target"]
+    texts = [target] if isinstance(target, str) else target
+    return [text.removesuffix(f"/{one_found['direction']}") for text in texts]
 
 
 def _running(running: dict[str, Any] | None) -> str:

@@ -18,6 +18,8 @@ def execute(arguments: argparse.Namespace) -> int:
     print(f"{file}: instance {plan.instance}, {len(plan.jobs)} processes")
     for source, block in zip(prepared.config.source, plan.blocks, strict=True):
         print(printable(f"  {_describe(block, peer(source))}"))
+    for text in prepared.injections:
+        print(printable(f"  {text}"))
     print(f"  segment {PREFIX}{plan.instance}: {plan.segment_bytes / 1e6:.2f} MB of shared memory")
     for warning in plan.warnings:
         print(printable(warning))

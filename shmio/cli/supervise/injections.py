@@ -16,10 +16,14 @@ from shmio.segment import NO_WRITER
 from shmio.segment.standing import Running, Standing, declared_document, encode, ranges_of
 
 
-def check_injections(config: Config, layouts: Mapping[str, Layout]) -> dict[str, bytes]:
-    """What each source's process is given of them, by its name; ConfigError with the full key."""
+def check_injections(config: Config, layouts: Mapping[str, Layout]) -> tuple[dict[str, bytes], tuple[str, ...]]:
+    """What each source's process is given of them, by its name, and what they are, a line each.
+
+    ConfigError with the full key.
+    """
     periods_ns = {source.name: source.period_ns for source in config.source}
     found: dict[str, list[Program]] = {}
+    described = []
     for index, declaration in enumerate(config.injection):
         try:
             if not config.source:
@@ -31,7 +35,9 @@ def check_injections(config: Config, layouts: Mapping[str, Layout]) -> dict[str,
         except ConfigError as error:
             raise ConfigError(f"injection[{index}].{error}") from None
         found.setdefault(program.source, []).append(program)
-    return {source: _document(source, programs) for source, programs in found.items()}
+        over = f"{declaration.operation} over source {program.source} /{program.direction}"
+        described.append(f"injection {declaration.name}: {over}")
+    return {source: _document(source, programs) for source, programs in found.items()}, tuple(described)
 
 
 def _check_in(program: Program, source: Source, layout: Layout) -> None:

@@ -35,6 +35,8 @@ class Prepared:
     """Of each source, by its name."""
     emulated: dict[str, tuple[Layout, ...]]
     """All blocks of each emulator, by its name."""
+    injections: tuple[str, ...]
+    """What is declared, in words."""
 
 
 def prepare(file: Path, mode: str = "live") -> Prepared:
@@ -51,7 +53,7 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
         check_listening(config)
         layouts, computed = check_sources(config, files)
         emulated = {emulator.name: _check_emulator(i, emulator, files) for i, emulator in enumerate(config.emulator)}
-        declared = check_injections(config, layouts)
+        declared, described = check_injections(config, layouts)
         odd = [*_odd(config, layouts), *_not_served(config, layouts, emulated), *_unread(emulated)]
     except ConfigError as error:
         raise ConfigError(f"{file}: {named(str(error), msgspec.to_builtins(config))}") from None
@@ -59,7 +61,7 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
     plan = make_plan(
         config, layouts, emulated, config_file=file, mode=mode, declared=declared, warnings=warnings, computed=computed
     )
-    return Prepared(config, plan, layouts, emulated)
+    return Prepared(config, plan, layouts, emulated, described)
 
 
 def peer(source: Source) -> str:

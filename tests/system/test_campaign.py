@@ -1,0 +1,158 @@
+"""Campaigns in the whole A50 cell: by a file, twice with the same seed, recorded; and from the configuration."""
+
+from __future__ import annotations
+
+import json
+import re
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+import shmio
+from shmio.segment import Cursor, Event, EventKind
+from shmio.segment.attach import Attachment
+from shmio.testing.cell import BIN, CONFIG, PATIENCE_S, Cell, until
+
+ARMED = CONFIG.replace('connector = "s7"\n', 'connector = "s7"\nwritable = ["Outputs"]\narmed = true\n')
+RECORDER = """
+[recorder]
+directory = "dumps"
+"""
+CONFIGURED = """
+[[injection]]
+name = "blind"
+target = "cell/Outputs/98"
+operation = "set"
+value = 77
+when = "cell/Outputs/99.%X7"
+"""
+# Bytes from 90 on are of no meaning to the controller's program.
+CAMPAIGN = """
+[[injection]]
+name = "noise"
+target = "cell/Outputs/100..101"
+operation = "noise"
+amplitude = 20
+when = "cell/Outputs/99 == 1"
+for_s = 0.6
+times = 1
+
+[[injection]]
+name = "doubled"
+target = "cell/Outputs/98/in"
+operation = "scale"
+value = 2
+"""
+
+
+@pytest.fixture
+def cell(make_cell: Callable[..., Cell], tmp_path: Path) -> Cell:
+    (tmp_path / "campaign.toml").write_text(CAMPAIGN)
+    return make_cell(config=ARMED + RECORDER)
+
+
+def start(cell: Cell) -> None:
+    cell.up()
+    until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")
+
+
+@contextmanager
+def campaign(cell: Cell, *options: str) -> Iterator[list[str]]:
+    """The command at work, and what it had told when it was laid; afterwards all that it told."""
+    command = [str(BIN / "shmio"), "inject", "--file", "campaign.toml", *options]
+    with subprocess.Popen(command, cwd=cell.folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as popen:
+        try:
+            assert popen.stdout is not None
+            told = [popen.stdout.readline() for _ in range(3)]
+            assert all(told), popen.communicate(timeout=PATIENCE_S)
+            yield told
+            popen.send_signal(signal.SIGINT)
+            rest, errors = popen.communicate(timeout=PATIENCE_S)
+            assert popen.returncode == 0, errors
+            told += rest.splitlines(keepends=True)
+        finally:
+            popen.kill()
+
+
+def event(events: Cursor[Event], kind: EventKind, name: str = "noise") -> Event:
+    while (found := events.next(PATIENCE_S)) is not None:
+        if found.kind == kind and found.text == name:
+            return found
+    raise AssertionError(f"no event {kind} of {name}")
+
+
+def noise_of(cell: Cell, local: Attachment, seed: int) -> dict[int, tuple[object, object]]:
+    """What consumers see in a run of the campaign, by cycles since its noise began."""
+    local.write({"cell/Outputs/98": 0, "cell/Outputs/99": 0, "cell/Outputs/100": 100, "cell/Outputs/101": 100})
+    block = local.block("cell")
+    frames, events = block.cursor(), block.events.cursor()
+    with campaign(cell, "--seed", str(seed)) as told:
+        assert told[0] == f"seed {seed}: --seed {seed} does the same again\n"
+        event(events, EventKind.ACTIVATED, "doubled")
+        (outcome,) = local.write({"cell/Outputs/98": 21})
+        assert outcome.done
+        until(lambda: local["cell/Outputs/98"] == 42, "the device has twice what was written")
+        local.write({"cell/Outputs/99": 1})
+        begin, end = event(events, EventKind.ACTIVATED), event(events, EventKind.DEACTIVATED)
+    seen: dict[int, tuple[object, object]] = {}
+    at = block.layout.registers[block.layout.by_path["Outputs"]].offset + 100
+    while (frame := frames.next(PATIENCE_S)) is not None and frame.cycle < end.cycle:
+        assert frame.raw[at : at + 2] == b"\x64\x64", "the device's own values are there, too"
+        if frame.cycle >= begin.cycle:
+            seen[frame.cycle - begin.cycle] = (frame.image[at], frame.image[at + 1])
+    assert any(re.search(rf"cycle {begin.cycle}  {begin.injection} activated: noise", line) for line in told), told
+    assert local.injections()["cell"] == ()
+    return seen
+
+
+def test_a_campaign_runs_twice_with_the_same_seed_and_is_in_the_recording(cell: Cell) -> None:
+    start(cell)
+    with shmio.attach(cell.instance, writable=True) as local:
+        first, second, other = (noise_of(cell, local, seed) for seed in (7, 7, 8))
+    common = first.keys() & second.keys()
+    assert len(common) > 10, "both runs have cycles in common"
+    assert {place: first[place] for place in common} == {place: second[place] for place in common}
+    assert any(first[place] != other[place] for place in first.keys() & other.keys())
+    assert all(80 <= value <= 120 for pair in first.values() for value in pair if isinstance(value, int))
+    cell.down()
+    (file,) = (cell.folder / "dumps").glob("*.mem")
+    recorded = cell.run("shmio-dump", "cat", "--json", str(file), "cell/Outputs/99").stdout
+    events = [line for line in map(json.loads, recorded.splitlines()) if line.get("text") == "noise"]
+    assert [line["kind"] for line in events].count("activated") == 3, events[:5]
+    declared = b"".join(bytes.fromhex(line["data"]) for line in events if line["kind"] == "injected")
+    assert declared.count(b'"seed":7') == 2, "what is needed for doing it again"
+    assert declared.count(b'"seed":8') == 1
+
+
+def test_the_configuration_declares_and_a_reload_changes_without_a_restart(cell: Cell) -> None:
+    file = cell.folder / "supervisor.toml"
+    plain = file.read_text()
+    file.write_text(plain + CONFIGURED)
+    checked = cell.supervisor("check")
+    assert "injection blind: set over source cell /out" in checked.stdout
+    start(cell)
+    pid = cell.processes()["cell"]["pid"]
+    with shmio.attach(cell.instance, writable=True) as local:
+        local.write({"cell/Outputs/98": 5, "cell/Outputs/99": 0x80})
+        until(lambda: local["cell/Outputs/98"] == 77, "injected")
+        assert local.read("cell/Outputs/98").provenance == "injected"
+        listed = cell.run("shmio", "inject", "--list").stdout
+        assert re.search(r"cell/Outputs/98 /out, .*supervisor.toml, .*set, seed \d+: active.*blind", listed), listed
+        file.write_text(plain + CONFIGURED.replace("77", "78"))
+        assert "injection blind: changed at cell" in cell.supervisor("reload").stdout
+        until(lambda: local["cell/Outputs/98"] == 78, "changed")
+        assert cell.run("shmio", "inject", "--lift-all").returncode == 0
+        until(lambda: local["cell/Outputs/98"] == 5, "lifted in an emergency")
+        file.write_text(plain)
+        assert "injection blind: lifted at cell" in cell.supervisor("reload").stdout
+        until(lambda: local.injections()["cell"] == (), "gone")
+    assert cell.processes()["cell"]["pid"] == pid
+    file.write_text(plain + CONFIGURED.replace("cell/Outputs/98", "cell/Outputs/9800"))
+    refused = cell.supervisor("reload")
+    assert refused.returncode == 1
+    assert "injection[0].target: cell/Outputs: index [9800] is outside" in refused.stderr
+    assert '(injection "blind")' in refused.stderr
