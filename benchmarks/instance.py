@@ -26,6 +26,7 @@ START_S = 60.0
 _HEAD = """
 [instance]
 name = "{name}"
+clock = "{clock}"
 [grpc]
 listen = ["{grpc}"]
 """
@@ -100,14 +101,14 @@ def instance(period_ms: float, *, more: str = "", priority: int | None = None) -
 
 
 @contextmanager
-def started(sources: Sequence[Polled], *, more: str = "") -> Iterator[Instance]:
+def started(sources: Sequence[Polled], *, more: str = "", clock: str = "wall") -> Iterator[Instance]:
     """Run an instance with these sources; ``more``: further sections of the configuration."""
     name = f"bench-{os.getpid()}"
     with ExitStack() as stack:
         grpc = stack.enter_context(reserved_port())
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         config = folder / "supervisor.toml"
-        parts = [_HEAD.format(name=name, grpc=grpc), *(source.text() for source in sources), more]
+        parts = [_HEAD.format(name=name, grpc=grpc, clock=clock), *(source.text() for source in sources), more]
         config.write_text("".join(parts))
         output = stack.enter_context((folder / "output").open("w+"))
         supervisor = subprocess.Popen(

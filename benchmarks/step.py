@@ -1,0 +1,68 @@
+"""Steps a second: a model with 100 registers that all change, stepped from another process that receives them.
+
+Each client steps, waits for the answer, and for everything that it has subscribed to. Model, endpoint and client are
+processes of their own. They take turns; while one steps, nobody else has subscribed.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+
+from common import HERE, Child, begin, interleave, report
+from instance import started
+
+from shmio import attach
+
+OURS = "v2, 100 topics in one stream"
+MODEL = f"""
+[[source]]
+name = "sim"
+connector = "simulation"
+model = "counting:Counting"
+folder = "{HERE}"
+"""
+CONTENDERS = {
+    OURS: "v2",
+    "v2, an array of 100 as one topic": "v2-array",
+    "v1, 100 topics and model/clock": "v1",
+    "SimServerAPI.step, no subscriber": "alone",
+}
+
+
+def local(instance: str, duration_s: float) -> Callable[[], float]:
+    """A program on the host that steps; nobody has subscribed."""
+
+    def sample() -> float:
+        with attach(instance, writable=True) as program:
+            program.step()
+            steps, begun_s = 0, time.perf_counter()
+            while (taken_s := time.perf_counter() - begun_s) < duration_s:
+                program.step()
+                steps += 1
+        return steps / taken_s
+
+    return sample
+
+
+def remote(client: Child, duration_s: float) -> Callable[[], float]:
+    """A client in a process of its own."""
+    return lambda: float(client.ask(duration_s))
+
+
+def main() -> None:
+    quick = begin("Steps: a model with 100 changing registers")
+    duration_s, rounds = (0.5, 1) if quick else (3.0, 9)
+    with ExitStack() as stack:
+        running = stack.enter_context(started([], more=MODEL, clock="stepped"))
+        contenders = {
+            name: remote(stack.enter_context(Child("stepping.py", running.grpc, kind)), duration_s)
+            for name, kind in CONTENDERS.items()
+        }
+        contenders["a program on the host, no subscriber"] = local(running.segment.instance, duration_s)
+        report("steps a second", interleave(contenders, rounds), OURS, "more")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""A client that steps and has subscribed to what changes, as a process. A number of seconds in; steps a second out.
+
+``v2`` and ``v1``: it steps when it has received all of the step before. ``alone``: it has subscribed to nothing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from queue import SimpleQueue
+from typing import Any
+
+import grpc
+from common import tell
+from counting import COUNT
+
+from shmio.wire import simlog_v1_pb2 as v1
+from shmio.wire import simlog_v2_pb2 as v2
+from shmio.wire import simserver_pb2 as sim
+from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub as V1Stub
+from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as V2Stub
+from shmio.wire.simserver_pb2_grpc import SimServerAPIStub
+
+PATHS = [f"sim/values/r{index:02}" for index in range(COUNT)]
+PATIENCE_S = 30
+
+
+@contextmanager
+def alone(channel: grpc.Channel) -> Iterator[Callable[[], None]]:
+    """Nobody has subscribed."""
+    stub: Any = SimServerAPIStub(channel)  # type: ignore[no-untyped-call]
+
+    def step() -> None:
+        stub.step(sim.StepRequest(), timeout=PATIENCE_S)
+
+    yield step
+
+
+@contextmanager
+def version_2(channel: grpc.Channel, paths: list[str]) -> Iterator[Callable[[], None]]:
+    """One stream; a step is over when its marker has come, and all values of it."""
+    stub: Any = V2Stub(channel)  # type: ignore[no-untyped-call]
+    uuid = f"benchmark-{time.monotonic_ns()}"
+    stream = stub.CreateSubscriber(v2.Subscriber(name="benchmark", uuid=uuid))
+    stream.initial_metadata()
+    for path in [*paths, "SIMLOG://step"]:
+        stub.Subscribe(v2.SubscriptionRequest(path=path, subscriberUUID=uuid), timeout=PATIENCE_S)
+    for _ in paths:
+        next(stream)
+    with alone(channel) as call:
+
+        def step() -> None:
+            call()
+            for _ in paths:
+                next(stream)
+            if next(stream).header.path != "SIMLOG://step":
+                raise SystemExit("the marker is not behind the values")
+
+        yield step
+    stream.cancel()
+
+
+@contextmanager
+def version_1(channel: grpc.Channel) -> Iterator[Callable[[], None]]:
+    """A stream for each register, and one for the clock, each followed in a thread."""
+    stub: Any = V1Stub(channel)  # type: ignore[no-untyped-call]
+    came: SimpleQueue[None] = SimpleQueue()
+
+    def follow(stream: Any) -> None:
+        try:
+            for _ in stream:
+                came.put(None)
+        except grpc.RpcError:
+            return
+
+    streams = [stub.Subscribe(v1.TopicDescriptor(path=path)) for path in [*PATHS, "model/clock"]]
+    threads = [threading.Thread(target=follow, args=(stream,), daemon=True) for stream in streams]
+    for thread in threads:
+        thread.start()
+    for _ in streams:
+        came.get(timeout=PATIENCE_S)
+
+    def step() -> None:
+        if stub.step(v1.StepRequest(), timeout=PATIENCE_S).code:
+            raise SystemExit("a step failed: see the log of the endpoint")
+        for _ in streams:
+            came.get(timeout=PATIENCE_S)
+
+    yield step
+    for stream in streams:
+        stream.cancel()
+    for thread in threads:
+        thread.join()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("target")
+    parser.add_argument("kind", choices=["alone", "v2", "v2-array", "v1"])
+    arguments = parser.parse_args()
+    kinds: dict[str, Callable[[grpc.Channel], Any]] = {
+        "alone": alone,
+        "v2": lambda channel: version_2(channel, PATHS),
+        "v2-array": lambda channel: version_2(channel, ["sim/row"]),
+        "v1": version_1,
+    }
+    with grpc.insecure_channel(arguments.target) as channel:
+        tell("ready")
+        for line in sys.stdin:
+            with kinds[arguments.kind](channel) as step:
+                step()
+                steps, begun_s = 0, time.perf_counter()
+                while (taken_s := time.perf_counter() - begun_s) < float(line):
+                    step()
+                    steps += 1
+            tell(steps / taken_s)
+    tell("done")
+
+
+if __name__ == "__main__":
+    main()
