@@ -1,7 +1,8 @@
 """Steps a second: a model with 100 registers that all change, stepped from another process that receives them.
 
 Each client steps, waits for the answer, and for everything that it has subscribed to. Model, endpoint and client are
-processes of their own. They take turns; while one steps, nobody else has subscribed.
+processes of their own. They take turns; while one steps, nobody else has subscribed. The bare server has no model, and
+nothing to find out: it is what sending alone takes.
 """
 
 from __future__ import annotations
@@ -11,11 +12,13 @@ from collections.abc import Callable
 from contextlib import ExitStack
 
 from common import HERE, Child, begin, interleave, report
+from counting import COUNT
 from instance import started
 
 from shmio import attach
 
 OURS = "v2, 100 topics in one stream"
+BARE = "a bare grpc.aio server, 101 ready messages in one stream"
 MODEL = f"""
 [[source]]
 name = "sim"
@@ -25,6 +28,7 @@ folder = "{HERE}"
 """
 CONTENDERS = {
     OURS: "v2",
+    "v2, a structure of 100 as one topic": "v2-structure",
     "v2, an array of 100 as one topic": "v2-array",
     "v1, 100 topics and model/clock": "v1",
     "SimServerAPI.step, no subscriber": "alone",
@@ -60,6 +64,9 @@ def main() -> None:
             name: remote(stack.enter_context(Child("stepping.py", running.grpc, kind)), duration_s)
             for name, kind in CONTENDERS.items()
         }
+        ready = stack.enter_context(Child("bare_steps.py", COUNT + 1))
+        client = stack.enter_context(Child("stepping.py", ready.hello, "bare"))
+        contenders[BARE] = remote(client, duration_s)
         contenders["a program on the host, no subscriber"] = local(running.segment.instance, duration_s)
         report("steps a second", interleave(contenders, rounds), OURS, "more")
 

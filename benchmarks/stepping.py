@@ -1,6 +1,7 @@
 """A client that steps and has subscribed to what changes, as a process. A number of seconds in; steps a second out.
 
-``v2`` and ``v1``: it steps when it has received all of the step before. ``alone``: it has subscribed to nothing.
+It steps when it has received all of the step before. ``alone``: it has subscribed to nothing; ``bare``: to a server
+that has its messages ready.
 """
 
 from __future__ import annotations
@@ -65,6 +66,22 @@ def version_2(channel: grpc.Channel, paths: list[str]) -> Iterator[Callable[[], 
 
 
 @contextmanager
+def bare(channel: grpc.Channel) -> Iterator[Callable[[], None]]:
+    """As many messages of a server that does nothing else."""
+    follow: Any = channel.unary_stream("/benchmark.Bare/Follow")
+    call: Any = channel.unary_unary("/benchmark.Bare/Step")
+    stream = follow(b"")
+
+    def step() -> None:
+        call(b"", timeout=PATIENCE_S)
+        for _ in range(COUNT + 1):
+            v2.SimlogMessage.FromString(next(stream))
+
+    yield step
+    stream.cancel()
+
+
+@contextmanager
 def version_1(channel: grpc.Channel) -> Iterator[Callable[[], None]]:
     """A stream for each register, and one for the clock, each followed in a thread."""
     stub: Any = V1Stub(channel)  # type: ignore[no-untyped-call]
@@ -100,13 +117,15 @@ def version_1(channel: grpc.Channel) -> Iterator[Callable[[], None]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("target")
-    parser.add_argument("kind", choices=["alone", "v2", "v2-array", "v1"])
+    parser.add_argument("kind", choices=["alone", "v2", "v2-array", "v2-structure", "v1", "bare"])
     arguments = parser.parse_args()
     kinds: dict[str, Callable[[grpc.Channel], Any]] = {
         "alone": alone,
         "v2": lambda channel: version_2(channel, PATHS),
         "v2-array": lambda channel: version_2(channel, ["sim/row"]),
+        "v2-structure": lambda channel: version_2(channel, ["sim/values"]),
         "v1": version_1,
+        "bare": bare,
     }
     with grpc.insecure_channel(arguments.target) as channel:
         tell("ready")

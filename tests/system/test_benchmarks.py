@@ -49,6 +49,17 @@ def printed(benchmark: str) -> str:
                 "eventfd": 4,
             },
         ),
+        (
+            "step",
+            ROW,
+            {
+                "v2, 100 topics in one stream": 1,
+                "v2, a structure of 100 as one topic": 1,
+                "v2, an array of 100 as one topic": 1,
+                "v1, 100 topics and model/clock": 1,
+                "a bare grpc.aio server, 101 ready messages in one stream": 1,
+            },
+        ),
         ("command", SPREAD, {"shmio": 2, "python-snap7, without an instance": 2, "accepted to written": 1}),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

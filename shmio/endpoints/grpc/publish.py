@@ -149,9 +149,9 @@ class Publisher:
 
         What has come and was not read yet is read. A client that goes on sending is waited for ``SETTLE_S`` at most.
         """
+        before: dict[_Stream, int] = {}
         with suppress(TimeoutError):
             async with asyncio.timeout(SETTLE_S):
-                before: dict[_Stream, int] | None = None
                 while (now := {stream: stream.received for stream in self._streams.get(peer, ())}) != before:
                     for stream in now:
                         await stream.heard()
