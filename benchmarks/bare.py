@@ -1,37 +1,70 @@
-"""A bare grpc.aio server, as a process: every call gets the same ready bytes, as fast as its client takes them."""
+"""A bare grpc.aio server, as a process: every call gets the same ready bytes.
+
+As fast as its client takes them; or, with a second argument, so many times a second, out of a queue for each stream, as
+a server has it whose values come from somewhere else.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import sys
+import time
 from collections.abc import AsyncIterator
 from typing import Any
 
 import grpc
 from common import tell
 
+QUEUE = 64
+
 
 class Everything(grpc.GenericRpcHandler):
     """Answers any call."""
 
-    def __init__(self, message: bytes) -> None:
+    def __init__(self, message: bytes, hz: float) -> None:
         self._message = message
+        self._hz = hz
+        self._queues: set[asyncio.Queue[bytes]] = set()
 
     def service(self, _: Any) -> Any:
-        return grpc.unary_stream_rpc_method_handler(self._stream)
+        return grpc.unary_stream_rpc_method_handler(self._paced if self._hz else self._stream)
 
     async def _stream(self, _request: bytes, _context: Any) -> AsyncIterator[bytes]:
         while True:
             yield self._message
 
+    async def _paced(self, _request: bytes, _context: Any) -> AsyncIterator[bytes]:
+        queue: asyncio.Queue[bytes] = asyncio.Queue(QUEUE)
+        self._queues.add(queue)
+        try:
+            yield self._message
+            while True:
+                yield await queue.get()
+        finally:
+            self._queues.discard(queue)
+
+    async def pace(self) -> None:
+        """Fill the queues, for ever."""
+        begun_s, count = time.monotonic(), 0
+        while self._hz:
+            while count < (time.monotonic() - begun_s) * self._hz:
+                count += 1
+                for queue in self._queues:
+                    if not queue.full():
+                        queue.put_nowait(self._message)
+            await asyncio.sleep(1 / min(self._hz, 1000))
+
 
 async def main() -> None:
+    handler = Everything(bytes(int(sys.argv[1])), float(sys.argv[2]) if len(sys.argv) > 2 else 0)
     server = grpc.aio.server()
-    server.add_generic_rpc_handlers([Everything(bytes(int(sys.argv[1])))])
+    server.add_generic_rpc_handlers([handler])
     port = server.add_insecure_port("127.0.0.1:0")
     await server.start()
+    pacing = asyncio.create_task(handler.pace())
     tell(f"127.0.0.1:{port}")
     await asyncio.to_thread(sys.stdin.read)
+    pacing.cancel()
     await server.stop(0)
 
 

@@ -59,11 +59,12 @@ function open({ method, request, then }) {
   return new Promise((resolve, reject) => {
     const stream = client.makeServerStreamRequest(method, raw, raw, Buffer.from(request, 'base64'));
     stream.on('error', reject);
-    stream.on('metadata', () => {
-      for (const call of then) {
-        client.makeUnaryRequest(call.method, raw, raw, Buffer.from(call.request, 'base64'), (error) => error && reject(error));
-      }
-    });
+    const next = (error) => {
+      if (error) reject(error);
+      const call = then.shift();
+      if (call) client.makeUnaryRequest(call.method, raw, raw, Buffer.from(call.request, 'base64'), next);
+    };
+    stream.on('metadata', () => next(null));
     stream.on('data', (data) => {
       messages += 1;
       if (specification.stamps) latencies.push((Number(process.hrtime.bigint()) - startedNs - stamp(data)) / 1000);

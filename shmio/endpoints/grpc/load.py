@@ -39,12 +39,14 @@ class Load:
 
     def add(self, message: Sized) -> None:
         """One waits."""
+        size = len(message)
         self.count += 1
-        self.size += len(message)
-        self._total.size += len(message)
+        self.size += size
+        self._total.size += size
 
     def remove(self, message: Sized) -> None:
         """It waits no more."""
+        size = len(message)
         self.count -= 1
-        self.size -= len(message)
-        self._total.size -= len(message)
+        self.size -= size
+        self._total.size -= size

@@ -47,10 +47,12 @@ class Outbox:
 
     def add(self, lane: _Lane, message: Sized) -> int:
         """Take a message; its number."""
-        number, self._next = self._next, self._next + 1
+        number = self._next
+        self._next = number + 1
         self._waiting[number] = lane, message
         lane.load.add(message)
-        self._wake()
+        if self._waiter is not None:
+            self._wake()
         return number
 
     def drop(self, number: int) -> None:
@@ -112,9 +114,11 @@ class Outbox:
 
         The one given before is with the client then, as far as flow control lets it.
         """
-        self._taken = next(iter(self._waiting), self._next)
-        self._tell()
-        while not self._waiting:
+        waiting = self._waiting
+        self._taken = next(iter(waiting)) if waiting else self._next
+        if self._told is not None:
+            self._tell()
+        while not waiting:
             if self._ended:
                 self._ended = False
                 return None
@@ -123,7 +127,7 @@ class Outbox:
                 await self._waiter
             finally:
                 self._waiter = None
-        _, (lane, message) = self._waiting.popitem(last=False)
+        _, (lane, message) = waiting.popitem(last=False)
         return lane.take(message)
 
     def _wake(self) -> None:
@@ -181,7 +185,8 @@ class StateLane(_Lane):
 
     def deliver(self, message: Sized) -> None:
         """Add a message, in place of the topic's that wait if they are too many."""
-        if len(self._numbers) >= TOPIC_BOUND or self.load.full(message, STATE_BOUND):
+        waits = len(self._numbers)  # of a client that keeps up nothing does, and this is all
+        if waits >= TOPIC_BOUND or (self.load.count and self.load.full(message, STATE_BOUND)):
             self.drop()
         self._add(message)
 
