@@ -4,7 +4,7 @@ Clients are those of @grpc/grpc-js, one process with a connection for each strea
 the same for all; a subscriber of version 2 has 100. Frames come as fast as the bare server could send what they change,
 or a little faster. The source that publishes them is one process more than the bare server has beside it: where cores
 are short, the server's CPU time for an update says more than the rate. *Out of a queue* is the bare server with an
-asyncio.Queue for each stream, filled at the pace of the frames: what any server must do whose values come from elsewhere.
+asyncio.Queue for each stream, filled at the pace of the frames: what a server must do whose values come from elsewhere.
 """
 
 from __future__ import annotations
