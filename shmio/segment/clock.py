@@ -9,9 +9,8 @@ from __future__ import annotations
 import math
 import struct
 import time
-from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Final
+from typing import Final, NamedTuple
 
 from shmio.errors import SegmentError
 from shmio.segment import _atomics
@@ -27,6 +26,7 @@ _COPIES_AT: Final = (64, 320)
 _TABLE_AT: Final = 576
 _ENTRY: Final = struct.Struct("<QII")  # delivered, bell, 0
 _STATE: Final = struct.Struct("<IIQqqQqdI4x168s")
+_TIME: Final = struct.Struct("<IIQqq")  # how it begins
 _NOTE_SIZE: Final = 167
 _PLAYING: Final = 1
 _STEPPING: Final = 2
@@ -43,8 +43,7 @@ class ClockMode(IntEnum):
         return self.name.lower()
 
 
-@dataclass(frozen=True, slots=True)
-class ClockState:
+class ClockState(NamedTuple):
     """The page at one moment.
 
     ``step``: number of the last step asked for; ``time_ns``: the instance's clock after it, ``dt_ns`` before which it
@@ -120,11 +119,15 @@ class ClockPage:
 
     def read(self) -> ClockState:
         """The page as it is now. SegmentError: it cannot be read, which no writer of ours brings about."""
+        state = _unpack(self._copy(_STATE.size))
+        return state if state.virtual else state._replace(time_ns=time.monotonic_ns() - self._started_ns)
+
+    def _copy(self, size: int) -> bytes:
+        """The first bytes of the state. SegmentError."""
         for at in _COPIES_AT * 4:  # one of them is whole, whenever their writer was killed
-            data = _atomics.cell_read(self._memory, self._offset + at, _STATE.size)
+            data = _atomics.cell_read(self._memory, self._offset + at, size)
             if data is not None:
-                state = _unpack(data)
-                return state if state.virtual else replace(state, time_ns=time.monotonic_ns() - self._started_ns)
+                return data
         raise SegmentError("the clock page makes no sense: restart the instance: shmio-supervisor down, up")
 
     def write(self, state: ClockState) -> None:
@@ -137,7 +140,11 @@ class ClockPage:
 
         In wall time it is CLOCK_MONOTONIC.
         """
-        return self._started_ns + self.read().present_ns
+        mode, flags, _, time_ns, dt_ns = _TIME.unpack(self._copy(_TIME.size))  # not all of it: each age asks
+        if not mode:
+            return time.monotonic_ns()
+        present_ns: int = time_ns - dt_ns if flags & _STEPPING else time_ns
+        return self._started_ns + present_ns
 
     def monotonic_ns(self, time_ns: int) -> int:
         """A time of the instance's clock as one that is comparable to CLOCK_MONOTONIC."""

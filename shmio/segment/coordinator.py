@@ -7,7 +7,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 from shmio.errors import SegmentError, TimeError, ValueRangeError
@@ -84,7 +84,7 @@ class Coordinator:
             self._owns = True
             state = self.read()
             note = f"step {state.step} was not finished: who asked for it has ended" if state.stepping else state.note
-            state = replace(state, owner=os.getpid(), playing=False, stepping=False, note=note)
+            state = state._replace(owner=os.getpid(), playing=False, stepping=False, note=note)
             if not state.virtual:
                 # Who free-runs looks at the page before each cycle: none begins after this write, so that none of
                 # theirs is later than the present one, as it is found once more after it.
@@ -102,7 +102,7 @@ class Coordinator:
         check_step(dt_ns)
         with self._turn:
             self.take_over()
-            self._write(replace(self.read(), step_size_ns=dt_ns))
+            self._write(self.read()._replace(step_size_ns=dt_ns))
 
     def set_playing(self, playing: bool, rate: float = 1.0) -> None:
         """Tell that steps come by themselves, at ``rate`` times real time, or no longer; takes time over.
@@ -113,7 +113,7 @@ class Coordinator:
             raise ValueRangeError(f"a rate is above 0, at most {MAX_RATE:g}, not {rate:g}")
         with self._turn:
             self.take_over()
-            self._write(replace(self.read(), playing=playing, rate=rate))
+            self._write(self.read()._replace(playing=playing, rate=rate))
 
     def step(self, dt_ns: int | None = None) -> Step:
         """Move time by ``dt_ns`` (default: the step size), and wait until all have done so; takes time over.
@@ -129,7 +129,7 @@ class Coordinator:
             check_step(dt_ns)
             step = Step(before.step + 1, before.time_ns + dt_ns, dt_ns)
             participants = self._participants()
-            asked = replace(before, step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
+            asked = before._replace(step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
             problem = "it was broken off"
             try:
                 self._write(asked)
@@ -138,7 +138,7 @@ class Coordinator:
             finally:
                 note = f"step {step.number} failed: {problem}" if problem else ""
                 done = before.done if problem else step.number
-                self._write(replace(asked, done=done, stepping=False, note=note))
+                self._write(asked._replace(done=done, stepping=False, note=note))
             if not problem:
                 self._deliver(step)
                 problem = self._await_delivery(step.number)
@@ -158,7 +158,7 @@ class Coordinator:
         with self._turn:
             if not self._owns or self._segment.closed:
                 return
-            self._write(replace(self.read(), owner=0, playing=False))
+            self._write(self.read()._replace(owner=0, playing=False))
             self._segment.shared.unlock(self._lock_byte)
             self._owns = False
             self._segment.clock.bell.ring()  # once more: who waits for the lock
@@ -184,7 +184,7 @@ class Coordinator:
         """Virtual time that goes on from now."""
         now_ns = self._segment.clock_ns(time.monotonic_ns())
         step = max((self._cycle(block, now_ns) for block in self._participants()), default=0)
-        return replace(state, mode=ClockMode.VIRTUAL, step=step, done=step, time_ns=now_ns)
+        return state._replace(mode=ClockMode.VIRTUAL, step=step, done=step, time_ns=now_ns)
 
     def _participants(self) -> list[Block]:
         self._segment.refresh()
@@ -224,7 +224,7 @@ class Coordinator:
                 silent = [block.source for block in waiting if _answer(block, number) is None]
                 note = f"step {number} waits for {', '.join(silent)}"
                 log.warning(note)
-                self._write(replace(asked, note=note))
+                self._write(asked._replace(note=note))
             block.ring.wait(seen, (self._hard_ns if told else min(self._soft_ns, self._hard_ns)) - passed_ns)
         return "; ".join(problems)
 

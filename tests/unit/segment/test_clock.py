@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 
 import pytest
 
@@ -61,7 +60,7 @@ def test_who_opens_the_segment_reads_what_was_written(segment: Segment, instance
 def test_the_present_is_before_the_step_that_is_under_way(segment: Segment) -> None:
     segment.clock.write(STATE)
     assert segment.clock.now_ns() == segment.header.started_ns + 4_980_000_000
-    segment.clock.write(replace(STATE, stepping=False))
+    segment.clock.write(STATE._replace(stepping=False))
     assert segment.clock.now_ns() == segment.header.started_ns + 5_000_000_000
 
 
@@ -77,17 +76,17 @@ def test_a_writer_that_died_half_way_hides_nothing(segment: Segment, copy: int) 
     odd = int.from_bytes(segment.memory[at : at + 8], "little") | 1
     segment.memory[at : at + 8] = odd.to_bytes(8, "little")
     assert segment.clock.read() == STATE
-    segment.clock.write(replace(STATE, step=13))
+    segment.clock.write(STATE._replace(step=13))
     assert segment.clock.read().step == 13
 
 
 def test_a_rate_that_is_none_is_one(segment: Segment) -> None:
-    segment.clock.write(replace(STATE, rate=float("nan")))
+    segment.clock.write(STATE._replace(rate=float("nan")))
     assert segment.clock.read().rate == 1.0
 
 
 def test_a_long_note_is_cut(segment: Segment) -> None:
-    segment.clock.write(replace(STATE, note="ä" * 200))
+    segment.clock.write(STATE._replace(note="ä" * 200))
     assert segment.clock.read().note == "ä" * 83
 
 
@@ -119,7 +118,7 @@ def test_deliveries_are_told_by_slot(segment: Segment, instance: str) -> None:
 def test_ages_are_taken_against_the_clock_that_a_block_lives_on(segment: Segment) -> None:
     sim, cell = segment.writer("sim"), segment.writer("cell")
     hour_ns = 3_600_000_000_000
-    segment.clock.write(replace(STATE, time_ns=hour_ns, stepping=False))
+    segment.clock.write(STATE._replace(time_ns=hour_ns, stepping=False))
     sim.publish(bytes(4), cycle=12)
     cell.publish(bytes(4), cycle=12)
     frames = {}
@@ -131,7 +130,7 @@ def test_ages_are_taken_against_the_clock_that_a_block_lives_on(segment: Segment
     assert frames["sim"].clock_ns == hour_ns
     assert frames["cell"].clock_ns < hour_ns, "a device's frames keep real time"
     assert frames["sim"].age_ns(segment.blocks["sim"].now_ns()) == 0
-    segment.clock.write(replace(STATE, time_ns=hour_ns + 600_000_000, stepping=False))
+    segment.clock.write(STATE._replace(time_ns=hour_ns + 600_000_000, stepping=False))
     block = segment.blocks["sim"]
     assert frames["sim"].assess(block.stale_ns, block.now_ns())[0] is Quality.BAD
     assert frames["cell"].assess(block.stale_ns, segment.blocks["cell"].now_ns())[0] is Quality.GOOD
