@@ -59,6 +59,7 @@ def written(folder: Path, text: str) -> Path:
 def test_the_whole_contract_is_read(folder: Path) -> None:
     config = load(written(folder, WHOLE))
     assert (config.instance.name, config.instance.group, config.instance.ring_mb) == ("a50", "twins", 8)
+    assert config.instance.clock == "wall"
     assert config.log_dir == folder / "var/log"
     (source,) = config.source
     assert (source.name, source.period_ns, source.writable) == ("cell", 20_000_000, ["Outputs", "Robot_*/*"])

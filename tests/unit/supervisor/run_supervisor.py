@@ -50,6 +50,7 @@ def make(settings: dict[str, Any]) -> Plan:
             for name, kind, behaviour, *_ in settings["jobs"]
         ),
         warnings=tuple(settings.get("warnings", ())),
+        stepped=settings.get("stepped", False),
     )
 
 

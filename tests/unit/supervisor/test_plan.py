@@ -38,6 +38,16 @@ def test_blocks_and_processes_follow_the_configuration(tmp_path: Path) -> None:
     assert plan.segment_bytes > block.size
 
 
+def test_what_is_computed_lives_on_the_clock_which_may_stand_from_the_start(tmp_path: Path) -> None:
+    settings = config(tmp_path, sources=2)
+    layouts = {"cell0": LAYOUT, "cell1": LAYOUT}
+    plan = make_plan(settings, layouts, PLAYED, config_file=tmp_path / "s.toml", computed=["cell1"])
+    assert [block.attributes.stepped for block in plan.blocks] == [False, True]
+    assert not plan.stepped
+    settings.instance.clock = "stepped"
+    assert make_plan(settings, layouts, PLAYED, config_file=tmp_path / "s.toml").stepped
+
+
 def test_a_process_is_told_what_it_needs(tmp_path: Path) -> None:
     plan = make_plan(config(tmp_path), {"cell0": LAYOUT}, PLAYED, config_file=tmp_path / "s.toml")
     emulator, source, grpc = (json.loads(job.describe(plan.instance, 77)) for job in plan.jobs)

@@ -182,7 +182,11 @@ def test_what_goes_is_stopped_in_the_order_of_a_stop(launch: Launch) -> None:
 
 @pytest.mark.parametrize(
     ("others", "refused"),
-    [({"instance": "other"}, "instance.name"), ({"log_dir": "/elsewhere"}, "instance.log_dir")],
+    [
+        ({"instance": "other"}, "instance.name"),
+        ({"log_dir": "/elsewhere"}, "instance.log_dir"),
+        ({"stepped": True}, "instance.clock"),
+    ],
 )
 def test_what_cannot_change_is_refused_by_its_key(launch: Launch, others: dict[str, Any], refused: str) -> None:
     cell = launch()
