@@ -19,6 +19,7 @@
 #include <sys/syscall.h>
 #include <time.h>
 #include <unistd.h>
+#include "clock.h"
 
 enum { ABI = 1, LAYOUT = 1, FRAMES = 2, RETIRED = 1, ENTRY = 128, RING_HEADER = 128, RAW = 320, LOOK_NS = 200000000 };
 
@@ -44,7 +45,7 @@ static uint64_t relaxed64(uint64_t at) { return WORD(uint64_t, at, memory_order_
 static bool within(uint64_t at, uint64_t length) { return at <= size && length <= size - at; }
 
 typedef struct { /* of a ring: where its header is, and our own copy of its geometry, checked */
-    uint64_t at, entry; /* entry: of the section table */
+    uint64_t at, entry, clock; /* entry: of the section table; clock: the page, 0: the source keeps real time */
     uint32_t slots, stride, frame_size, effective;
     int64_t stale_ns;
 } Ring;
@@ -111,7 +112,8 @@ static Ring find(const char *source, const char *path, Register *found)
     if (layout >= end || get32(layout) != LAYOUT || !within(get64(layout + 8), get64(layout + 16)) ||
         at % 64 || !within(at, length) || length < RING_HEADER)
         fail("the sections of source %s are not sound", source);
-    Ring ring = {at, entry, get32(at), get32(at + 4), get32(at + 8), get32(at + 20), (int64_t)get64(at + 40)};
+    uint64_t clock = clock_page(base, size, table, end, get32(entry + 24));
+    Ring ring = {at, entry, clock, get32(at), get32(at + 4), get32(at + 8), get32(at + 20), (int64_t)get64(at + 40)};
     uint64_t image = ((uint64_t)ring.frame_size + 7) / 8 * 8;
     if (ring.slots < 4 || (ring.slots & (ring.slots - 1)) || get32(at + 16) != RAW || ring.effective % 8 ||
         ring.stride % 8 || ring.effective < RAW + image || ring.stride < ring.effective + image ||
@@ -146,9 +148,7 @@ static bool read_frame(const Ring *ring, const Register *of, uint64_t number, Fr
 
 static bool stale(const Frame *frame, const Ring *ring)
 {
-    struct timespec now;
-    clock_gettime(CLOCK_MONOTONIC, &now);
-    return now.tv_sec * INT64_C(1000000000) + now.tv_nsec - frame->asked_ns > ring->stale_ns;
+    return present_ns(base, ring->clock) - frame->asked_ns > ring->stale_ns;
 }
 
 static void show(const Frame *frame, const Register *of, uint64_t missed, bool is_stale)

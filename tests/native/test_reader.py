@@ -20,7 +20,8 @@ import pytest
 
 from shmio.layout.codec import codec
 from shmio.layout.compiler import Source, compile_sources
-from shmio.segment import BlockSpec, BlockWriter, ProcessSpec, Quality, Segment
+from shmio.segment import Attributes, BlockSpec, BlockWriter, ProcessSpec, Quality, Segment
+from shmio.segment.clock import ClockMode, ClockState
 
 SOURCE = Path(__file__).parents[2] / "examples/reader.c"
 COMPILER = shutil.which("cc") or shutil.which("gcc") or "cc"
@@ -77,8 +78,11 @@ def reader(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
 
 
 @contextmanager
-def segment(instance: str, *, ring_bytes: int = 1 << 16, stale_ns: int = NEVER_NS) -> Iterator[Segment]:
-    blocks = [BlockSpec(name, LAYOUT, 10_000_000, stale_ns, ring_bytes) for name in ("other", "device")]
+def segment(
+    instance: str, *, ring_bytes: int = 1 << 16, stale_ns: int = NEVER_NS, stepped: bool = False
+) -> Iterator[Segment]:
+    attributes = Attributes(stepped=stepped)
+    blocks = [BlockSpec(name, LAYOUT, 10_000_000, stale_ns, ring_bytes, attributes) for name in ("other", "device")]
     with Segment.create(instance, blocks, [ProcessSpec("device", "source")]) as made:
         try:
             yield made
@@ -196,6 +200,22 @@ def test_bad_and_stale_are_said(reader: Path, instance: str) -> None:
             while shown[3] == "good":
                 shown = running.line()  # nothing new comes: it says so itself, once
             assert shown == (str(number), "5", "0", "bad", "true", "stale")
+
+
+def test_what_lives_on_the_clock_is_as_old_as_that_says(reader: Path, instance: str) -> None:
+    with segment(instance, stale_ns=300_000_000, stepped=True) as made:
+        hour_ns = 3600 * 10**9
+        made.clock.write(ClockState(ClockMode.VIRTUAL, 7, hour_ns, 10**7, 7))
+        writer = made.writer("device")
+        with Running(reader, writer, instance, "device/on") as running:
+            made.clock.write(ClockState(ClockMode.VIRTUAL, 8, 2 * hour_ns, hour_ns, 7, stepping=True))
+            number = writer.publish(image(), cycle=7)
+            assert running.line()[:4] == (str(number), "7", "0", "good"), "the step is under way"
+            made.clock.write(ClockState(ClockMode.VIRTUAL, 8, 2 * hour_ns, hour_ns, 8))
+            assert running.line() == (str(number), "7", "0", "bad", "true", "stale")
+            writer.at_ns = made.clock.monotonic_ns(2 * hour_ns)
+            number = writer.publish(image(), cycle=8)
+            assert running.line()[:4] == (str(number), "8", "0", "good")
 
 
 def test_an_instance_that_stops_ends_it(reader: Path, instance: str) -> None:
