@@ -10,8 +10,12 @@ import weakref
 import pytest
 
 from shmio.endpoints.grpc.feeds import Feeds
+from shmio.endpoints.grpc.hold import Hold, Moment
+from shmio.endpoints.grpc.subject import Subject
 from shmio.segment import Attributes, BlockSpec, Segment
 from tests.unit.endpoints.harness import LAYOUT, STALE_NS, TIMEOUT_S, WRITABLE, WRITER, image
+from tests.unit.endpoints.stepped import LAYOUT as MODEL_LAYOUT
+from tests.unit.endpoints.stepped import stepped_segment
 from tests.unit.endpoints.test_grpc import STEP, Recorder
 
 
@@ -83,3 +87,37 @@ def test_the_loop_goes_on_while_a_new_layout_is_read(segment: Segment, instance:
 
     with Segment.open(instance, writable=True) as opened, pytest.MonkeyPatch.context() as monkeypatch:
         asyncio.run(run(opened, monkeypatch))
+
+
+COUNT = Subject("raw", "count", (MODEL_LAYOUT.registers[0],), lambda picture: bytes((picture.number, picture.image[3])))
+
+
+def test_a_model_that_a_reload_changes_in_virtual_time_is_shown_step_by_step_too(instance: str) -> None:
+    async def run(opened: Segment) -> None:
+        hold = Hold()
+        hold.on, hold.moment = True, Moment(6, 0)
+        feeds = Feeds(opened, WRITER, asyncio.get_running_loop(), lambda source, good: None, hold)
+        feeds.start()
+        attributes = Attributes("simulation", ("goal",), stepped=True)
+        spec = BlockSpec("sim", MODEL_LAYOUT, 10_000_000, STALE_NS, 1 << 20, attributes)
+        opened.change(retire=["sim"], add=[spec])
+        await feeds.follow()
+        stream = Recorder()
+        feeds["sim"].listen(COUNT, stream)
+        writer = opened.writer("sim")
+        for count in (1, 2, 3):
+            writer.publish(b"\0\0\0" + bytes([count]) + bytes(MODEL_LAYOUT.size - 4), cycle=count)
+            async with asyncio.timeout(TIMEOUT_S):
+                while not stream.got:  # noqa: ASYNC110  another thread's doing
+                    await asyncio.sleep(0)
+        assert stream.got == [bytes((6, 1))], "the first image, and nothing more before a step"
+        for number in (7, 8):
+            hold.moment = Moment(number, 0)
+            feeds["sim"].step()
+        assert stream.got == [bytes((6, 1)), bytes((7, 3))]
+        feeds["sim"].leave(COUNT, stream)
+        feeds.stop()
+        feeds.join()
+
+    with stepped_segment(instance, "sim") as segment:
+        asyncio.run(run(segment))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from contextlib import ExitStack
 
 import pytest
 
@@ -138,3 +139,70 @@ def test_when_all_streams_hold_too_much_those_with_more_than_their_part_give_way
         assert slow.failure.startswith("cell/x/in: 3 messages wait to be read")
     assert outboxes.waiting_bytes == 0
     assert outboxes.dropped == hog.dropped + slow.dropped
+
+
+def test_values_of_a_step_are_all_kept_or_the_stream_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "STEP_BOUND", TOPIC_BOUND + 5)
+
+    async def test() -> None:
+        outbox = Outbox()
+        lane, other = StateLane(outbox), StateLane(outbox)
+        for number in range(TOPIC_BOUND + 5):
+            (lane if number % 50 else other).keep(bytes([number]))
+        assert await rest(outbox) == [bytes([number]) for number in range(TOPIC_BOUND + 5)]
+        assert (outbox.failure, outbox.dropped) == ("", 0)
+        for number in range(TOPIC_BOUND + 6):
+            lane.keep(bytes([number]))
+        assert await outbox.pop() is None
+        assert (
+            outbox.failure == f"{TOPIC_BOUND + 5} values wait to be read: too many change in one step for this stream"
+        )
+        assert not outbox.owing
+
+    asyncio.run(test())
+
+
+def test_a_message_is_taken_when_the_reader_asks_for_the_next_one() -> None:
+    async def test() -> None:
+        outbox = Outbox()
+        lane = StateLane(outbox)
+        lane.deliver(b"before")
+        lane.keep(b"a")
+        lane.deliver(b"after")
+        taken = asyncio.ensure_future(outbox.taken())
+        for expected in (b"before", b"a"):
+            assert await outbox.pop() == expected
+            await asyncio.sleep(0)
+            assert outbox.owing
+            assert not taken.done()
+        assert await outbox.pop() == b"after"
+        await taken
+        assert not outbox.owing
+
+    asyncio.run(test())
+
+
+def test_those_that_take_nothing_end_and_the_others_do_not() -> None:
+    async def test() -> None:
+        outboxes = Outboxes()
+        with (
+            outboxes.opened() as idle,
+            outboxes.opened() as reader,
+            outboxes.opened() as gone,
+            outboxes.opened() as none,
+        ):
+            for outbox in (idle, reader, gone):
+                StateLane(outbox).keep(b"x")
+            StateLane(none).deliver(b"of a device")
+            waiting = asyncio.ensure_future(outboxes.taken(0.05))
+            await asyncio.sleep(0)
+            assert await reader.pop() == b"x"
+            popping = asyncio.ensure_future(reader.pop())
+            gone.close()
+            await waiting
+            assert idle.failure == "the client has not taken the values of a step within 0.05 s"
+            assert (reader.failure, gone.failure, none.failure) == ("", "", "")
+            await outboxes.taken(60)  # nobody owes anything
+            popping.cancel()
+
+    asyncio.run(test())
