@@ -185,12 +185,8 @@ def test_a_message_is_taken_when_the_reader_asks_for_the_next_one() -> None:
 def test_those_that_take_nothing_end_and_the_others_do_not() -> None:
     async def test() -> None:
         outboxes = Outboxes()
-        with (
-            outboxes.opened() as idle,
-            outboxes.opened() as reader,
-            outboxes.opened() as gone,
-            outboxes.opened() as none,
-        ):
+        with ExitStack() as stack:
+            idle, reader, gone, none = (stack.enter_context(outboxes.opened()) for _ in range(4))
             for outbox in (idle, reader, gone):
                 StateLane(outbox).keep(b"x")
             StateLane(none).deliver(b"of a device")
