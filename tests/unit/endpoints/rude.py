@@ -14,13 +14,16 @@ from grpc_health.v1 import health_pb2
 from grpc_reflection.v1alpha import reflection_pb2
 
 from shmio.segment import Segment
+from shmio.wire import shmio_v1_pb2 as ours
 from shmio.wire import simlog_v1_pb2 as v1
 from shmio.wire import simlog_v2_pb2 as v2
+from shmio.wire import simserver_pb2 as simserver
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, endpoint, message, value
 from tests.unit.endpoints.plant import Plant
 from tests.unit.endpoints.test_publish import plant
 
 V1, V2 = "/simulation.server.SimlogAPI/", "/simlog.server.SimlogAPI/"
+SIM, OURS = "/com.ttsnetwork.simulator3.SimServerAPI/", "/shmio.v1.Shmio/"
 HEALTH, REFLECTION = "/grpc.health.v1.Health/", "/grpc.reflection.v1alpha.ServerReflection/"
 
 
@@ -59,6 +62,15 @@ CALLS = (
     Call(V2 + "Write", _put("CELL://axis/speed/in")),
     Call(V2 + "PublishSynch", _put("CELL://axis/speed/in")),
     Call(V2 + "Publish", _put("CELL://axis/speed/in"), many=True, stays=True),
+    Call(V1 + "setStepSize", v1.StepSizeRequest(step=20).SerializeToString()),
+    Call(V1 + "step", b""),
+    Call(SIM + "subscribe", b"", stays=True),
+    Call(SIM + "step", simserver.StepRequest(deltaTime=50).SerializeToString()),
+    Call(SIM + "pause", b""),
+    Call(OURS + "GetLayouts", b""),
+    Call(OURS + "GetStatus", b""),
+    Call(OURS + "Read", ours.ReadRequest(patterns=["cell/axis/*"]).SerializeToString()),
+    Call(OURS + "Subscribe", ours.SubscribeRequest(patterns=["cell/inputs"]).SerializeToString(), stays=True),
     Call(HEALTH + "Check", health_pb2.HealthCheckRequest(service="source.cell").SerializeToString()),
     Call(HEALTH + "Watch", health_pb2.HealthCheckRequest(service="source.cell").SerializeToString(), stays=True),
     Call(
