@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -75,6 +76,24 @@ def test_a_benchmark_compares(benchmark: str, row: re.Pattern[str], tables: dict
 
 def test_cycles_under_way_are_counted() -> None:
     assert len(re.findall(r"^[0-9]+ jobs: [124] under way +[1-9]", printed("s7_cycle"), re.MULTILINE)) == 3
+
+
+@pytest.mark.skipif(
+    shutil.which("node") is None or not (ROOT / "tests/unit/endpoints/node/node_modules").exists(),
+    reason="needs Node and its packages",
+)
+def test_streams_are_measured_beside_a_bare_server() -> None:
+    found = printed("grpc_streams")
+    rates = re.findall(r"^(version [12]|bare.*?)  +([1-9]\d*) +\d+\.\d+ +\d+\.\d+ +\d+\.\d+$", found, re.MULTILINE)
+    assert [name for name, _ in rates] == [
+        "version 1",
+        "version 2",
+        "bare, out of a queue",
+        "bare grpc.aio, ready bytes",
+    ]
+    latencies = re.findall(r"^version [12], (?:1|50) subscribers +(\d+\.\d+)", found, re.MULTILINE)
+    assert len(latencies) == 4
+    assert all(float(latency) > 0 for latency in latencies)
 
 
 def test_a_growing_load_is_measured_row_by_row() -> None:
