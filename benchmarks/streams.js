@@ -1,7 +1,7 @@
 // Subscribers on @grpc/grpc-js, on one connection, that count messages as bytes; with `stamps` they also take from each
 // the time at which its frame was published. Usage: node streams.js ADDRESS STARTED_NS. The first line it reads is
 // {streams: [{method, request, then: [{method, request}]}], stamps: path of fields, or null}, the requests in base64.
-// It prints a line when all streams have had a message, and for each line more that it reads what came since the one before.
+// It prints a line when all streams have all they asked for and had a message, and for each line more that it reads what came since the one before.
 'use strict';
 
 const path = require('path');
@@ -58,17 +58,23 @@ const client = new grpc.Client(address, grpc.credentials.createInsecure());
 function open({ method, request, then }) {
   return new Promise((resolve, reject) => {
     const stream = client.makeServerStreamRequest(method, raw, raw, Buffer.from(request, 'base64'));
-    stream.on('error', reject);
+    const left = new Set(['a message', 'all it asks for']);
+    const done = (what) => {
+      left.delete(what);
+      if (!left.size) resolve();
+    };
     const next = (error) => {
       if (error) reject(error);
       const call = then.shift();
       if (call) client.makeUnaryRequest(call.method, raw, raw, Buffer.from(call.request, 'base64'), next);
+      else done('all it asks for');
     };
+    stream.on('error', reject);
     stream.on('metadata', () => next(null));
     stream.on('data', (data) => {
       messages += 1;
       if (specification.stamps) latencies.push((Number(process.hrtime.bigint()) - startedNs - stamp(data)) / 1000);
-      resolve();
+      done('a message');
     });
   });
 }
