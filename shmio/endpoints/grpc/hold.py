@@ -12,6 +12,15 @@ class Moment(NamedTuple):
     clock_ns: int
 
 
+class Status(NamedTuple):
+    """How time stands. ``dt_ns``: of the step that it tells of, or else what a step moves time by at present."""
+
+    clock_ns: int
+    dt_ns: int
+    alive: bool
+    playing: bool
+
+
 class Still(NamedTuple):
     """A :class:`~shmio.endpoints.grpc.subject.Picture` of a block as a step has left it."""
 

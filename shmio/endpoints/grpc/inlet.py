@@ -147,7 +147,7 @@ class Inlet:
         told = self._loop.create_future()
         with self._asking:
             head = self.block.events.head()
-            if self._told < head and self.alive:
+            if self._told < head and self._thread.is_alive():
                 self._asked = head, told
             else:
                 self._loop.call_soon(_set, told)  # behind what is on its way

@@ -8,12 +8,12 @@ import threading
 from collections.abc import Callable, Coroutine, Mapping
 from contextlib import suppress
 from functools import partial
-from typing import Any, Final, NamedTuple, TypeVar
+from typing import Any, Final, TypeVar
 
 from shmio.endpoints.grpc.delivery import Delivery
 from shmio.endpoints.grpc.errand import Errands
 from shmio.endpoints.grpc.feed import Feed
-from shmio.endpoints.grpc.hold import Hold, Moment
+from shmio.endpoints.grpc.hold import Hold, Moment, Status
 from shmio.endpoints.grpc.marks import Marks
 from shmio.endpoints.grpc.outbox import Outboxes
 from shmio.endpoints.grpc.publish import Publisher
@@ -31,15 +31,6 @@ TURN_NS: Final = 200_000_000
 _Result = TypeVar("_Result")
 
 log = logging.getLogger("shmio.grpc")
-
-
-class Status(NamedTuple):
-    """How time stands. ``dt_ns``: of the step that it tells of, or else what a step moves time by at present."""
-
-    clock_ns: int
-    dt_ns: int
-    alive: bool
-    playing: bool
 
 
 class Stepper:
@@ -67,7 +58,7 @@ class Stepper:
         self._publisher = publisher
         self._loop = asyncio.get_running_loop()
         self._errands = Errands("time", self._loop)
-        self._coordinator = Coordinator(segment, deliver=self._deliver_now)
+        self._coordinator = Coordinator(segment)
         self._turn = asyncio.Lock()  # one moves time
         self._owns = False
         self._moving = False
@@ -113,6 +104,7 @@ class Stepper:
 
     async def set_step_size(self, dt_ns: int) -> None:
         """How far a step goes that does not say it itself; takes time over. ValueRangeError, TimeError."""
+        _check(dt_ns)
         await self._do(self._move(partial(self._coordinator.set_step_size, dt_ns)))
 
     async def step(self, dt_ns: int | None = None, peer: str = "") -> Step:
@@ -167,6 +159,7 @@ class Stepper:
         return task
 
     async def _step(self, dt_ns: int | None, peer: str) -> Step:
+        _check(dt_ns)
         if peer:
             await self._publisher.settle(peer)
         if self._player is not None:
@@ -174,7 +167,7 @@ class Stepper:
         return await self._move(partial(self._coordinator.step, dt_ns))
 
     async def _move(self, call: Callable[[], _Result], *, alive: bool = True) -> _Result:
-        """Take time over, and call the coordinator beside the event loop."""
+        """Take time over, call the coordinator beside the event loop, and deliver the step if it was one."""
         async with self._turn:
             self._moving = True
             try:
@@ -184,6 +177,8 @@ class Stepper:
                     self._look()
                 done = await self._errands.call(call)
                 self._alive = alive
+                if isinstance(done, Step):
+                    await self._deliver(done)
                 return done
             finally:
                 self._moving = False
@@ -208,8 +203,7 @@ class Stepper:
     # ---- playing ---------------------------------------------------------------------------------------------------
 
     async def _begin_play(self, dt_ns: int | None, rate: float) -> Status:
-        if dt_ns is not None and not MIN_STEP_NS <= dt_ns <= MAX_STEP_NS:
-            raise ValueRangeError(f"a step is from 1 us to 1 h, not {dt_ns / 1e6:g} ms")
+        _check(dt_ns)
         self._play_dt_ns, self._rate = dt_ns, rate
         await self._move(partial(self._coordinator.set_playing, True, rate))
         if self._player is None:
@@ -243,10 +237,6 @@ class Stepper:
                     await asyncio.wait_for(self._woken.wait(), wait_s)
 
     # ---- delivering ------------------------------------------------------------------------------------------------
-
-    def _deliver_now(self, step: Step) -> None:
-        """Deliver a step of this process, from its thread; return when all have taken it."""
-        asyncio.run_coroutine_threadsafe(self._deliver(step), self._loop).result()
 
     async def _deliver(self, step: Step) -> None:
         def mark() -> None:
@@ -295,3 +285,9 @@ class Stepper:
                 heeded = news
                 self._loop.call_soon_threadsafe(self._look)
             clock.bell.wait(seen, TURN_NS)
+
+
+def _check(dt_ns: int | None) -> None:
+    """ValueRangeError: no step goes so far, and nothing has been taken over for it."""
+    if dt_ns is not None and not MIN_STEP_NS <= dt_ns <= MAX_STEP_NS:
+        raise ValueRangeError(f"a step is from 1 us to 1 h, not {dt_ns / 1e6:g} ms")

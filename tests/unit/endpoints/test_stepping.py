@@ -402,6 +402,19 @@ def test_who_comes_between_two_steps_sees_the_last_one_and_what_is_newer_with_th
     simulate(instance, test)
 
 
+def test_what_is_refused_takes_nothing_over(instance: str) -> None:
+    async def test(served: Endpoint, models: Models) -> None:
+        for call in (
+            served.stub.setStepSize(v1.StepSizeRequest(step=-20), timeout=TIMEOUT_S),
+            served.time.step(sim.StepRequest(deltaTime=-1), timeout=TIMEOUT_S),
+            served.time.start(sim.StartRequest(deltaTime=-1), timeout=TIMEOUT_S),
+        ):
+            assert (await refusal(call))[0] is Status.INVALID_ARGUMENT
+        assert not served.segment.clock.read().virtual
+
+    simulate(instance, test, virtual=False)
+
+
 def test_wall_time_goes_by_itself_until_somebody_takes_it_over(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         clock = await open_v1(served, "model/clock")
