@@ -78,7 +78,7 @@ async def _serve(worker: Worker) -> None:
                 worker.log.info("a reload added, changed or ended %s", ", ".join(changed))
                 services.move(changed)
             reading = None
-        if not (feeds.alive and services.stepper.alive):
+        if not (feeds.alive and services.stepper.alive and server.alive):
             raise RuntimeError("a thread ended that should not have; the endpoint starts anew")
         streams, dropped, published, refused = services.counters
         worker.report((streams, feeds.messages + services.updates, dropped, published, refused))

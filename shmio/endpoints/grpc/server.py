@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import os
 from collections.abc import Sequence
-from typing import Any
+from contextlib import suppress
+from typing import Any, Final
 from urllib.parse import quote
 
 import grpc
@@ -21,6 +23,10 @@ from shmio.endpoints.grpc.services import Services
 from shmio.errors import EndpointError
 
 MAX_REQUEST_BYTES = 1 << 20
+LOOK_S: Final = 0.2
+"""Time between two looks whether gRPC still serves."""
+
+log = logging.getLogger("shmio.grpc")
 
 _SERVING = health_pb2.HealthCheckResponse.SERVING
 _NOT_SERVING = health_pb2.HealthCheckResponse.NOT_SERVING
@@ -42,8 +48,15 @@ class Server:
         """Those that are open, on all addresses."""
         self._services = services
         self._health = health.aio.HealthServicer()
-        self._servers: list[grpc.aio.Server] = []
-        self._files: list[SocketFile] = []
+        self._servers: dict[grpc.aio.Server, None] = {}
+        self._files: dict[str, SocketFile] = {}
+        self._keepers: list[asyncio.Task[None]] = []
+        logging.getLogger("grpc._cython.cygrpc").addFilter(_is_news)
+
+    @property
+    def alive(self) -> bool:
+        """Whether it listens on all addresses, or is about to again."""
+        return not any(keeper.done() for keeper in self._keepers)
 
     async def start(self, listeners: Sequence[Listener], tls: Tls | None = None, gid: int | None = None) -> list[int]:
         """Listen on all addresses; the ports, for those that were 0.
@@ -52,9 +65,14 @@ class Server:
         EndpointError names the address in the way.
         """
         credentials = _credentials(tls) if tls else None
-        ports = [self._bind(listener, credentials, gid) for listener in listeners]
+        bound = [self._bind(listener, credentials, gid) for listener in listeners]
         for server in self._servers:
             await server.start()
+        ports = [port for _, port in bound]
+        for listener, (server, port) in zip(listeners, bound, strict=True):
+            host = listener.address
+            same = listener._replace(address=Address(host.host, port)) if isinstance(host, Address) else listener
+            self._keepers.append(asyncio.create_task(self._keep(server, same, credentials, gid)))
         for service in (health.OVERALL_HEALTH, *self._services.names):
             await self._health.set(service, _SERVING)
         return ports
@@ -65,22 +83,57 @@ class Server:
 
     async def stop(self) -> None:
         """Say so, end all streams, close."""
+        for keeper in self._keepers:
+            keeper.cancel()
+        await asyncio.gather(*self._keepers, return_exceptions=True)
         await self._health.enter_graceful_shutdown()
         await asyncio.gather(*(server.stop(grace=0.2) for server in self._servers))
-        for file in self._files:
+        for file in self._files.values():
             file.remove()
 
-    def _bind(self, listener: Listener, credentials: grpc.ServerCredentials | None, gid: int | None) -> int:
+    async def _keep(
+        self, server: grpc.aio.Server, listener: Listener, credentials: grpc.ServerCredentials | None, gid: int | None
+    ) -> None:
+        """Listen anew whenever gRPC stops by itself; calls that are open go on.
+
+        It does for all clients when one sends the name of a call that is not UTF-8.
+        """
+        retiring: set[asyncio.Task[None]] = set()
+        try:
+            while True:
+                try:
+                    await server.wait_for_termination(LOOK_S)
+                except Exception as error:  # noqa: BLE001  whatever has ended its loop
+                    log.warning("%s: gRPC stopped serving (%s) and listens anew", listener.address, error)
+                    task = asyncio.create_task(self._retire(server))
+                    retiring.add(task)
+                    task.add_done_callback(retiring.discard)
+                    server, _ = self._bind(listener, credentials, gid)
+                    await server.start()
+        finally:
+            for task in retiring:
+                task.cancel()
+
+    async def _retire(self, server: grpc.aio.Server) -> None:
+        """Let the calls of one that listens no more end by themselves."""
+        with suppress(Exception):  # why it listens no more
+            await server.wait_for_termination()
+        await server.stop(None)
+        del self._servers[server]
+
+    def _bind(
+        self, listener: Listener, credentials: grpc.ServerCredentials | None, gid: int | None
+    ) -> tuple[grpc.aio.Server, int]:
         address = listener.address
         server = self._server(Gate(listener.door, self.calls))
-        self._servers.append(server)
+        self._servers[server] = None
         if isinstance(address, UnixAddress):
             clear(address.path)  # gRPC itself would take it from a living process
         try:
             if isinstance(address, Address):
                 if credentials and listener.encrypted:
-                    return server.add_secure_port(str(address), credentials)
-                return server.add_insecure_port(str(address))
+                    return server, server.add_secure_port(str(address), credentials)
+                return server, server.add_insecure_port(str(address))
             before = os.umask(0o177)
             try:
                 port = server.add_insecure_port(f"unix:{quote(address.path)}")
@@ -91,8 +144,8 @@ class Server:
                 f"grpc: cannot listen on {address}: another program has it (ss -ltnp shows which), or this host has no "
                 "such address"
             ) from None
-        self._files.append(SocketFile(address.path, gid))
-        return port
+        self._files[address.path] = SocketFile(address.path, gid)
+        return server, port
 
     def _server(self, gate: Gate) -> grpc.aio.Server:
         # No connection is told to have room for more than all calls. When 1000 wait to be looked at, gRPC breaks off
@@ -120,3 +173,8 @@ def _credentials(tls: Tls) -> grpc.ServerCredentials:
         root_certificates=files.client_ca,
         require_client_auth=files.client_ca is not None,
     )
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """What gRPC says, with a traceback, of headers that are not UTF-8 is none: any client may send them."""
+    return not (isinstance(record.msg, UnicodeDecodeError) or str(record.msg).startswith("Invalid encoding on "))
