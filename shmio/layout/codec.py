@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from functools import lru_cache
 from typing import Protocol
 
@@ -82,6 +83,7 @@ class _Array:
         self._starts = range(0, register.count * element.stride, element.stride)
         order = ">" if byte_order == "big" else "<"
         self._bulk = struct.Struct(f"{order}{register.count}{self._scalar.plain}") if self._scalar.plain else None
+        self._row = self._bulk if len(self._shape) == 1 else None
 
     def decode(self, data: Buffer) -> list[Value]:
         flat: list[Value]
@@ -92,6 +94,10 @@ class _Array:
         return nest(flat, self._shape)
 
     def encode_into(self, value: object, frame: bytearray | memoryview) -> None:
+        if self._row is not None and isinstance(value, list | tuple) and {float, int}.issuperset(map(type, value)):
+            with suppress(struct.error, OverflowError):  # what is wrong is said below
+                frame[self._offset : self._stop] = self._row.pack(*value)
+                return
         image = bytearray(frame[self._offset : self._stop])
         for start, item in zip(self._starts, flatten(value, self._shape, self._name), strict=True):
             image[start : start + self._size] = self._scalar.encode(item)

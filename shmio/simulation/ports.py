@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 
@@ -11,6 +11,10 @@ from shmio.errors import ValueRangeError
 from shmio.layout.checks import brief
 from shmio.layout.codec import codec
 from shmio.layout.model import ByteOrder, Register
+
+_PYTHON: Final = frozenset({bool, int, float, str, list, tuple})
+_NUMPY: Final = (np.ndarray, np.generic)
+_BYTES: Final = (bytes, bytearray)
 
 
 class Port(Protocol):
@@ -48,11 +52,11 @@ class RegisterPort:
 
     def write(self, value: object) -> None:
         """Put a value into the image, or change nothing; numpy's are as good as Python's."""
-        if self._is_row and isinstance(value, bytes | bytearray) and len(value) == self._stop - self._start:
+        if self._is_row and isinstance(value, _BYTES) and len(value) == self._stop - self._start:
             self._image[self._start : self._stop] = value
             return
         try:
-            self._codec.encode_into(_plain(value), self._image)
+            self._codec.encode_into(value if type(value) in _PYTHON else _plain(value), self._image)
         except ValueRangeError as error:
             text = str(error)
             raise ValueRangeError(text if text.startswith(f"{self._path}:") else f"{self._path}: {text}") from None
@@ -107,6 +111,6 @@ def _frozen(value: object) -> object:
 
 
 def _plain(value: object) -> object:
-    if isinstance(value, np.ndarray | np.generic):
+    if isinstance(value, _NUMPY):
         return value.tolist()
-    return list(value) if isinstance(value, bytes | bytearray) else value
+    return list(value) if isinstance(value, _BYTES) else value
