@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -38,6 +39,15 @@ class Places:
     def __len__(self) -> int:
         return len(self.index)
 
+    @cached_property
+    def limits(self) -> tuple[Any, Any]:
+        """The least and the greatest number, as the type that is calculated in."""
+        if self.dtype.kind == "f":
+            most = _REAL_LIMIT if self.dtype.itemsize == 4 else float(np.finfo(np.float64).max)
+            return -most, most
+        bounds, exact = np.iinfo(self.dtype), np.longdouble if self.dtype.itemsize == 8 else np.float64
+        return exact(bounds.min), exact(bounds.max)
+
     def numbers(self, image: Bytes) -> Values:
         """Their values; those of 64 bits, of which a double would lose some, as long doubles."""
         exact = np.longdouble if self.dtype.kind in "iu" and self.dtype.itemsize == 8 else np.float64
@@ -45,15 +55,13 @@ class Places:
 
     def put_numbers(self, image: Bytes, values: Values) -> None:
         """Change them; whole numbers are rounded, and what is beyond the type's range is its limit."""
-        if self.dtype.kind == "f":
-            most = _REAL_LIMIT if self.dtype.itemsize == 4 else np.finfo(np.float64).max
-            fitting = np.clip(values, -most, most)
-        else:
-            limits = np.iinfo(self.dtype)
-            if self.dtype.itemsize == 8:  # the limits of 64 bits are no doubles
+        least, most = self.limits
+        if self.dtype.kind != "f":
+            values = np.rint(values)
+            if self.dtype.itemsize == 8:  # its limits are no doubles
                 values = values.astype(np.longdouble)
-            fitting = np.clip(np.rint(values), values.dtype.type(limits.min), values.dtype.type(limits.max))
-        image[self.index] = np.ascontiguousarray(fitting.astype(self.dtype)).view(np.uint8).reshape(self.index.shape)
+        fitting = np.minimum(np.maximum(values, least), most).astype(self.dtype)
+        image[self.index] = fitting.view(np.uint8).reshape(self.index.shape)
 
     def put(self, image: Bytes, table: Bytes, choice: npt.NDArray[np.intp]) -> None:
         """Give each the one of a table's (k, size) values that is chosen (n,) for it; of bits, values are 0 or 1."""

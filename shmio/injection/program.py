@@ -167,7 +167,7 @@ def _clamp(declaration: Declaration, target: Target, layout: Layout, _period_ns:
     most = math.inf if declaration.max is None else declaration.max
 
     def clamp(_places: Places, values: Values) -> Values:
-        clamped: Values = np.clip(values, values.dtype.type(least), values.dtype.type(most))
+        clamped: Values = np.minimum(np.maximum(values, values.dtype.type(least)), values.dtype.type(most))
         return clamped
 
     return lambda _draw: Arithmetic(groups, clamp)
