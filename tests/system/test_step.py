@@ -240,36 +240,3 @@ def test_a_killed_program_that_played_leaves_time_standing(line: Cell) -> None:
     clock = step(line)
     assert clock["step"] in (stands["step"] + 1, stands["step"] + 2), "it may have been killed within a step"
     assert not clock["playing"]
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ('model = "nowhere:Belt"', "there is no module nowhere"),
-        ('model = "line:Bolt"', "line has no Bolt; its models are: Belt, Gate"),
-        ('model = "line:time"', "line:time is no subclass of shmio.simulation.Model"),
-        ('model = "broken:Belt"', "broken cannot be imported: ZeroDivisionError: division by zero (broken.py, line 2)"),
-        ('model = "ends:Belt"', "the process that imports ends:Belt ended with status 7"),
-        ('model = "line:Belt"\nspeed = 3', "unknown key"),
-        ('model = "line:Belt"\nparameters = { weight = 3 }', "parameters.weight: model Belt has no such parameter"),
-        ('model = "line:Belt"\nconnections = { position = "gate/closed" }', "the model has no such input"),
-        ('model = "line:Belt"\nconnections = { speed = "gate/closed" }', "BOOL, which does not fit an input of LREAL"),
-        ('model = "line:Belt"\nconnections = { speed = "plc/speed" }', "plc"),
-        ('model = "line:Belt"\nconnections = { speed = "panel/limits" }', "near: limit"),
-        ('model = "line:Belt"\nlayout = "panel.toml"', "layout: model line:Belt needs a register speed"),
-    ],
-)
-def test_what_is_wrong_with_a_model_is_said_by_check(
-    make_cell: Callable[..., Cell], tmp_path: Path, wrong: str, message: str
-) -> None:
-    (tmp_path / "line.py").write_text(MODELS)
-    (tmp_path / "broken.py").write_text("x = 1\ny = 1 / 0\n")
-    (tmp_path / "ends.py").write_text("import os\nos._exit(7)\n")
-    (tmp_path / "panel.toml").write_text('[registers]\nlimit = "LREAL"\n')
-    text = CONFIG.replace("CLOCK", "stepped").replace("parameters = {{ gain = 2.0 }}\n", "")
-    cell = make_cell(config=text.replace('model = "line:Belt"', wrong.replace("{", "{{").replace("}", "}}"), 1))
-    done = cell.supervisor("check")
-    assert done.returncode == 1
-    assert "source" in done.stderr
-    assert message in done.stderr
-    assert "Traceback" not in done.stderr

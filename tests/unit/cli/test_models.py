@@ -1,0 +1,134 @@
+"""Models in a configuration: their layouts, and what is said of those that cannot run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from shmio.cli.supervise.prepare import prepare
+from shmio.errors import ConfigError
+
+CONFIG = """
+[instance]
+name = "line"
+
+[[source]]
+name = "belt"
+connector = "simulation"
+MODEL
+
+[[source]]
+name = "gate"
+connector = "simulation"
+model = "line:Gate"
+connections = { position = "belt/position", limit = "panel/limit", "more/closed" = "gate/closed" }
+
+[[source]]
+name = "panel"
+connector = "memory"
+layout = "panel.toml"
+"""
+MODELS = """
+from shmio.simulation import Input, Model, Output, Parameter
+
+print("a model that talks")
+
+class Belt(Model):
+    gain = Parameter("LREAL", 1.0)
+    speed = Input("LREAL", 1.0)
+    position = Output("LREAL")
+
+    def step(self, time_s, dt_s):
+        self.position += self.gain * self.speed * dt_s
+
+class Gate(Model):
+    position = Input("LREAL")
+    limit = Input("LREAL")
+    before = Input("BOOL", path="more/closed")
+    closed = Output("BOOL")
+
+    def step(self, time_s, dt_s):
+        self.closed = self.position > self.limit
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "line.py").write_text(MODELS)
+    (tmp_path / "broken.py").write_text("x = 1\ny = 1 / 0\n")
+    (tmp_path / "ends.py").write_text(
+        "import os, sys\nsys.stderr.write('no licence')\nsys.stderr.flush()\nos._exit(7)\n"
+    )
+    (tmp_path / "panel.toml").write_text('[registers]\nlimit = "LREAL"\nlamps = "ARRAY[1..3] OF BOOL"\n')
+    return tmp_path
+
+
+def written(folder: Path, model: str) -> Path:
+    file = folder / "supervisor.toml"
+    file.write_text(CONFIG.replace("MODEL", model))
+    return file
+
+
+def test_registers_are_those_that_the_model_declares(folder: Path) -> None:
+    prepared = prepare(written(folder, 'model = "line:Belt"\nparameters = { gain = 2 }\nseed = 4'))
+    assert [register.path for register in prepared.layouts["belt"].registers] == ["speed", "position"]
+    assert {block.source: block.attributes.stepped for block in prepared.plan.blocks} == {
+        "belt": True,
+        "gate": True,
+        "panel": True,
+    }
+    belt = next(job for job in prepared.plan.jobs if job.name == "belt")
+    assert belt.config["options"] == {
+        "model": "line:Belt",
+        "parameters": {"gain": 2},
+        "seed": 4,
+        "connections": {},
+        "folder": str(folder),
+    }
+
+
+def test_or_those_of_a_layout_that_has_them(folder: Path) -> None:
+    (folder / "belt.toml").write_text('[registers]\nmore = "INT"\nposition = "LREAL"\nspeed = "LREAL"\n')
+    prepared = prepare(written(folder, 'model = "line:Belt"\nlayout = "belt.toml"'))
+    assert [register.path for register in prepared.layouts["belt"].registers] == ["more", "position", "speed"]
+
+
+def test_a_changed_model_is_seen_by_the_next_look(folder: Path) -> None:
+    prepare(written(folder, 'model = "line:Belt"'))
+    (folder / "line.py").write_text(MODELS.replace('speed = Input("LREAL", 1.0)', 'speed = Input("REAL")'))
+    prepared = prepare(folder / "supervisor.toml")
+    assert prepared.layouts["belt"].registers[0].type == "REAL"
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        ("", "source[0].model: this key is needed"),
+        ('model = "nowhere:Belt"', "source[0].model: there is no module nowhere"),
+        ('model = "line:Bolt"', "source[0].model: line has no Bolt; its models are: Belt, Gate"),
+        ('model = "line:print"', "source[0].model: line has no print"),
+        ('model = "os:getcwd"', "source[0].model: os:getcwd is no subclass of shmio.simulation.Model"),
+        ('model = "broken:Belt"', "broken cannot be imported: ZeroDivisionError: division by zero (broken.py, line 2)"),
+        ('model = "ends:Belt"', "the process that imports ends:Belt ended with status 7: no licence"),
+        ('model = "line:Belt"\nspeed = 3', "source[0].speed: unknown key"),
+        ('model = "line:Belt"\nseed = -1', "source[0].seed"),
+        ('model = "line:Belt"\nparameters = { weight = 3 }', "parameters.weight: model Belt has no such parameter"),
+        ('model = "line:Belt"\nlayout = "panel.toml"', "source[0].layout: model line:Belt needs a register speed"),
+        ('model = "line:Belt"\nconnections = { position = "gate/closed" }', "there are: speed"),
+        (
+            'model = "line:Belt"\nconnections = { speed = "gate/closed" }',
+            "source[0].connections.speed: gate/closed is BOOL, which does not fit an input of LREAL",
+        ),
+        ('model = "line:Belt"\nconnections = { speed = "panel/lamps" }', "BOOL[], which does not fit"),
+        ('model = "line:Belt"\nconnections = { speed = "panel/limits" }', "near: limit"),
+        ('model = "line:Belt"\nconnections = { speed = "panel/limit/in" }', "leave out /in"),
+        ('model = "line:Belt"\nconnections = { speed = "SIMLOG://step" }', "source[0].connections.speed: "),
+    ],
+)
+def test_what_is_wrong_is_said_with_its_key(folder: Path, model: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        prepare(written(folder, model))
+    assert str(caught.value).startswith(f"{folder / 'supervisor.toml'}: source[0]")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
