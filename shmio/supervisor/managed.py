@@ -57,12 +57,16 @@ class Managed:
         self.life = Life()
 
     def keep(self, job: Job) -> bool:
-        """Go on with the same job, as a new plan has it; whether its process is told to take the job's rules anew."""
+        """Go on with the same job, as a new plan has it; whether its process is told to take anew rules that there are.
+
+        What another supervisor has started may have had some: it is told in any case.
+        """
         before, self._job = self._job, job
-        if self.child is None or job.rules is None or not (job.rules or before is None or before.rules):
+        known = bool(job.rules or (before and before.rules))
+        if self.child is None or job.rules is None or not (known or before is None):
             return False
         self.child.reread()
-        return True
+        return known
 
     def adopt(self, child: Adopted) -> None:
         """Take a process that another supervisor has started and that runs."""

@@ -127,6 +127,8 @@ async def _take_anew(worker: Worker, file: Path, doors: Doors, server: Server) -
         worker.log.error("tokens and roles stay as they were: %s", error)
         return
     ended = server.calls.review()
+    if not (ended or config.grpc.guarded):
+        return  # there are none, and it is likely that there were none
     worker.log.info("took tokens and roles anew", extra=fields(tokens=len(config.grpc.token), calls_ended=ended))
 
 
