@@ -12,13 +12,14 @@ from typing import Any
 import msgspec
 
 from shmio.cli.campaign import run_campaign
+from shmio.cli.cell import Cell
+from shmio.cli.local import Local
 from shmio.cli.run import dumps
 from shmio.cli.set import Pairs, read_value, seconds
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.codec import Value
 from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.logs import printable
-from shmio.segment.attach import Attachment
 
 HELP = "Have consumers, or with /in the device, get other values than they would, until Ctrl-C."
 
@@ -42,14 +43,16 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lift-all", action="store_true", help="lift all of them, of all sources")
 
 
-def execute(cell: Attachment, options: argparse.Namespace) -> int:
+def execute(cell: Cell, options: argparse.Namespace) -> int:
     """Lay, list, or lift. PathError, ValueRangeError, CommandError."""
     if options.lift_all or options.lift is not None:
         return _lift(cell, options)
     if options.file is not None:
         if options.pairs:
             raise CommandError("give --file, or PATH VALUE, not both")
-        return run_campaign(cell, options)
+        if not isinstance(cell, Local):
+            raise CommandError("--file: what a file declares is laid on the host of the instance; leave out --host")
+        return run_campaign(cell.attachment, options)
     if options.list or not options.pairs:
         _list(cell, as_json=options.json)
         return 0
@@ -60,8 +63,9 @@ def execute(cell: Attachment, options: argparse.Namespace) -> int:
     with ExitStack() as stack:
         for (_, direction), values in wanted.items():
             paths = [f"{path}/{direction}" for path in values]
-            shadow = cell.inject(*paths, priority=options.priority, keep=options.keep, name=options.name)
-            stack.enter_context(shadow)
+            shadow = stack.enter_context(
+                cell.inject(*paths, priority=options.priority, keep=options.keep, name=options.name)
+            )
             for path, outcome in zip(paths, shadow.set(values), strict=True):
                 if not outcome.done:
                     raise CommandError(f"{path}: {outcome.text}")
@@ -78,12 +82,12 @@ def _seed(text: str) -> int:
     return int(text)
 
 
-def _read(cell: Attachment, path: str, text: str) -> tuple[Topic, Value]:
+def _read(cell: Cell, path: str, text: str) -> tuple[Topic, Value]:
     sources = cell.sources
     topic = parse_topic(path, sources, sources[0] if len(sources) == 1 else None)
     if topic.source not in sources:
         raise PathError(f"{path}: nothing is served under {topic.source} in this version")
-    register = look_up(cell.block(topic.source).layout, topic)
+    register = look_up(cell.layout(topic.source), topic)
     try:
         return topic, read_value(text, register)
     except ValueRangeError as error:
@@ -98,7 +102,7 @@ def _wait(for_s: float | None) -> None:
     over.wait(for_s)
 
 
-def _lift(cell: Attachment, options: argparse.Namespace) -> int:
+def _lift(cell: Cell, options: argparse.Namespace) -> int:
     if options.lift_all:
         chosen = cell.lift_all()
     else:
@@ -113,11 +117,11 @@ def _lift(cell: Attachment, options: argparse.Namespace) -> int:
     return 0
 
 
-def _list(cell: Attachment, *, as_json: bool) -> None:
+def _list(cell: Cell, *, as_json: bool) -> None:
     """What stands, with the registers that it is over."""
     found: list[dict[str, Any]] = []
     for source, standing in cell.injections().items():
-        layout = cell.block(source).layout
+        layout = cell.layout(source)
         for one in standing:
             over = [f"{source}/{register.path}" for register in layout.registers if one.reaches(register)]
             fields = msgspec.to_builtins(one)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from typing import Any
 
+from shmio.cli.cell import Cell, Selected
 from shmio.errors import PathError
 from shmio.layout.codec import Value
 from shmio.layout.glob import named
@@ -12,22 +14,18 @@ from shmio.layout.model import Register
 from shmio.layout.text import json_value, to_text
 from shmio.layout.topic import parse_topic
 from shmio.logs import printable
-from shmio.segment.attach import Attachment
-from shmio.segment.block import Block
 from shmio.segment.frame import Quality
 from shmio.segment.view import Reading
 
 SHOWN_CHARACTERS = 60
 
-Selected = tuple[Block, Register]
 
-
-def choose(cell: Attachment, patterns: list[str]) -> list[Selected]:
+def choose(cell: Cell, patterns: Sequence[str]) -> list[Selected]:
     """Registers that the patterns name, each once, in order: a path, an array's element or slice, a structure, a glob.
 
     PathError when one of them names nothing.
     """
-    chosen: dict[tuple[str, str], Selected] = {}
+    chosen: dict[Selected, None] = {}
     sources = cell.sources
     default = sources[0] if len(sources) == 1 else None
     for pattern in patterns:
@@ -36,17 +34,11 @@ def choose(cell: Attachment, patterns: list[str]) -> list[Selected]:
             raise PathError(f"{pattern}: what goes into a source cannot be read; leave out /in")
         if topic.source not in sources:
             raise PathError(f"{pattern}: nothing is served under {topic.source} in this version")
-        block = cell.block(topic.source)
-        registers = named(block.layout, topic)
+        registers = named(cell.layout(topic.source), topic)
         if not registers:
             raise PathError(f"{pattern}: no register of {topic.source} has such a path")
-        chosen |= {(topic.source, register.path): (block, register) for register in registers}
-    return list(chosen.values())
-
-
-def topic_path(block: Block, register: Register) -> str:
-    """The register's path with its source."""
-    return f"{block.source}/{register.path}"
+        chosen |= dict.fromkeys(Selected(topic.source, register) for register in registers)
+    return list(chosen)
 
 
 def as_json(reading: Reading, register: Register) -> dict[str, Any]:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 
-from shmio.cli.readings import choose, topic_path
+from shmio.cli.cell import Cell
+from shmio.cli.readings import choose
 from shmio.cli.run import dumps
 from shmio.layout.model import Register
 from shmio.logs import printable
-from shmio.segment.attach import Attachment
 
 HELP = "List registers with their types."
 
@@ -18,7 +18,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("patterns", nargs="*", metavar="PATH", help="path, structure or glob (default: everything)")
 
 
-def execute(cell: Attachment, options: argparse.Namespace) -> int:
+def execute(cell: Cell, options: argparse.Namespace) -> int:
     """Print a line for each register, or one JSON list."""
     found = choose(cell, options.patterns or cell.sources)
     if options.json:
@@ -26,20 +26,20 @@ def execute(cell: Attachment, options: argparse.Namespace) -> int:
             dumps(
                 [
                     {
-                        "path": topic_path(block, r),
-                        "type": r.type,
-                        "dims": [list(d) for d in r.dims] or None,
-                        "comment": r.comment,
+                        "path": one.path,
+                        "type": one.register.type,
+                        "dims": [list(d) for d in one.register.dims] or None,
+                        "comment": one.register.comment,
                     }
-                    for block, r in found
+                    for one in found
                 ]
             )
         )
         return 0
-    width = max((len(topic_path(*item)) for item in found), default=0)
-    for block, register in found:
-        comment = f"  {register.comment}" if register.comment else ""
-        print(printable(f"{topic_path(block, register):<{width}}  {_type(register)}{comment}".rstrip()))
+    width = max((len(one.path) for one in found), default=0)
+    for one in found:
+        comment = f"  {one.register.comment}" if one.register.comment else ""
+        print(printable(f"{one.path:<{width}}  {_type(one.register)}{comment}".rstrip()))
     return 0
 
 

@@ -9,7 +9,7 @@ import re
 import shlex
 from collections.abc import Sequence
 
-from shmio.cli.readings import topic_path
+from shmio.cli.cell import Cell, Selected
 from shmio.cli.run import dumps
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.codec import Value
@@ -20,8 +20,7 @@ from shmio.layout.model import Register
 from shmio.layout.text import from_text, wire_type
 from shmio.layout.topic import look_up, parse_topic
 from shmio.logs import printable
-from shmio.segment import Block, EventKind
-from shmio.segment.attach import Attachment
+from shmio.segment import EventKind
 from shmio.segment.commander import MIN_PERIODS, TIMEOUT_S, Outcome
 
 HELP = "Write values of registers, and print what became of each."
@@ -66,13 +65,13 @@ class Pairs(argparse.Action):
         namespace.pairs = list(zip(words[::2], words[1::2], strict=True))
 
 
-def execute(cell: Attachment, options: argparse.Namespace) -> int:
+def execute(cell: Cell, options: argparse.Namespace) -> int:
     """Write all values of each source as one command. CommandError, when not all were written, names the first."""
     wanted: dict[str, dict[str, Value]] = {}
     for path, text in options.pairs:
-        block, register = _target(cell, path)
-        values = wanted.setdefault(block.source, {})
-        name = topic_path(block, register)
+        target = _target(cell, path)
+        values = wanted.setdefault(target.source, {})
+        name, register = target.path, target.register
         if name in values:
             raise PathError(f"{name}: given twice")
         try:
@@ -135,20 +134,20 @@ def _literal(text: str, register: Register) -> Value:
         raise
 
 
-def _target(cell: Attachment, path: str) -> tuple[Block, Register]:
+def _target(cell: Cell, path: str) -> Selected:
     sources = cell.sources
     topic = parse_topic(path, sources, sources[0] if len(sources) == 1 else None)
     if topic.direction == "out":
         raise PathError(f"{path}: what comes out of a source is not written; leave out /out")
     if topic.source not in sources:
         raise PathError(f"{path}: nothing is served under {topic.source} in this version")
-    block = cell.block(topic.source)
+    layout = cell.layout(topic.source)
     try:
-        return block, look_up(block.layout, topic)
+        return Selected(topic.source, look_up(layout, topic))
     except PathError:
         if "*" not in topic.path:
             raise
-    chosen = [topic_path(block, block.layout.registers[index]) for index in select(block.layout, [topic.path])]
+    chosen = [f"{topic.source}/{layout.registers[index].path}" for index in select(layout, [topic.path])]
     some = f"{', '.join(chosen[:MATCHES])}{', …' if chosen[MATCHES:] else ''}" if chosen else "nothing"
     raise PathError(f"{path}: set takes one register, not a pattern; this one matches {some}")
 

@@ -1,4 +1,4 @@
-"""``shmio``: the user's tool, on a running instance of this host."""
+"""``shmio``: the user's tool, on a running instance of this host, or of another."""
 
 from __future__ import annotations
 
@@ -10,13 +10,15 @@ from pathlib import Path
 from shmio import __version__
 from shmio.cli import get, inject, registers, step, watch
 from shmio.cli import set as set_verb
+from shmio.cli.cell import Cell
+from shmio.cli.local import Local
 from shmio.cli.run import run
 from shmio.cli.target import instance_name
-from shmio.segment.attach import Attachment, attach
+from shmio.segment.attach import attach
 
 PROGRAM = "shmio"
 
-Verb = Callable[[Attachment, argparse.Namespace], int]
+Verb = Callable[[Cell, argparse.Namespace], int]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -25,9 +27,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = _parser().parse_args(set_verb.shield(words) if words[:1] in (["set"], ["inject"]) else words)
 
     def command() -> int:
-        with attach(instance_name(arguments), writable=arguments.writable) as cell:
-            verb: Verb = arguments.verb
-            return verb(cell, arguments)
+        verb: Verb = arguments.verb
+        if arguments.host is not None:
+            from shmio.cli.remote import connected  # noqa: PLC0415  gRPC only for those who ask for it
+
+            with connected(arguments) as remote:
+                return verb(remote, arguments)
+        with attach(instance_name(arguments), writable=arguments.writable) as attachment:
+            return verb(Local(attachment), arguments)
 
     return run(PROGRAM, command)
 
@@ -39,6 +46,11 @@ def _parser() -> argparse.ArgumentParser:
     common.add_argument("-c", dest="config", type=Path, metavar="FILE", help="the instance of this supervisor.toml")
     common.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
     common.add_argument("--json", action="store_true", help="print JSON")
+    common.add_argument("--host", metavar="HOST:PORT", help="an instance's gRPC endpoint, on any host; or unix:PATH")
+    common.add_argument("--ca", type=Path, metavar="FILE", help="with --host: use TLS, and trust this authority (PEM)")
+    common.add_argument("--certificate", type=Path, metavar="FILE", help="our own certificate (PEM), if it asks for it")
+    common.add_argument("--key", type=Path, metavar="FILE", help="its key (PEM)")
+    common.add_argument("--token-file", type=Path, metavar="FILE", help="what the endpoint knows us by")
     verbs = parser.add_subparsers(required=True, metavar="VERB")
     modules = {"list": registers, "get": get, "watch": watch, "set": set_verb, "inject": inject, "step": step}
     for name, module in modules.items():

@@ -17,9 +17,10 @@ from os import PathLike
 from pathlib import Path
 
 from shmio.client import aio
-from shmio.client.calls import Injection, Outcome, Target
+from shmio.client.calls import Clock, Injection, Lifted, Outcome, Target
 from shmio.client.layout import BlockLayout
 from shmio.client.sync import Client, Subscription
+from shmio.client.sync_shadow import Shadow
 from shmio.client.table import Change, Column, Register, Table
 from shmio.client.update import Provenance, Quality, Snapshot, Update
 
@@ -27,12 +28,15 @@ __all__ = [
     "BlockLayout",
     "Change",
     "Client",
+    "Clock",
     "Column",
     "Injection",
+    "Lifted",
     "Outcome",
     "Provenance",
     "Quality",
     "Register",
+    "Shadow",
     "Snapshot",
     "Subscription",
     "Table",

@@ -8,11 +8,13 @@ from typing import Any, Self
 
 import grpc
 
-from shmio.client import calls
-from shmio.client.arrays import ReadResponse, SubscribeResponse
-from shmio.client.calls import Injection, Outcome, Target
+from shmio.client import calls, shadow
+from shmio.client.aio_shadow import Shadow
+from shmio.client.arrays import InjectResponse, ReadResponse, SubscribeResponse
+from shmio.client.calls import Clock, Injection, Lifted, Outcome, Target
 from shmio.client.layout import BlockLayout, layouts
 from shmio.client.update import Snapshot, Tables, Update
+from shmio.errors import CommandError
 from shmio.wire import shmio_v1_pb2 as wire
 from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
 
@@ -34,6 +36,7 @@ class Client:
         self._read = self._channel.unary_unary(
             f"/{calls.SERVICE}/Read", wire.ReadRequest.SerializeToString, ReadResponse.FromString
         )
+        self._inject: Any = self._channel.stream_stream(f"/{calls.SERVICE}/Inject", None, InjectResponse.FromString)
         self._subscribe = self._channel.unary_stream(
             f"/{calls.SERVICE}/Subscribe", wire.SubscribeRequest.SerializeToString, SubscribeResponse.FromString
         )
@@ -73,16 +76,68 @@ class Client:
         )
         return Subscription(self._subscribe(request, metadata=self.target.metadata), self.target)
 
-    async def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
+    async def write(
+        self, values: Mapping[str, object], timeout_s: float | None = None, *, until_accepted: bool = False
+    ) -> list[Outcome]:
         """As :meth:`shmio.client.Client.write`."""
-        request = calls.write_request(values, timeout_s)
+        request = calls.write_request(values, timeout_s, until_accepted=until_accepted)
         answer = await self._call(self._stub.Write, request, (timeout_s or 0) + calls.WRITE_PATIENCE_S)
         return calls.outcomes(values, answer.outcomes)
+
+    async def inject(
+        self,
+        *patterns: str,
+        priority: int = 0,
+        keep: bool = False,
+        name: str = "",
+        for_s: float | None = None,
+        originals: bool = False,
+    ) -> Shadow:
+        """As :meth:`shmio.client.Client.inject`."""
+        first = shadow.lay(patterns, priority=priority, keep=keep, name=name, for_s=for_s, originals=originals)
+        call = self._inject(metadata=self.target.metadata)
+        try:
+            await call.write(first)
+            found = await call.read()
+        except grpc.RpcError as error:
+            self.target.fail(error)
+        return Shadow(call, shadow.Held(found), self.target)
 
     async def injections(self, *sources: str) -> list[Injection]:
         """What stands at present, on these sources or all; of each the innermost first."""
         request = wire.ListInjectionsRequest(sources=sources)
         return calls.injections(await self._call(self._stub.ListInjections, request))
+
+    async def lift(self, source: str, number: int) -> None:
+        """Lift an injection, whoever laid it. PathError: there is none; CommandError: the source does not answer."""
+        await self._call(self._stub.Lift, wire.LiftRequest(source=source, number=number))
+
+    async def lift_all(self, *sources: str) -> list[Lifted]:
+        """The emergency: lift all of these sources, or of all, whoever laid them. CommandError: some still stand."""
+        found = calls.lifted(await self._call(self._stub.LiftAll, wire.LiftAllRequest(sources=sources)))
+        if left := [one for one in found if one.failure]:
+            raise CommandError(f"{len(left)} of {len(found)} injections still stand: {left[0].failure}")
+        return found
+
+    async def step(self, dt_s: float | None = None) -> Clock:
+        """Take time over, and move it by one step; it returns when all streams have what has changed in it.
+
+        CommandError: the step failed, or another program owns time; ValueRangeError.
+        """
+        request = wire.StepRequest(dt_ns=calls.ns(dt_s))
+        return Clock.of(await self._call(self._stub.Step, request, calls.STEP_PATIENCE_S))
+
+    async def set_step_size(self, dt_s: float) -> Clock:
+        """How far a step goes that does not say it; takes time over. CommandError, ValueRangeError."""
+        return Clock.of(await self._call(self._stub.SetStepSize, wire.SetStepSizeRequest(dt_ns=calls.ns(dt_s))))
+
+    async def play(self, dt_s: float | None = None, rate: float = 1.0) -> Clock:
+        """Have time step by itself, ``rate`` times as fast as real time. CommandError, ValueRangeError."""
+        return Clock.of(await self._call(self._stub.Play, wire.PlayRequest(dt_ns=calls.ns(dt_s), rate=rate)))
+
+    async def pause(self) -> Clock:
+        """Have time step no more by itself; takes it over. CommandError."""
+        return Clock.of(await self._call(self._stub.Pause, wire.PauseRequest()))
 
     async def _call(self, method: Callable[..., Any], request: Any, timeout_s: float | None = None) -> Any:
         try:

@@ -13,6 +13,7 @@ import numpy as np
 from shmio.errors import CommandError, EndpointError, PathError, RemoteError, ShmioError, ValueRangeError
 from shmio.wire import shmio_v1_pb2 as wire
 
+STEP_PATIENCE_S: Final = 60.0
 SERVICE: Final = wire.DESCRIPTOR.services_by_name["Shmio"].full_name
 WRITE_PATIENCE_S: Final = 30.0
 """Beyond its own time-out a write is given so long to be answered: a slow source has its cycles."""
@@ -78,7 +79,7 @@ _MEANING: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of one value. ``kind``: written, taken, rejected, refused, expired, unknown or shadowed.
+    """What became of one value. ``kind``: written, taken, rejected, refused, expired, unknown, shadowed or accepted.
 
     ``text``: the reason, if there is one to give.
     """
@@ -90,7 +91,16 @@ class Outcome:
     @property
     def done(self) -> bool:
         """Whether it has gone where it was meant to."""
-        return self.kind in ("written", "taken", "shadowed")
+        return self.kind in ("written", "taken", "shadowed", "accepted")
+
+
+def ns(dt_s: float | None) -> int:
+    """A step's size in ns; 0: the step size that there is. ValueRangeError."""
+    if dt_s is None:
+        return 0
+    if not 0 < dt_s <= 3600:
+        raise ValueRangeError(f"a step is from 1 us to 1 h, not {dt_s} s")
+    return max(1, round(dt_s * 1e9))
 
 
 def read_request(patterns: Iterable[str], *, originals: bool, tables: Iterable[int]) -> Any:
@@ -111,9 +121,10 @@ def subscribe_request(
     )
 
 
-def write_request(values: Mapping[str, object], timeout_s: float | None) -> Any:
+def write_request(values: Mapping[str, object], timeout_s: float | None, *, until_accepted: bool) -> Any:
     """For Write; ValueRangeError: a value of no kind that goes by wire."""
-    return wire.WriteRequest(values=assignments(values), timeout_ms=round(1000 * (timeout_s or 0)))
+    timeout_ms = round(1000 * (timeout_s or 0))
+    return wire.WriteRequest(values=assignments(values), timeout_ms=timeout_ms, until_accepted=until_accepted)
 
 
 def assignments(values: Mapping[str, object]) -> list[Any]:
@@ -168,6 +179,39 @@ class Injection:
     name: str
     pid: int
     ranges: tuple[tuple[int, int, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Lifted:
+    """An injection that was to be lifted. ``failure``: why it still stands; empty: it does not."""
+
+    source: str
+    number: int
+    name: str
+    failure: str
+
+
+def lifted(found: Any) -> list[Lifted]:
+    """Of an answer."""
+    return [Lifted(one.source, one.number, one.name, one.failure) for one in found.lifted]
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """How time stands. ``virtual``: only steps move it; ``step``: number of the last one that all have finished."""
+
+    virtual: bool
+    step: int
+    time_ns: int
+    step_size_ns: int
+    playing: bool
+    rate: float
+    note: str
+
+    @classmethod
+    def of(cls, found: Any) -> Clock:
+        """From the wire."""
+        return cls(found.virtual, found.step, found.time_ns, found.step_size_ns, found.playing, found.rate, found.note)
 
 
 def injections(found: Any) -> list[Injection]:

@@ -8,11 +8,13 @@ from typing import Any, Self
 
 import grpc
 
-from shmio.client import calls
-from shmio.client.arrays import ReadResponse, SubscribeResponse
-from shmio.client.calls import Injection, Outcome, Target
+from shmio.client import calls, shadow
+from shmio.client.arrays import InjectResponse, ReadResponse, SubscribeResponse
+from shmio.client.calls import Clock, Injection, Lifted, Outcome, Target
 from shmio.client.layout import BlockLayout, layouts
+from shmio.client.sync_shadow import Shadow
 from shmio.client.update import Snapshot, Tables, Update
+from shmio.errors import CommandError
 from shmio.wire import shmio_v1_pb2 as wire
 from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
 
@@ -38,6 +40,7 @@ class Client:
         self._read = self._channel.unary_unary(
             f"/{calls.SERVICE}/Read", wire.ReadRequest.SerializeToString, ReadResponse.FromString
         )
+        self._inject: Any = self._channel.stream_stream(f"/{calls.SERVICE}/Inject", None, InjectResponse.FromString)
         self._subscribe = self._channel.unary_stream(
             f"/{calls.SERVICE}/Subscribe", wire.SubscribeRequest.SerializeToString, SubscribeResponse.FromString
         )
@@ -89,19 +92,71 @@ class Client:
         )
         return Subscription(self._subscribe(request, metadata=self.target.metadata), self.target)
 
-    def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
+    def write(
+        self, values: Mapping[str, object], timeout_s: float | None = None, *, until_accepted: bool = False
+    ) -> list[Outcome]:
         """Write registers, arrays or elements of one source, all or none; what became of each, by the source.
 
-        ``timeout_s``: how long the source may take until it begins; default: 2 s, or three of its cycles. PathError,
-        ValueRangeError, CommandError: nothing has been sent.
+        ``timeout_s``: how long the source may take until it begins; default: 2 s, or three of its cycles.
+        ``until_accepted``: do not wait for what the device says. PathError, ValueRangeError, CommandError: nothing has
+        been sent.
         """
-        request = calls.write_request(values, timeout_s)
+        request = calls.write_request(values, timeout_s, until_accepted=until_accepted)
         answer = self._call(self._stub.Write, request, (timeout_s or 0) + calls.WRITE_PATIENCE_S)
         return calls.outcomes(values, answer.outcomes)
+
+    def inject(
+        self,
+        *patterns: str,
+        priority: int = 0,
+        keep: bool = False,
+        name: str = "",
+        for_s: float | None = None,
+        originals: bool = False,
+    ) -> Shadow:
+        """Lay a shadow over registers, elements, slices, structures or patterns of one source, all /out or all /in.
+
+        It is lifted when it is closed, at the end of its ``with`` block, when this program ends, or ``for_s`` later;
+        with ``keep`` only when somebody lifts it. ``originals``: iterate over it for what it stands over. PathError,
+        ValueRangeError; CommandError: the source refuses it.
+        """
+        first = shadow.lay(patterns, priority=priority, keep=keep, name=name, for_s=for_s, originals=originals)
+        return Shadow(self._inject, first, self.target, self._timeout_s)
 
     def injections(self, *sources: str) -> list[Injection]:
         """What stands at present, on these sources or all; of each the innermost first."""
         return calls.injections(self._call(self._stub.ListInjections, wire.ListInjectionsRequest(sources=sources)))
+
+    def lift(self, source: str, number: int) -> None:
+        """Lift an injection, whoever laid it. PathError: there is none; CommandError: the source does not answer."""
+        self._call(self._stub.Lift, wire.LiftRequest(source=source, number=number))
+
+    def lift_all(self, *sources: str) -> list[Lifted]:
+        """The emergency: lift all of these sources, or of all, whoever laid them. CommandError: some still stand."""
+        found = calls.lifted(self._call(self._stub.LiftAll, wire.LiftAllRequest(sources=sources)))
+        if left := [one for one in found if one.failure]:
+            raise CommandError(f"{len(left)} of {len(found)} injections still stand: {left[0].failure}")
+        return found
+
+    def step(self, dt_s: float | None = None) -> Clock:
+        """Take time over, and move it by one step; it returns when all streams have what has changed in it.
+
+        CommandError: the step failed, or another program owns time; ValueRangeError.
+        """
+        request = wire.StepRequest(dt_ns=calls.ns(dt_s))
+        return Clock.of(self._call(self._stub.Step, request, calls.STEP_PATIENCE_S))
+
+    def set_step_size(self, dt_s: float) -> Clock:
+        """How far a step goes that does not say it; takes time over. CommandError, ValueRangeError."""
+        return Clock.of(self._call(self._stub.SetStepSize, wire.SetStepSizeRequest(dt_ns=calls.ns(dt_s))))
+
+    def play(self, dt_s: float | None = None, rate: float = 1.0) -> Clock:
+        """Have time step by itself, ``rate`` times as fast as real time. CommandError, ValueRangeError."""
+        return Clock.of(self._call(self._stub.Play, wire.PlayRequest(dt_ns=calls.ns(dt_s), rate=rate)))
+
+    def pause(self) -> Clock:
+        """Have time step no more by itself; takes it over. CommandError."""
+        return Clock.of(self._call(self._stub.Pause, wire.PauseRequest()))
 
     def _call(self, method: Callable[..., Any], request: Any, timeout_s: float | None = None) -> Any:
         try:

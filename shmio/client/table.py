@@ -36,7 +36,7 @@ DTYPES: Final[Mapping[Column, np.dtype[Any]]] = {
     Column.DOUBLE: np.dtype("<f8"),
     Column.TEXT: np.dtype(object),
 }
-_FIELDS: Final = {
+FIELDS: Final = {
     Column.BOOL: "bools",
     Column.INT32: "int32s",
     Column.INT64: "int64s",
@@ -201,7 +201,7 @@ class Table:
             raise RemoteError(f"source {self.source}: an update that makes no sense: {error}") from None
 
     def _read(self, values: Any) -> Iterator[Change]:
-        for column, name in _FIELDS.items():
+        for column, name in FIELDS.items():
             if values.HasField(name):
                 part = getattr(values, name)
                 if column is Column.TEXT:

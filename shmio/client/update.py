@@ -39,14 +39,14 @@ class Update:
 
     ``changes`` has what came, ``table.arrays`` all values by now; ``update[path]`` is the value of a register by now.
     Times in ns: ``clock_ns`` since the instance's start, ``source_ns`` UTC of the values, 0 if there never were any.
-    ``missed``: with every frame, frames lost between the update before and this one. ``ended``: a reload has taken
-    away the source, or all that was asked of it. ``image``, ``raw``: with raw frames, as consumers see
-    them, and as the source delivered them. ``age_ns``: with reads.
+    ``marked``: it says anew which registers are invalid, or injected. ``missed``: with every frame, frames lost between
+    the update before and this one. ``ended``: a reload has taken away the source, or all that was asked of it.
+    ``image``, ``raw``: with raw frames, as consumers see them, and as delivered. ``age_ns``: with reads.
     """
 
     __slots__ = (
-        "_originals", "age_ns", "changes", "clock_ns", "cycle", "ended", "frame", "image", "incarnation", "missed",
-        "provenance", "quality", "raw", "reason", "source_ns", "table", "whole",
+        "_originals", "age_ns", "changes", "clock_ns", "cycle", "ended", "frame", "image", "incarnation", "marked",
+        "missed",        "provenance", "quality", "raw", "reason", "source_ns", "table", "whole",
     )  # fmt: skip
 
     def __init__(self, table: Table, found: Any) -> None:
@@ -67,6 +67,7 @@ class Update:
         self.age_ns: int = found.age_ns
         self.ended = False
         self.changes: tuple[Change, ...] = table.apply(found.values) if found.HasField("values") else ()
+        self.marked = found.HasField("invalid") or found.HasField("injected")
         if found.HasField("invalid"):
             table.mark(found.invalid, table.invalid)
         if found.HasField("injected"):

@@ -310,14 +310,24 @@ class SubscribeRequest(_message.Message):
     def __init__(self, patterns: _Optional[_Iterable[str]] = ..., mode: _Optional[_Union[Mode, str]] = ..., format: _Optional[_Union[Format, str]] = ..., max_rate_hz: _Optional[float] = ..., deadband: _Optional[float] = ...) -> None: ...
 
 class SubscribeResponse(_message.Message):
-    __slots__ = ("tables", "updates", "ended")
+    __slots__ = ("tables", "updates", "ended", "step")
     TABLES_FIELD_NUMBER: _ClassVar[int]
     UPDATES_FIELD_NUMBER: _ClassVar[int]
     ENDED_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
     tables: _containers.RepeatedCompositeFieldContainer[Table]
     updates: _containers.RepeatedCompositeFieldContainer[Update]
     ended: _containers.RepeatedCompositeFieldContainer[Ended]
-    def __init__(self, tables: _Optional[_Iterable[_Union[Table, _Mapping]]] = ..., updates: _Optional[_Iterable[_Union[Update, _Mapping]]] = ..., ended: _Optional[_Iterable[_Union[Ended, _Mapping]]] = ...) -> None: ...
+    step: Step
+    def __init__(self, tables: _Optional[_Iterable[_Union[Table, _Mapping]]] = ..., updates: _Optional[_Iterable[_Union[Update, _Mapping]]] = ..., ended: _Optional[_Iterable[_Union[Ended, _Mapping]]] = ..., step: _Optional[_Union[Step, _Mapping]] = ...) -> None: ...
+
+class Step(_message.Message):
+    __slots__ = ("number", "time_ns")
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    number: int
+    time_ns: int
+    def __init__(self, number: _Optional[int] = ..., time_ns: _Optional[int] = ...) -> None: ...
 
 class Ended(_message.Message):
     __slots__ = ("source", "reason")
@@ -358,12 +368,14 @@ class Assignment(_message.Message):
     def __init__(self, path: _Optional[str] = ..., value: _Optional[_Union[Value, _Mapping]] = ...) -> None: ...
 
 class WriteRequest(_message.Message):
-    __slots__ = ("values", "timeout_ms")
+    __slots__ = ("values", "timeout_ms", "until_accepted")
     VALUES_FIELD_NUMBER: _ClassVar[int]
     TIMEOUT_MS_FIELD_NUMBER: _ClassVar[int]
+    UNTIL_ACCEPTED_FIELD_NUMBER: _ClassVar[int]
     values: _containers.RepeatedCompositeFieldContainer[Assignment]
     timeout_ms: int
-    def __init__(self, values: _Optional[_Iterable[_Union[Assignment, _Mapping]]] = ..., timeout_ms: _Optional[int] = ...) -> None: ...
+    until_accepted: bool
+    def __init__(self, values: _Optional[_Iterable[_Union[Assignment, _Mapping]]] = ..., timeout_ms: _Optional[int] = ..., until_accepted: bool = ...) -> None: ...
 
 class WriteResponse(_message.Message):
     __slots__ = ("outcomes",)
@@ -382,6 +394,7 @@ class Outcome(_message.Message):
         KIND_REFUSED: _ClassVar[Outcome.Kind]
         KIND_EXPIRED: _ClassVar[Outcome.Kind]
         KIND_SHADOWED: _ClassVar[Outcome.Kind]
+        KIND_ACCEPTED: _ClassVar[Outcome.Kind]
     KIND_UNKNOWN: Outcome.Kind
     KIND_WRITTEN: Outcome.Kind
     KIND_TAKEN: Outcome.Kind
@@ -389,6 +402,7 @@ class Outcome(_message.Message):
     KIND_REFUSED: Outcome.Kind
     KIND_EXPIRED: Outcome.Kind
     KIND_SHADOWED: Outcome.Kind
+    KIND_ACCEPTED: Outcome.Kind
     KIND_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
     kind: Outcome.Kind
@@ -448,12 +462,12 @@ class Laid(_message.Message):
     def __init__(self, number: _Optional[int] = ..., table: _Optional[_Union[Table, _Mapping]] = ...) -> None: ...
 
 class Answer(_message.Message):
-    __slots__ = ("sequence", "outcomes")
+    __slots__ = ("sequence", "outcome")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
-    OUTCOMES_FIELD_NUMBER: _ClassVar[int]
+    OUTCOME_FIELD_NUMBER: _ClassVar[int]
     sequence: int
-    outcomes: _containers.RepeatedCompositeFieldContainer[Outcome]
-    def __init__(self, sequence: _Optional[int] = ..., outcomes: _Optional[_Iterable[_Union[Outcome, _Mapping]]] = ...) -> None: ...
+    outcome: Outcome
+    def __init__(self, sequence: _Optional[int] = ..., outcome: _Optional[_Union[Outcome, _Mapping]] = ...) -> None: ...
 
 class ListInjectionsRequest(_message.Message):
     __slots__ = ("sources",)
@@ -534,7 +548,7 @@ class GetStatusRequest(_message.Message):
     def __init__(self) -> None: ...
 
 class Status(_message.Message):
-    __slots__ = ("instance", "mode", "state", "segment", "segment_bytes", "supervisor", "processes", "note")
+    __slots__ = ("instance", "mode", "state", "segment", "segment_bytes", "supervisor", "processes", "note", "clock")
     INSTANCE_FIELD_NUMBER: _ClassVar[int]
     MODE_FIELD_NUMBER: _ClassVar[int]
     STATE_FIELD_NUMBER: _ClassVar[int]
@@ -543,6 +557,7 @@ class Status(_message.Message):
     SUPERVISOR_FIELD_NUMBER: _ClassVar[int]
     PROCESSES_FIELD_NUMBER: _ClassVar[int]
     NOTE_FIELD_NUMBER: _ClassVar[int]
+    CLOCK_FIELD_NUMBER: _ClassVar[int]
     instance: str
     mode: str
     state: str
@@ -551,7 +566,8 @@ class Status(_message.Message):
     supervisor: Supervisor
     processes: _containers.RepeatedCompositeFieldContainer[Process]
     note: str
-    def __init__(self, instance: _Optional[str] = ..., mode: _Optional[str] = ..., state: _Optional[str] = ..., segment: _Optional[str] = ..., segment_bytes: _Optional[int] = ..., supervisor: _Optional[_Union[Supervisor, _Mapping]] = ..., processes: _Optional[_Iterable[_Union[Process, _Mapping]]] = ..., note: _Optional[str] = ...) -> None: ...
+    clock: Clock
+    def __init__(self, instance: _Optional[str] = ..., mode: _Optional[str] = ..., state: _Optional[str] = ..., segment: _Optional[str] = ..., segment_bytes: _Optional[int] = ..., supervisor: _Optional[_Union[Supervisor, _Mapping]] = ..., processes: _Optional[_Iterable[_Union[Process, _Mapping]]] = ..., note: _Optional[str] = ..., clock: _Optional[_Union[Clock, _Mapping]] = ...) -> None: ...
 
 class Supervisor(_message.Message):
     __slots__ = ("pid", "uptime_s")
@@ -603,3 +619,49 @@ class SourceState(_message.Message):
     rate_hz: float
     overruns: int
     def __init__(self, quality: _Optional[str] = ..., reason: _Optional[str] = ..., cycle: _Optional[int] = ..., rate_hz: _Optional[float] = ..., overruns: _Optional[int] = ...) -> None: ...
+
+class StepRequest(_message.Message):
+    __slots__ = ("dt_ns",)
+    DT_NS_FIELD_NUMBER: _ClassVar[int]
+    dt_ns: int
+    def __init__(self, dt_ns: _Optional[int] = ...) -> None: ...
+
+class SetStepSizeRequest(_message.Message):
+    __slots__ = ("dt_ns",)
+    DT_NS_FIELD_NUMBER: _ClassVar[int]
+    dt_ns: int
+    def __init__(self, dt_ns: _Optional[int] = ...) -> None: ...
+
+class PlayRequest(_message.Message):
+    __slots__ = ("dt_ns", "rate")
+    DT_NS_FIELD_NUMBER: _ClassVar[int]
+    RATE_FIELD_NUMBER: _ClassVar[int]
+    dt_ns: int
+    rate: float
+    def __init__(self, dt_ns: _Optional[int] = ..., rate: _Optional[float] = ...) -> None: ...
+
+class PauseRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class WatchClockRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class Clock(_message.Message):
+    __slots__ = ("virtual", "step", "time_ns", "step_size_ns", "playing", "rate", "note")
+    VIRTUAL_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    STEP_SIZE_NS_FIELD_NUMBER: _ClassVar[int]
+    PLAYING_FIELD_NUMBER: _ClassVar[int]
+    RATE_FIELD_NUMBER: _ClassVar[int]
+    NOTE_FIELD_NUMBER: _ClassVar[int]
+    virtual: bool
+    step: int
+    time_ns: int
+    step_size_ns: int
+    playing: bool
+    rate: float
+    note: str
+    def __init__(self, virtual: bool = ..., step: _Optional[int] = ..., time_ns: _Optional[int] = ..., step_size_ns: _Optional[int] = ..., playing: bool = ..., rate: _Optional[float] = ..., note: _Optional[str] = ...) -> None: ...

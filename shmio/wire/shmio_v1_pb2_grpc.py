@@ -79,6 +79,31 @@ class ShmioStub(object):
                 request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.LiftAllRequest.SerializeToString,
                 response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.LiftResponse.FromString,
                 _registered_method=True)
+        self.Step = channel.unary_unary(
+                '/shmio.v1.Shmio/Step',
+                request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.StepRequest.SerializeToString,
+                response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
+                _registered_method=True)
+        self.SetStepSize = channel.unary_unary(
+                '/shmio.v1.Shmio/SetStepSize',
+                request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.SetStepSizeRequest.SerializeToString,
+                response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
+                _registered_method=True)
+        self.Play = channel.unary_unary(
+                '/shmio.v1.Shmio/Play',
+                request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.PlayRequest.SerializeToString,
+                response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
+                _registered_method=True)
+        self.Pause = channel.unary_unary(
+                '/shmio.v1.Shmio/Pause',
+                request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.PauseRequest.SerializeToString,
+                response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
+                _registered_method=True)
+        self.WatchClock = channel.unary_stream(
+                '/shmio.v1.Shmio/WatchClock',
+                request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.WatchClockRequest.SerializeToString,
+                response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
+                _registered_method=True)
 
 
 class ShmioServicer(object):
@@ -147,6 +172,41 @@ class ShmioServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def Step(self, request, context):
+        """Takes time over, and moves it by one step; answered when every stream has what has changed in it.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def SetStepSize(self, request, context):
+        """How far a step goes that does not say it; takes time over.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def Play(self, request, context):
+        """Steps by itself from now on, in real time or faster or slower.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def Pause(self, request, context):
+        """Steps no more by itself; takes time over.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def WatchClock(self, request, context):
+        """How time stands: at once, then after each step and each change.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_ShmioServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -194,6 +254,31 @@ def add_ShmioServicer_to_server(servicer, server):
                     servicer.LiftAll,
                     request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.LiftAllRequest.FromString,
                     response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.LiftResponse.SerializeToString,
+            ),
+            'Step': grpc.unary_unary_rpc_method_handler(
+                    servicer.Step,
+                    request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.StepRequest.FromString,
+                    response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.SerializeToString,
+            ),
+            'SetStepSize': grpc.unary_unary_rpc_method_handler(
+                    servicer.SetStepSize,
+                    request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.SetStepSizeRequest.FromString,
+                    response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.SerializeToString,
+            ),
+            'Play': grpc.unary_unary_rpc_method_handler(
+                    servicer.Play,
+                    request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.PlayRequest.FromString,
+                    response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.SerializeToString,
+            ),
+            'Pause': grpc.unary_unary_rpc_method_handler(
+                    servicer.Pause,
+                    request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.PauseRequest.FromString,
+                    response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.SerializeToString,
+            ),
+            'WatchClock': grpc.unary_stream_rpc_method_handler(
+                    servicer.WatchClock,
+                    request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.WatchClockRequest.FromString,
+                    response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -439,6 +524,141 @@ class Shmio(object):
             '/shmio.v1.Shmio/LiftAll',
             shmio_dot_wire_dot_shmio__v1__pb2.LiftAllRequest.SerializeToString,
             shmio_dot_wire_dot_shmio__v1__pb2.LiftResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Step(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/shmio.v1.Shmio/Step',
+            shmio_dot_wire_dot_shmio__v1__pb2.StepRequest.SerializeToString,
+            shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def SetStepSize(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/shmio.v1.Shmio/SetStepSize',
+            shmio_dot_wire_dot_shmio__v1__pb2.SetStepSizeRequest.SerializeToString,
+            shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Play(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/shmio.v1.Shmio/Play',
+            shmio_dot_wire_dot_shmio__v1__pb2.PlayRequest.SerializeToString,
+            shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Pause(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/shmio.v1.Shmio/Pause',
+            shmio_dot_wire_dot_shmio__v1__pb2.PauseRequest.SerializeToString,
+            shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def WatchClock(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/shmio.v1.Shmio/WatchClock',
+            shmio_dot_wire_dot_shmio__v1__pb2.WatchClockRequest.SerializeToString,
+            shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
             options,
             channel_credentials,
             insecure,

@@ -16,6 +16,7 @@ from shmio.endpoints.grpc.simlog_v2 import SimlogV2
 from shmio.endpoints.grpc.simserver import SimServer
 from shmio.endpoints.grpc.stepper import Stepper
 from shmio.endpoints.grpc.topics import Topics
+from shmio.errors import SegmentError
 from shmio.segment import ProcessSlot, Segment
 
 
@@ -29,12 +30,14 @@ class Services:
 
         ``default_source``: that of paths which name none; default: the only one.
         """
+        if slot.writer is None:
+            raise SegmentError("the segment has no command queue for this process")
         topics = Topics(feeds, default_source)
         self._outboxes = Outboxes()
         self._publisher = Publisher(topics)
         self.stepper = Stepper(segment, slot, hold, feeds, self._outboxes, self._publisher)
         """The instance's time."""
-        self._native = NativeService(topics, feeds, segment)
+        self._native = NativeService(topics, feeds, segment, slot.writer)
         self._services = (
             self._native,
             SimlogV1(topics, self._publisher, self._outboxes, self.stepper),

@@ -7,21 +7,31 @@ import time
 from collections.abc import Sequence
 
 from shmio.connectors.desk import CommandDesk
-from shmio.connectors.output import Output
+from shmio.connectors.injections import Owner
+from shmio.connectors.output import Image, Output
 from shmio.errors import ConnectorError
-from shmio.segment import BlockWriter, Write
+from shmio.segment import BlockWriter, Provenance, Quality, Write
+from tests.unit.endpoints.harness import WRITER
+
+GUEST = 0
+"""The command queue of a program from outside."""
 
 
 class Plant:
     """A desk in its thread, and a device that does what it is told unless ``refusal`` says why not."""
 
-    def __init__(self, writer: BlockWriter) -> None:
+    def __init__(self, writer: BlockWriter, *, armed: bool = True) -> None:
         self.writer = writer
         self.memory = bytearray(writer.block.layout.size)
         self.written: list[Write] = []
         self.refusal = ""
         self.lost = False
-        self.desk = CommandDesk(Output(writer), writer.block.attributes.writable, time.monotonic_ns)
+        self.owners: dict[int, Owner] = {WRITER: Owner(WRITER, 1), GUEST: Owner(GUEST, 2)}
+        self.quality = Quality.GOOD
+        self.output = Output(writer)
+        self.desk = CommandDesk(
+            self.output, writer.block.attributes.writable, time.monotonic_ns, armed=armed, owner_of=self.owners.get
+        )
         self.desk.open()
         self._cycles = 0
         self._stop = threading.Event()
@@ -36,7 +46,8 @@ class Plant:
         except ConnectorError as error:
             self.desk.close(str(error))
         self._cycles += 1
-        self.writer.publish(self.memory, cycle=self._cycles)
+        image = bytes(self.memory)
+        self.output.publish(Image(image, self._cycles, time.time_ns(), self.quality, Provenance.LIVE, ""))
 
     def run(self, period_s: float = 0.002) -> None:
         """Go on cycle after cycle."""

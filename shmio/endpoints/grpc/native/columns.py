@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -83,6 +85,7 @@ class _Other:
     register: int
     decode: Callable[[Buffer, int], Scalar]
     offset: int
+    size: int
 
 
 class Columns:
@@ -113,7 +116,7 @@ class Columns:
                 self._numbers.append((column, _numbers(chosen, code, order, where)))
             else:
                 self._others += self._others_of(members, chosen, order)
-        starts = {(other.offset, registers[other.register].element.size) for other in self._others}
+        starts = {(other.offset, other.size) for other in self._others}
         self._watched = np.array([at for start, size in starts for at in range(start, start + size)], np.intp)
         self._seen: tuple[bytes, dict[Column, list[tuple[int, Any]]], tuple[str, ...], tuple[int, ...]] | None = None
 
@@ -122,10 +125,37 @@ class Columns:
             column, first = self.places[place]
             decode = scalar_codec(register.element, order).decode
             for flat in range(register.count):
-                yield _Other(column, first + flat, place, decode, register.offset + flat * register.element.stride)
+                at = register.offset + flat * register.element.stride
+                yield _Other(column, first + flat, place, decode, at, register.element.size)
 
-    def decode(self, image: bytes) -> Decoded:
-        """All elements of an image of the block."""
+    def place(self, column: Column, slot: int) -> int | None:
+        """Place of the register that has a slot; None: there is no such slot."""
+        if not 0 <= slot < self.sizes[column]:
+            return None
+        firsts, places = self._starts[column]
+        return places[bisect_right(firsts, slot) - 1]
+
+    @cached_property
+    def _starts(self) -> Mapping[Column, tuple[list[int], list[int]]]:
+        """First slots of the registers of each column, ascending, and their places."""
+        found: dict[Column, tuple[list[int], list[int]]] = {column: ([], []) for column in Column}
+        for place, (column, slot) in sorted(enumerate(self.places), key=lambda pair: pair[1][1]):
+            found[column][0].append(slot)
+            found[column][1].append(place)
+        return found
+
+    def touched(self, mask: bytes) -> dict[Column, Array]:
+        """Slots of the elements that any of the bits set in a mask of the block belongs to."""
+        arrays = self.decode_numbers(mask)
+        found = {column: array.view(_BITS[column]) != 0 for column, array in arrays.items()}
+        if self.sizes[Column.TEXT]:
+            found[Column.TEXT] = np.zeros(self.sizes[Column.TEXT], bool)
+        for other in self._others:
+            found[other.column][other.slot] = any(mask[other.offset : other.offset + other.size])
+        return {column: np.flatnonzero(hit) for column, hit in found.items() if hit.any()}
+
+    def decode_numbers(self, image: bytes) -> dict[Column, Array]:
+        """The columns of numbers and bits; elements that are not just that are 0."""
         data = np.frombuffer(image, np.uint8)
         arrays = {column: np.zeros(self.sizes[column], kind) for column, kind in KINDS.items() if self.sizes[column]}
         if Column.BOOL in arrays:
@@ -133,9 +163,14 @@ class Columns:
             np.bitwise_and(data[where] >> shifts, 1, out=arrays[Column.BOOL])
         for column, part in self._numbers:
             arrays[column][part.slots] = data[part.bytes].view(part.kind)[:, 0]
+        return arrays
+
+    def decode(self, image: bytes) -> Decoded:
+        """All elements of an image of the block."""
+        arrays = self.decode_numbers(image)
         if not self._others:
             return Decoded(arrays, (), ())
-        numbers, texts, invalid = self._rest(image, data)
+        numbers, texts, invalid = self._rest(image, np.frombuffer(image, np.uint8))
         for column, found in numbers.items():
             for slot, value in found:
                 arrays[column][slot] = value
@@ -186,6 +221,18 @@ def pack(new: Decoded, old: Decoded | None = None, deadband: float = 0.0) -> byt
         if changed:
             where = field(1, np.array(changed, "<u4").tobytes())
             parts.append(field(Column.TEXT, where + _texts(new.texts[slot] for slot in changed)))
+    return b"".join(parts)
+
+
+def pack_slots(values: Decoded, chosen: Mapping[Column, Array]) -> bytes:
+    """A serialised ``Values`` of these slots."""
+    parts = []
+    for column, slots in chosen.items():
+        where = field(1, slots.astype("<u4").tobytes())
+        if column is Column.TEXT:
+            parts.append(field(column, where + _texts(values.texts[slot] for slot in slots)))
+        else:
+            parts.append(field(column, where + field(2, values.arrays[column][slots].tobytes())))
     return b"".join(parts)
 
 

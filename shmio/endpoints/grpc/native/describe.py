@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from shmio.endpoints.grpc.native.views import describe
 from shmio.segment import Block, Segment
+from shmio.segment.standing import Standing
 from shmio.segment.status import ProcessStatus, SourceStatus, status_of
 from shmio.wire import shmio_v1_pb2 as wire
 
@@ -40,6 +41,20 @@ def layout_parts(block: Block) -> Iterator[wire.LayoutPart]:
             if register.initial is not None:
                 found.initial = register.initial
         yield part
+
+
+def injection(block: Block, one: Standing) -> wire.Injection:
+    """An injection that stands on a block."""
+    return wire.Injection(
+        source=block.source,
+        number=one.id,
+        direction=wire.DIRECTION_IN if one.direction == "in" else wire.DIRECTION_OUT,
+        priority=one.priority,
+        keep=one.keep,
+        name=one.name,
+        pid=one.pid,
+        ranges=[wire.Range(offset=offset, size=size, mask=mask) for offset, size, mask in one.ranges],
+    )
 
 
 def status(segment: Segment) -> wire.Status:

@@ -70,6 +70,14 @@ class Selections:
             budget.take(view)
         return views
 
+    async def registers(self, wanted: Wanted) -> Selection:
+        """That of the one source there is."""
+        ((source, topics),) = wanted.items()
+        view = await self._view(source, topics, _Budget())
+        if not isinstance(view, Selection):  # topics are never none
+            raise PathError(f"{source}: no register is named")
+        return view
+
     async def _view(self, source: str, topics: Sequence[Topic], budget: _Budget) -> View:
         """``topics``: none for raw frames."""
         block = self._topics.feed(source).block

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Collection, Mapping
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 import grpc
 
@@ -12,11 +12,13 @@ from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.native import describe
 from shmio.endpoints.grpc.native.bells import Bells
 from shmio.endpoints.grpc.native.follow import aged
+from shmio.endpoints.grpc.native.orders import Orders
+from shmio.endpoints.grpc.native.refusal import Context, refuse
 from shmio.endpoints.grpc.native.selection import Selections
 from shmio.endpoints.grpc.native.subscribe import Subscription
 from shmio.endpoints.grpc.native.views import AGE_NS, ORIGINALS, Selection, View
 from shmio.endpoints.grpc.topics import Topics
-from shmio.errors import CommandError, EndpointError, PathError, SegmentError, ShmioError, ValueRangeError
+from shmio.errors import EndpointError, ShmioError
 from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as wire
 
@@ -24,27 +26,19 @@ SERVICE: Final = wire.DESCRIPTOR.services_by_name["Shmio"].full_name
 MAX_STREAMS: Final = 256
 """Subscribe calls that may be open at once."""
 
-Context = grpc.aio.ServicerContext[Any, Any]
-
-_STATUS: Final[Mapping[type[ShmioError], grpc.StatusCode]] = {
-    PathError: grpc.StatusCode.NOT_FOUND,
-    ValueRangeError: grpc.StatusCode.INVALID_ARGUMENT,
-    CommandError: grpc.StatusCode.FAILED_PRECONDITION,
-    EndpointError: grpc.StatusCode.RESOURCE_EXHAUSTED,
-    SegmentError: grpc.StatusCode.UNAVAILABLE,
-}
-
 
 class NativeService:
     """Serves the registers of all sources typed and packed."""
 
     name = SERVICE
 
-    def __init__(self, topics: Topics, feeds: Mapping[str, Feed], segment: Segment) -> None:
+    def __init__(self, topics: Topics, feeds: Mapping[str, Feed], segment: Segment, writer: int) -> None:
+        """``writer``: the command queue of this process."""
         self._feeds = feeds
         self._segment = segment
         self._selections = Selections(topics)
         self._bells = Bells()
+        self._orders = Orders(topics, feeds, self._selections, self._bells, writer)
         self._open: set[Subscription] = set()
         self._ended_updates = 0
 
@@ -69,14 +63,16 @@ class NativeService:
             "Read": unary(self.read, wire.ReadRequest.FromString),
             "Subscribe": streaming(self.subscribe, wire.SubscribeRequest.FromString),
         }
-        return grpc.method_handlers_generic_handler(SERVICE, calls)
+        return grpc.method_handlers_generic_handler(SERVICE, calls | self._orders.handlers())
 
     async def get_layouts(self, request: wire.GetLayoutsRequest, context: Context) -> AsyncIterator[wire.LayoutPart]:
         """The layouts of these sources, or of all. NOT_FOUND: no such source."""
-        for source in request.sources or list(self._feeds):
-            if source not in self._feeds:
-                await _refuse(context, PathError(f"no source {source!r}; there are: {', '.join(self._feeds)}"))
-            for part in describe.layout_parts(self._feeds[source].block):
+        try:
+            blocks = self._orders.blocks(request.sources)
+        except ShmioError as error:
+            await refuse(context, error)
+        for block in blocks:
+            for part in describe.layout_parts(block):
                 yield part
 
     async def get_status(self, _: wire.GetStatusRequest, __: Context) -> wire.Status:
@@ -94,7 +90,7 @@ class NativeService:
             tables = [field(1, view.table) for view in views if view.number not in known]
             return b"".join(tables + [field(2, _reading(view, originals=request.originals)) for view in views])
         except ShmioError as error:
-            await _refuse(context, error)
+            await refuse(context, error)
 
     async def subscribe(self, request: wire.SubscribeRequest, context: Context) -> AsyncIterator[bytes]:
         """The present values, then what changes, or every frame.
@@ -109,14 +105,14 @@ class NativeService:
                 )
             subscription = Subscription(self._selections, self._bells, request)
         except ShmioError as error:
-            await _refuse(context, error)
+            await refuse(context, error)
         self._open.add(subscription)
         try:
             yield await subscription.open()
             async for message in subscription.messages():
                 yield message
         except ShmioError as error:
-            await _refuse(context, error)
+            await refuse(context, error)
         finally:
             self._open.discard(subscription)
             self._ended_updates += subscription.updates
@@ -124,6 +120,7 @@ class NativeService:
 
     def move(self, sources: Collection[str]) -> None:
         """Have the streams of these sources go over to the blocks that there are by now."""
+        self._orders.move()
         for subscription in self._open:
             subscription.move(sources)
 
@@ -137,10 +134,3 @@ def _reading(view: View, *, originals: bool) -> bytes:
     if originals and isinstance(view, Selection) and frame.effective is not None and frame.source_ns:
         update += field(ORIGINALS, view.originals(frame))
     return update + number(AGE_NS, max(0, frame.age_ns(view.block.now_ns())))
-
-
-async def _refuse(context: Context, error: ShmioError) -> NoReturn:
-    """End a call with what its error means to the client."""
-    codes = (code for kind, code in _STATUS.items() if isinstance(error, kind))
-    await context.abort(next(codes, grpc.StatusCode.INTERNAL), str(error))
-    raise error  # abort never returns

@@ -1,0 +1,73 @@
+"""What the user's verbs act on: an instance of this host (local.py), or one that is reached by gRPC (remote.py)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from typing import NamedTuple, Protocol
+
+from shmio.layout.model import Layout, Register
+from shmio.segment.commander import Outcome
+from shmio.segment.standing import Standing
+from shmio.segment.view import Reading
+
+
+class Selected(NamedTuple):
+    """A register, or an array's element, of a source."""
+
+    source: str
+    register: Register
+
+    @property
+    def path(self) -> str:
+        """The register's path with its source."""
+        return f"{self.source}/{self.register.path}"
+
+
+class News(NamedTuple):
+    """A reading that differs from the one before. ``width``: of the longest path that is watched."""
+
+    what: Selected
+    now: Reading
+    width: int
+
+
+class Shadow(Protocol):
+    """An injection that was laid."""
+
+    number: int
+
+    def set(self, values: Mapping[str, object]) -> Sequence[Outcome]:
+        """Give values by path; what became of each."""
+
+
+class Cell(Protocol):
+    """An instance. Errors are those of :mod:`shmio.errors`."""
+
+    @property
+    def sources(self) -> list[str]:
+        """Names of the sources."""
+
+    def layout(self, source: str) -> Layout:
+        """The layout of a source; PathError."""
+
+    def readings(self, patterns: Sequence[str], chosen: Sequence[Selected]) -> list[Reading]:
+        """The chosen registers as of now, which are what the patterns name; those of one source from one frame."""
+
+    def news(self, patterns: Sequence[str]) -> Iterator[News]:
+        """The present readings of all that the patterns name, then each that changes. NotRunningError at the end."""
+
+    def write(self, values: Mapping[str, object], timeout_s: float | None) -> Sequence[Outcome]:
+        """Write registers of one source as one command."""
+
+    def inject(self, *paths: str, priority: int, keep: bool, name: str) -> AbstractContextManager[Shadow]:
+        """Lay an injection, for the time of a ``with`` block unless it is to be kept."""
+
+    def injections(self) -> dict[str, tuple[Standing, ...]]:
+        """What stands at present, by source; the innermost first."""
+
+    def lift(self, source: str, number: int) -> None:
+        """Lift an injection."""
+
+    def lift_all(self) -> list[tuple[str, Standing]]:
+        """Lift all."""

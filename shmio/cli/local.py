@@ -1,0 +1,140 @@
+"""An instance of this host, as the user's verbs see it: by its shared memory."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
+
+from shmio.cli.cell import News, Selected
+from shmio.cli.readings import choose
+from shmio.errors import NotRunningError, PathError
+from shmio.layout.model import Layout, Register
+from shmio.segment import Block, Frame, Quality
+from shmio.segment.attach import Attachment
+from shmio.segment.commander import Outcome
+from shmio.segment.shadow import Shadow
+from shmio.segment.standing import Standing
+from shmio.segment.view import Reading, reading
+
+IDLE_S: Final = 0.5
+WAITING_FRAMES: Final = 64
+"""Changes of so many frames may wait for a slow terminal; a block further behind goes on with its newest frame."""
+
+_Changes = list[tuple[Block, Register, Reading]]
+
+
+class Local:
+    """An attachment as a :class:`shmio.cli.cell.Cell`."""
+
+    def __init__(self, attachment: Attachment) -> None:
+        self.attachment = attachment
+
+    @property
+    def sources(self) -> list[str]:
+        """Names of the sources."""
+        return self.attachment.sources
+
+    def layout(self, source: str) -> Layout:
+        """The layout of a source; PathError."""
+        return self.attachment.block(source).layout
+
+    def readings(self, patterns: Sequence[str], chosen: Sequence[Selected]) -> list[Reading]:  # noqa: ARG002
+        """The chosen registers as of now; those of one source from one frame."""
+        blocks = {source: self.attachment.block(source) for source in {one.source for one in chosen}}
+        frames = {source: block.latest() for source, block in blocks.items()}
+        return [reading(blocks[one.source], one.register, frames[one.source]) for one in chosen]
+
+    def news(self, patterns: Sequence[str]) -> Iterator[News]:
+        """What all blocks report; a thread waits on each.
+
+        NotRunningError: the instance has stopped, or a reload has removed a source or a register.
+        """
+        news: queue.Queue[_Changes] = queue.Queue(WAITING_FRAMES)
+        followed: set[int] = set()
+        chosen = choose(self, patterns)
+        width = self._follow_new(chosen, followed, news)
+        while True:
+            try:
+                batch = news.get(timeout=IDLE_S)
+            except queue.Empty:
+                self._check_running()
+                continue
+            if not batch:  # a reload has ended a block
+                self._check_running()
+                chosen = self._choose_again(patterns, {one.source for one in chosen})
+                width = self._follow_new(chosen, followed, news)
+            yield from (News(Selected(block.source, register), now, width) for block, register, now in batch)
+
+    def _check_running(self) -> None:
+        if not self.attachment.current:
+            raise NotRunningError(f"instance {self.attachment.instance!r} has stopped")
+
+    def _choose_again(self, patterns: Sequence[str], sources: set[str]) -> list[Selected]:
+        """What the patterns name after a reload; ``sources``: of what they named before. NotRunningError."""
+        try:
+            return choose(self, patterns)
+        except PathError as error:
+            if gone := sorted(sources.difference(self.sources)):
+                named = f"source {gone[0]!r} was" if len(gone) == 1 else f"sources {', '.join(gone)} were"
+                raise NotRunningError(
+                    f"{named} removed from instance {self.attachment.instance!r} by a reload"
+                ) from None
+            raise NotRunningError(f"{error}: a reload has taken it away") from None
+
+    def _follow_new(self, chosen: Sequence[Selected], followed: set[int], news: queue.Queue[_Changes]) -> int:
+        """Have a thread follow each block that none follows yet; the width of the longest path."""
+        registers: dict[int, tuple[Block, list[Register]]] = {}
+        for one in chosen:
+            block = self.attachment.block(one.source)
+            if block.section not in followed:
+                registers.setdefault(block.section, (block, []))[1].append(one.register)
+        followed.update(registers)
+        for block, wanted in registers.values():
+            threading.Thread(target=_follow, args=(block, wanted, news), daemon=True).start()
+        return max(len(one.path) for one in chosen)
+
+    def write(self, values: Mapping[str, object], timeout_s: float | None) -> list[Outcome]:
+        """Write registers of one source as one command."""
+        return self.attachment.write(values, timeout_s)
+
+    def inject(self, *paths: str, priority: int, keep: bool, name: str) -> Shadow:
+        """Lay an injection, for the time of a ``with`` block unless it is to be kept."""
+        return self.attachment.inject(*paths, priority=priority, keep=keep, name=name)
+
+    def injections(self) -> dict[str, tuple[Standing, ...]]:
+        """What stands at present, by source; the innermost first."""
+        return self.attachment.injections()
+
+    def lift(self, source: str, number: int) -> None:
+        """Lift an injection."""
+        self.attachment.lift(source, number)
+
+    def lift_all(self) -> list[tuple[str, Standing]]:
+        """Lift all."""
+        return self.attachment.lift_all()
+
+
+def _follow(block: Block, registers: list[Register], news: queue.Queue[_Changes]) -> None:
+    """Report each register's reading, then every change of value or quality; an empty list when the block ends."""
+    shown: list[tuple[str, Quality, str] | None] = [None] * len(registers)
+    cursor = block.cursor()
+    frame: Frame | None = block.latest()
+    while True:
+        changes: _Changes = []
+        for index, register in enumerate(registers):
+            now = reading(block, register, frame)
+            # A stale reason holds the age: its text changes, the fact does not.
+            state = (repr(now.value), now.quality, now.reason.partition(":")[0])  # repr: a NaN equals itself
+            if state != shown[index]:
+                shown[index] = state
+                changes.append((block, register, now))
+        if changes:
+            news.put(changes)
+        if block.retired:
+            news.put([])
+            return
+        if cursor.behind > WAITING_FRAMES:
+            cursor = block.cursor(after=block.ring.head() - 1)
+        frame = cursor.next(timeout_s=min(IDLE_S, block.stale_ns / 1e9)) or block.latest()

@@ -1,0 +1,170 @@
+"""An instance that is reached by gRPC, as the user's verbs see it."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from functools import cached_property
+from typing import Any
+
+from shmio.cli.cell import News, Selected, Shadow
+from shmio.cli.readings import choose
+from shmio.client import BlockLayout, Client, Outcome, Update, connect
+from shmio.client import Quality as ClientQuality
+from shmio.client import Shadow as ClientShadow
+from shmio.errors import ConfigError, NotRunningError, PathError, RemoteError
+from shmio.layout.codec import Value
+from shmio.layout.model import Layout, Register
+from shmio.layout.types import element_type
+from shmio.segment import EventKind, Quality
+from shmio.segment.commander import Outcome as LocalOutcome
+from shmio.segment.standing import Standing
+from shmio.segment.view import Reading
+
+
+@contextmanager
+def connected(options: argparse.Namespace) -> Iterator[Remote]:
+    """The instance that the options name. OSError: a file cannot be read."""
+    if options.config is not None or options.instance is not None:
+        raise ConfigError("--host names the instance already: leave out -c and --instance")
+    token = options.token_file.read_text().strip() if options.token_file else None
+    with connect(options.host, ca=options.ca, certificate=options.certificate, key=options.key, token=token) as client:
+        yield Remote(client)
+
+
+class Remote:
+    """A client as a :class:`shmio.cli.cell.Cell`."""
+
+    def __init__(self, client: Client) -> None:
+        self._client = client
+
+    @cached_property
+    def _layouts(self) -> dict[str, Layout]:
+        return {source: _layout(found) for source, found in self._client.layouts().items()}
+
+    @property
+    def sources(self) -> list[str]:
+        """Names of the sources."""
+        return list(self._layouts)
+
+    def layout(self, source: str) -> Layout:
+        """The layout of a source; PathError."""
+        if source not in self._layouts:
+            raise PathError(f"no source {source!r}; there are: {', '.join(self._layouts)}")
+        return self._layouts[source]
+
+    def readings(self, patterns: Sequence[str], chosen: Sequence[Selected]) -> list[Reading]:
+        """The chosen registers as of now; those of one source from one frame."""
+        found = self._client.read(*patterns).updates
+        readings = []
+        for one in chosen:
+            update = found.get(one.source)
+            if update is None or one.register.path not in update.table.places:
+                raise NotRunningError(f"{one.path}: a reload has taken it away")
+            readings.append(_reading(update, update.table.places[one.register.path]))
+        return readings
+
+    def news(self, patterns: Sequence[str]) -> Iterator[News]:
+        """The present readings of all that the patterns name, then each that changes.
+
+        RemoteError: the instance has ended; NotRunningError: a reload has removed a source or a register.
+        """
+        chosen = choose(self, patterns)
+        width = max(len(one.path) for one in chosen)
+        shown: dict[str, tuple[object, ...]] = {}
+        for update in self._client.subscribe(*patterns):
+            if update.ended:
+                raise NotRunningError(f"{update.reason}: a reload has taken it away")
+            state = update.quality, update.reason.partition(":")[0]  # a stale reason holds the age
+            table = update.table
+            everything = update.whole or update.marked or shown.get(table.source) != state
+            shown[table.source] = state
+            for place in range(len(table.registers)) if everything else table.changed(update.changes):
+                what = Selected(table.source, _register(table.registers[place]))
+                now = _reading(update, place)
+                seen = repr(now.value), now.quality, now.reason.partition(":")[0]
+                if shown.get(what.path) != seen:
+                    shown[what.path] = seen
+                    yield News(what, now, width)
+
+    def write(self, values: Mapping[str, object], timeout_s: float | None) -> list[LocalOutcome]:
+        """Write registers of one source as one command."""
+        return _outcomes(self._client.write(values, timeout_s))
+
+    @contextmanager
+    def _lay(self, shadow: ClientShadow) -> Iterator[Shadow]:
+        with shadow:
+            yield _RemoteShadow(shadow)
+
+    def inject(self, *paths: str, priority: int, keep: bool, name: str) -> AbstractContextManager[Shadow]:
+        """Lay an injection, for the time of a ``with`` block unless it is to be kept."""
+        return self._lay(self._client.inject(*paths, priority=priority, keep=keep, name=name, originals=False))
+
+    def injections(self) -> dict[str, tuple[Standing, ...]]:
+        """What stands at present, by source; the innermost first."""
+        found: dict[str, tuple[Standing, ...]] = {}
+        for one in self._client.injections():
+            standing = Standing(one.number, one.direction, one.priority, one.keep, one.name, 0, one.pid, one.ranges)
+            found[one.source] = (*found.get(one.source, ()), standing)
+        return found
+
+    def lift(self, source: str, number: int) -> None:
+        """Lift an injection."""
+        self._client.lift(source, number)
+
+    def lift_all(self) -> list[tuple[str, Standing]]:
+        """Lift all."""
+        return [(one.source, Standing(one.number, "", 0, False, one.name, 0, 0, ())) for one in self._client.lift_all()]
+
+
+class _RemoteShadow:
+    def __init__(self, shadow: ClientShadow) -> None:
+        self.number = shadow.number
+        self._shadow = shadow
+
+    def set(self, values: Mapping[str, object]) -> list[LocalOutcome]:
+        return _outcomes(self._shadow.set(values))
+
+
+def _outcomes(found: Sequence[Outcome]) -> list[LocalOutcome]:
+    return [LocalOutcome(one.path, EventKind[one.kind.upper()], one.text) for one in found]
+
+
+def _layout(found: BlockLayout) -> Layout:
+    return Layout(
+        found.name,
+        found.number,
+        found.size,
+        found.optimized,
+        tuple(map(_register, found.registers)),
+        "big" if found.big_endian else "little",
+    )
+
+
+def _register(found: Any) -> Register:
+    if element_type(found.type) is None:
+        raise RemoteError(f"{found.path}: it has the type {found.type!r}, which this version does not know")
+    return Register(
+        found.path, found.type, found.dims, found.offset, found.bit, found.size, found.count, found.comment,
+        found.initial,
+    )  # fmt: skip
+
+
+def _reading(update: Update, place: int) -> Reading:
+    """One register of an update."""
+    table = update.table
+    value: Value = None
+    if update.source_ns:
+        found = table.value(place)
+        value = found.tolist() if hasattr(found, "tolist") else found
+    path = table.registers[place].path
+    quality, reason = update.quality_of(path)
+    return Reading(
+        value,
+        Quality[quality.name],
+        reason,
+        str(update.provenance_of(path)),
+        update.source_ns / 1e9 if update.source_ns else None,
+        round(update.age_ns / 1e9, 6) if update.age_ns or quality is not ClientQuality.BAD else None,
+    )

@@ -1,0 +1,104 @@
+"""Injections as their clients hold them: what goes up and what comes down, without the way it goes."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from shmio.client import calls
+from shmio.client.arrays import InjectRequest
+from shmio.client.calls import Outcome
+from shmio.client.table import DTYPES, FIELDS, Array, Column, Table
+from shmio.client.update import Tables, Update
+from shmio.errors import RemoteError, ValueRangeError
+from shmio.wire import shmio_v1_pb2 as wire
+
+MAX_WAITING: Final = 4096
+"""Messages with originals that may wait to be read."""
+
+Arrays = Mapping[Column, Array | tuple[Array, Array]]
+"""Values of whole columns as in the table, or (slots, values)."""
+
+
+def lay(
+    patterns: Iterable[str], *, priority: int, keep: bool, name: str, for_s: float | None, originals: bool
+) -> bytes:
+    """The first message. ValueRangeError."""
+    if for_s is not None and not 0 < for_s <= 86_400:
+        raise ValueRangeError(f"for_s: {for_s} is not a number of seconds above 0, at most 86400")
+    lifetime_ms = 0 if for_s is None else max(1, round(1000 * for_s))
+    request = InjectRequest()
+    request.lay.patterns.extend(patterns)
+    request.lay.priority, request.lay.keep, request.lay.name = priority, keep, name
+    request.lay.lifetime_ms, request.lay.quiet = lifetime_ms, not originals
+    return bytes(request.SerializeToString())
+
+
+class Held:
+    """What is known of an injection that stands."""
+
+    def __init__(self, found: Any) -> None:
+        """``found``: the first answer. RemoteError: it is none."""
+        if not found.HasField("laid"):
+            raise RemoteError("the endpoint's first answer to Inject is none")
+        self.number: int = found.laid.number
+        self._tables = Tables()
+        self.table = Table(found.laid.table)
+        self._tables.known[self.table.number] = self.table
+        self._sequence = 0
+        self._waiting: deque[Any] = deque()
+
+    def request(self, values: Mapping[str, object], arrays: Arrays | None, *, answered: bool) -> tuple[int, bytes]:
+        """A message with values, and its sequence number. ValueRangeError."""
+        request = InjectRequest()
+        shadow = request.shadow
+        if answered:
+            self._sequence += 1
+            shadow.sequence = self._sequence
+        for column, given in (arrays or {}).items():
+            self._fill(getattr(shadow.values, FIELDS[column]), column, given)
+        data = bytes(request.SerializeToString())
+        if values:
+            more = wire.InjectRequest(shadow=wire.Shadow(assignments=calls.assignments(values)))
+            data += more.SerializeToString()  # parts of one message are merged
+        return shadow.sequence, data
+
+    def _fill(self, part: Any, column: Column, given: Array | tuple[Array, Array]) -> None:
+        slots, values = given if isinstance(given, tuple) else (None, given)
+        expected = len(self.table.arrays.get(column, ())) if slots is None else len(slots)
+        if len(values) != expected:
+            raise ValueRangeError(f"{FIELDS[column]}: {len(values)} values for {expected} elements")
+        if slots is not None:
+            part.slots = np.asarray(slots, "<u4").tobytes()
+        if column is Column.TEXT:
+            part.values.extend(map(str, values))
+        else:
+            part.values = np.asarray(values, DTYPES[column]).tobytes()
+
+    def keep(self, found: Any) -> None:
+        """Keep the originals of a message until they are asked for. RemoteError: nobody does."""
+        if found.originals:
+            if len(self._waiting) >= MAX_WAITING:
+                raise RemoteError(f"{MAX_WAITING} messages with originals wait to be read: iterate, or do not ask")
+            self._waiting.append(found.originals)
+
+    @property
+    def waits(self) -> bool:
+        """Whether originals wait."""
+        return bool(self._waiting)
+
+    def originals(self) -> Iterator[Update]:
+        """Those of the oldest message that waits."""
+        for update in self._waiting.popleft():
+            if update.table != self.table.number:
+                raise RemoteError(f"an original of table {update.table}, which was not sent")
+            yield Update(self.table, update)
+
+
+def ends(values: Mapping[str, object], arrays: Arrays | None, outcome: Any) -> list[Outcome]:
+    """An answer for each value; one for all that went as arrays."""
+    paths = [*values, *([""] if arrays else [])]
+    return calls.outcomes(paths, [outcome])

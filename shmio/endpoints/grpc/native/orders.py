@@ -1,0 +1,192 @@
+"""The calls of shmio.v1 that have a source do something: Write, Inject, and those about injections."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Collection, Coroutine, Mapping
+from typing import Any, Final
+
+import grpc
+
+from shmio.endpoints.grpc.feed import Feed
+from shmio.endpoints.grpc.native import describe
+from shmio.endpoints.grpc.native.bells import Bells
+from shmio.endpoints.grpc.native.desk import Desk
+from shmio.endpoints.grpc.native.inject import Injection
+from shmio.endpoints.grpc.native.refusal import Context, refuse
+from shmio.endpoints.grpc.native.selection import Selections
+from shmio.endpoints.grpc.native.values import assigned, outcome
+from shmio.endpoints.grpc.topics import Topics
+from shmio.errors import CommandError, EndpointError, PathError, ShmioError, ValueRangeError
+from shmio.layout.topic import shorten
+from shmio.segment import Block
+from shmio.segment.standing import Standing
+from shmio.wire import shmio_v1_pb2 as wire
+
+MAX_INJECTIONS: Final = 256
+"""Inject calls that may be open at once."""
+MAX_TIMEOUT_MS: Final = 86_400_000
+
+
+class Orders:
+    """A part of the service."""
+
+    def __init__(
+        self, topics: Topics, feeds: Mapping[str, Feed], selections: Selections, bells: Bells, writer: int
+    ) -> None:
+        """``writer``: the command queue of this process."""
+        self._topics = topics
+        self._feeds = feeds
+        self._selections = selections
+        self._bells = bells
+        self._writer = writer
+        self._desks: dict[int, Desk] = {}  # by the section of their block
+        self._injections: set[Injection] = set()
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
+        """Its calls, by name."""
+        unary = grpc.unary_unary_rpc_method_handler
+        return {
+            "Write": unary(self.write, wire.WriteRequest.FromString, wire.WriteResponse.SerializeToString),
+            "Inject": grpc.stream_stream_rpc_method_handler(self.inject, wire.InjectRequest.FromString),
+            "ListInjections": unary(
+                self.list_injections,
+                wire.ListInjectionsRequest.FromString,
+                wire.ListInjectionsResponse.SerializeToString,
+            ),
+            "Lift": unary(self.lift, wire.LiftRequest.FromString, wire.LiftResponse.SerializeToString),
+            "LiftAll": unary(self.lift_all, wire.LiftAllRequest.FromString, wire.LiftResponse.SerializeToString),
+        }
+
+    async def write(self, request: wire.WriteRequest, context: Context) -> wire.WriteResponse:
+        """Write registers of one source, all or nothing; what became of each, by the source.
+
+        NOT_FOUND: no such register; INVALID_ARGUMENT: no value of its type, several sources, too many;
+        FAILED_PRECONDITION: not writable, or the source takes nothing. Nothing has been sent then.
+        """
+        try:
+            if request.timeout_ms > MAX_TIMEOUT_MS:
+                raise ValueRangeError(f"timeout_ms: at most {MAX_TIMEOUT_MS}, a day")
+            source, values = assigned(request.values, self._topics)
+            timeout_s = request.timeout_ms / 1000 or None
+            ends = await self._desk(source).write(values, timeout_s, until_accepted=request.until_accepted)
+            return wire.WriteResponse(outcomes=[outcome(*end) for end in ends])
+        except ShmioError as error:
+            await refuse(context, error)
+
+    async def inject(self, requests: AsyncIterator[wire.InjectRequest], context: Context) -> AsyncIterator[bytes]:
+        """Lay an injection as long as the stream is open, or for good; originals down, other values up.
+
+        NOT_FOUND: no such register; INVALID_ARGUMENT: no injection, or values that are none of it; FAILED_PRECONDITION:
+        the source refuses it, and says why; RESOURCE_EXHAUSTED: too many streams, or what is written is not read;
+        ABORTED: somebody else has lifted it.
+        """
+        opening: asyncio.Task[bytes] | None = None
+        taking: asyncio.Task[None] | None = None
+        try:
+            injection = await self._injection(requests)
+            opening = asyncio.get_running_loop().create_task(injection.open(self._desk(injection.source)))
+            yield await asyncio.shield(opening)
+            taking = asyncio.get_running_loop().create_task(injection.take(requests))
+            taking.add_done_callback(injection.taken)
+            async for message in injection.messages():
+                yield message
+            taking.cancel()
+            await asyncio.shield(self._spawn(self._close(injection, opening)))  # who sees the end sees it lifted
+            opening = None
+        except ShmioError as error:
+            await refuse(context, error)
+        finally:
+            if taking is not None:
+                taking.cancel()
+            if opening is not None:
+                self._spawn(self._close(injection, opening))
+        if injection.failure is not None:
+            await refuse(context, injection.failure)
+        if injection.over:
+            await context.abort(grpc.StatusCode.ABORTED, f"{injection.source}: {injection.over}")
+
+    async def _injection(self, requests: AsyncIterator[wire.InjectRequest]) -> Injection:
+        """What the first message asks for. PathError, ValueRangeError, EndpointError."""
+        if len(self._injections) >= MAX_INJECTIONS:
+            raise EndpointError(f"{MAX_INJECTIONS} calls of Inject are open, the most there may be")
+        async for request in requests:
+            if request.WhichOneof("what") == "lay":
+                injection = Injection(self._topics, self._selections, self._bells, request.lay)
+                self._injections.add(injection)
+                return injection
+            break
+        raise ValueRangeError("the first message of Inject lays an injection, all others give values")
+
+    async def _close(self, injection: Injection, opening: asyncio.Task[bytes]) -> None:
+        try:
+            await asyncio.wait((opening,))
+            if not opening.cancelled() and opening.exception() is None:
+                await injection.close()
+        finally:
+            self._injections.discard(injection)
+
+    async def list_injections(
+        self, request: wire.ListInjectionsRequest, context: Context
+    ) -> wire.ListInjectionsResponse:
+        """What stands at present. NOT_FOUND: no such source."""
+        found = wire.ListInjectionsResponse()
+        try:
+            for block in self.blocks(request.sources):
+                found.injections.extend(describe.injection(block, one) for one in block.standing.read())
+        except ShmioError as error:
+            await refuse(context, error)
+        return found
+
+    async def lift(self, request: wire.LiftRequest, context: Context) -> wire.LiftResponse:
+        """Lift one. NOT_FOUND: there is no such injection; FAILED_PRECONDITION: the source does not answer."""
+        try:
+            (block,) = self.blocks([request.source])
+            standing = [one for one in block.standing.read() if one.id == request.number]
+            if not standing:
+                raise PathError(f"{request.source}: there is no injection {request.number}; ListInjections lists them")
+            lifted = await self._lift(block, standing[0])
+            if lifted.failure:
+                raise CommandError(f"{request.source}: {lifted.failure}")
+            return wire.LiftResponse(lifted=[lifted])
+        except ShmioError as error:
+            await refuse(context, error)
+
+    async def lift_all(self, request: wire.LiftAllRequest, context: Context) -> wire.LiftResponse:
+        """Lift all, at once; of one that still stands it is said why. NOT_FOUND: no such source."""
+        try:
+            blocks = self.blocks(request.sources)
+        except ShmioError as error:
+            await refuse(context, error)
+        standing = [(block, one) for block in blocks for one in block.standing.read()]
+        lifted = await asyncio.gather(*(self._lift(block, one) for block, one in standing))
+        return wire.LiftResponse(lifted=lifted)
+
+    async def _lift(self, block: Block, one: Standing) -> wire.Lifted:
+        failure = await self._desk(block.source).lift(one.id)
+        return wire.Lifted(source=block.source, number=one.id, name=one.name, failure=failure)
+
+    def blocks(self, sources: Collection[str]) -> list[Block]:
+        """The blocks of these sources, or of all; PathError."""
+        for source in sources:
+            if source not in self._feeds:
+                raise PathError(f"no source {shorten(source)!r}; there are: {', '.join(self._feeds)}")
+        return [self._feeds[source].block for source in sources or self._feeds]
+
+    def _desk(self, source: str) -> Desk:
+        block = self._topics.feed(source).block
+        desk = self._desks.get(block.section)
+        if desk is None:
+            desk = self._desks[block.section] = Desk(block, self._writer, self._bells)
+        return desk
+
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    def move(self) -> None:
+        """A reload has ended some blocks."""
+        self._desks = {section: desk for section, desk in self._desks.items() if not desk.block.retired}

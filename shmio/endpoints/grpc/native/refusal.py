@@ -1,0 +1,28 @@
+"""How an error is told to a client of shmio.v1."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final, NoReturn
+
+import grpc
+
+from shmio.errors import CommandError, EndpointError, PathError, SegmentError, ShmioError, TimeError, ValueRangeError
+
+Context = grpc.aio.ServicerContext[Any, Any]
+
+_STATUS: Final[Mapping[type[ShmioError], grpc.StatusCode]] = {
+    PathError: grpc.StatusCode.NOT_FOUND,
+    ValueRangeError: grpc.StatusCode.INVALID_ARGUMENT,
+    CommandError: grpc.StatusCode.FAILED_PRECONDITION,
+    EndpointError: grpc.StatusCode.RESOURCE_EXHAUSTED,
+    TimeError: grpc.StatusCode.FAILED_PRECONDITION,
+    SegmentError: grpc.StatusCode.UNAVAILABLE,
+}
+
+
+async def refuse(context: Context, error: ShmioError) -> NoReturn:
+    """End a call with what its error means to the client."""
+    codes = (code for kind, code in _STATUS.items() if isinstance(error, kind))
+    await context.abort(next(codes, grpc.StatusCode.INTERNAL), str(error))
+    raise error  # abort never returns

@@ -1,0 +1,112 @@
+"""Values that clients send: one by one by path, or packed by a table's slots."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Final
+
+from shmio.endpoints.grpc.native.columns import Column
+from shmio.endpoints.grpc.native.views import Selection
+from shmio.endpoints.grpc.topics import Topics
+from shmio.errors import CommandError, ValueRangeError
+from shmio.layout.model import Register
+from shmio.layout.text import from_text, wire_type
+from shmio.layout.topic import shorten
+from shmio.segment import EventKind
+from shmio.wire import shmio_v1_pb2 as wire
+
+MAX_VALUES: Final = 4096
+"""Of one command."""
+
+_FIELDS: Final = {column: wire.Values.DESCRIPTOR.fields_by_number[column].name for column in Column}
+_OUTCOMES: Final = {
+    EventKind.WRITTEN: wire.Outcome.KIND_WRITTEN,
+    EventKind.TAKEN: wire.Outcome.KIND_TAKEN,
+    EventKind.REJECTED: wire.Outcome.KIND_REJECTED,
+    EventKind.REFUSED: wire.Outcome.KIND_REFUSED,
+    EventKind.EXPIRED: wire.Outcome.KIND_EXPIRED,
+    EventKind.SHADOWED: wire.Outcome.KIND_SHADOWED,
+    EventKind.ACCEPTED: wire.Outcome.KIND_ACCEPTED,
+}
+
+
+def outcome(kind: EventKind, reason: str) -> wire.Outcome:
+    """What became of a value, for the client."""
+    return wire.Outcome(kind=_OUTCOMES.get(kind, wire.Outcome.KIND_UNKNOWN), reason=reason)
+
+
+def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, object]]:
+    """The source, and values by their paths in it. PathError, ValueRangeError; CommandError: ``/out``."""
+    values: dict[str, object] = {}
+    sources: dict[str, None] = {}
+    for assignment in assignments:
+        topic = topics.topic(assignment.path)
+        register = topics.register(topic)
+        if topic.direction == "out":
+            raise CommandError(f"{shorten(assignment.path)}: what comes out of a source is not written; leave out /out")
+        if register.path in values:
+            raise ValueRangeError(f"{shorten(assignment.path)}: given twice")
+        values[register.path] = plain(assignment.value, register)
+        sources[topic.source] = None
+    if not values:
+        raise ValueRangeError("no value is given")
+    if len(values) > MAX_VALUES:
+        raise ValueRangeError(f"{len(values)} values, {MAX_VALUES} are the most: write whole arrays, or less at once")
+    if len(sources) > 1:
+        raise ValueRangeError(f"one call is for one source, these values are for {', '.join(sorted(sources))}")
+    return next(iter(sources)), values
+
+
+def plain(value: wire.Value, register: Register) -> object:
+    """A value as Python has it; ValueRangeError: there is none, or no text of its type."""
+    if value.WhichOneof("kind") == "text" and (register.dims or wire_type(register) != "string"):
+        return from_text(value.text, register)
+    return _plain(value, register.path)
+
+
+def _plain(value: wire.Value, path: str) -> object:
+    kind = value.WhichOneof("kind")
+    if kind is None:
+        raise ValueRangeError(f"{path}: no value is given")
+    if kind == "list":
+        return [_plain(item, path) for item in value.list.values]
+    found: object = getattr(value, kind)
+    return found
+
+
+def packed(values: wire.Values, selection: Selection) -> dict[str, object]:
+    """Values by path, of registers or of arrays' elements. ValueRangeError: not of this table."""
+    found: dict[str, object] = {}
+    for column, name in _FIELDS.items():
+        if not values.HasField(name):
+            continue
+        part = getattr(values, name)
+        slots = part.slots or range(selection.columns.sizes[column])
+        if len(slots) != len(part.values):
+            raise ValueRangeError(f"{name}: {len(part.values)} values for {len(slots)} slots")
+        if len(found) + len(slots) > MAX_VALUES:
+            raise ValueRangeError(f"more than {MAX_VALUES} values: send less at once")
+        for slot, value in zip(slots, part.values, strict=True):
+            found[_path(selection, column, slot)] = value
+    return found
+
+
+def _path(selection: Selection, column: Column, slot: int) -> str:
+    """The path of the register or element at a slot; ValueRangeError."""
+    place = selection.columns.place(column, slot)
+    if place is None:
+        raise ValueRangeError(f"{column.name.lower()}s: the table has no slot {slot}")
+    register = selection.registers[place]
+    if not register.dims:
+        return register.path
+    flat = slot - selection.columns.places[place][1]
+    return "/".join((register.path, *map(str, _index(register, flat))))
+
+
+def _index(register: Register, flat: int) -> Iterator[int]:
+    """The declared indices of an array's element."""
+    indices = []
+    for low, high in reversed(register.dims):
+        flat, rest = divmod(flat, high - low + 1)
+        indices.append(low + rest)
+    return reversed(indices)
