@@ -19,7 +19,8 @@ from shmio.wire import shmio_v1_pb2 as wire
 MAX_WAITING: Final = 4096
 """Messages with originals that may wait to be read."""
 
-Arrays = Mapping[Column, Array | tuple[Array, Array]]
+Given = Array | list[Any]
+Arrays = Mapping[Column, Given | tuple[Given, Given]]
 """Values of whole columns as in the table, or (slots, values)."""
 
 
@@ -66,7 +67,7 @@ class Held:
             data += more.SerializeToString()  # parts of one message are merged
         return shadow.sequence, data
 
-    def _fill(self, part: Any, column: Column, given: Array | tuple[Array, Array]) -> None:
+    def _fill(self, part: Any, column: Column, given: Given | tuple[Given, Given]) -> None:
         slots, values = given if isinstance(given, tuple) else (None, given)
         expected = len(self.table.arrays.get(column, ())) if slots is None else len(slots)
         if len(values) != expected:

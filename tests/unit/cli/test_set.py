@@ -288,7 +288,6 @@ def test_sources_have_a_command_each_and_what_was_written_is_told(
         ["--timeout", "0", "cell/count", "1"],
         ["--timeout", "nan", "cell/count", "1"],
         ["--timeout", "x", "cell/count", "1"],
-        ["--host", "127.0.0.1:8089", "cell/count", "1"],
     ],
 )
 def test_wrong_usage_is_2(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> None:

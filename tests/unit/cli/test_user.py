@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from shmio.cli import target, watch
+from shmio.cli import target
+from shmio.cli.local import Local
 from shmio.cli.user import main
 from shmio.layout.model import Layout, Register
 from shmio.segment import BlockSpec, Segment
@@ -71,7 +72,7 @@ def test_watch_ends_with_ctrl_c(running: str, monkeypatch: pytest.MonkeyPatch) -
     def news(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(watch, "_news", news)
+    monkeypatch.setattr(Local, "news", news)
     assert main(["watch", "--instance", running, "cell/a"]) == 130
 
 

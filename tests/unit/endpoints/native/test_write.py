@@ -47,7 +47,7 @@ def test_registers_arrays_and_elements_in_one_command(segment: Segment) -> None:
         assert await kinds(write(served, values)) == [KINDS.KIND_WRITTEN] * 6
         memory = device.memory
         assert struct.unpack_from(">f", memory)[0] == 1.5
-        assert (memory[8], memory[10:12], memory[12:14], memory[14:16]) == (8, b"\0\7", b"\xff\xfd", b"\1\0")
+        assert bytes(memory[8:16]) == b"\x08\0\0\7\xff\xfd\1\0"
         assert memory[16:21] == b"\x08\x03abc"
 
     with_plant(segment, test)

@@ -1,0 +1,135 @@
+"""The user's verbs with --host: the same output as on the instance's own host."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from shmio.cli.user import main
+from shmio.segment import Segment
+from tests.unit.endpoints.conftest import segment as segment  # noqa: PLC0414  the fixture
+from tests.unit.endpoints.harness import Endpoint
+from tests.unit.endpoints.plant import Plant
+from tests.unit.endpoints.test_publish import with_plant
+
+EXAMPLE = Path(__file__).parents[3] / "examples/remote.py"
+
+Output = Callable[..., tuple[int, str, str]]
+Test = Callable[[Output, Output, Plant], None]
+
+
+def both(segment: Segment, capsys: pytest.CaptureFixture[str], test: Test) -> None:
+    """Run a test with verbs by ``--host``, and by attaching."""
+
+    async def run(served: Endpoint, device: Plant) -> None:
+        def verb(*words: str) -> tuple[int, str, str]:
+            capsys.readouterr()
+            status = 2
+            with suppress(SystemExit):
+                status = main(words)
+            out, err = capsys.readouterr()
+            return status, out, err
+
+        def remote(name: str, *words: str) -> tuple[int, str, str]:
+            return verb(name, "--host", f"127.0.0.1:{served.port}", *words)
+
+        def local(name: str, *words: str) -> tuple[int, str, str]:
+            return verb(name, "--instance", segment.instance, *words)
+
+        device.memory[0:4] = b"\x3d\xcc\xcc\xcd"  # 0.1
+        device.memory[16:21] = b"\x08\x03abc"
+        device.cycle()
+        await asyncio.to_thread(test, remote, local, device)
+
+    with_plant(segment, run, running=False)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("list",),
+        ("list", "--json", "cell"),
+        ("list", "cell/axis", "cell/inputs/1"),
+        ("get", "cell"),
+        ("get", "cell/long/2..4", "cell/axis/*", "running"),
+        ("get", "--json", "cell/name", "cell/axis", "cell/inputs"),
+        ("get", "cell/nothing"),
+        ("get", "cell/axs/position"),
+        ("get", "cell/x*"),
+        ("get", "cell/step/in"),
+        ("get", "SIMLOG://step"),
+        ("watch", "-n", "2", "cell/axis"),
+        ("watch", "--json", "-n", "3", "cell/axis", "cell/name"),
+        ("inject",),
+        ("inject", "--json"),
+        ("inject", "--lift", "7"),
+        ("set", "cell/nothing", "1"),
+        ("set", "cell/*", "1"),
+        ("set", "cell/step", "40000"),
+        ("set", "cell/secret", "1"),
+        ("get",),
+    ],
+)
+def test_the_output_is_the_same(segment: Segment, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]) -> None:
+    def test(remote: Output, local: Output, _: Plant) -> None:
+        def comparable(result: tuple[int, str, str]) -> tuple[int, str, str]:
+            status, out, err = result
+            return status, re.sub(r'"age_s": [0-9.e-]+|"age_s": null', '"age_s": 0', out), err
+
+        there, here = comparable(remote(*words)), comparable(local(*words))
+        if words[0] == "watch":  # of one frame the order is that of what changed
+            assert sorted(there[1].splitlines()) == sorted(here[1].splitlines())
+        else:
+            assert there == here
+
+    both(segment, capsys, test)
+
+
+def test_set_and_inject(segment: Segment, capsys: pytest.CaptureFixture[str]) -> None:
+    def test(remote: Output, local: Output, device: Plant) -> None:
+        device.run()
+        assert remote("set", "cell/step", "7", "cell/running", "true")[1].splitlines() == [
+            "cell/step     written",
+            "cell/running  written",
+        ]
+        assert device.memory[13] == 7
+        assert json.loads(remote("set", "--json", "cell/step", "8")[1])["cell/step"]["outcome"] == "written"
+        status, out, _ = remote("inject", "--keep", "--name", "x", "cell/step", "9")
+        assert status == 0
+        number = out.partition(":")[0]
+        assert remote("get", "cell/step")[1] == "cell/step  9\n"
+        assert json.loads(remote("get", "--json", "cell/step")[1])["cell/step"]["provenance"] == "injected"
+        assert remote("inject")[1] == local("inject")[1]
+        assert remote("inject", "--lift", number)[0] == 0
+        assert remote("get", "cell/step")[1] == "cell/step  8\n"
+        assert remote("inject", "--lift-all") == (0, "", "")
+
+    both(segment, capsys, test)
+
+
+def test_what_is_wrong_with_the_host(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main(["get", "--host", "127.0.0.1:1", "cell"]) == 1
+    assert capsys.readouterr().err.startswith("127.0.0.1:1: no instance serves there, or it has ended")
+    assert main(["get", "--host", "127.0.0.1:1", "--instance", "x", "cell"]) == 1
+    assert capsys.readouterr().err == "--host names the instance already: leave out -c and --instance\n"
+    assert main(["get", "--host", "127.0.0.1:1", "--token-file", str(tmp_path / "none"), "cell"]) == 1
+    assert capsys.readouterr().err == f"{tmp_path / 'none'}: No such file or directory\n"
+
+
+def test_the_example(segment: Segment) -> None:
+    async def run(served: Endpoint, device: Plant) -> None:
+        device.memory[13] = 7
+        command = [sys.executable, str(EXAMPLE), f"127.0.0.1:{served.port}", "cell/step", "--count", "1"]
+        done = await asyncio.to_thread(subprocess.run, command, capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 0, done.stderr
+        assert re.search(r"cell/step +7\b", done.stdout)
+
+    with_plant(segment, run)
