@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
@@ -238,6 +238,7 @@ def status(found: Any) -> dict[str, Any]:
         else None,
         "processes": list(map(_process, found.processes)),
         "note": found.note,
+        "clock": asdict(Clock.of(found.clock)),
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Final
 
 from shmio.endpoints.grpc.feed import Feed
@@ -31,6 +31,8 @@ class Delivery:
         self._feeds = feeds
         self._outboxes = outboxes
         self._turn = asyncio.Lock()
+        self.others: list[Callable[[Step], Awaitable[None]]] = []
+        """Who has streams of his own: sends what has changed in a step, then that it is over, and waits for them."""
 
     def begin(self, moment: Moment) -> None:
         """Time has become virtual, and this is what was delivered of it."""
@@ -58,6 +60,7 @@ class Delivery:
                 except SegmentError as error:
                     log.warning("step %d: %s", step.number, str(error))
             await self._outboxes.taken(PATIENCE_S)
+            await asyncio.gather(*(other(step) for other in self.others))
             mark()
             await self._outboxes.taken(PATIENCE_S)
             return True

@@ -23,9 +23,10 @@ _SERVICES: Final[Mapping[str, Mapping[str, str]]] = {
         INJECT: "Inject",
     },
     "shmio.v1.Shmio": {
-        READ: "GetLayouts GetStatus Read Subscribe ListInjections",
+        READ: "GetLayouts GetStatus Read Subscribe ListInjections WatchClock",
         WRITE: "Write",
         INJECT: "Inject Lift LiftAll",
+        CONTROL: "Step SetStepSize Play Pause",
     },
     "com.ttsnetwork.simulator3.SimServerAPI": {
         READ: "subscribe",

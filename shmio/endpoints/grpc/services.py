@@ -37,7 +37,7 @@ class Services:
         self._publisher = Publisher(topics)
         self.stepper = Stepper(segment, slot, hold, feeds, self._outboxes, self._publisher)
         """The instance's time."""
-        self._native = NativeService(topics, feeds, segment, slot.writer)
+        self._native = NativeService(topics, feeds, segment, slot.writer, self.stepper)
         self._services = (
             self._native,
             SimlogV1(topics, self._publisher, self._outboxes, self.stepper),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import threading
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextlib import suppress
 from functools import partial
 from typing import Any, Final, TypeVar
@@ -53,7 +53,8 @@ class Stepper:
         """Tells steps and time."""
         self._clock = segment.clock
         self._slot = slot
-        self._hold = hold
+        self.hold = hold
+        """Whether time is virtual, and what was delivered."""
         self._delivery = Delivery(hold, feeds, outboxes)
         self._publisher = publisher
         self._loop = asyncio.get_running_loop()
@@ -92,6 +93,10 @@ class Stepper:
     def alive(self) -> bool:
         """Whether time is being followed, and played if it should be."""
         return self._thread.is_alive() and (self._player is None or not self._player.done())
+
+    def also(self, deliver: Callable[[Step], Awaitable[None]]) -> None:
+        """Have each step delivered to others, too, before it is over."""
+        self._delivery.others.append(deliver)
 
     def watch(self, watcher: Callable[[Status], None]) -> None:
         """Have it told of each step and of each change."""
@@ -250,9 +255,9 @@ class Stepper:
     def _look(self) -> None:
         """Heed what the page says by now."""
         state = self._clock.read()
-        if state.virtual and not self._hold.on:
+        if state.virtual and not self.hold.on:
             self._delivery.begin(Moment(state.done, state.present_ns))
-        if state.done > self._hold.moment.number and not self._moving:
+        if state.done > self.hold.moment.number and not self._moving:
             self._spawn(self._deliver(Step(state.done, state.present_ns, state.dt_ns)))
         elif self._status(state)[1:] != self._told:
             self._tell(self._status(state))
@@ -267,8 +272,8 @@ class Stepper:
             watcher(status)
 
     def _now(self) -> Moment:
-        if self._hold.on:
-            return self._hold.moment
+        if self.hold.on:
+            return self.hold.moment
         return Moment(0, self._clock.read().time_ns)
 
     # ---- the thread ------------------------------------------------------------------------------------------------

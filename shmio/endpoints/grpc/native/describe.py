@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from shmio.endpoints.grpc.native.clock import clock
 from shmio.endpoints.grpc.native.views import describe
 from shmio.segment import Block, Segment
 from shmio.segment.standing import Standing
@@ -68,6 +69,7 @@ def status(segment: Segment) -> wire.Status:
         segment_bytes=now.segment_bytes,
         processes=map(_process, now.processes),
         note=now.note,
+        clock=clock(segment.clock.read()),
     )
     if now.supervisor is not None:
         found.supervisor.pid, found.supervisor.uptime_s = now.supervisor.pid, now.supervisor.uptime_s

@@ -21,6 +21,10 @@ class Follower(Protocol):
     due_s: float
     """Event loop's time before which :meth:`next` gives nothing; infinity: only a frame makes it."""
 
+    @property
+    def begun(self) -> bool:
+        """Whether the present values have been given."""
+
     def next(self, now_s: float) -> bytes | None:
         """The next serialised ``Update``, if there is one."""
 
@@ -36,6 +40,11 @@ class EveryFrame:
         self._missed = 0
         self._shown: Frame | None = None
         self._age = _Age(view)
+
+    @property
+    def begun(self) -> bool:
+        """Whether the present values have been given."""
+        return self._shown is not None
 
     def next(self, now_s: float) -> bytes | None:  # noqa: ARG002  as fast as the client takes them
         """The next frame, or what has become of the last one."""
@@ -62,6 +71,11 @@ class Latest:
         self._shown: Frame | None = None
         self._sent: Decoded | None = None  # with a dead-band
         self._age = _Age(view)
+
+    @property
+    def begun(self) -> bool:
+        """Whether the present values have been given."""
+        return self._shown is not None
 
     def next(self, now_s: float) -> bytes | None:
         """What differs in the newest frame from what was sent last; or what has become of that."""

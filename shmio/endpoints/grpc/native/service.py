@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator, Collection, Mapping
 from typing import Any, Final
 
 import grpc
 
+from shmio.endpoints.grpc.delivery import PATIENCE_S
 from shmio.endpoints.grpc.encoding import field, number
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.native import describe
 from shmio.endpoints.grpc.native.bells import Bells
+from shmio.endpoints.grpc.native.clock import Clocks
 from shmio.endpoints.grpc.native.follow import aged
 from shmio.endpoints.grpc.native.orders import Orders
 from shmio.endpoints.grpc.native.refusal import Context, refuse
 from shmio.endpoints.grpc.native.selection import Selections
 from shmio.endpoints.grpc.native.subscribe import Subscription
 from shmio.endpoints.grpc.native.views import AGE_NS, ORIGINALS, Selection, View
+from shmio.endpoints.grpc.stepper import Stepper
 from shmio.endpoints.grpc.topics import Topics
 from shmio.errors import EndpointError, ShmioError
 from shmio.segment import Segment
+from shmio.segment.coordinator import Step
 from shmio.wire import shmio_v1_pb2 as wire
 
 SERVICE: Final = wire.DESCRIPTOR.services_by_name["Shmio"].full_name
@@ -32,12 +37,17 @@ class NativeService:
 
     name = SERVICE
 
-    def __init__(self, topics: Topics, feeds: Mapping[str, Feed], segment: Segment, writer: int) -> None:
+    def __init__(
+        self, topics: Topics, feeds: Mapping[str, Feed], segment: Segment, writer: int, stepper: Stepper
+    ) -> None:
         """``writer``: the command queue of this process."""
         self._feeds = feeds
         self._segment = segment
         self._selections = Selections(topics)
         self._bells = Bells()
+        self._clocks = Clocks(segment, stepper)
+        self._hold = stepper.hold
+        stepper.also(self._deliver)
         self._orders = Orders(topics, feeds, self._selections, self._bells, writer)
         self._open: set[Subscription] = set()
         self._ended_updates = 0
@@ -63,7 +73,7 @@ class NativeService:
             "Read": unary(self.read, wire.ReadRequest.FromString),
             "Subscribe": streaming(self.subscribe, wire.SubscribeRequest.FromString),
         }
-        return grpc.method_handlers_generic_handler(SERVICE, calls | self._orders.handlers())
+        return grpc.method_handlers_generic_handler(SERVICE, calls | self._orders.handlers() | self._clocks.handlers())
 
     async def get_layouts(self, request: wire.GetLayoutsRequest, context: Context) -> AsyncIterator[wire.LayoutPart]:
         """The layouts of these sources, or of all. NOT_FOUND: no such source."""
@@ -103,7 +113,7 @@ class NativeService:
                 raise EndpointError(
                     f"{MAX_STREAMS} calls of Subscribe are open, the most there may be: one takes many patterns"
                 )
-            subscription = Subscription(self._selections, self._bells, request)
+            subscription = Subscription(self._selections, self._bells, self._hold, request)
         except ShmioError as error:
             await refuse(context, error)
         self._open.add(subscription)
@@ -117,6 +127,14 @@ class NativeService:
             self._open.discard(subscription)
             self._ended_updates += subscription.updates
             subscription.close()
+
+    async def _deliver(self, step: Step) -> None:
+        """Have all streams send what has changed in a step, and then say so; wait until they have."""
+        marks = {subscription.mark(step): subscription for subscription in self._open}
+        if marks:
+            _, late = await asyncio.wait(marks, timeout=PATIENCE_S)
+            for mark in late:
+                marks[mark].late = True
 
     def move(self, sources: Collection[str]) -> None:
         """Have the streams of these sources go over to the blocks that there are by now."""

@@ -9,19 +9,21 @@ from collections.abc import AsyncIterator, Collection, Iterator
 from typing import Final
 
 from shmio.endpoints.grpc.encoding import field
+from shmio.endpoints.grpc.hold import Hold
 from shmio.endpoints.grpc.native.bells import Bells
 from shmio.endpoints.grpc.native.follow import EveryFrame, Follower, Latest
 from shmio.endpoints.grpc.native.selection import Selections
 from shmio.endpoints.grpc.native.views import View
-from shmio.errors import PathError, ValueRangeError
+from shmio.errors import EndpointError, PathError, ValueRangeError
+from shmio.segment.coordinator import Step
 from shmio.wire import shmio_v1_pb2 as wire
 
 BATCH_BYTES: Final = 1 << 18
 """What has come of all blocks goes out in one message up to this size."""
 MAX_RATE_HZ: Final = 1e6
 
-TABLES, UPDATES, ENDED = (
-    wire.SubscribeResponse.DESCRIPTOR.fields_by_name[name].number for name in ("tables", "updates", "ended")
+TABLES, UPDATES, ENDED, STEP = (
+    wire.SubscribeResponse.DESCRIPTOR.fields_by_name[name].number for name in ("tables", "updates", "ended", "step")
 )
 
 
@@ -46,10 +48,14 @@ def check(request: wire.SubscribeRequest) -> None:
 class Subscription:
     """One call of Subscribe."""
 
-    def __init__(self, selections: Selections, bells: Bells, request: wire.SubscribeRequest) -> None:
-        """PathError, ValueRangeError: as of the request."""
+    def __init__(self, selections: Selections, bells: Bells, hold: Hold, request: wire.SubscribeRequest) -> None:
+        """``hold``: virtual time. PathError, ValueRangeError: as of the request."""
         check(request)
         self.updates = 0
+        self.late = False
+        """Whether a step has waited too long for it."""
+        self._hold = hold
+        self._marks: deque[tuple[Step, asyncio.Future[None]]] = deque()
         self._selections = selections
         self._bells = bells
         self._request = request
@@ -67,6 +73,8 @@ class Subscription:
 
     def close(self) -> None:
         """Leave them."""
+        while self._marks:
+            _set(self._marks.popleft()[1])
         for source in list(self._followers):
             self._leave(source)
 
@@ -75,9 +83,19 @@ class Subscription:
         self._moved |= dict.fromkeys(source for source in self._wanted if source in sources)
         self._news.set()
 
+    def mark(self, step: Step) -> asyncio.Future[None]:
+        """Say that a step is over, when all that has changed in it is sent; what is done then, or when this ends."""
+        sent = asyncio.get_running_loop().create_future()
+        if self.late:
+            sent.set_result(None)
+        else:
+            self._marks.append((step, sent))
+            self._news.set()
+        return sent
+
     async def messages(self) -> AsyncIterator[bytes]:
-        """Serialised SubscribeResponses, without end."""
-        while True:
+        """Serialised SubscribeResponses, without end. EndpointError: a step has waited too long to be read."""
+        while not self.late:
             self._news.clear()  # before looking
             if batch := b"".join(self._batch()):
                 yield batch
@@ -85,13 +103,20 @@ class Subscription:
                 source = next(iter(self._moved))
                 del self._moved[source]
                 yield await self._go_over(source)
+            elif self._marks:
+                step, sent = self._marks.popleft()
+                try:
+                    yield field(STEP, wire.Step(number=step.number, time_ns=step.time_ns).SerializeToString())
+                finally:
+                    _set(sent)
             else:
                 await self._wait()
+        raise EndpointError("a step has waited too long to be read: this client is too slow for how time is stepped")
 
     def _batch(self) -> Iterator[bytes]:
         """What there is at present, up to a bound; of each block in turn."""
         size, now_s = 0, self._clock()
-        waiting = deque(self._followers.values())
+        waiting = deque(follower for follower in self._followers.values() if self._open(follower))
         waiting.rotate(self._turn)
         self._turn += 1  # else one with long updates would hide the others
         while waiting and size < BATCH_BYTES:
@@ -103,6 +128,11 @@ class Subscription:
             self.updates += 1
             size += len(update)
             yield field(UPDATES, update)
+
+    def _open(self, follower: Follower) -> bool:
+        """Whether a block may be shown now: on the instance's clock, in virtual time, only when a step is over."""
+        held = self._hold.on and follower.view.block.attributes.stepped
+        return not held or bool(self._marks) or not follower.begun
 
     async def _wait(self) -> None:
         due_s = min((follower.due_s for follower in self._followers.values()), default=math.inf)
@@ -140,3 +170,8 @@ class Subscription:
     def _leave(self, source: str) -> None:
         follower = self._followers.pop(source)
         self._bells.leave(follower.view.block, self._news.set)
+
+
+def _set(sent: asyncio.Future[None]) -> None:
+    if not sent.done():
+        sent.set_result(None)
