@@ -9,8 +9,9 @@ from typing import Any
 
 import grpc
 
+from shmio.endpoints.grpc.hold import Status
 from shmio.endpoints.grpc.native.refusal import Context, refuse
-from shmio.endpoints.grpc.stepper import Status, Stepper
+from shmio.endpoints.grpc.stepper import Stepper
 from shmio.errors import EndpointError, ShmioError, ValueRangeError
 from shmio.segment import Segment
 from shmio.segment.clock import ClockState
