@@ -17,6 +17,8 @@ Elementary = Literal["float", "uint32", "uint64", "string"]
 
 MAX_JOINTS: Final = 64
 MAX_POINTS: Final = 512
+MAX_REGISTERS: Final = 4096
+"""Of a structure; the longest trajectory in a tag table has fewer."""
 
 
 class Member(NamedTuple):
@@ -127,10 +129,12 @@ def recognise(path: str, registers: Sequence[Register]) -> tuple[str, Found] | N
 
     All needed members are there, with types that fit, and no others.
     """
+    if not 0 < len(registers) <= MAX_REGISTERS:
+        return None
     start = len(path) + 1
     parts = [(register.path[start:].lower().split("/"), register) for register in registers]
     for shape in CONTENTS:
-        if parts and (found := _match(shape, parts)):
+        if found := _match(shape, parts):
             return shape, found
     return None
 

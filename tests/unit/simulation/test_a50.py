@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from shmio.cli.supervise.prepare import prepare
 from shmio.emulators.a50 import A50
 from shmio.layout.codec import codec
 from shmio.layout.compiler import Source, compile_sources
@@ -17,12 +18,13 @@ from shmio.simulation import ModelRunner, layout_of
 from shmio.simulation.a50 import A50Cell
 
 STEP_NS = 50_000_000
+ROOT = Path(__file__).parents[3]
 AXIS = "Robot_825/Axs1_Pos"
 
 
 @pytest.fixture
 def db201() -> Layout:
-    source = Path(__file__).parents[3] / "db201.db"
+    source = ROOT / "db201.db"
     (layout,) = compile_sources([Source(source.name, source.read_bytes())]).layouts
     return layout
 
@@ -76,3 +78,14 @@ def test_what_it_does_not_drive_is_as_it_was_written(db201: Layout) -> None:
     assert runner.write([encode(find(db201, AXIS), 0.0, "big")]) == [
         "the model computes Robot_825/Axs1_Pos: it is an output, which nobody writes"
     ]
+
+
+def test_runs_as_a_source_on_db201(db201: Layout, tmp_path: Path) -> None:
+    file = tmp_path / "supervisor.toml"
+    file.write_text(
+        '[instance]\nname = "a50"\n[[source]]\nname = "cell"\nconnector = "simulation"\nwritable = ["Outputs"]\n'
+        f'model = "shmio.simulation.a50:A50Cell"\nlayout = "{ROOT / "db201.db"}"\n'
+    )
+    prepared = prepare(file)
+    assert prepared.plan.warnings == ()
+    assert prepared.layouts["cell"] == db201
