@@ -174,7 +174,7 @@ class Declaration(Section, omit_defaults=True):
     """
 
     name: Name
-    target: Text | Texts
+    target: Text | Annotated[list[Text], Meta(min_length=1, max_length=64)]
     operation: OperationName
     value: Operand | None = None
     values: Annotated[list[Any], Meta(min_length=1, max_length=256)] | None = None

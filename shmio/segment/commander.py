@@ -134,10 +134,14 @@ class Commander:
 
         The declaration is checked by the source. CommandError: it refuses, and says why, or does not answer.
         """
-        writes = [Write(0, 0, msgspec.json.encode(declaration))]
-        ticket = self._send(("",), writes, timeout_s, CommandKind.DECLARE, keep=keep, name=declaration.name)
+        ticket = self.ask_to_declare(declaration, timeout_s, keep=keep)
         self._expect(ticket, EventKind.INJECTED)
         return ticket.number
+
+    def ask_to_declare(self, declaration: Declaration, timeout_s: float | None = None, *, keep: bool = False) -> Ticket:
+        """The first half of :meth:`declare`; the number will be the ticket's. CommandError: not sent. Never waits."""
+        writes = [Write(0, 0, msgspec.json.encode(declaration))]
+        return self._send(("",), writes, timeout_s, CommandKind.DECLARE, keep=keep, name=declaration.name)
 
     def lift(self, injection: int, timeout_s: float | None = None) -> None:
         """Lift an injection, whoever laid it. CommandError: there is none, or the source does not answer."""

@@ -587,3 +587,60 @@ def test_what_an_emulator_cannot_serve_is_odd(folder: Path, capsys: pytest.Captu
     assert "'Enabel' names nothing in DB7; did you mean Enable?\n" in out
     assert "it reads DB7 of emulator 'plc', which serves DB8 alone\n" in out
     assert "the initial value NOWHERE of Enable cannot be read as INT; an emulated PLC starts it at 0\n" in out
+
+
+INJECTION = """
+[[injection]]
+name = "one"
+target = "cell/Outputs/100"
+operation = "set"
+value = 7
+
+[grpc]
+"""
+
+
+def test_check_tells_what_is_declared(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    example("[grpc]\n", INJECTION)
+    assert main(["check"]) == 0
+    assert "  injection one: set over source cell /out\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "error"),
+    [
+        ("Outputs/100", "Outputs/2000", "target: cell/Outputs: index [2000] is outside [0..1099]"),
+        ("value = 7", "value = 256", "value: Outputs/100: BYTE: "),
+        ("value = 7", 'value = 7\nwhen = "cell/Nothing > 1"', "when: cell/Nothing: no such register in DB201"),
+        ("value = 7", 'value = 7\nwhen = "cell/Inputs/1 >"', "when: at character 16: expected a register or a number"),
+        ("value = 7", "value = 7\nfor = 1", "for: unknown key; did you mean for_s?"),
+        ("Outputs/100", "Outputs/100/in", "target: an injection toward a device needs `armed = true` in source 'cell'"),
+    ],
+)
+def test_faults_of_declared_injections_are_named(
+    example: Edit, old: str, new: str, error: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example("[grpc]\n", INJECTION)
+    example(old, new)
+    assert main(["check"]) == 1
+    told = capsys.readouterr().err
+    assert told.startswith(f"supervisor.toml: injection[0].{error}"), told
+    assert told.endswith('(injection "one")\n')
+
+
+def test_what_is_declared_over_in_must_be_writable_and_armed(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    example("[grpc]\n", INJECTION)
+    example("armed = false ", "armed = true ")
+    example("Outputs/100", "Outputs/100/in")
+    assert main(["check"]) == 0
+    capsys.readouterr()
+    example("Outputs/100", "Inputs/100")
+    assert main(["check"]) == 1
+    assert "target: it covers what is not writable; name that in `writable` of source 'cell'" in capsys.readouterr().err
+
+
+def test_what_is_declared_for_a_source_has_a_bound(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    tables = "".join(INJECTION.replace("one", f"n{place}").replace("[grpc]\n", "") for place in range(65))
+    example("[grpc]\n", f"{tables}[grpc]\n")
+    assert main(["check"]) == 1
+    assert "injection: 65 over source 'cell': a source has at most 64" in capsys.readouterr().err

@@ -139,8 +139,9 @@ class Running:
         self.clock = PageClock(own.clock, slot.index)
         schedule = Schedule(own.header.started_ns, PERIOD_NS)
         self.cursor = own.blocks[name].cursor()
+        writer = writer_of(own.blocks[name], own.clock_ns)
         self.loop = SteppedLoop(
-            source, writer_of(own.blocks[name], own.clock_ns), schedule, self.clock, ("given",), inputs=inputs
+            source, writer, schedule, self.clock, ("given",), inputs=inputs, blocks=lambda: own.blocks
         )
         self._threads = [threading.Thread(target=run) for run in (self.loop.run, self.loop.desk.run)]
         for thread in self._threads:
