@@ -1,6 +1,7 @@
 """Write values of topics from another process or host, by SimlogAPI version 1.
 
-python examples/publish.py [--ca CA.pem [--certificate C.pem --key K.pem]] HOST:PORT TOPIC VALUE [TOPIC VALUE]...
+python examples/publish.py [--ca CA.pem [--certificate C.pem --key K.pem]] [--token-file FILE]
+    HOST:PORT|unix:PATH TOPIC VALUE [TOPIC VALUE]...
 """
 
 from __future__ import annotations
@@ -41,7 +42,8 @@ async def main() -> int:
     parser.add_argument("--ca", type=Path, help="use TLS, and trust this authority (PEM)")
     parser.add_argument("--certificate", type=Path, help="our own certificate (PEM), where the server asks for one")
     parser.add_argument("--key", type=Path, help="its key (PEM)")
-    parser.add_argument("address", metavar="HOST:PORT")
+    parser.add_argument("--token-file", type=Path, help="the token to send, where the server asks for one")
+    parser.add_argument("address", metavar="HOST:PORT|unix:PATH")
     parser.add_argument("words", metavar="TOPIC VALUE", nargs="+")
     options = parser.parse_args()
     paths, texts = options.words[::2], options.words[1::2]
@@ -49,9 +51,11 @@ async def main() -> int:
         parser.error(f"no value for {paths[-1]}")
     async with channel_to(options) as channel:
         stub = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
+        token = options.token_file and options.token_file.read_text().strip()
+        metadata = token and [("authorization", f"Bearer {token}")]
         try:
-            topics = [await stub.GetTopic(TopicDescriptor(path=path)) for path in paths]
-            await stub.Publish(values(topics, texts))
+            topics = [await stub.GetTopic(TopicDescriptor(path=path), metadata=metadata) for path in paths]
+            await stub.Publish(values(topics, texts), metadata=metadata)
         except grpc.aio.AioRpcError as error:
             print(f"{options.address}: {error.code().name}: {error.details()}", file=sys.stderr)
             return 1

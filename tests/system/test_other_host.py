@@ -64,3 +64,38 @@ def test_another_host_receives_changing_values(make_cell: Callable[..., Cell], o
     values = {line.split()[-1] for line in done.stdout.splitlines()}
     assert len(values) > 1
     assert all(float(value) is not None for value in values)
+
+
+def test_another_host_in_plain_text_may_what_its_address_gives(
+    make_cell: Callable[..., Cell], other_host: tuple[str, str]
+) -> None:
+    host, address = other_host
+    token = '[[grpc.token]]\nname = "all"\nroles = ["read", "write"]\ntoken_file = "token"\n'
+    exposed = f'[[grpc.address]]\nlisten = "{address}:{{grpc.port}}"\ninsecure = true\n'
+    cell = make_cell(config=CONFIG + token + exposed)
+    (cell.folder / "token").write_text("0123456789abcdefghijklmnop")
+    (cell.folder / "token").chmod(0o600)
+    cell.up()
+
+    def run(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+        command = ["ip", "netns", "exec", host, sys.executable, str(ROOT / "examples" / script), *arguments]
+        return subprocess.run(command, cwd=cell.folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+
+    there, topic = f"{address}:{cell.grpc.port}", "cell/Robot_800/Axs1_Pos"
+    assert run("subscribe.py", "--count", "2", there, topic).returncode == 0
+    shown = run("subscribe.py", "--count", "2", "--token-file", "token", there, topic)
+    assert (shown.returncode, "have this token replaced" in shown.stderr) == (1, True)
+    written = run("publish.py", there, "cell/Outputs/13", "1")
+    assert (written.returncode, "Publish needs the role write; this address has read" in written.stderr) == (1, True)
+    local = cell.run(
+        "python", str(ROOT / "examples/publish.py"), "--token-file", "token", str(cell.grpc), "cell/Outputs/13", "1"
+    )
+    assert local.returncode == 0, local.stderr
+    refused = cell.folder / "supervisor.toml"
+    refused.write_text(
+        refused.read_text()
+        .replace(str(cell.grpc), f"{address}:1", 1)
+        .replace("[[grpc.token]]", "insecure = true\n[[grpc.token]]")
+    )
+    checked = cell.supervisor("check")
+    assert (checked.returncode, "would carry the tokens of [[grpc.token]]" in checked.stderr) == (1, True)
