@@ -45,6 +45,15 @@ connector = "memory"
 layout = "panel.toml"
 writable = ["**"]
 
+[[injection]]
+name = "falsified"
+target = "sim/joints/Kuka.j2/R"
+operation = "noise"
+amplitude = 0.25
+when = "noise/measured > 10"
+for_s = 0.3
+seed = 11
+
 [grpc]
 listen = ["{grpc}"]
 default_source = "sim"

@@ -12,7 +12,7 @@ import pytest
 
 from shmio.testing.cell import Cell, kill, until
 from shmio.wire import simlog_v2_pb2 as v2
-from tests.system.campaign import CONFIG, J1, NOISY, PANEL, SLOW_S, STEPS, Streams, run
+from tests.system.campaign import CONFIG, J1, J2, NOISY, PANEL, SLOW_S, STEPS, Streams, run
 
 BURNERS = 4
 BURN = "while True: pass"
@@ -92,3 +92,5 @@ def test_a_campaign_repeats_exactly(cell: Cell) -> None:
     }
     assert len(first["v1 noise/measured"]) == STEPS + 1
     assert -20.0 in [m.value.number_value for m in two if m.header.path == J1], "the injection"
+    second_joint = [m.value.number_value for m in two if m.header.path == J2]
+    assert any(value not in (0.0, *(1 / n for n in range(1, STEPS, 2))) for value in second_joint), "the declared one"
