@@ -18,8 +18,13 @@ def clear(path: str) -> None:
     """
     if (reason := obstacle(path)) is not None:
         raise EndpointError(f"cannot listen on unix:{path}: {reason}")
-    with suppress(FileNotFoundError):
-        Path(path).unlink()
+    try:
+        Path(path).unlink(missing_ok=True)
+    except OSError as error:  # another user's, in a folder for all
+        raise EndpointError(
+            f"cannot listen on unix:{path}: what another process has left there cannot be removed ({error.strerror}): "
+            "have its owner do it, or choose another path"
+        ) from None
 
 
 def obstacle(path: str) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import stat
@@ -37,6 +38,18 @@ def test_what_a_living_one_has_is_not_taken(tmp_path: Path) -> None:
             with pytest.raises(EndpointError, match=rf"unix:{path}: another program listens there.*ss -xlp"):
                 clear(str(path))
     assert path.is_socket()
+
+
+def test_what_another_user_left_in_a_folder_for_all_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "s"
+    bound(path).close()
+
+    def unlink(_: Path, **__: bool) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(Path, "unlink", unlink)
+    with pytest.raises(EndpointError, match=rf"unix:{path}: .* \(Operation not permitted\): have its owner do it"):
+        clear(str(path))
 
 
 def test_what_is_no_socket_is_left(tmp_path: Path) -> None:
