@@ -36,6 +36,7 @@ class Worker:
         self.stopping = threading.Event()
         self._on_stop: Callable[[], object] | None = None
         self._on_reread: Callable[[], object] | None = None
+        self._rereads = False  # told so while there was nothing to call
         self.log = self._set_up_log(Path(spec["log_file"]))
         self.segment = Segment.open(spec["instance"], writable=True)
         if self.segment.header.epoch != spec["epoch"]:
@@ -96,8 +97,13 @@ class Worker:
             call()
 
     def on_reread(self, call: Callable[[], object]) -> None:
-        """Have ``call`` run in a thread of its own whenever a reload may have changed what it takes while it runs."""
+        """Have ``call`` run in a thread of its own whenever a reload may have changed what it takes while it runs.
+
+        At once if one may have since the process began.
+        """
         self._on_reread = call
+        if self._rereads:
+            call()
 
     def _heed_signals(self) -> None:
         """Let SIGTERM set ``stopping``, and SIGHUP have it reread; Ctrl-C is the supervisor's.
@@ -114,6 +120,7 @@ class Worker:
 
     def _await_signal(self, reader: int) -> None:
         while os.read(reader, 1)[0] != signal.SIGTERM:
+            self._rereads = True  # first, so that it is found by who sets the call meanwhile
             if self._on_reread is not None:
                 self._on_reread()
         self.stopping.set()

@@ -17,7 +17,7 @@ from shmio.segment import Activity, ProcessSpec, Segment
 from shmio.testing.cell import until
 
 WORK = """
-import sys
+import os, signal, sys
 from shmio import worker
 from shmio.errors import ConfigError, ConnectorError
 
@@ -31,7 +31,10 @@ def run(w):
     if what == "crash":
         raise ZeroDivisionError
     told = []
-    if what == "reread":
+    if what == "reread late":
+        os.kill(os.getpid(), signal.SIGHUP)
+        w.stopping.wait(0.2)
+    if what.startswith("reread"):
         w.on_reread(lambda: told.append("anew"))
     while not w.stopping.wait(0.01):
         w.report((1, 2, 3), note=" ".join(["at work", *told]))
@@ -116,6 +119,14 @@ def test_it_reads_anew_as_often_as_it_is_told(segment: Segment, tmp_path: Path) 
         worker.process.send_signal(signal.SIGHUP)
         beat = slot.heartbeat_ns
         until(lambda: slot.heartbeat_ns > beat, "a beat after SIGHUP")
+        worker.process.terminate()
+        assert worker.end() == (0, "")
+
+
+def test_what_it_was_told_before_it_could_read_anew_is_not_lost(segment: Segment, tmp_path: Path) -> None:
+    slot = segment.processes.find("cell")
+    with Started(segment, tmp_path, "reread late") as worker:
+        until(lambda: slot.report.note.startswith("at work anew"), "it reads anew")
         worker.process.terminate()
         assert worker.end() == (0, "")
 
