@@ -172,7 +172,7 @@ class Orders:
         for source in sources:
             if source not in self._feeds:
                 raise PathError(f"no source {shorten(source)!r}; there are: {', '.join(self._feeds)}")
-        return [self._feeds[source].block for source in sources or self._feeds]
+        return [self._feeds[source].block for source in dict.fromkeys(sources) or self._feeds]
 
     def _desk(self, source: str) -> Desk:
         block = self._topics.feed(source).block

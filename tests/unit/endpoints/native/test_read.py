@@ -195,6 +195,8 @@ def test_layouts(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
             )
             assert (there.bit if there.HasField("bit") else None) == here.bit
             assert [(bounds.low, bounds.high) for bounds in there.dims] == list(here.dims)
+        often = wire.GetLayoutsRequest(sources=["cell"] * 1000)  # a small request is not answered with a million parts
+        assert [part async for part in stub(served).GetLayouts(often, timeout=TIMEOUT_S)] == parts
         call = stub(served).GetLayouts(wire.GetLayoutsRequest(sources=["cell", "x"]), timeout=TIMEOUT_S)
         with pytest.raises(grpc.aio.AioRpcError, match="no source 'x'; there are: cell"):
             _ = [part async for part in call]
