@@ -31,6 +31,7 @@ def run(worker: Worker) -> None:
 async def _serve(worker: Worker) -> None:
     loop = asyncio.get_running_loop()
     stopping = asyncio.Event()
+    rereading = asyncio.Lock()
     worker.on_stop(lambda: loop.call_soon_threadsafe(stopping.set))
     config, place = _settings(worker)
     doors = Doors(config)
@@ -49,7 +50,7 @@ async def _serve(worker: Worker) -> None:
         task.add_done_callback(tasks.discard)
 
     def reread(file: Path) -> None:
-        task = loop.create_task(_take_anew(worker, file, doors, server))
+        task = loop.create_task(_take_anew(worker, file, doors, server, rereading))
         tasks.add(task)
         task.add_done_callback(tasks.discard)
 
@@ -58,7 +59,7 @@ async def _serve(worker: Worker) -> None:
     services = Services(worker.segment, worker.slot, hold, feeds, config.default_source)
     server = Server(services)
     feeds.start()
-    await services.stepper.start()
+    await services.stepper.start(worker.before.pid)
     ports = await server.start(doors.listeners, config.tls, place.gid)
     addresses = [listener.address for listener in doors.listeners]
     served = [
@@ -116,17 +117,18 @@ def _settings(worker: Worker) -> tuple[Grpc, _Place]:
     return msgspec.convert(config, Grpc), place
 
 
-async def _take_anew(worker: Worker, file: Path, doors: Doors, server: Server) -> None:
+async def _take_anew(worker: Worker, file: Path, doors: Doors, server: Server, turn: asyncio.Lock) -> None:
     """Take tokens and roles as the configuration has them by now; calls that these do not allow end."""
-    try:
-        config = await asyncio.to_thread(load, file)
-        if config.grpc is None:
-            return  # the supervisor is about to stop this process
-        doors.take(config.grpc)
-    except ShmioError as error:
-        worker.log.error("tokens and roles stay as they were: %s", error)
-        return
-    ended = server.calls.review()
+    async with turn:  # of two, the one that has read later must be the last
+        try:
+            config = await asyncio.to_thread(load, file)
+            if config.grpc is None:
+                return  # the supervisor is about to stop this process
+            doors.take(config.grpc)
+        except ShmioError as error:
+            worker.log.error("tokens and roles stay as they were: %s", error)
+            return
+        ended = server.calls.review()
     if not (ended or config.grpc.guarded):
         return  # there are none, and it is likely that there were none
     worker.log.info("took tokens and roles anew", extra=fields(tokens=len(config.grpc.token), calls_ended=ended))

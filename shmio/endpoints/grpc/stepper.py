@@ -62,7 +62,8 @@ class Stepper:
         self._coordinator = Coordinator(segment)
         self._turn = asyncio.Lock()  # one moves time
         self._owns = False
-        self._moving = False
+        self._changing = asyncio.Lock()  # one begins to play, or ends
+        self._moving: asyncio.Task[Any] | None = None
         self._alive = True
         self._watchers: list[Callable[[Status], None]] = []
         self._rest: asyncio.TimerHandle | None = None
@@ -79,11 +80,11 @@ class Stepper:
         self._told = self.status[1:]
         self._coordinator.delivered(slot, state.done)
 
-    async def start(self) -> None:
-        """Begin to follow time; go on playing if a process before this one did when it died."""
+    async def start(self, before: int = 0) -> None:
+        """Begin to follow time; go on playing if the process before this one, by its pid, did when it died."""
         self._thread.start()
         state = self._clock.read()
-        if state.playing:
+        if state.playing and state.owner == before:  # what another program that died has played stands
             try:
                 await self.play(state.dt_ns or None, state.rate)
             except TimeError as error:
@@ -115,20 +116,22 @@ class Stepper:
     async def step(self, dt_ns: int | None = None, peer: str = "") -> Step:
         """Move time on, by the step size unless it is told; return when all streams have taken the step's marker.
 
-        Before it, what was received on this peer's Publish streams is with its sources. A step that was begun is done,
-        even if its client is gone. TimeError: it failed, it is not ours to do, or time is played; ValueRangeError.
+        Before it, what was received on this peer's Publish streams is with its sources. One that was begun is done even
+        if its client is gone, one that waits is not. TimeError: it failed, is not ours, or time plays; ValueRangeError.
         """
-        return await self._do(self._step(dt_ns, peer))
+        task = self._spawn(self._step(dt_ns, peer))
+        try:
+            return await asyncio.shield(task)
+        finally:
+            if task is not self._moving:  # it is over, or others would wait for a step that nobody waits for
+                task.cancel()
 
     async def play(self, dt_ns: int | None = None, rate: float = 1.0) -> Status:
         """Step from now on ``rate`` times as fast as real time; how time stands then. TimeError, ValueRangeError."""
         return await self._do(self._begin_play(dt_ns, rate))
 
     async def pause(self, *, end: bool = False) -> Status:
-        """Step no more by itself; how time stands then. ``end``: tell that it is not alive, until somebody moves it.
-
-        TimeError.
-        """
+        """Step no more by itself; TimeError. ``end``: tell that it is not alive, until somebody moves time."""
         return await self._do(self._end_play(end))
 
     async def stop(self) -> None:
@@ -154,8 +157,7 @@ class Stepper:
     # ---- moving time ---------------------------------------------------------------------------------------------
 
     async def _do(self, work: Coroutine[Any, Any, _Result]) -> _Result:
-        """Do it to its end, whoever waits for that."""
-        return await asyncio.shield(self._spawn(work))
+        return await asyncio.shield(self._spawn(work))  # to its end, whoever waits for that
 
     def _spawn(self, work: Coroutine[Any, Any, _Result]) -> asyncio.Task[_Result]:
         task = self._loop.create_task(work)
@@ -174,7 +176,7 @@ class Stepper:
     async def _move(self, call: Callable[[], _Result], *, alive: bool = True) -> _Result:
         """Take time over, call the coordinator beside the event loop, and deliver the step if it was one."""
         async with self._turn:
-            self._moving = True
+            self._moving = asyncio.current_task()
             try:
                 if not self._owns:
                     await self._errands.call(self._coordinator.take_over)
@@ -186,7 +188,7 @@ class Stepper:
                     await self._deliver(done)
                 return done
             finally:
-                self._moving = False
+                self._moving = None
                 self._look()
                 self._set_rest()
 
@@ -209,18 +211,20 @@ class Stepper:
 
     async def _begin_play(self, dt_ns: int | None, rate: float) -> Status:
         _check(dt_ns)
-        self._play_dt_ns, self._rate = dt_ns, rate
-        await self._move(partial(self._coordinator.set_playing, True, rate))
-        if self._player is None:
-            self._player = self._loop.create_task(self._play())
+        async with self._changing:
+            self._play_dt_ns, self._rate = dt_ns, rate
+            await self._move(partial(self._coordinator.set_playing, True, rate))
+            if self._player is None:
+                self._player = self._loop.create_task(self._play())
         return self.status
 
     async def _end_play(self, end: bool) -> Status:
-        player, self._player = self._player, None
-        self._woken.set()
-        if player is not None:
-            await player
-        await self._move(partial(self._coordinator.set_playing, False), alive=not end)
+        async with self._changing:
+            player, self._player = self._player, None
+            self._woken.set()
+            if player is not None:
+                await player
+            await self._move(partial(self._coordinator.set_playing, False), alive=not end)
         return self.status
 
     async def _play(self) -> None:
@@ -232,11 +236,11 @@ class Stepper:
                 await self._move(partial(self._coordinator.step, self._play_dt_ns))
                 reason = ""
             except ShmioError as error:
-                if str(error) != reason:
-                    log.warning("playing: %s", str(error))
-                reason = str(error)
-            dt_ns = self._play_dt_ns or self._clock.read().step_size_ns
-            due_s = max(due_s + dt_ns / 1e9 / self._rate, self._loop.time() - LATE_S)
+                before, reason = reason, str(error)
+                if reason != before:
+                    log.warning("playing: %s", reason)
+            dt_s = (self._play_dt_ns or self._clock.read().step_size_ns) / 1e9
+            due_s = max(due_s + dt_s / self._rate, self._loop.time() - LATE_S)
             if (wait_s := due_s - self._loop.time()) > 0:
                 with suppress(TimeoutError):
                     await asyncio.wait_for(self._woken.wait(), wait_s)
@@ -272,24 +276,21 @@ class Stepper:
             watcher(status)
 
     def _now(self) -> Moment:
-        if self.hold.on:
-            return self.hold.moment
-        return Moment(0, self._clock.read().time_ns)
+        return self.hold.moment if self.hold.on else Moment(0, self._clock.read().time_ns)
 
     # ---- the thread ------------------------------------------------------------------------------------------------
 
     def _follow(self) -> None:
         """Hear of what other processes do with time."""
-        clock = self._clock
         heeded: tuple[object, ...] = ()
         while not self._stopping.is_set():
-            seen = clock.bell.value()
-            state = clock.read()
+            seen = self._clock.bell.value()
+            state = self._clock.read()
             news = state.mode, state.done, state.step_size_ns, state.playing
             if news != heeded and not self._moving:
                 heeded = news
                 self._loop.call_soon_threadsafe(self._look)
-            clock.bell.wait(seen, TURN_NS)
+            self._clock.bell.wait(seen, TURN_NS)
 
 
 def _check(dt_ns: int | None) -> None:

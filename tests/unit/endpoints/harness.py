@@ -117,7 +117,8 @@ class Endpoint:
 
 
 @asynccontextmanager
-async def endpoint(segment: Segment, limits: Limits | None = None) -> AsyncIterator[Endpoint]:
+async def endpoint(segment: Segment, limits: Limits | None = None, before: int = 0) -> AsyncIterator[Endpoint]:
+    """``before``: pid of the process that was the endpoint before."""
     tasks: set[asyncio.Task[None]] = set()
 
     def on_quality(source: str, good: bool) -> None:
@@ -133,7 +134,7 @@ async def endpoint(segment: Segment, limits: Limits | None = None) -> AsyncItera
     ports = await server.start([LOOPBACK])
     for feed in feeds.values():
         feed.start()
-    await service.stepper.start()
+    await service.stepper.start(before)
     served = Endpoint(segment, feeds, service, server, ports[0])
     try:
         yield served

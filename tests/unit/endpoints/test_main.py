@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
+import itertools
 import logging
 import queue
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import grpc
 import pytest
 
-from shmio.endpoints.grpc.__main__ import run
+from shmio.endpoints.grpc.__main__ import _take_anew, run
 from shmio.segment import Segment
 from shmio.testing.ports import reserved_port
 from shmio.wire import simlog_v1_pb2 as v1
@@ -51,6 +54,7 @@ def test_it_beats_while_layouts_are_read(segment: Segment, instance: str, monkey
             on_stop=stops.append,
             config={"listen": ["127.0.0.1:0"]},
             slot=opened.processes.find("grpc"),
+            before=opened.processes.find("grpc").report,
             segment=opened,
             log=logging.getLogger("test"),
             running=lambda: None,
@@ -102,6 +106,7 @@ def test_a_stop_with_open_streams_leaves_no_traceback(
             on_stop=stops.append,
             config={"listen": [str(address)]},
             slot=opened.processes.find("grpc"),
+            before=opened.processes.find("grpc").report,
             segment=opened,
             log=logging.getLogger("test"),
             running=begin,
@@ -113,3 +118,29 @@ def test_a_stop_with_open_streams_leaves_no_traceback(
     assert set(codes) <= {grpc.StatusCode.UNAVAILABLE, grpc.StatusCode.CANCELLED}
     assert "Traceback" not in capfd.readouterr().err
     assert [record.message for record in caplog.records if record.levelno >= logging.ERROR] == []
+
+
+def test_of_two_reloads_the_later_one_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though the first takes longer to read: a token that is gone must not come back."""
+    overtaken = threading.Event()
+    numbers = itertools.count()
+    taken: list[int] = []
+
+    def load(_: Path) -> SimpleNamespace:
+        number = next(numbers)
+        if number:
+            overtaken.set()
+        else:
+            overtaken.wait(0.5)
+        return SimpleNamespace(grpc=SimpleNamespace(number=number, token=[], guarded=True))
+
+    async def test() -> None:
+        worker: Any = SimpleNamespace(log=logging.getLogger("test"))
+        doors: Any = SimpleNamespace(take=lambda grpc: taken.append(grpc.number))
+        server: Any = SimpleNamespace(calls=SimpleNamespace(review=lambda: 0))
+        turn = asyncio.Lock()
+        await asyncio.gather(*(_take_anew(worker, Path("x"), doors, server, turn) for _ in range(2)))
+
+    monkeypatch.setattr("shmio.endpoints.grpc.__main__.load", load)
+    asyncio.run(test())
+    assert taken == [0, 1]

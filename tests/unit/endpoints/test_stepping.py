@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from typing import Any
 
 import grpc
@@ -16,8 +17,8 @@ from shmio.wire import simlog_v1_pb2 as v1
 from shmio.wire import simlog_v2_pb2 as v2
 from shmio.wire import simserver_pb2 as sim
 from tests.unit.endpoints import http2
-from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, image, listening, message, refusal, serve
-from tests.unit.endpoints.stepped import Model, simulate
+from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, endpoint, image, listening, message, refusal, serve
+from tests.unit.endpoints.stepped import Model, simulate, stepped_segment
 from tests.unit.endpoints.test_simlog_v2 import write
 from tests.unit.endpoints.test_subscribers import messages
 
@@ -328,6 +329,84 @@ def test_a_step_goes_to_its_end_without_its_client(instance: str) -> None:
         assert await message(stream) == ("SIMLOG://step", 2.0)
 
     simulate(instance, test)
+
+
+def test_a_step_that_waits_for_others_is_not_made_without_its_client(instance: str) -> None:
+    async def test(served: Endpoint, models: Models) -> None:
+        models["sim"].mute = True
+        first = served.time.step(sim.StepRequest(), timeout=TIMEOUT_S)
+        clock = served.segment.clock
+
+        async def open_calls(count: int) -> None:
+            async def there() -> bool:
+                await asyncio.sleep(0)
+                return clock.read().step == 1 and len(served.server.calls) == count
+
+            await served.until(there)
+
+        await open_calls(1)
+        others = [served.time.step(sim.StepRequest(), timeout=TIMEOUT_S) for _ in range(5)]
+        await open_calls(6)
+        for call in others:
+            call.cancel()
+        await open_calls(1)
+        models["sim"].answer()
+        await first
+        assert await step(served) == 0
+        assert clock.read().step == 2
+
+    simulate(instance, test)
+
+
+def test_start_behind_a_pause_that_waits_for_a_step_plays(instance: str) -> None:
+    async def test(served: Endpoint, models: Models) -> None:
+        stream = await served.subscriber("one", "SIMLOG://step")
+        await served.time.start(sim.StartRequest(deltaTime=5), timeout=TIMEOUT_S)
+        await messages(stream, 1)
+        models["sim"].mute = True
+        clock = served.segment.clock
+
+        async def held_up() -> bool:
+            await asyncio.sleep(0)
+            return clock.read().stepping and len(served.server.calls) == calls
+
+        calls = 1
+        await served.until(held_up)
+        pause = served.time.pause(Empty(), timeout=TIMEOUT_S)
+        calls = 2
+        await served.until(held_up)
+        start = served.time.start(sim.StartRequest(deltaTime=5), timeout=TIMEOUT_S)
+        calls = 3
+        await served.until(held_up)
+        models["sim"].answer()
+        assert not (await pause).playing
+        assert (await start).playing
+        assert clock.read().playing
+        assert not (await served.time.pause(Empty(), timeout=TIMEOUT_S)).playing
+        assert await step(served) == 0
+
+    simulate(instance, test)
+
+
+@pytest.mark.parametrize("ours", [True, False])
+def test_an_endpoint_goes_on_playing_what_its_predecessor_did_and_nobody_elses(instance: str, ours: bool) -> None:
+    with stepped_segment(instance, "sim") as segment:
+        with Segment.open(instance, writable=True) as dying:  # without giving time up
+            Coordinator(dying).set_playing(True)
+        model = Model(segment, "sim")
+
+        async def run() -> None:
+            async with endpoint(segment, before=os.getpid() if ours else os.getpid() + 1) as served:
+                if ours:
+                    stream = await served.subscriber("one", "SIMLOG://step")
+                    await messages(stream, 2)
+                    await served.time.pause(Empty(), timeout=TIMEOUT_S)
+                assert await step(served) == 0, "nobody plays"
+
+        try:
+            asyncio.run(run())
+        finally:
+            model.stop()
 
 
 def test_steps_of_several_clients_are_made_one_after_another(instance: str) -> None:
