@@ -1,7 +1,8 @@
 """A source without a device, and the gRPC endpoint in its own process; frames are published as they are asked for.
 
 It prints the endpoint's address, its pid and the instance's start. For each line {"hz", "seconds"} that it reads it
-publishes so many frames a second, in which every register has another value, and prints how many these were.
+publishes so many frames a second, in which every register has another value, and prints how many these were. An
+argument is the number of registers.
 """
 
 from __future__ import annotations
@@ -25,28 +26,29 @@ REGISTERS = 100
 TICK_S = 0.001
 
 
-def publish(segment: Segment, hz: float, seconds: float) -> int:
+def publish(segment: Segment, hz: float, seconds: float, registers: int) -> int:
     """At times that are evenly spaced, or as many as are due each ms."""
     writer = segment.writer("cell")
-    packer = struct.Struct(f">{REGISTERS}f")
+    packer = struct.Struct(f">{registers}f")
     begun_s, count = time.monotonic(), 0
     first = writer.block.ring.head()
     while (elapsed_s := time.monotonic() - begun_s) < seconds:
         while count < elapsed_s * hz:
             count += 1
-            writer.publish(packer.pack(*(((first + count) % 100_000 + 0.5,) * REGISTERS)), cycle=first + count)
+            writer.publish(packer.pack(*(((first + count) % 100_000 + 0.5,) * registers)), cycle=first + count)
         next_s = max(count / hz, elapsed_s + TICK_S if hz > 1 / TICK_S else 0)
         time.sleep(max(0.0, begun_s + next_s - time.monotonic()))
     return count
 
 
 def main() -> None:
+    registers = int(sys.argv[1]) if sys.argv[1:] else REGISTERS
     layout = Layout(
         "DB1",
         1,
-        4 * REGISTERS,
+        4 * registers,
         False,
-        tuple(Register(f"r{i}", "REAL", (), 4 * i, None, 4, 1) for i in range(REGISTERS)),
+        tuple(Register(f"r{i}", "REAL", (), 4 * i, None, 4, 1) for i in range(registers)),
     )
     block = BlockSpec("cell", layout, 1_000_000, 60_000_000_000, 8 << 20, Attributes("bench", ()))
     processes = [ProcessSpec("cell", "source"), ProcessSpec("grpc", "grpc")]
@@ -73,11 +75,11 @@ def main() -> None:
                 if endpoint.poll() is not None:
                     raise SystemExit(slot.report.note or "the endpoint ended")
                 time.sleep(0.01)
-            publish(segment, 100, 0.1)
+            publish(segment, 100, 0.1, registers)
             tell({"address": str(address), "pid": endpoint.pid, "started_ns": segment.header.started_ns})
             for line in sys.stdin:
                 wanted = json.loads(line)
-                tell(publish(segment, wanted["hz"], wanted["seconds"]))
+                tell(publish(segment, wanted["hz"], wanted["seconds"], registers))
         finally:
             endpoint.terminate()
             endpoint.wait(20)

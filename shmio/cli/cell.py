@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager
 from typing import NamedTuple, Protocol
 
 from shmio.layout.model import Layout, Register
+from shmio.segment.clock import ClockState
 from shmio.segment.commander import Outcome
 from shmio.segment.standing import Standing
 from shmio.segment.view import Reading
@@ -71,3 +72,16 @@ class Cell(Protocol):
 
     def lift_all(self) -> list[tuple[str, Standing]]:
         """Lift all."""
+
+    @property
+    def clock(self) -> ClockState:
+        """How time stands."""
+
+    def step(self, dt_ms: float | None) -> None:
+        """Move time by one step."""
+
+    def play(self, rate: float, dt_ms: float | None) -> None:
+        """Have time step by itself."""
+
+    def pause(self) -> None:
+        """Have it step no more by itself."""

@@ -13,6 +13,7 @@ from shmio.errors import NotRunningError, PathError
 from shmio.layout.model import Layout, Register
 from shmio.segment import Block, Frame, Quality
 from shmio.segment.attach import Attachment
+from shmio.segment.clock import ClockState
 from shmio.segment.commander import Outcome
 from shmio.segment.shadow import Shadow
 from shmio.segment.standing import Standing
@@ -114,6 +115,23 @@ class Local:
     def lift_all(self) -> list[tuple[str, Standing]]:
         """Lift all."""
         return self.attachment.lift_all()
+
+    @property
+    def clock(self) -> ClockState:
+        """How time stands."""
+        return self.attachment.clock
+
+    def step(self, dt_ms: float | None) -> None:
+        """Move time by one step."""
+        self.attachment.step(dt_ms)
+
+    def play(self, rate: float, dt_ms: float | None) -> None:
+        """Have time step by itself."""
+        self.attachment.play(rate, dt_ms)
+
+    def pause(self) -> None:
+        """Have it step no more by itself."""
+        self.attachment.pause()
 
 
 def _follow(block: Block, registers: list[Register], news: queue.Queue[_Changes]) -> None:

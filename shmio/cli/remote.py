@@ -18,6 +18,7 @@ from shmio.layout.codec import Value
 from shmio.layout.model import Layout, Register
 from shmio.layout.types import element_type
 from shmio.segment import EventKind, Quality
+from shmio.segment.clock import ClockMode, ClockState
 from shmio.segment.commander import Outcome as LocalOutcome
 from shmio.segment.standing import Standing
 from shmio.segment.view import Reading
@@ -116,6 +117,27 @@ class Remote:
     def lift_all(self) -> list[tuple[str, Standing]]:
         """Lift all."""
         return [(one.source, Standing(one.number, "", 0, False, one.name, 0, 0, ())) for one in self._client.lift_all()]
+
+    @property
+    def clock(self) -> ClockState:
+        """How time stands."""
+        now = self._client.clock()
+        mode = ClockMode.VIRTUAL if now.virtual else ClockMode.WALL
+        return ClockState(
+            mode, now.step, now.time_ns, 0, now.step, now.step_size_ns, now.playing, now.rate, note=now.note
+        )
+
+    def step(self, dt_ms: float | None) -> None:
+        """Move time by one step."""
+        self._client.step(None if dt_ms is None else dt_ms / 1000)
+
+    def play(self, rate: float, dt_ms: float | None) -> None:
+        """Have time step by itself."""
+        self._client.play(None if dt_ms is None else dt_ms / 1000, rate)
+
+    def pause(self) -> None:
+        """Have it step no more by itself."""
+        self._client.pause()
 
 
 class _RemoteShadow:

@@ -9,9 +9,9 @@ import threading
 
 import msgspec
 
+from shmio.cli.cell import Cell
 from shmio.cli.run import at_least, dumps
 from shmio.cli.supervise.status import clock_line
-from shmio.segment.attach import Attachment
 from shmio.segment.status import clock_status
 
 HELP = "Step the instance's time: from the first step on nothing else moves it."
@@ -34,7 +34,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     how.add_argument("--pause", action="store_true", help="have time stand, and do no step")
 
 
-def execute(cell: Attachment, options: argparse.Namespace) -> int:
+def execute(cell: Cell, options: argparse.Namespace) -> int:
     """Step, play or pause, and tell the time then. TimeError, ValueRangeError."""
     if options.play is not None:
         _play(cell, options.play, options.dt_ms)
@@ -48,7 +48,7 @@ def execute(cell: Attachment, options: argparse.Namespace) -> int:
     return 0
 
 
-def _play(cell: Attachment, rate: float, dt_ms: float | None) -> None:
+def _play(cell: Cell, rate: float, dt_ms: float | None) -> None:
     over = threading.Event()
     for sign in (signal.SIGINT, signal.SIGTERM):
         signal.signal(sign, lambda *_: over.set())

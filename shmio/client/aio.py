@@ -119,6 +119,10 @@ class Client:
             raise CommandError(f"{len(left)} of {len(found)} injections still stand: {left[0].failure}")
         return found
 
+    async def clock(self) -> Clock:
+        """How time stands."""
+        return Clock.of((await self._call(self._stub.GetStatus, wire.GetStatusRequest())).clock)
+
     async def step(self, dt_s: float | None = None) -> Clock:
         """Take time over, and move it by one step; it returns when all streams have what has changed in it.
 

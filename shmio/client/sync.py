@@ -138,6 +138,10 @@ class Client:
             raise CommandError(f"{len(left)} of {len(found)} injections still stand: {left[0].failure}")
         return found
 
+    def clock(self) -> Clock:
+        """How time stands."""
+        return Clock.of((self._call(self._stub.GetStatus, wire.GetStatusRequest())).clock)
+
     def step(self, dt_s: float | None = None) -> Clock:
         """Take time over, and move it by one step; it returns when all streams have what has changed in it.
 

@@ -96,6 +96,13 @@ def test_streams_are_measured_beside_a_bare_server() -> None:
     assert all(float(latency) > 0 for latency in latencies)
 
 
+def test_one_client_of_our_own_service_is_measured() -> None:
+    found = re.findall(
+        r"^(every frame|latest|raw frames, every one) +([1-9]\d*) +([1-9]\d*) ", printed("grpc_client"), re.MULTILINE
+    )
+    assert [name for name, *_ in found] == ["every frame", "latest", "raw frames, every one"] * 2
+
+
 def test_a_growing_load_is_measured_row_by_row() -> None:
     found = re.search(r"^2 of each +(.+)$", printed("scaling"), re.MULTILINE)
     assert found is not None

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 from typing import Final
 
-_SMALL: Final = tuple(bytes((number,)) for number in range(0x80))
+_SHORT: Final = [bytes((number,)) for number in range(0x80)]
 
 
 def varint(number: int) -> bytes:
     """A number from 0 on."""
     if number < 0x80:
-        return _SMALL[number]
+        return _SHORT[number]
+    if number < 0x4000:
+        return bytes((number & 0x7F | 0x80, number >> 7))
     data = bytearray()
     while number > 0x7F:
         data.append(number & 0x7F | 0x80)

@@ -18,6 +18,7 @@ from shmio.segment import Segment
 from tests.unit.endpoints.conftest import segment as segment  # noqa: PLC0414  the fixture
 from tests.unit.endpoints.harness import Endpoint
 from tests.unit.endpoints.plant import Plant
+from tests.unit.endpoints.stepped import Model, simulate, stepped_segment
 from tests.unit.endpoints.test_publish import with_plant
 
 EXAMPLE = Path(__file__).parents[3] / "examples/remote.py"
@@ -133,3 +134,26 @@ def test_the_example(segment: Segment) -> None:
         assert re.search(r"cell/step +7\b", done.stdout)
 
     with_plant(segment, run)
+
+
+def test_step(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+    async def run(served: Endpoint, _: dict[str, Model]) -> None:
+        def verb(*words: str) -> str:
+            assert main(["step", "--host", f"127.0.0.1:{served.port}", *words]) == 0
+            return capsys.readouterr().out
+
+        told = json.loads(await asyncio.to_thread(verb, "--json", "--count", "2", "--dt-ms", "20"))
+        assert (told["mode"], told["step"], told["time_s"]) == ("virtual", 2, 0.04)
+        assert "0.040" in await asyncio.to_thread(verb, "--pause")
+
+    simulate(instance, run)
+
+
+def test_step_here(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with stepped_segment(instance, "sim") as segment:
+        model = Model(segment, "sim")
+        try:
+            assert main(["step", "--instance", instance, "--json"]) == 0
+        finally:
+            model.stop()
+    assert json.loads(capsys.readouterr().out)["step"] == 1

@@ -23,7 +23,7 @@ class Bell:
         self.listeners: set[Ring] = set()
         self._block = block
         self._loop = asyncio.get_running_loop()
-        self._rung = False
+        self._told = threading.Event()
         self._stopping = False
         self._thread = threading.Thread(target=self._run, name=f"bell-{block.source}", daemon=True)
         self._thread.start()
@@ -33,7 +33,7 @@ class Bell:
         self._stopping = True
 
     def _tell(self) -> None:
-        self._rung = False  # before looking: what comes from now on rings again
+        self._told.set()  # before looking: what comes from now on rings again
         for ring in self.listeners:
             ring()
 
@@ -43,11 +43,11 @@ class Bell:
         with suppress(RuntimeError):  # the event loop is closed
             while not self._stopping:
                 seen = ring.doorbell()  # before it is told, so that no frame is lost
-                if not self._rung:
-                    self._rung = True
-                    self._loop.call_soon_threadsafe(self._tell)
+                self._told.clear()
+                self._loop.call_soon_threadsafe(self._tell)
                 if self._block.retired:
                     return
+                self._told.wait(WAIT_NS / 1e9)  # a loop that is busy is not rung for every frame
                 ring.wait(seen, wait_ns)
 
 

@@ -45,7 +45,6 @@ class _Pending:
     until_accepted: bool
     done: asyncio.Future[list[End]]
     ends: dict[int, End] = field(default_factory=dict)
-    taken: bool = False
 
     @property
     def items(self) -> int:

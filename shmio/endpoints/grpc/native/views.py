@@ -101,7 +101,7 @@ class Selection:
             if old is None or new.invalid != old.invalid:
                 parts.append(field(INVALID, field(1, np.array(new.invalid, "<u4").tobytes())))
         now = self.injected(frame)
-        if before is None or not np.array_equal(now, self.injected(before)):
+        if before is None or (now is not (was := self.injected(before)) and not np.array_equal(now, was)):
             parts.append(field(INJECTED, field(1, now.tobytes())))
         return Message(head(self.number, frame, whole=before is None), b"".join(parts))
 
