@@ -240,3 +240,19 @@ def test_a_killed_program_that_played_leaves_time_standing(line: Cell) -> None:
     clock = step(line)
     assert clock["step"] in (stands["step"] + 1, stands["step"] + 2), "it may have been killed within a step"
     assert not clock["playing"]
+
+
+def test_a_supervisor_that_takes_over_keeps_the_time_unless_it_is_to_be_stepped_from_the_start(
+    make_line: Callable[[str], Cell],
+) -> None:
+    line = make_line("wall")
+    file = line.folder / "supervisor.toml"
+    kill(line.status()["supervisor"]["pid"])
+    file.write_text(file.read_text().replace('clock = "wall"', 'clock = "stepped"'))
+    assert f"{line.instance} ran in real time" in line.supervisor("up", "--detach").stdout
+    assert line.status()["clock"]["step"] == 0
+    assert step(line, "--count", "3")["step"] == 3
+    kill(line.status()["supervisor"]["pid"])
+    taken = line.supervisor("up", "--detach").stdout
+    assert "took over belt" in taken
+    assert step(line)["step"] == 4
