@@ -7,7 +7,7 @@ import secrets
 import signal
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import Final
 
@@ -33,8 +33,10 @@ def run_campaign(cell: Attachment, options: argparse.Namespace) -> int:
 
     ConfigError, CommandError: nothing was laid.
     """
-    declarations = _with_seed(read_campaign(options.file), options)
-    if options.from_now:
+    seed = secrets.randbits(SEED_BITS) if options.seed is None else options.seed
+    read = read_campaign(options.file)
+    declarations = [_with_seed(declaration, seed) for declaration in read]
+    if options.from_now and cell.sources:
         now_s = cell.block(cell.sources[0]).clock.read().present_ns / 1e9
         declarations = [_shifted(declaration, now_s) for declaration in declarations]
     cursors = {source: cell.block(source).events.cursor() for source in cell.sources}
@@ -42,6 +44,8 @@ def run_campaign(cell: Attachment, options: argparse.Namespace) -> int:
     for sign in (signal.SIGINT, signal.SIGTERM):
         signal.signal(sign, lambda *_: over.set())
     laid = {one.number: one for one in cell.declare(declarations, keep=options.keep)}
+    if any(declaration.seed is None for declaration in read):
+        print(dumps({"seed": seed}) if options.json else f"seed {seed}: --seed {seed} does the same again", flush=True)
     deadline_s = None if options.for_s is None else time.monotonic() + options.for_s
     try:
         while True:
@@ -59,16 +63,9 @@ def run_campaign(cell: Attachment, options: argparse.Namespace) -> int:
                 one.lift()
 
 
-def _with_seed(declarations: Sequence[Declaration], options: argparse.Namespace) -> list[Declaration]:
-    """Those that have no seed of their own get one that the user is told, or has told."""
-    if all(declaration.seed is not None for declaration in declarations):
-        return list(declarations)
-    seed = secrets.randbits(SEED_BITS) if options.seed is None else options.seed
-    print(dumps({"seed": seed}) if options.json else f"seed {seed}: --seed {seed} does the same again", flush=True)
-    return [
-        msgspec.structs.replace(declaration, seed=seed if declaration.seed is None else declaration.seed)
-        for declaration in declarations
-    ]
+def _with_seed(declaration: Declaration, seed: int) -> Declaration:
+    """One that has no seed of its own gets one that the user is told, or has told."""
+    return msgspec.structs.replace(declaration, seed=seed) if declaration.seed is None else declaration
 
 
 def _shifted(declaration: Declaration, now_s: float) -> Declaration:

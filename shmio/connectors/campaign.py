@@ -110,7 +110,7 @@ class Campaign:
         over = {layer.id for layer in self._layers if _finished(layer)}
         if over:
             self._chain.lift(lambda layer: layer.id in over, "over")
-        self.settle()
+            self.settle()
         sequence = self._own.declared.sequence
         if sequence == self._configuration or sequence % 2:  # odd: it is just being written, and a bell follows
             return

@@ -42,29 +42,36 @@ class Draw:
 
     def words(self, run: int, place: int, purpose: Purpose, count: int) -> Words:
         """``count`` words of 64 random bits."""
-        base = _mix(_mix(_mix(self._key + run & _MASK) + place & _MASK) + purpose & _MASK)
         if count <= FEW:
-            return np.array([_mix_word(base + number * _GOLDEN & _MASK) for number in range(1, count + 1)], np.uint64)
+            return np.array(self._few(run, place, purpose, count), np.uint64)
+        base = self._base(run, place, purpose)
         counter = np.arange(1, count + 1, dtype=np.uint64)
         return _mix_all(counter * np.uint64(_GOLDEN) + np.full(count, base, np.uint64))
 
     def uniform(self, run: int, place: int, count: int, purpose: Purpose = Purpose.VALUE) -> Floats:
         """Numbers from 0 to below 1."""
+        if count <= FEW:
+            return np.array([(word >> 11) * 2.0**-53 for word in self._few(run, place, purpose, count)])
         return (self.words(run, place, purpose, count) >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
     def gaussian(self, run: int, place: int, count: int) -> Floats:
         """Numbers of mean 0 and standard deviation 1 (Box and Muller, 1958)."""
         if count <= FEW:
-            pairs = zip(
-                self.uniform(run, place, count).tolist(),
-                self.uniform(run, place, count, Purpose.ANGLE).tolist(),
-                strict=True,
-            )
-            return np.array([math.sqrt(-2 * math.log(1 - one)) * math.cos(math.tau * other) for one, other in pairs])
+            radii = (1 - (word >> 11) * 2.0**-53 for word in self._few(run, place, Purpose.VALUE, count))
+            angles = ((word >> 11) * 2.0**-53 for word in self._few(run, place, Purpose.ANGLE, count))
+            pairs = zip(radii, angles, strict=True)
+            return np.array([math.sqrt(-2 * math.log(one)) * math.cos(math.tau * other) for one, other in pairs])
         radius = np.sqrt(-2 * np.log(1 - self.uniform(run, place, count)))
         angle = self.uniform(run, place, count, Purpose.ANGLE)
         normal: Floats = radius * np.cos(math.tau * angle)
         return normal
+
+    def _base(self, run: int, place: int, purpose: Purpose) -> int:
+        return _mix(_mix(_mix(self._key + run & _MASK) + place & _MASK) + purpose & _MASK)
+
+    def _few(self, run: int, place: int, purpose: Purpose, count: int) -> list[int]:
+        base = self._base(run, place, purpose)
+        return [_mix_word(base + number * _GOLDEN & _MASK) for number in range(1, count + 1)]
 
     def below(self, limit: int, run: int, place: int, count: int) -> npt.NDArray[np.intp]:
         """Whole numbers from 0 to below a limit of at most 2^32."""

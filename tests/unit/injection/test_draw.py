@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.injection.draw import Draw, Purpose
+from shmio.injection.draw import FEW, Draw, Purpose
 
 places = st.integers(0, 2**40)
 
@@ -59,3 +59,12 @@ def test_distributions_are_as_they_are_called() -> None:
     assert np.mean([draw.happens(0.25, 1, place) for place in range(10_000)]) == pytest.approx(0.25, abs=0.015)
     counts = np.bincount(np.concatenate([draw.below(4, 1, place, 50) for place in range(1000)]))
     assert counts == pytest.approx(12_500, rel=0.05)
+
+
+@given(st.integers(0, 2**32), places)
+def test_few_numbers_are_the_first_of_many(seed: int, place: int) -> None:
+    draw = Draw(seed, "x")
+    for purpose in Purpose:
+        assert draw.words(3, place, purpose, FEW).tolist() == draw.words(3, place, purpose, FEW + 1)[:FEW].tolist()
+    assert draw.uniform(3, place, FEW).tolist() == draw.uniform(3, place, FEW + 1)[:FEW].tolist()
+    assert draw.gaussian(3, place, FEW) == pytest.approx(draw.gaussian(3, place, FEW + 1)[:FEW], rel=1e-12)

@@ -1,0 +1,61 @@
+"""``shmio inject --file``: what it refuses before anything is laid; the whole is in tests/system/test_campaign.py."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shmio.cli.user import main
+from shmio.layout.model import Layout, Register
+from shmio.segment import BlockSpec, ProcessSpec, Segment
+
+LAYOUT = Layout("DB1", 1, 4, False, (Register("a", "INT", (), 0, None, 2, 1), Register("b", "INT", (), 2, None, 2, 1)))
+GOOD = '[[injection]]\nname = "x"\ntarget = "cell/a"\noperation = "noise"\namplitude = 1\n'
+
+
+@pytest.fixture
+def segment(instance: str) -> Iterator[Segment]:
+    spec = BlockSpec("cell", LAYOUT, 20_000_000, 10**9, 1 << 16)
+    with Segment.create(instance, [spec], [ProcessSpec("cell", "source")]) as segment:
+        yield segment
+        segment.unlink()
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        (None, "c.toml: No such file or directory"),
+        ("[[injection]\n", "c.toml: not TOML"),
+        ("", "c.toml: injection: this key is needed"),
+        (GOOD.replace("amplitude = 1", ""), "injection[0].amplitude: this key is needed for operation 'noise'"),
+        (GOOD.replace("cell/a", "cell/c"), "injection[0].target: cell/c: no such register in DB1"),
+        (GOOD + GOOD.replace('"x"', '"y"') + 'when = "a >"\n', "injection[1].when: at character 4: expected"),
+        (GOOD + "for = 1\n", "injection[0].for: unknown key; did you mean for_s?"),
+    ],
+)
+def test_a_file_with_a_fault_lays_nothing(
+    segment: Segment, tmp_path: Path, text: str | None, error: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "c.toml"
+    if text is not None:
+        file.write_text(text)
+    assert main(["inject", "--instance", segment.instance, "--seed", "1", "--file", str(file)]) == 1
+    told = capsys.readouterr().err
+    assert error in told
+    assert told.count("\n") == 1
+    assert segment.blocks["cell"].standing.read() == ()
+
+
+def test_a_file_and_values_do_not_go_together(segment: Segment, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["inject", "--instance", segment.instance, "--file", "c.toml", "cell/a", "1"]) == 1
+    assert capsys.readouterr().err == "give --file, or PATH VALUE, not both\n"
+
+
+@pytest.mark.parametrize("seed", ["-1", "x", str(2**63)])
+def test_a_seed_is_a_whole_number(seed: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["inject", "--file", "c.toml", "--seed", seed])
+    assert ended.value.code == 2
+    assert "--seed" in capsys.readouterr().err
