@@ -18,6 +18,9 @@ from shmio.wire.simserver_pb2_grpc import SimServerAPIStub
 from tests.system.campaign import CONFIG, NOISY, PANEL
 
 
+pytestmark = pytest.mark.timeout(240)
+
+
 @pytest.fixture
 def cell(make_cell: Callable[..., Cell]) -> Cell:
     """Models, noise and a memory, whose time stands at 0."""
