@@ -17,7 +17,6 @@ from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub
 from shmio.wire.simserver_pb2_grpc import SimServerAPIStub
 from tests.system.campaign import CONFIG, NOISY, PANEL
 
-
 pytestmark = pytest.mark.timeout(240)
 
 
