@@ -31,6 +31,7 @@ CONTENDERS = {
     "v2, a structure of 100 as one topic": "v2-structure",
     "v2, an array of 100 as one topic": "v2-array",
     "v1, 100 topics and model/clock": "v1",
+    "shmio.v1, 100 registers in one update": "native",
     "SimServerAPI.step, no subscriber": "alone",
 }
 

@@ -19,6 +19,7 @@ import grpc
 from common import tell
 from counting import COUNT
 
+from shmio.client import connect
 from shmio.wire import simlog_v1_pb2 as v1
 from shmio.wire import simlog_v2_pb2 as v2
 from shmio.wire import simserver_pb2 as sim
@@ -63,6 +64,20 @@ def version_2(channel: grpc.Channel, paths: list[str]) -> Iterator[Callable[[], 
 
         yield step
     stream.cancel()
+
+
+@contextmanager
+def native(target: str) -> Iterator[Callable[[], None]]:
+    """By shmio.v1: all that has changed in one update."""
+    with connect(target) as client, client.subscribe("sim/values/*") as updates:
+        next(updates)
+
+        def step() -> None:
+            number = client.step().step
+            while next(updates).cycle < number:
+                pass
+
+        yield step
 
 
 @contextmanager
@@ -117,7 +132,7 @@ def version_1(channel: grpc.Channel) -> Iterator[Callable[[], None]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("target")
-    parser.add_argument("kind", choices=["alone", "v2", "v2-array", "v2-structure", "v1", "bare"])
+    parser.add_argument("kind", choices=["alone", "native", "v2", "v2-array", "v2-structure", "v1", "bare"])
     arguments = parser.parse_args()
     kinds: dict[str, Callable[[grpc.Channel], Any]] = {
         "alone": alone,
@@ -126,6 +141,7 @@ def main() -> None:
         "v2-structure": lambda channel: version_2(channel, ["sim/values"]),
         "v1": version_1,
         "bare": bare,
+        "native": lambda _: native(arguments.target),
     }
     with grpc.insecure_channel(arguments.target) as channel:
         tell("ready")

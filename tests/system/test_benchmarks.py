@@ -58,6 +58,7 @@ def printed(benchmark: str) -> str:
                 "v2, a structure of 100 as one topic": 1,
                 "v2, an array of 100 as one topic": 1,
                 "v1, 100 topics and model/clock": 1,
+                "shmio.v1, 100 registers in one update": 1,
                 "a bare grpc.aio server, 101 ready messages in one stream": 1,
             },
         ),
