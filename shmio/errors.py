@@ -7,6 +7,7 @@
     ├── LayoutError        a data-block source is wrong; carries diagnostics with file, line, column
     ├── ValueRangeError    a value does not fit its register's type
     ├── PathError          no such source or register
+    ├── ConflictError      a name is in use for something else
     ├── SegmentError       the shared memory cannot be used
     │   ├── NotRunningError      no running instance of that name
     │   │   └── UnfinishedError      its segment is just being made, or its maker died
@@ -64,6 +65,10 @@ class ValueRangeError(ShmioError, ValueError):
 
 class PathError(ShmioError, LookupError):
     """No source or register has this path."""
+
+
+class ConflictError(ShmioError):
+    """A name, such as a shadow's path, is in use for something else."""
 
 
 class SegmentError(ShmioError):

@@ -14,9 +14,8 @@ from shmio.config import Declaration
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
-from shmio.layout.write import Write, bits_of, cover, encode, merge
+from shmio.layout.write import Write, apply, bits_of, cover, encode, merge
 from shmio.segment.commands import CommandKind, CommandSender, Laid
-from shmio.segment.diverted import apply
 from shmio.segment.events import DONE, ENDS, Event, EventKind
 
 if TYPE_CHECKING:
@@ -106,8 +105,8 @@ class Commander:
         for path, value in values.items():
             register = find(self.block.layout, path)
             write = self._encode(register, path, value)
-            apply(image, [write])
-            apply(bits, [write._replace(data=bits_of(register))])
+            apply(write, image)
+            apply(write._replace(data=bits_of(register)), bits)
             ranges.append((write.offset, write.offset + len(write.data)))
         writes = merge(image, bits, ranges)
         return self._send(("",) * len(writes), writes, timeout_s, CommandKind.SHADOW, injection)

@@ -36,4 +36,5 @@ class Channel:
         first = subject.registers[0]
         self.order = first.offset, first.bit or 0, subject.path, subject.wire
         """Of those that a step has changed, whoever came first."""
-        self.entries = entries(subject.registers, slot)
+        self.changed = subject.changed
+        self.entries = b"" if self.changed else entries(subject.registers, slot)

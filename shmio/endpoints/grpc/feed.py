@@ -28,6 +28,8 @@ WAIT_S = 0.2
 class _Table(NamedTuple):
     slots: tuple[Channel | None, ...]
     scan: ChangeScan
+    apart: tuple[Channel, ...]
+    """Those that the scan does not look at."""
 
 
 class Feed:
@@ -62,7 +64,7 @@ class Feed:
         self._on_quality = on_quality
         self._channels: dict[Subject, Channel] = {}
         self._free: list[int] = []  # slots
-        self._table = _Table((), ChangeScan([]))
+        self._table = _Table((), ChangeScan([]), ())
         self._outdated = False
         self._owed: dict[Listener, Channel] = {}  # joined while there was no good value
         _ = block.layout.members("")  # builds what paths are looked up in, before the first client waits for it
@@ -120,6 +122,12 @@ class Feed:
                 self._outdated = True
                 self._loop.call_soon(self._rebuild)
 
+    def tell_again(self, subject: Subject) -> None:
+        """Deliver a subject's value again: it has become another one without a frame that shows it."""
+        if channel := self._channels.get(subject):
+            self._owed |= dict.fromkeys(channel.listeners, channel)
+            self._settle()
+
     def hold(self) -> None:
         """Show nothing any more but by :meth:`step`, if the block is on the instance's clock.
 
@@ -140,7 +148,7 @@ class Feed:
         if frame is None or frame.quality is Quality.BAD:
             self._shown = None
             return
-        shown, self._shown = self._shown, Still(*self._hold.moment, frame.image)
+        shown, self._shown = self._shown, Still(*self._hold.moment, frame.image, frame.raw)
         for channel in sorted(self._news(shown, frame), key=lambda channel: channel.order):
             self._keep(channel.listeners, channel.encode(self._shown))
         self._settle()
@@ -155,7 +163,7 @@ class Feed:
     def _adopt(self, frame: Frame | None) -> None:
         """Before the first step the first good image is shown as it is."""
         if self._held and not self._stepped and self._shown is None and frame and frame.quality is not Quality.BAD:
-            self._shown = Still(*self._hold.moment, frame.image)
+            self._shown = Still(*self._hold.moment, frame.image, frame.raw)
             self._settle()
 
     def _settle(self) -> None:
@@ -197,7 +205,9 @@ class Feed:
         slots: list[Channel | None] = [None] * (len(self._channels) + len(self._free))
         for channel in self._channels.values():
             slots[channel.slot] = channel
-        self._table = _Table(tuple(slots), ChangeScan.joined(channel.entries for channel in self._channels.values()))
+        apart = tuple(channel for channel in self._channels.values() if channel.changed)
+        scan = ChangeScan.joined(channel.entries for channel in self._channels.values())
+        self._table = _Table(tuple(slots), scan, apart)
         self._outdated = False
 
     # ---- the feed's own thread ---------------------------------------------------------------------------------
@@ -264,9 +274,18 @@ class Feed:
 
     def _news(self, shown: Frame | Still | None, frame: Frame) -> list[Channel]:
         """The channels whose bytes have changed since then; all, if nothing was shown."""
-        slots, scan = self._table
-        news = slots if shown is None else [slots[i] for i in scan.changed(shown.image, frame.image)]
-        return [channel for channel in news if channel]
+        slots, scan, apart = self._table
+        if shown is None:
+            return [channel for channel in slots if channel]
+        news = [channel for slot in scan.changed(shown.image, frame.image) if (channel := slots[slot])]
+        return news + [channel for channel in apart if channel.changed and channel.changed(shown, frame)]
+
+    def present(self) -> Frame | Still | None:
+        """What would be shown to who listens now; None: nothing good."""
+        if self._held:
+            return self._shown
+        frame = self.block.latest()
+        return None if frame is None or self.block.assess(frame)[0] is Quality.BAD else frame
 
     def _stamp(self, event: Event) -> tuple[int, int]:
         """Number and time of what is told of an event: the frame before it, in virtual time the step before."""

@@ -22,11 +22,12 @@ class Status(NamedTuple):
 
 
 class Still(NamedTuple):
-    """A :class:`~shmio.endpoints.grpc.subject.Picture` of a block as a step has left it."""
+    """A :class:`~shmio.endpoints.grpc.subject.Picture` of a block as a step has left it; ``raw`` as of a frame."""
 
     number: int
     clock_ns: int
     image: bytes
+    raw: bytes
 
 
 class Hold:

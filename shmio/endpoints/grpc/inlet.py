@@ -6,17 +6,21 @@ import asyncio
 import logging
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Callable, Collection, Iterable, Mapping
+from functools import partial
+from typing import Final, Unpack
 
 from shmio.endpoints.grpc.echo import Echo, Message
+from shmio.endpoints.grpc.followers import Follower, Followers, News
+from shmio.endpoints.grpc.pending import Cost, Done, Pending
+from shmio.endpoints.grpc.progress import Progress
 from shmio.errors import CommandError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
-from shmio.segment import DONE, ENDS, Block, Event, EventKind
-from shmio.segment.commander import PATIENCE_S, Commander
-from shmio.segment.events import EVENT_DATA_SIZE
+from shmio.layout.write import bits_of
+from shmio.segment import Block, Event, EventKind
+from shmio.segment.commander import PATIENCE_S, Commander, Ticket
+from shmio.segment.commands import Laid
 
 log = logging.getLogger("shmio.grpc")
 
@@ -27,24 +31,6 @@ BATCH: Final = 32
 WAIT_S: Final = 0.2
 
 _RETIRED: Final = "the source was changed or removed by a reload"
-
-Done = Callable[[EventKind, str], None]
-"""Called once with what became of a value, one of ``ENDS``, and the reason if the device does not have it."""
-
-
-@dataclass(slots=True)
-class _Pending:
-    """A command whose end has not come."""
-
-    incarnation: int
-    until_ns: int
-    record_bytes: int
-    events: int
-    items: int  # whose end has not come
-    done: Done
-    accepted: Callable[[], None] | None
-    taken: bool = False
-    failure: tuple[EventKind, str] | None = None  # the first
 
 
 class Inlet:
@@ -62,13 +48,15 @@ class Inlet:
     ) -> None:
         """``writer``: the command queue of this process. ``stamp``: see :class:`Echo`."""
         self.block = block
+        self.stamp = stamp
         self.echo = Echo(block, stamp)
         self._writer = writer
         self._loop = loop
         self._commander = Commander(block, writer)
         self._prepared = False
         self._preparing = asyncio.Lock()
-        self._pending: dict[int, _Pending] = {}
+        self._pending: dict[int, Pending] = {}
+        self._followers = Followers()
         self._untaken_bytes = 0  # of records that may still lie in the queue
         self._open_events = 0
         self._silent = False
@@ -76,9 +64,7 @@ class Inlet:
         self._freed: asyncio.Future[None] | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._cursor = block.events.cursor()
-        self._told = self._cursor.last  # number of the last event whose messages are on their way to the event loop
-        self._asked: tuple[int, asyncio.Future[None]] | None = None
-        self._asking = threading.Lock()  # around these two
+        self._progress = Progress(loop, self._cursor.last)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"inlet-{block.source}", daemon=True)
 
@@ -107,8 +93,8 @@ class Inlet:
         self._thread.join()
 
     def ready(self, values: Mapping[str, object]) -> bool:
-        """Whether :meth:`send` would not have to wait."""
-        return self._prepared and not self._turn.locked() and self._has_room(*self._cost(values))
+        """Whether :meth:`send`, or :meth:`give`, would not have to wait."""
+        return self._prepared and not self._turn.locked() and self._has_room(self._cost(values))
 
     async def writable(self, registers: Iterable[Register]) -> bool:
         """Whether the configuration lets all of them be written."""
@@ -121,10 +107,37 @@ class Inlet:
         ``done`` is called once, when the end of all is known, a bounded time later; ``accepted`` before, if the source
         accepts them. CommandError: one is not writable, or the source is silent; ValueRangeError: neither is called.
         """
+        await self._send(partial(self._commander.submit, values), self._cost(values), done, accepted)
+
+    async def give(
+        self, injection: int, values: Mapping[str, object], done: Done, accepted: Callable[[], None] | None = None
+    ) -> None:
+        """The same for values as an injection's; ``accepted`` is called of one over ``/in`` only."""
+        await self._send(partial(self._commander.give, injection, values), self._cost(values), done, accepted)
+
+    def lay(self, registers: Collection[Register], follower: Follower, done: Done, **laid: Unpack[Laid]) -> int:
+        """Have an injection laid over registers; its number. Never waits. CommandError: not sent."""
+        bits = bytearray(self.block.layout.size)
+        for register in registers:
+            for at, own in enumerate(bits_of(register), register.offset):
+                bits[at] |= own
+        ticket = self._commander.lay(bytes(bits), **laid)
+        cost = Cost.of([register.size for register in registers], laid.get("name", ""))
+        self._follow_up(ticket, cost, done)
+        self._followers.add(ticket.number, follower)
+        return ticket.number
+
+    def lift(self, injection: int, done: Done) -> None:
+        """Have an injection lifted, whose follower is told nothing more. Never waits. CommandError: not sent."""
+        self._followers.remove(injection)
+        self._follow_up(self._commander.ask_to_lift(injection), Cost.of(()), done)
+
+    async def _send(
+        self, submit: Callable[[], Ticket], cost: Cost, done: Done, accepted: Callable[[], None] | None
+    ) -> None:
         async with self._turn:
             await self._prepare()
-            record_bytes, events = self._cost(values)
-            while not self._has_room(record_bytes, events):
+            while not self._has_room(cost):
                 self._freed = self._loop.create_future()
                 await self._freed
             if self.block.retired:
@@ -133,25 +146,19 @@ class Inlet:
                 raise CommandError(
                     f"source {self.block.source} does not answer; shmio-supervisor status says how it fares"
                 )
-            ticket = self._commander.submit(values)
-            self._pending[ticket.number] = _Pending(
-                ticket.incarnation, ticket.until_ns, record_bytes, events, len(values), done, accepted
-            )
-            self._untaken_bytes += record_bytes
-            self._open_events += events
-            if self._timer is None:
-                self._set_timer()
+            self._follow_up(submit(), cost, done, accepted)
+
+    def _follow_up(self, ticket: Ticket, cost: Cost, done: Done, accepted: Callable[[], None] | None = None) -> None:
+        items = set(range(len(ticket.paths)))
+        self._pending[ticket.number] = Pending(ticket.incarnation, ticket.until_ns, cost, items, done, accepted)
+        self._untaken_bytes += cost.record_bytes
+        self._open_events += cost.events
+        if self._timer is None:
+            self._set_timer()
 
     async def caught_up(self) -> None:
         """Wait until what has been told so far is delivered, to those who listen to what is written too."""
-        told = self._loop.create_future()
-        with self._asking:
-            head = self.block.events.head()
-            if self._told < head and self._thread.is_alive():
-                self._asked = head, told
-            else:
-                self._loop.call_soon(_set, told)  # behind what is on its way
-        await told
+        await self._progress.reached(self.block.events.head() if self._thread.is_alive() else 0)
 
     async def _prepare(self) -> None:
         if not self._prepared:
@@ -159,21 +166,22 @@ class Inlet:
                 await asyncio.to_thread(self._commander.prepare)
                 self._prepared = True
 
-    def _cost(self, values: Mapping[str, object]) -> tuple[int, int]:
-        """At most so many bytes in the queue, and events until the end, have writes of these; PathError."""
-        sizes = [find(self.block.layout, path).size for path in values]
-        return 64 + sum(24 + size for size in sizes), sum(2 + size // EVENT_DATA_SIZE for size in sizes)
+    def _cost(self, values: Mapping[str, object]) -> Cost:
+        """What a command with these costs; PathError."""
+        return Cost.of([find(self.block.layout, path).size for path in values])
 
-    def _has_room(self, record_bytes: int, events: int) -> bool:
-        fits = self._untaken_bytes + record_bytes <= self.block.commands.capacity
-        return self._silent or not self._pending or (fits and self._open_events + events <= MAX_OPEN)
+    def _has_room(self, cost: Cost) -> bool:
+        fits = self._untaken_bytes + cost.record_bytes <= self.block.commands.capacity
+        return self._silent or not self._pending or (fits and self._open_events + cost.events <= MAX_OPEN)
 
     # ---- what the source says --------------------------------------------------------------------------------
 
-    def _on_events(self, events: list[Event], messages: list[Message]) -> None:
+    def _on_events(self, events: list[Event], messages: list[Message], news: list[News]) -> None:
         for channel, message in messages:
             for listener in channel.listeners:
                 listener.deliver(message)
+        for item in news:
+            self._followers.tell(item)
         for event in events:
             if event.kind == EventKind.STARTED:
                 self._restarted(event)
@@ -182,20 +190,15 @@ class Inlet:
                 self._hear(event, pending)
         self._free()
 
-    def _hear(self, event: Event, pending: _Pending) -> None:
+    def _hear(self, event: Event, pending: Pending) -> None:
         if not pending.taken:
-            pending.taken = True
-            self._untaken_bytes -= pending.record_bytes
-            if event.kind == EventKind.ACCEPTED and pending.accepted is not None:
-                pending.accepted()
-        if event.kind not in ENDS:
-            return
-        pending.items -= event.items
-        kind = EventKind(event.kind)
-        if kind not in DONE and pending.failure is None:
-            pending.failure = kind, f"{kind}: {event.text}"
-        if pending.items <= 0:
-            self._end(event.command, *(pending.failure or (kind, "")))
+            self._untaken_bytes -= pending.cost.record_bytes
+        if end := pending.hear(event):
+            self._end(event.command, *end)
+
+    def _missed(self, reason: str) -> None:
+        self.echo.fail(reason)
+        self._followers.fail(reason)
 
     def _restarted(self, event: Event) -> None:
         """A successor rejects what its predecessor had not taken; of what it had taken nobody knows."""
@@ -214,13 +217,14 @@ class Inlet:
     def _retired(self) -> None:
         for number in list(self._pending):
             self._end(number, EventKind.UNKNOWN, _RETIRED)
+        self._followers.end(_RETIRED)
         self._free()
 
     def _end(self, number: int, kind: EventKind, reason: str) -> None:
         pending = self._pending.pop(number)
-        self._open_events -= pending.events
+        self._open_events -= pending.cost.events
         if not pending.taken:
-            self._untaken_bytes -= pending.record_bytes
+            self._untaken_bytes -= pending.cost.record_bytes
         pending.done(kind, reason)
 
     def _free(self) -> None:
@@ -263,37 +267,27 @@ class Inlet:
             retired = self.block.retired
             event = cursor.next(WAIT_S)
             if event is None:
-                self._tell(cursor.last)
+                self._progress.tell(cursor.last)
                 if retired:
                     self._loop.call_soon_threadsafe(self._retired)
                     return
                 continue
             ours: list[Event] = []
             messages: list[Message] = []
+            news: list[News] = []
             for left in reversed(range(BATCH)):
                 if cursor.missed != missed:
                     self.echo.skip()
+                    self._followers.skip()
                     reason = f"{cursor.missed - missed} events of source {self.block.source} were missed"
-                    self._loop.call_soon_threadsafe(self.echo.fail, reason)
+                    self._loop.call_soon_threadsafe(self._missed, reason)
                     missed = cursor.missed
                 messages += self.echo.follow(event)
+                news += self._followers.gather(event)
                 if event.writer == self._writer or event.kind == EventKind.STARTED:
                     ours.append(event)
                 if not left or (event := cursor.poll()) is None:
                     break
-            if ours or messages:
-                self._loop.call_soon_threadsafe(self._on_events, ours, messages)
-            self._tell(cursor.last)
-
-    def _tell(self, number: int) -> None:
-        """All up to this event is on its way."""
-        with self._asking:
-            self._told = number
-            if self._asked is not None and self._asked[0] <= number:
-                self._loop.call_soon_threadsafe(_set, self._asked[1])
-                self._asked = None
-
-
-def _set(future: asyncio.Future[None]) -> None:
-    if not future.done():
-        future.set_result(None)
+            if ours or messages or news:
+                self._loop.call_soon_threadsafe(self._on_events, ours, messages, news)
+            self._progress.tell(cursor.last)

@@ -37,6 +37,8 @@ class Outbox:
         self.dropped = 0
         self.failure = ""
         """Why it ended; empty: it did not fail."""
+        self.on_failure: Callable[[], object] | None = None
+        """Called then: the stream itself may wait for its client, who does not read, for ever."""
         self._waiting: OrderedDict[int, tuple[_Lane, Sized]] = OrderedDict()
         self._next = 0
         self._waiter: asyncio.Future[None] | None = None
@@ -81,10 +83,12 @@ class Outbox:
 
     def fail(self, reason: str) -> None:
         """End at once; what waits is dropped, and all that comes."""
-        self.failure = self.failure or reason
+        failed, self.failure = self.failure, self.failure or reason
         self.clear()
         self.end()
         self._tell()
+        if self.on_failure and not failed:
+            asyncio.get_running_loop().call_soon(self.on_failure)  # not while what it leaves is gone through
 
     def owe(self) -> None:
         """What has been added so far is waited for by :meth:`taken`."""

@@ -12,8 +12,9 @@ from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError
 
 from shmio.endpoints.grpc.arrivals import Arrivals
-from shmio.endpoints.grpc.inlet import Done, Inlet
+from shmio.endpoints.grpc.pending import Done
 from shmio.endpoints.grpc.refusals import Refusals
+from shmio.endpoints.grpc.shadows import Shadows, Way
 from shmio.endpoints.grpc.shape import Shape, shape
 from shmio.endpoints.grpc.topics import Topics
 from shmio.errors import CommandError, ShmioError, ValueRangeError
@@ -24,6 +25,13 @@ SETTLE_S: Final = 5.0
 """So long a step waits for what its client has sent before it, and goes on sending."""
 MAX_VALUES: Final = 256
 """Registers that one structure may write at once; a cycle of the source takes as many."""
+
+
+class _Way(NamedTuple):
+    """Where a value goes. ``send``: as :meth:`Inlet.send`; ``ready``: whether that would not have to wait."""
+
+    send: Callable[[Done, Callable[[], None]], Coroutine[None, None, None]]
+    ready: bool
 
 
 class Request(NamedTuple):
@@ -91,9 +99,10 @@ class Publisher:
     Every message is in the end one of ``published``, the device has it, or ``refused``.
     """
 
-    def __init__(self, topics: Topics) -> None:
+    def __init__(self, topics: Topics, shadows: Shadows) -> None:
         self.published = 0
         self._topics = topics
+        self._shadows = shadows
         self._refusals = Refusals()
         self._waiting: set[asyncio.Task[None]] = set()
         self._streams: dict[str, set[_Stream]] = {}  # of each peer
@@ -130,7 +139,7 @@ class Publisher:
         try:
             request = parse(message)
             path = request.path
-            inlet, values = self._read(request)
+            way = self._way(request)
         except DecodeError:
             self._refusals.add(f"{len(message)} bytes are no PubRequest", path, peer)
             return
@@ -138,8 +147,8 @@ class Publisher:
             self._refusals.add(str(error), path, peer)
             return
         value = _Value(stream)
-        sending = self._send(inlet, values, partial(self._ended, value, path, peer), value.hear)
-        if inlet.ready(values):
+        sending = self._send(way, partial(self._ended, value, path, peer), value.hear)
+        if way.ready:
             await sending
         else:  # meanwhile nothing is read: the client is slowed down by the flow control of its stream
             await asyncio.shield(self._keep(sending))
@@ -181,15 +190,20 @@ class Publisher:
                 answer.set_result((kind, reason))
 
         try:
-            inlet, values = self._read(request)
-            await inlet.send(values, ended, accepted)
+            await self._way(request).send(ended, accepted)
         except ShmioError:
             self._refusals.count += 1
             raise
         return await answer
 
-    def _read(self, request: Request) -> tuple[Inlet, Mapping[str, object]]:
+    def _way(self, request: Request) -> _Way:
         """What is to be written where; PathError, ValueRangeError, CommandError."""
+        if shadow := self._shadows.find(request.path):
+            if shadow.way is Way.ORIGINALS:
+                raise CommandError(f"{shorten(request.path)}: originals come from here; values go to the shadow's /in")
+            injection = shadow.injection
+            values = request.read(injection.shape)
+            return _Way(partial(injection.give, values), injection.ready(values))
         topic = self._topics.topic(request.path)
         found = shape(self._topics.layout(topic), topic)
         if topic.direction == "out":
@@ -199,11 +213,12 @@ class Publisher:
             raise ValueRangeError(
                 f"{shorten(request.path)}: {len(values)} registers are too many at once, at most {MAX_VALUES}"
             )
-        return self._topics.feed(topic.source).inlet, values
+        inlet = self._topics.feed(topic.source).inlet
+        return _Way(partial(inlet.send, values), inlet.ready(values))
 
-    async def _send(self, inlet: Inlet, values: Mapping[str, object], done: Done, accepted: Callable[[], None]) -> None:
+    async def _send(self, way: _Way, done: Done, accepted: Callable[[], None]) -> None:
         try:
-            await inlet.send(values, done, accepted)
+            await way.send(done, accepted)
         except ShmioError as error:
             done(EventKind.REJECTED, str(error))
 

@@ -11,6 +11,7 @@ from shmio.endpoints.grpc.hold import Hold
 from shmio.endpoints.grpc.native.service import NativeService
 from shmio.endpoints.grpc.outbox import Outboxes
 from shmio.endpoints.grpc.publish import Publisher
+from shmio.endpoints.grpc.shadows import Shadows
 from shmio.endpoints.grpc.simlog_v1 import SimlogV1
 from shmio.endpoints.grpc.simlog_v2 import SimlogV2
 from shmio.endpoints.grpc.simserver import SimServer
@@ -34,14 +35,15 @@ class Services:
             raise SegmentError("the segment has no command queue for this process")
         topics = Topics(feeds, default_source)
         self._outboxes = Outboxes()
-        self._publisher = Publisher(topics)
+        self._shadows = Shadows(topics)
+        self._publisher = Publisher(topics, self._shadows)
         self.stepper = Stepper(segment, slot, hold, feeds, self._outboxes, self._publisher)
         """The instance's time."""
         self._native = NativeService(topics, feeds, segment, slot.writer, self.stepper)
         self._services = (
             self._native,
-            SimlogV1(topics, self._publisher, self._outboxes, self.stepper),
-            SimlogV2(topics, self._publisher, self._outboxes, self.stepper.marks),
+            SimlogV1(topics, self._publisher, self._outboxes, self._shadows, self.stepper),
+            SimlogV2(topics, self._publisher, self._outboxes, self._shadows, self.stepper.marks),
             SimServer(self.stepper, self._outboxes),
         )
 
@@ -72,6 +74,7 @@ class Services:
 
     def move(self, sources: Collection[str]) -> None:
         """Have the streams of these sources go over to the feeds that there are by now."""
+        self._shadows.move(sources)
         for service in self._services:
             if not isinstance(service, SimServer):
                 service.move(sources)

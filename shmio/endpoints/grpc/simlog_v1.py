@@ -1,4 +1,4 @@
-"""SimlogAPI version 1, package ``simulation.server``; without injection for now."""
+"""SimlogAPI version 1, package ``simulation.server``."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ import grpc
 from google.protobuf.empty_pb2 import Empty
 
 from shmio.endpoints.grpc.hold import Moment
+from shmio.endpoints.grpc.inject_v1 import Injecting
 from shmio.endpoints.grpc.outbox import EventLane, Lane, Outbox, Outboxes, StateLane
 from shmio.endpoints.grpc.publish import Publisher, Request
 from shmio.endpoints.grpc.rosmessage import encoder, message_type, read, time_stamp
+from shmio.endpoints.grpc.shadows import Shadows
 from shmio.endpoints.grpc.shape import Shape, shape
 from shmio.endpoints.grpc.stepper import Stepper
 from shmio.endpoints.grpc.subject import Subject
@@ -37,10 +39,13 @@ class SimlogV1:
 
     name = SERVICE
 
-    def __init__(self, topics: Topics, publisher: Publisher, outboxes: Outboxes, stepper: Stepper) -> None:
+    def __init__(
+        self, topics: Topics, publisher: Publisher, outboxes: Outboxes, shadows: Shadows, stepper: Stepper
+    ) -> None:
         self._topics = topics
         self._publisher = publisher
         self._outboxes = outboxes
+        self._injecting = Injecting(outboxes, shadows, self._resolve)
         self._stepper = stepper
         self._streams: dict[Outbox, str] = {}  # and their source
 
@@ -54,6 +59,7 @@ class SimlogV1:
             "GetTopic": unary(self.get_topic, decode, wire.TopicDescriptor.SerializeToString),
             # No serializer: a change is encoded once, by the feed, and its bytes go to every stream.
             "Subscribe": grpc.unary_stream_rpc_method_handler(self.subscribe, decode),
+            "Inject": grpc.unary_stream_rpc_method_handler(self._injecting.inject, wire.InjectRequest.FromString),
             # No deserializer either: bytes that are no message must not end the stream.
             "Publish": grpc.stream_unary_rpc_method_handler(self.publish, None, Empty.SerializeToString),
         }
@@ -86,6 +92,8 @@ class SimlogV1:
 
     async def get_topic(self, request: wire.TopicDescriptor, context: Context) -> wire.TopicDescriptor:
         """Tell a topic's type; NOT_FOUND, INVALID_ARGUMENT for a structure that there is no message for."""
+        if injection := await self._injecting.find(request.path, context):
+            return wire.TopicDescriptor(path=request.path, msgType=message_type(injection.shape))
         if mark := await self._mark(request.path, context):
             return wire.TopicDescriptor(path=request.path, msgType=_MARK_TYPES[mark])
         _, found = await self._resolve(request.path, context)
@@ -99,6 +107,10 @@ class SimlogV1:
         with RESOURCE_EXHAUSTED. When a reload changes the source the stream goes on, if there still is such a register;
         else it ends with NOT_FOUND.
         """
+        if injection := await self._injecting.find(request.path, context):
+            async for gift in self._injecting.gifts(injection, request.path, context):
+                yield gift
+            return
         if mark := await self._mark(request.path, context):
             async for moment in self._follow(mark, context):
                 yield moment

@@ -1,10 +1,10 @@
-"""SimlogAPI version 2, package ``simlog.server``; without injection for now."""
+"""SimlogAPI version 2, package ``simlog.server``."""
 
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Collection, Iterable
 from functools import partial
-from typing import Any, Final, NoReturn
+from typing import Any, Final
 
 import grpc
 from google.protobuf.empty_pb2 import Empty
@@ -12,7 +12,9 @@ from google.protobuf.empty_pb2 import Empty
 from shmio.endpoints.grpc.marks import Marks
 from shmio.endpoints.grpc.outbox import Outboxes
 from shmio.endpoints.grpc.publish import Publisher, Request
+from shmio.endpoints.grpc.shadows import Shadow, Shadows, Way, shadow_paths
 from shmio.endpoints.grpc.shape import Shape, shape
+from shmio.endpoints.grpc.status import refuse
 from shmio.endpoints.grpc.subscribers import Subscribers
 from shmio.endpoints.grpc.topics import Topics
 from shmio.endpoints.grpc.values import (
@@ -26,7 +28,7 @@ from shmio.endpoints.grpc.values import (
     time_stamp,
     value_type,
 )
-from shmio.errors import CommandError, EndpointError, PathError, ShmioError, ValueRangeError
+from shmio.errors import PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import Topic, shorten
 from shmio.segment import EventKind, Frame, Quality
 from shmio.wire import simlog_v2_pb2 as wire
@@ -35,24 +37,20 @@ SERVICE: Final = wire.DESCRIPTOR.services_by_name["SimlogAPI"].full_name
 
 Context = grpc.aio.ServicerContext[Any, Any]
 
-_STATUS: Final = {
-    PathError: grpc.StatusCode.NOT_FOUND,
-    ValueRangeError: grpc.StatusCode.INVALID_ARGUMENT,
-    CommandError: grpc.StatusCode.FAILED_PRECONDITION,
-    EndpointError: grpc.StatusCode.RESOURCE_EXHAUSTED,
-}
-
 
 class SimlogV2:
     """Serves the registers and structures of all sources as ``google.protobuf.Value``."""
 
     name = SERVICE
 
-    def __init__(self, topics: Topics, publisher: Publisher, outboxes: Outboxes, marks: Marks) -> None:
+    def __init__(
+        self, topics: Topics, publisher: Publisher, outboxes: Outboxes, shadows: Shadows, marks: Marks
+    ) -> None:
         self._topics = topics
         self._publisher = publisher
         self._outboxes = outboxes
-        self._subscribers = Subscribers(topics, marks)
+        self._shadows = shadows
+        self._subscribers = Subscribers(topics, shadows, marks)
 
     def handlers(self) -> grpc.GenericRpcHandler:
         """The service's calls, for a server. Values are serialised where they are made, and once."""
@@ -67,7 +65,7 @@ class SimlogV2:
                 self.create_subscriber, wire.Subscriber.FromString
             ),
             "Subscribe": unary(self.subscribe, wire.SubscriptionRequest.FromString, empty),
-            "Inject": unary(self.inject),
+            "Inject": unary(self.inject, wire.InjectRequest.FromString, wire.InjectResponse.SerializeToString),
             "Publish": grpc.stream_unary_rpc_method_handler(self.publish, None, empty),
             "Write": write,
             "PublishSynch": write,
@@ -77,6 +75,10 @@ class SimlogV2:
 
     async def get_topic_info(self, request: wire.TopicInfoRequest, _: Context) -> wire.TopicInfo:
         """Tell what a topic is; ``exists`` is false, and no more said, for what does not exist."""
+        if shadow := self._shadows.find(request.path):
+            kind = value_type(shadow.injection.shape)
+            direction = wire.OUT if shadow.way is Way.ORIGINALS else wire.IN
+            return wire.TopicInfo(path=request.path, type=kind, direction=direction, exists=True)
         try:
             if self._topics.mark(request.path):
                 return wire.TopicInfo(path=request.path, type=wire.NUMBER, direction=wire.OUT, exists=True)
@@ -95,8 +97,9 @@ class SimlogV2:
         with self._outboxes.opened() as outbox:
             try:
                 subscriber = self._subscribers.enter(request.uuid, request.name, outbox)
+                outbox.on_failure = subscriber.close  # what it holds goes at once
             except ShmioError as error:
-                await _refuse(context, error)
+                await refuse(context, error)
             try:
                 await context.send_initial_metadata(())  # who waits for it may subscribe from then on
                 while (message := await outbox.pop()) is not None:
@@ -116,15 +119,25 @@ class SimlogV2:
         try:
             await self._subscribers.subscribe(request.subscriberUUID, request.path)
         except ShmioError as error:
-            await _refuse(context, error)
+            await refuse(context, error)
         return Empty()
 
-    async def inject(self, _: bytes, context: Context) -> bytes:
-        """Not built yet: UNIMPLEMENTED."""
-        await context.abort(
-            grpc.StatusCode.UNIMPLEMENTED, "Inject: not by gRPC yet; shmio inject does it on the instance's host"
-        )
-        raise AssertionError  # abort never returns
+    async def inject(self, request: wire.InjectRequest, context: Context) -> wire.InjectResponse:
+        """Lay a shadow over a topic; where its originals come from and its values go to, as long as it stands.
+
+        It stands as long as a subscriber has ``shadowPathOut``; until the first has, as long as the connection that
+        this call came by. NOT_FOUND: no such topic; INVALID_ARGUMENT: a structure too large for a message, or no
+        prefix; FAILED_PRECONDITION: the source refuses it, and says why; RESOURCE_EXHAUSTED: too many.
+        """
+        try:
+            topic, found = self._find(request.targetPath)
+            encoder(found, self._topics.layout(topic))
+            path_in, path_out = shadow_paths(request.shadowPathPrefix, topic)
+            ways = {path_in: Way.GIFTS, path_out: Way.ORIGINALS}
+            await self._shadows.lay_for_client(topic, found, ways, context.peer())
+        except ShmioError as error:
+            await refuse(context, error)
+        return wire.InjectResponse(shadowPathIn=path_in, shadowPathOut=path_out)
 
     async def publish(self, messages: AsyncIterator[bytes], context: Context) -> Empty:
         """Write the values of a stream, in its order, and answer when it has ended and all of them have."""
@@ -139,7 +152,7 @@ class SimlogV2:
         try:
             kind, reason = await self._publisher.write(_request(request), context.peer())
         except ShmioError as error:
-            await _refuse(context, error)
+            await refuse(context, error)
         if kind is EventKind.UNKNOWN:
             await context.abort(grpc.StatusCode.DEADLINE_EXCEEDED, f"{shorten(request.topic)}: {reason}")
         if kind is not EventKind.ACCEPTED:
@@ -154,7 +167,7 @@ class SimlogV2:
         try:
             return repeated(self._read(request.path))
         except ShmioError as error:
-            await _refuse(context, error)
+            await refuse(context, error)
 
     def move(self, sources: Collection[str]) -> None:
         """Have the subscriptions of these sources go over to the feeds that there are by now."""
@@ -173,19 +186,26 @@ class SimlogV2:
 
     def _read(self, paths: Iterable[str]) -> list[bytes]:
         """Serialised messages; PathError, ValueRangeError."""
-        wanted: list[tuple[str, str, Shape]] = []
+        wanted: list[tuple[str, str | Shadow, Shape]] = []
         members = elements = 0
         for path in paths:
-            topic, found = self._find(path)
+            shadow = self._shadows.find(path)
+            topic, found = (shadow.injection.target, shadow.injection.shape) if shadow else self._find(path)
             members, elements = members + len(found.registers), elements + found.elements
             if members > MAX_MEMBERS or elements > MAX_ELEMENTS:
                 raise ValueRangeError(
                     f"{shorten(path)}: too much for one Read: {MAX_MEMBERS} registers with {MAX_ELEMENTS} elements are "
                     "the most"
                 )
-            wanted.append((path, topic.source, found))
-        frames = {source: self._topics.feed(source).block.latest() for source in {source for _, source, _ in wanted}}
-        return [self._message(path, source, found, frames[source]) for path, source, found in wanted]
+            wanted.append((path, shadow or topic.source, found))
+        sources = {source for _, source, _ in wanted if isinstance(source, str)}
+        frames = {source: self._topics.feed(source).block.latest() for source in sources}
+        return [
+            _shadowed(path, source)
+            if isinstance(source, Shadow)
+            else self._message(path, source, found, frames[source])
+            for path, source, found in wanted
+        ]
 
     def _message(self, path: str, source: str, found: Shape, frame: Frame | None) -> bytes:
         block = self._topics.feed(source).block
@@ -197,15 +217,17 @@ class SimlogV2:
         return message.under(path_field(path))
 
 
+def _shadowed(path: str, shadow: Shadow) -> bytes:
+    """The message of an injection's topic: the original of ``/out`` as of now; of what is written there is none."""
+    injection = shadow.injection
+    shown = injection.present() if shadow.way is Way.ORIGINALS else None
+    message = None if shown is None else encoder(injection.shape, injection.feed.block.layout)(shown)
+    return (message or nothing(b"")).under(path_field(path))
+
+
 def _parse(message: bytes) -> Request:
     return _request(wire.PubRequest.FromString(message))
 
 
 def _request(request: wire.PubRequest) -> Request:
     return Request(request.topic, partial(from_wire, request.data.value))
-
-
-async def _refuse(context: Context, error: ShmioError) -> NoReturn:
-    """End a call with what its error means to the client."""
-    await context.abort(_STATUS.get(type(error), grpc.StatusCode.INTERNAL), str(error))
-    raise error  # abort never returns

@@ -25,6 +25,14 @@ class Picture(Protocol):
         """The block's bytes."""
 
 
+class Source(Picture, Protocol):
+    """A frame, with what its source delivered."""
+
+    @property
+    def raw(self) -> bytes:
+        """That, whatever injections show instead."""
+
+
 Encode = Callable[[Picture], Sized | None]
 """The message, whose length is in bytes; None where the bytes hold no value."""
 
@@ -33,10 +41,12 @@ Encode = Callable[[Picture], Sized | None]
 class Subject:
     """A register, an array's element or a structure as one wire shows it; equal ones are encoded once for all.
 
-    ``wire``: which one. ``path``: canonical, in the block. ``registers``: what it shows.
+    ``wire``: which one. ``path``: canonical, in the block. ``registers``: what it shows. ``changed``: whether two
+    frames differ in it, if it is not what consumers see of the registers.
     """
 
     wire: str
     path: str
     registers: tuple[Register, ...] = field(compare=False)
     encode: Encode = field(compare=False)
+    changed: Callable[[Source, Source], bool] | None = field(default=None, compare=False)

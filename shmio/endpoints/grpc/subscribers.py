@@ -11,10 +11,11 @@ from functools import partial
 from typing import Final
 
 from shmio.endpoints.grpc.marks import Marks
-from shmio.endpoints.grpc.outbox import EventLane, Lane, Outbox, StateLane
+from shmio.endpoints.grpc.outbox import EventLane, Finish, Lane, Outbox, StateLane
+from shmio.endpoints.grpc.shadows import Shadow, Shadows, Way
 from shmio.endpoints.grpc.shape import shape
 from shmio.endpoints.grpc.topics import Mark, Topics
-from shmio.endpoints.grpc.values import Encoded, marked, path_field, subject
+from shmio.endpoints.grpc.values import Encoded, encoder, marked, path_field, subject
 from shmio.errors import EndpointError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import Topic, shorten
 from shmio.logs import fields
@@ -34,22 +35,23 @@ log = logging.getLogger("shmio.grpc")
 
 @dataclass(slots=True)
 class _Subscription:
-    """``leave``: None while no source has such a topic."""
+    """``topic``: None of an injection's. ``leave``: None while no source has such a topic."""
 
-    topic: Topic | Mark
-    lane: Lane
+    topic: Topic | Mark | None
+    lane: Lane | None
     leave: Callable[[], None] | None = None
 
 
 class Subscriber:
     """One CreateSubscriber call."""
 
-    def __init__(self, topics: Topics, marks: Marks, name: str, outbox: Outbox) -> None:
+    def __init__(self, topics: Topics, shadows: Shadows, marks: Marks, name: str, outbox: Outbox) -> None:
         self.name = name
         self.outbox = outbox
         self.replaced = False
         """Whether another one of its uuid has taken its place."""
         self._topics = topics
+        self._shadows = shadows
         self._marks = marks
         self._subscriptions: dict[str, _Subscription] = {}
 
@@ -60,8 +62,11 @@ class Subscriber:
         """Subscribe to a topic; again, if it is already: nothing. PathError, ValueRangeError, EndpointError."""
         if path in self._subscriptions:
             return
-        topic = self._topics.mark(path) or self._topics.topic(path)
         finish = partial(Encoded.under, path=path_field(path))
+        if shadow := self._shadows.find(path):
+            self._subscriptions[path] = _Subscription(None, None, self._join_shadow(path, shadow, finish))
+            return
+        topic = self._topics.mark(path) or self._topics.topic(path)
         lane: Lane = StateLane(self.outbox, finish)
         if isinstance(topic, Topic) and topic.direction == "in":
             lane = EventLane(self.outbox, shorten(path), finish)
@@ -81,12 +86,36 @@ class Subscriber:
 
     def close(self) -> None:
         """Leave all topics."""
-        for subscription in self._subscriptions.values():
+        subscriptions, self._subscriptions = self._subscriptions, {}
+        for subscription in subscriptions.values():
             self._leave(subscription)
-        self._subscriptions.clear()
+
+    def _join_shadow(self, path: str, shadow: Shadow, finish: Finish) -> Callable[[], None]:
+        """Listen to a topic of an injection, which a listener to originals holds; how to leave again."""
+        injection, key = shadow.injection, object()
+        to_message = encoder(injection.shape, injection.feed.block.layout)
+        if shadow.way is Way.ORIGINALS:
+            leave = injection.originals("v2", to_message, self.outbox, shorten(path), finish)
+            self._shadows.hold(injection, key)
+        else:
+            leave = injection.gifts("v2", to_message, EventLane(self.outbox, shorten(path), finish))
+
+        def over() -> None:
+            log.info("a subscribed topic is gone: %s", injection.over, extra=fields(topic=shorten(path)))
+            self._leave(self._subscriptions.pop(path))
+
+        def leave_it() -> None:
+            injection.ends.pop(key, None)
+            leave()
+            self._shadows.release(injection, key)
+
+        injection.ends[key] = over
+        return leave_it
 
     def _join(self, subscription: _Subscription) -> None:
         topic, lane = subscription.topic, subscription.lane
+        if topic is None or lane is None:
+            return
         if isinstance(topic, Mark):
             subscription.leave = self._marks.listen(topic, marked, lane)
             return
@@ -96,15 +125,16 @@ class Subscriber:
 
     def _leave(self, subscription: _Subscription) -> None:
         if subscription.leave is not None:
-            subscription.leave()
-            subscription.leave = None
+            leave, subscription.leave = subscription.leave, None
+            leave()
 
 
 class Subscribers:
     """Those whose stream is open, by their uuid."""
 
-    def __init__(self, topics: Topics, marks: Marks) -> None:
+    def __init__(self, topics: Topics, shadows: Shadows, marks: Marks) -> None:
         self._topics = topics
+        self._shadows = shadows
         self._marks = marks
         self._open: dict[str, Subscriber] = {}
         self._arrived = asyncio.Event()
@@ -127,7 +157,7 @@ class Subscribers:
             log.info("subscriber %s came again; its stream before ends", shorten(name), extra=fields(uuid=uuid))
         elif len(self._open) >= MAX_SUBSCRIBERS:
             raise EndpointError(f"there are {MAX_SUBSCRIBERS} subscribers already; one stream serves many topics")
-        subscriber = self._open[uuid] = Subscriber(self._topics, self._marks, name, outbox)
+        subscriber = self._open[uuid] = Subscriber(self._topics, self._shadows, self._marks, name, outbox)
         self._arrived.set()
         self._arrived = asyncio.Event()
         return subscriber

@@ -39,7 +39,8 @@ class Topics:
             if self._mark(topic):
                 raise PathError(f"{shorten(path)}: it can be subscribed to, and nothing else")
             raise PathError(
-                f"{shorten(path)}: {topic.source} is reserved; SIMLOG://step and model/clock are all there is"
+                f"{shorten(path)}: {topic.source} is reserved; SIMLOG://step, model/clock and shadows that stand are "
+                "all there is"
             )
         return topic
 
@@ -49,6 +50,13 @@ class Topics:
 
     def _mark(self, topic: Topic) -> Mark | None:
         return _MARKS.get(f"{topic.source}/{topic.path}") if topic.direction != "in" else None
+
+    def name(self, path: str) -> str:
+        """One name for all ways to write a path, also one that names nothing here."""
+        try:
+            return str(self._parse(path))
+        except PathError:
+            return path.removeprefix("/")
 
     def _parse(self, path: str) -> Topic:
         default = self._default or (next(iter(self._feeds)) if len(self._feeds) == 1 else None)

@@ -41,6 +41,11 @@ def _put(path: str) -> bytes:
     return v2.PubRequest(topic=path, data=data).SerializeToString()
 
 
+def _inject(target: str) -> v1.InjectRequest:
+    shadow = v1.TopicDescriptor(path=f"{target}/shadow")
+    return v1.InjectRequest(injected=shadow, target=v1.TopicDescriptor(path=target))
+
+
 CALLS = (
     Call(V1 + "GetTopic", v1.TopicDescriptor(path="cell/inputs").SerializeToString()),
     Call(V1 + "Subscribe", v1.TopicDescriptor(path="cell/inputs").SerializeToString(), stays=True),
@@ -53,6 +58,8 @@ CALLS = (
         many=True,
         stays=True,
     ),
+    Call(V1 + "Inject", _inject("cell/bits/in").SerializeToString(), stays=True),
+    Call(V1 + "Inject", _inject("cell/bits/out").SerializeToString(), stays=True),
     Call(V2 + "GetTopicInfo", v2.TopicInfoRequest(path="CELL://inputs").SerializeToString()),
     Call(V2 + "CreateSubscriber", v2.Subscriber(name="rude", uuid="rude").SerializeToString(), stays=True),
     Call(
@@ -60,6 +67,7 @@ CALLS = (
     ),
     Call(V2 + "Read", v2.ReadRequest(path=["CELL://inputs", "cell/axis"]).SerializeToString()),
     Call(V2 + "Write", _put("CELL://axis/speed/in")),
+    Call(V2 + "Inject", v2.InjectRequest(targetPath="CELL://name/in", shadowPathPrefix="rude").SerializeToString()),
     Call(V2 + "PublishSynch", _put("CELL://axis/speed/in")),
     Call(V2 + "Publish", _put("CELL://axis/speed/in"), many=True, stays=True),
     Call(V1 + "setStepSize", v1.StepSizeRequest(step=20).SerializeToString()),
@@ -103,15 +111,21 @@ class Polite:
             path, got = await message(second)
         assert got == number
 
-    async def alone(self) -> None:
-        """Nothing is left of any other: calls, streams, topics, values under way, bytes."""
+    async def alone(self, *, connected: bool = False) -> None:
+        """Nothing is left of any other: calls, streams, topics, values under way, bytes, injections.
+
+        ``connected``: its connection is, and with it the injection that version 2 has laid.
+        """
         served, feed = self._served, self._served.feeds["cell"]
 
         async def left() -> bool:
             await asyncio.sleep(0)
             topics = {subject.path for subject in feed._channels} - {"inputs"}
             return (len(served.server.calls), served.service.counters[0], topics) == (2, 2, {"step"}) and not (
-                feed.inlet.echo.busy or feed.inlet._pending or served.service.waiting_bytes
+                feed.inlet.echo.busy
+                or feed.inlet._pending
+                or served.service.waiting_bytes
+                or any(not (connected and one.name.startswith("SIMLOG")) for one in feed.block.standing.read())
             )
 
         await served.until(left)

@@ -200,15 +200,6 @@ def test_a_value_that_went_stale_is_sent_again_when_frames_come_again(soon_stale
     serve(soon_stale, test)
 
 
-def test_what_is_not_built_yet_says_so(segment: Segment) -> None:
-    async def test(served: Endpoint) -> None:
-        stub = served.stub
-        unimplemented = grpc.StatusCode.UNIMPLEMENTED
-        assert await code(stub.Inject(wire.InjectRequest(), timeout=TIMEOUT_S).read()) is unimplemented
-
-    serve(segment, test)
-
-
 def test_reflection_names_the_services(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         stub: Any = reflection_pb2_grpc.ServerReflectionStub(served.channel)  # type: ignore[arg-type]

@@ -69,9 +69,11 @@ def test_a_client_of_version_2_calls_as_clients_do(segment: Segment) -> None:
         assert found["step"] == {}
         assert found["refused"] == "INVALID_ARGUMENT"
         assert found["secret"] == "FAILED_PRECONDITION"
-        assert found["inject"] == "UNIMPLEMENTED"
+        assert found["given"]["value"] == 20
+        assert found["original"] == "NUMBER"
+        assert found["shadow"] == [["NUMBER", "IN"], ["NUMBER", "OUT"]]
         assert found["replaced"] == "ABORTED"
-        assert found["again"]["value"] == 8
+        assert found["again"]["value"] == 20
         assert counted(served)[1] == 3  # of which one was published
 
     with_plant(segment, test)
@@ -88,7 +90,11 @@ def test_a_client_of_version_1_calls_as_clients_do(segment: Segment) -> None:
         assert found["negative"]["value"] == "-0.0"
         assert found["published"] == {}
         assert found["ended"] == ["CANCELLED", "CANCELLED"]
-        assert counted(served) == (2, 2)
+        assert (found["original"]["value"], found["injected"]["value"]) == ("2.5", "3.5")
+        assert (found["taken"], found["lifted"]) == ("ALREADY_EXISTS", "CANCELLED")
+        published, refused = counted(served)
+        assert published >= 5, "the last value until the injection was lifted"
+        assert refused == 2
 
     with_plant(segment, test)
 

@@ -105,7 +105,7 @@ def test_half_closed_calls_end_by_themselves_or_go_on(segment: Segment) -> None:
                     whole.cancel()
                 else:
                     assert await status(whole) is Status.OK, call.method
-                await polite.alone()
+                await polite.alone(connected=True)
 
     beside_a_polite_one(segment, test)
 

@@ -356,16 +356,6 @@ def test_a_read_of_too_much_is_refused(segment: Segment, monkeypatch: pytest.Mon
     serve(segment, test)
 
 
-def test_what_is_not_built_yet_says_so(segment: Segment) -> None:
-    async def test(served: Endpoint) -> None:
-        inject = v2.InjectRequest(targetPath="cell/step/out", shadowPathPrefix="p")
-        status, text = await refusal(served.v2.Inject(inject, timeout=TIMEOUT_S))
-        assert status is Status.UNIMPLEMENTED
-        assert "not by gRPC yet" in text
-
-    serve(segment, test)
-
-
 def test_requests_that_are_no_messages_end_alone(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(step=1))

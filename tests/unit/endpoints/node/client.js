@@ -84,11 +84,18 @@ async function main() {
   result.read = messages.map((message) => [message.header.path, message.type, plain(message.value)]);
   result.refused = await call('Write', { topic: 'cell/step', data: { value: { stringValue: 'seven' } } });
   result.secret = await call('Write', { topic: 'cell/secret', data: number(1) });
-  result.inject = await call('Inject', { targetPath: 'CELL://step/in', shadowPathPrefix: 'a/b' });
+  const shadow = await call('Inject', { targetPath: 'CELL://step/in', shadowPathPrefix: 'a/b' });
+  await call('Write', { topic: shadow.shadowPathIn, data: number(20) }); // before any message has come
+  result.given = await stream.until('CELL://step/out', 20);
+  await call('Subscribe', { path: shadow.shadowPathOut, subscriberUUID: 'u-1' });
+  result.original = await call('Write', { topic: 'CELL://step/in', data: number(9) });
+  result.original = (await stream.until(shadow.shadowPathOut, 9)).type;
+  result.shadow = [await call('GetTopicInfo', { path: shadow.shadowPathIn }),
+    await call('GetTopicInfo', { path: shadow.shadowPathOut })].map(({ type, direction }) => [type, direction]);
   const again = new Stream('u-1');
   result.replaced = await stream.ended;
   await call('Subscribe', { path: 'cell/step', subscriberUUID: 'u-1' });
-  result.again = await again.until('cell/step', 8);
+  result.again = await again.until('cell/step', 20);
   again.call.cancel();
   console.log(JSON.stringify(result));
   client.close();

@@ -17,10 +17,10 @@ const call = (name, request) =>
 
 // One topic: everything that came, and a promise of what is still to come.
 class Stream {
-  constructor(path) {
+  constructor(call) {
     this.seen = [];
     this.waiting = null;
-    this.call = client.Subscribe({ path, msgType: 'double' }, deadline());
+    this.call = call;
     this.open = new Promise((resolve) => this.call.on('metadata', resolve));
     this.ended = new Promise((resolve) => this.call.on('error', (error) => resolve(grpc.status[error.code])));
     this.call.on('data', (message) => {
@@ -36,6 +36,10 @@ class Stream {
   }
 }
 
+const subscribe = (path) => new Stream(client.Subscribe({ path, msgType: 'double' }, deadline()));
+const inject = (target, shadow) => new Stream(client.Inject({ target: { path: target, msgType: 'double' },
+  injected: { path: shadow, msgType: 'double' } }, deadline()));
+
 async function main() {
   const result = {};
   const published = new Promise((resolve) => {
@@ -47,9 +51,9 @@ async function main() {
     publish.write({ topic: { path, msgType: 'double' }, data: { type: 'double', value } });
   result.topic = await call('GetTopic', { path: 'axis/position/in' });
   result.unknown = await call('GetTopic', { path: 'joints/none/in' });
-  const input = new Stream('axis/position/in');
-  const output = new Stream('axis/position/out');
-  const nothing = new Stream('joints/none/out');
+  const input = subscribe('axis/position/in');
+  const output = subscribe('axis/position/out');
+  const nothing = subscribe('joints/none/out');
   result.nothing = await nothing.ended;
   await input.open;
   await output.open;
@@ -60,6 +64,21 @@ async function main() {
   put('axis/position/in', 'what');
   put('axis/position/in', '-0.0');
   result.negative = await output.until('-0.0');
+  const originals = inject('axis/position/in', 'axis/position/shadow');
+  await originals.open;
+  put('axis/position/in', '2.5');
+  result.original = await originals.until('2.5');
+  put('axis/position/shadow', '3.5');
+  result.injected = await output.until('3.5');
+  result.taken = await inject('axis/speed/in', 'axis/position/shadow').ended;
+  originals.call.cancel();
+  result.lifted = await originals.ended;
+  let lifted = false;
+  const restored = output.until('4.5').then(() => { lifted = true; });
+  while (!lifted) {
+    put('axis/position/in', '4.5');
+    await Promise.race([restored, new Promise((resolve) => setTimeout(resolve, 20))]);
+  }
   publish.end();
   result.published = await published;
   input.call.cancel();
