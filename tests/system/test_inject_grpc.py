@@ -1,0 +1,207 @@
+"""Inject of both versions of SimlogAPI in whole cells: as in the contract, and when clients or endpoints are killed."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import grpc
+import pytest
+from google.protobuf.struct_pb2 import Value
+
+import shmio
+from shmio.segment.attach import Attachment
+from shmio.testing.cell import CONFIG, PATIENCE_S, Cell, kill, until
+from shmio.wire import simlog_v1_pb2 as v1
+from shmio.wire import simlog_v2_pb2 as v2
+from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
+from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as SimlogV2Stub
+
+ARMED = CONFIG.replace('connector = "s7"\n', 'connector = "s7"\nwritable = ["Outputs"]\narmed = true\n')
+MEMORY = """
+[[source]]
+name = "sim"
+connector = "memory"
+layout = "joints.toml"
+writable = ["**"]
+"""
+JOINTS = '[registers]\n"joints/R3200/Link1/R/position" = "LREAL"\n"joints/Kuka.j1/R" = "REAL"\n'
+POSITION = "joints/R3200/Link1/R/position"
+PLACE = "cell/Outputs/100"  # of no meaning to the controller's program
+
+
+@pytest.fixture
+def cell(make_cell: Callable[..., Cell], tmp_path: Any) -> Cell:
+    """The A50 cell, armed, and a memory with the joints that old clients expect."""
+    (tmp_path / "joints.toml").write_text(JOINTS)
+    cell = make_cell(config=(ARMED + MEMORY).replace("[grpc]\n", '[grpc]\ndefault_source = "sim"\n'))
+    cell.up()
+    until(lambda: all(cell.processes()[name]["quality"] == "good" for name in ("cell", "sim")), "good quality")
+    return cell
+
+
+@pytest.fixture
+def local(cell: Cell) -> Iterator[Attachment]:
+    with shmio.attach(cell.instance) as local:
+        yield local
+
+
+@contextmanager
+def client(cell: Cell) -> Iterator[tuple[Any, Any]]:
+    """Both versions over a connection of their own."""
+    with grpc.insecure_channel(str(cell.grpc), [("grpc.use_local_subchannel_pool", 1)]) as channel:
+        grpc.channel_ready_future(channel).result(PATIENCE_S)
+        yield SimlogAPIStub(channel), SimlogV2Stub(channel)  # type: ignore[no-untyped-call]
+
+
+def inject(stub: Any, target: str, shadow: str) -> Any:
+    topics = {"target": v1.TopicDescriptor(path=target), "injected": v1.TopicDescriptor(path=shadow)}
+    stream = stub.Inject(v1.InjectRequest(**topics), timeout=PATIENCE_S)
+    stream.initial_metadata()
+    return stream
+
+
+def publish(stub: Any, path: str, text: str) -> None:
+    data = v1.ROSMessage(type="double", value=text)
+    stub.Publish(iter([v1.PubRequest(topic=v1.TopicDescriptor(path=path), data=data)]), timeout=PATIENCE_S)
+
+
+def write(stub: Any, path: str, number: float) -> None:
+    data = v2.SimlogMessage(type=v2.NUMBER, value=Value(number_value=number))
+    stub.Write(v2.PubRequest(topic=path, data=data), timeout=PATIENCE_S)
+
+
+def standing(local: Attachment) -> int:
+    return sum(map(len, local.injections().values()))
+
+
+def test_version_1_between_a_publisher_and_a_memory_and_between_that_and_consumers(
+    cell: Cell, local: Attachment
+) -> None:
+    with client(cell) as (stub, _), client(cell) as (other, _):
+        watching = other.Subscribe(v1.TopicDescriptor(path=f"{POSITION}/out"), timeout=PATIENCE_S)
+        assert next(watching).value == "0.0"
+        originals = inject(stub, f"{POSITION}/in", f"{POSITION}/shadow")
+        publish(other, f"{POSITION}/in", "1.0E-4")
+        first = next(originals)
+        assert (first.value, first.type, first.timeStamp.stamp.nsec > 0) == ("0.0001", "double", True)
+        publish(stub, f"{POSITION}/shadow", "2.5")
+        assert next(watching).value == "2.5"
+        originals.cancel()
+        until(lambda: standing(local) == 0, "lifted")
+        publish(other, f"{POSITION}/in", "3.5")
+        assert next(watching).value == "3.5"
+
+        originals = inject(stub, f"SIM://{POSITION}/out", f"/{POSITION}/shadow")
+        assert next(originals).value == "3.5"
+        publish(stub, f"{POSITION}/shadow", "-0.0")
+        assert next(watching).value == "-0.0"
+        publish(other, POSITION, "4.5")
+        assert next(originals).value == "4.5"
+        originals.cancel()
+        assert next(watching).value == "4.5", "without subscribing anew"
+
+
+def test_version_2_toward_an_emulated_controller(cell: Cell, local: Attachment) -> None:
+    with client(cell) as (_, stub), client(cell) as (_, other):
+        stream = stub.CreateSubscriber(v2.Subscriber(name="injector", uuid="1"), timeout=PATIENCE_S)
+        stream.initial_metadata()
+        answer = stub.Inject(v2.InjectRequest(targetPath=f"{PLACE}/in", shadowPathPrefix="shadow"), timeout=PATIENCE_S)
+        write(stub, answer.shadowPathIn, 7)
+        until(lambda: local[PLACE] == 7, "the device has the injected value")
+        stub.Subscribe(v2.SubscriptionRequest(path=answer.shadowPathOut, subscriberUUID="1"), timeout=PATIENCE_S)
+        write(other, f"CELL://{PLACE.removeprefix('cell/')}/in", 9)
+        original = next(stream)
+        assert (original.header.path, original.value.number_value) == (answer.shadowPathOut, 9)
+        assert local[PLACE] == 7
+        stream.cancel()
+        until(lambda: standing(local) == 0, "lifted")
+        write(other, f"{PLACE}/in", 9)
+        until(lambda: local[PLACE] == 9, "what is written reaches the device again")
+
+
+CLIENT = """
+import sys, grpc
+from shmio.wire import simlog_v1_pb2 as v1
+from shmio.wire import simlog_v2_pb2 as v2
+from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
+from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as SimlogV2Stub
+address, target = sys.argv[1:]
+channel = grpc.insecure_channel(address)
+topics = dict(target=v1.TopicDescriptor(path=target), injected=v1.TopicDescriptor(path="killed"))
+stream = SimlogAPIStub(channel).Inject(v1.InjectRequest(**topics))
+stream.initial_metadata()
+SimlogV2Stub(channel).Inject(v2.InjectRequest(targetPath=target, shadowPathPrefix="killed"))
+print("laid", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_killed_client_and_a_killed_endpoint_leave_no_shadow(cell: Cell, local: Attachment) -> None:
+    command = [sys.executable, "-c", CLIENT, str(cell.grpc), "cell/Robot_800/Axs1_Pos"]
+    for victim in ("client", "grpc"):
+        with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as injecting:
+            assert injecting.stdout is not None
+            assert injecting.stdout.readline() == "laid\n"
+            assert standing(local) == 2
+            before = local.read("cell/Robot_800/Axs1_Pos")
+            assert before.provenance == "injected"
+            if victim == "client":
+                os.kill(injecting.pid, signal.SIGKILL)
+            else:
+                kill(cell.processes()["grpc"]["pid"])
+            until(lambda: standing(local) == 0, "lifted")
+            injecting.kill()
+        until(lambda: cell.processes()["grpc"]["state"] == "running", "the endpoint is back")
+        with client(cell) as (stub, _):
+            assert local.read("cell/Robot_800/Axs1_Pos").provenance == "live"
+            stub.GetTopic(v1.TopicDescriptor(path=PLACE), timeout=PATIENCE_S)
+            assert standing(local) == 0
+
+
+def test_the_sources_own_process_goes_on_with_the_injections_of_clients(cell: Cell, local: Attachment) -> None:
+    with client(cell) as (stub, _):
+        originals = inject(stub, f"{PLACE}/in", "s")
+        pid = cell.processes()["cell"]["pid"]
+        kill(pid)
+        until(lambda: cell.processes()["cell"]["pid"] not in (pid, None), "another process")
+        until(lambda: local.read(PLACE).quality.name == "GOOD", "good again")
+        publish(stub, PLACE, "5")
+        assert next(originals).value == "5"
+        publish(stub, "s", "6")
+        until(lambda: local[PLACE] == 6, "the device has the injected value")
+        originals.cancel()
+        until(lambda: standing(local) == 0, "lifted")
+
+
+def test_a_source_that_is_not_armed_refuses_by_name(make_cell: Callable[..., Cell]) -> None:
+    cell = make_cell(config=ARMED.replace("armed = true\n", ""))
+    cell.up()
+    until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")
+    with client(cell) as (stub, other):
+        with pytest.raises(grpc.RpcError) as refused:
+            next(inject(stub, f"{PLACE}/in", "s"))
+        assert refused.value.code() is grpc.StatusCode.FAILED_PRECONDITION
+        reason = str(refused.value.details())
+        assert f"{PLACE}/in" in reason
+        assert "needs `armed = true`" in reason
+        with pytest.raises(grpc.RpcError) as refused:
+            other.Inject(v2.InjectRequest(targetPath=f"{PLACE}/in", shadowPathPrefix="p"), timeout=PATIENCE_S)
+        assert refused.value.code() is grpc.StatusCode.FAILED_PRECONDITION
+
+
+def test_an_emergency_lifts_what_clients_have_laid(cell: Cell, local: Attachment) -> None:
+    with client(cell) as (stub, other):
+        originals = inject(stub, f"{PLACE}/in", "s")
+        other.Inject(v2.InjectRequest(targetPath=POSITION, shadowPathPrefix="p"), timeout=PATIENCE_S)
+        lifted = cell.run("shmio", "inject", "--lift-all")
+        assert (lifted.returncode, len(lifted.stdout.splitlines())) == (0, 2)
+        with pytest.raises(grpc.RpcError) as ended:
+            next(originals)
+        assert ended.value.code() is grpc.StatusCode.ABORTED
+        assert standing(local) == 0
