@@ -8,7 +8,8 @@ from typing import Final, NamedTuple
 
 from shmio.layout.codec import Value, codec
 from shmio.layout.model import Layout, Register
-from shmio.layout.write import Write, apply, bits_of
+from shmio.layout.write import Write, bits_of
+from shmio.layout.write import apply as write_to
 from shmio.segment.events import Event, EventKind
 
 
@@ -54,17 +55,17 @@ class Gatherer:
         return whole
 
 
-def bring(writes: Iterable[Write], image: bytearray) -> None:
+def apply(image: bytearray, writes: Iterable[Write]) -> None:
     """Bring writes to an image. What lies outside it, as only another process's mistake can, is passed over."""
     for write in writes:
         if write.data and write.offset + len(write.data) <= len(image):
-            apply(write, image)
+            write_to(write, image)
 
 
 def values(layout: Layout, image: bytes, writes: Iterable[Write]) -> dict[str, Value]:
     """The values in an image of what was written, by path: registers, or of arrays written in part their elements."""
     bits = bytearray(layout.size)
-    bring((Write(offset, mask, b"\xff" * len(data)) for offset, mask, data in writes), bits)
+    apply(bits, (Write(offset, mask, b"\xff" * len(data)) for offset, mask, data in writes))
     found: dict[str, Value] = {}
     for register in layout.registers:
         share = _share(bits, register)

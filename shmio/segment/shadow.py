@@ -14,7 +14,7 @@ from shmio.layout.topic import parse_topic
 from shmio.segment.commander import Commander, Outcome, Ticket
 from shmio.segment.commands import Direction
 from shmio.segment.cursor import Cursor
-from shmio.segment.diverted import Diverted, Gatherer, bring, values
+from shmio.segment.diverted import Diverted, Gatherer, apply, values
 from shmio.segment.events import Event, EventKind
 
 Next = Callable[[Cursor[Event], float | None], Event | None]
@@ -93,7 +93,7 @@ class Shadow:
                 return
 
     def _diversion(self, diverted: Diverted) -> Diversion:
-        bring(diverted.writes, self._image)
+        apply(self._image, diverted.writes)
         missed, self._missed = self._events.missed - self._missed, self._events.missed
         event = diverted.event
         written = values(self._commander.block.layout, bytes(self._image), diverted.writes)

@@ -21,7 +21,7 @@ from shmio.layout.topic import Topic, find
 from shmio.layout.write import encode
 from shmio.logs import fields
 from shmio.segment import DONE, Direction, EventKind
-from shmio.segment.diverted import Diverted, bring
+from shmio.segment.diverted import Diverted, apply
 from shmio.segment.scan import ChangeScan
 
 log = logging.getLogger("shmio.grpc")
@@ -190,7 +190,7 @@ class Injection:
     def _show_gifts(self, values: Mapping[str, object]) -> None:
         layout = self.feed.block.layout
         writes = (encode(find(layout, path), value, layout.byte_order) for path, value in values.items())
-        bring(writes, self._gifts)
+        apply(self._gifts, writes)
         if self._given and (now := self.feed.present() or self.feed.block.latest()):
             self._given.show(Shown(now.number, now.clock_ns, bytes(self._gifts)))
 
@@ -250,7 +250,7 @@ class Injection:
 
     def divert(self, diverted: Diverted) -> None:
         """A command's values went to it."""
-        bring(diverted.writes, self._originals)
+        apply(self._originals, diverted.writes)
         if self.inward:
             self._diverted.show(Shown(*self.feed.inlet.stamp(diverted.event), bytes(self._originals)))
         else:
