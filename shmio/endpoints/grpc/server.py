@@ -51,6 +51,7 @@ class Server:
         self._servers: dict[grpc.aio.Server, None] = {}
         self._files: dict[str, SocketFile] = {}
         self._keepers: list[asyncio.Task[None]] = []
+        self._retiring: set[asyncio.Task[None]] = set()
         logging.getLogger("grpc._cython.cygrpc").addFilter(_is_news)
 
     @property
@@ -65,11 +66,13 @@ class Server:
         EndpointError names the address in the way.
         """
         credentials = _credentials(tls) if tls else None
-        bound = [self._bind(listener, credentials, gid) for listener in listeners]
-        for server in self._servers:
+        ports = []
+        for listener in listeners:
+            server = self._server(Gate(listener.door, self.calls))
+            self._servers[server] = None
+            ports.append(self._bind(server, listener, credentials, gid))
+        for server, listener, port in zip(list(self._servers), listeners, ports, strict=True):
             await server.start()
-        ports = [port for _, port in bound]
-        for listener, (server, port) in zip(listeners, bound, strict=True):
             host = listener.address
             same = listener._replace(address=Address(host.host, port)) if isinstance(host, Address) else listener
             self._keepers.append(asyncio.create_task(self._keep(server, same, credentials, gid)))
@@ -87,65 +90,64 @@ class Server:
             keeper.cancel()
         await asyncio.gather(*self._keepers, return_exceptions=True)
         await self._health.enter_graceful_shutdown()
-        await asyncio.gather(*(server.stop(grace=0.2) for server in self._servers))
+        await asyncio.gather(*(server.stop(grace=0.2) for server in self._servers), *self._retiring)
         for file in self._files.values():
             file.remove()
 
     async def _keep(
         self, server: grpc.aio.Server, listener: Listener, credentials: grpc.ServerCredentials | None, gid: int | None
     ) -> None:
-        """Listen anew whenever gRPC stops by itself; calls that are open go on.
+        """Listen anew whenever gRPC stops by itself; calls that are open go on. EndpointError: it cannot.
 
         It does for all clients when one sends the name of a call that is not UTF-8.
         """
-        retiring: set[asyncio.Task[None]] = set()
-        try:
-            while True:
-                try:
-                    await server.wait_for_termination(LOOK_S)
-                except Exception as error:  # noqa: BLE001  whatever has ended its loop
-                    log.warning("%s: gRPC stopped serving (%s) and listens anew", listener.address, error)
-                    task = asyncio.create_task(self._retire(server))
-                    retiring.add(task)
-                    task.add_done_callback(retiring.discard)
-                    server, _ = self._bind(listener, credentials, gid)
-                    await server.start()
-        finally:
-            for task in retiring:
-                task.cancel()
+        while True:
+            try:
+                await server.wait_for_termination(LOOK_S)
+            except Exception as error:  # noqa: BLE001  whatever has ended its loop
+                log.warning("%s: gRPC stopped serving (%s) and listens anew", listener.address, error)
+                task = asyncio.create_task(self._retire(server))
+                self._retiring.add(task)
+                task.add_done_callback(self._retiring.discard)
+                await asyncio.sleep(LOOK_S)  # it has to have closed: gRPC does not survive to find the port taken
+                server = self._server(Gate(listener.door, self.calls))
+                self._servers[server] = None
+                self._bind(server, listener, credentials, gid)
+                await server.start()
 
     async def _retire(self, server: grpc.aio.Server) -> None:
-        """Let the calls of one that listens no more end by themselves."""
+        """Let the calls of one that listens no more end by themselves. Not to be cancelled: gRPC would take it ill."""
         with suppress(Exception):  # why it listens no more
             await server.wait_for_termination()
         await server.stop(None)
         del self._servers[server]
 
     def _bind(
-        self, listener: Listener, credentials: grpc.ServerCredentials | None, gid: int | None
-    ) -> tuple[grpc.aio.Server, int]:
+        self, server: grpc.aio.Server, listener: Listener, credentials: grpc.ServerCredentials | None, gid: int | None
+    ) -> int:
         address = listener.address
-        server = self._server(Gate(listener.door, self.calls))
-        self._servers[server] = None
         if isinstance(address, UnixAddress):
             clear(address.path)  # gRPC itself would take it from a living process
         try:
             if isinstance(address, Address):
                 if credentials and listener.encrypted:
-                    return server, server.add_secure_port(str(address), credentials)
-                return server, server.add_insecure_port(str(address))
-            before = os.umask(0o177)
-            try:
-                port = server.add_insecure_port(f"unix:{quote(address.path)}")
-            finally:
-                os.umask(before)
+                    port = server.add_secure_port(str(address), credentials)
+                else:
+                    port = server.add_insecure_port(str(address))
+            else:
+                before = os.umask(0o177)
+                try:
+                    port = server.add_insecure_port(f"unix:{quote(address.path)}")
+                finally:
+                    os.umask(before)
         except RuntimeError:
             raise EndpointError(
                 f"grpc: cannot listen on {address}: another program has it (ss -ltnp shows which), or this host has no "
                 "such address"
             ) from None
-        self._files[address.path] = SocketFile(address.path, gid)
-        return server, port
+        if isinstance(address, UnixAddress):
+            self._files[address.path] = SocketFile(address.path, gid)
+        return port
 
     def _server(self, gate: Gate) -> grpc.aio.Server:
         # No connection is told to have room for more than all calls. When 1000 wait to be looked at, gRPC breaks off

@@ -76,6 +76,11 @@ def test_on_a_unix_socket_neither(segment: Segment, tmp_path: Path, caplog: pyte
     async def test(served: Endpoint) -> None:
         server = Server(served.service)
         await server.start([Listener(UnixAddress(str(file)), Door(Keys()))])
+        served.publish(image(step=1))
+        before = fresh(f"unix:{quote(str(file))}")
+        stub: Any = SimlogAPIStub(before)  # type: ignore[no-untyped-call]
+        stream = stub.Subscribe(TopicDescriptor(path="cell/step"), timeout=TIMEOUT_S)
+        assert await value(stream) == "1"
         for times in (1, 2):
             _, writer = await asyncio.open_unix_connection(file)
             writer.write(http2.PREFACE + http2.frame(http2.SETTINGS, 0, 0, b"") + NO_TEXT)
@@ -83,8 +88,13 @@ def test_on_a_unix_socket_neither(segment: Segment, tmp_path: Path, caplog: pyte
             writer.close()
             async with fresh(f"unix:{quote(str(file))}") as channel:
                 assert await known(channel)
+        served.publish(image(step=2))
+        assert await value(stream) == "2"
         await server.stop()
         assert os.listdir(tmp_path) == []  # noqa: PTH208
+        with pytest.raises(grpc.aio.AioRpcError):  # it was open all the time
+            await stream.read()
+        await before.close()
 
     serve(segment, test)
     caplog.clear()
