@@ -232,12 +232,12 @@ class Injection:
         return bool(self._scan.changed(self._original(shown).image, self._original(frame).image))
 
     def _stack(self) -> None:
-        """Look what lies beneath it by now."""
+        """Look what clients' injections lie beneath it by now; what shmio runs by itself is not in originals."""
         bits = bytearray(len(self._originals))
         for one in self.feed.block.standing.read():
             if one.id == self._number:
                 break
-            for offset, size, mask in one.ranges if one.direction == "out" else ():
+            for offset, size, mask in one.ranges if one.direction == "out" and one.running is None else ():
                 for at in range(offset, min(offset + size, len(bits))):
                     bits[at] |= mask
         self._inner = (bytes(bits), bytes(self._originals)) if any(bits) else None

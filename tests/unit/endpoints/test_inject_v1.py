@@ -9,6 +9,7 @@ from typing import Any
 import grpc
 import pytest
 
+from shmio.config import Declaration
 from shmio.segment import Direction, Quality, Segment
 from shmio.segment.commander import Commander
 from shmio.wire import simlog_v1_pb2 as wire
@@ -478,6 +479,22 @@ def test_publishing_to_a_shadow_is_counted_and_its_refusals_logged(
         await publish(served, ("s", "1"), ("s", "many"), ("s", "2"))
         await counts(served, 2, 1)
         assert "expected a number" in caplog.text
+        originals.cancel()
+
+    with_plant(segment, test)
+
+
+def test_what_declared_injections_make_of_it_is_not_in_the_originals(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        consumer = served.subscribe("cell/step")
+        program = Commander(segment.blocks["cell"], GUEST)
+        declaration = Declaration(name="eleven", target="cell/step", operation="set", value=11)
+        await asyncio.to_thread(program.declare, declaration)
+        await seen(consumer, "11")
+        originals = await laid(served, "cell/step", "s")
+        assert await value(originals) == "0"
+        await publish(served, ("cell/step", "4"))
+        assert await value(originals) == "4"
         originals.cancel()
 
     with_plant(segment, test)
