@@ -10,7 +10,8 @@ from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
 
 from shmio.connectors.desk import CommandDesk
-from shmio.connectors.output import Output
+from shmio.connectors.injections import Owner
+from shmio.connectors.output import Image, Output
 from shmio.layout.model import Layout, Register
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Provenance, Quality, Segment, Write
 from tests.unit.endpoints.harness import STALE_NS, Endpoint, endpoint
@@ -41,7 +42,10 @@ class Model:
         """While it is set, steps are not answered."""
         self.failure = ""
         self.writer = segment.writer(source)
-        self.desk = CommandDesk(Output(self.writer), ["goal"], time.monotonic_ns)
+        self.output = Output(self.writer)
+        self.desk = CommandDesk(
+            self.output, ["goal"], time.monotonic_ns, armed=True, owner_of=lambda writer: Owner(writer, 1)
+        )
         self._clock = segment.clock
         self._stopping = False
         self._done = self._clock.read().step
@@ -54,8 +58,8 @@ class Model:
     def publish(self, cycle: int) -> None:
         """Publish the image as it is."""
         quality = Quality.BAD if self.failure else Quality.GOOD
-        self.writer.publish(
-            self.image, cycle=cycle, provenance=Provenance.SIMULATED, quality=quality, reason=self.failure
+        self.output.publish(
+            Image(bytes(self.image), cycle, time.time_ns(), quality, Provenance.SIMULATED, self.failure)
         )
 
     def answer(self) -> None:

@@ -15,9 +15,11 @@ import pytest
 from shmio.endpoints.grpc.connections import connected, peer_of
 from shmio.segment import Segment
 from shmio.wire import simlog_v2_pb2 as v2
+from shmio.wire import simserver_pb2 as sim
 from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as SimlogV2Stub
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, message, plain, refusal
 from tests.unit.endpoints.plant import Plant
+from tests.unit.endpoints.stepped import Model, simulate
 from tests.unit.endpoints.test_inject_v1 import everything, inject, laid, lifted, publish, standing
 from tests.unit.endpoints.test_publish import counted, with_plant
 from tests.unit.endpoints.test_simlog_v2 import read, request, write
@@ -309,6 +311,7 @@ def test_both_versions_meet_in_one_injection_chain(segment: Segment) -> None:
 KILLED = """
 import sys, grpc
 from shmio.wire import simlog_v2_pb2 as v2
+from shmio.wire import simserver_pb2 as sim
 from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub
 channel = grpc.insecure_channel(sys.argv[1])
 stub = SimlogAPIStub(channel)
@@ -404,3 +407,27 @@ def test_a_reload_ends_what_lies_over_the_sources_it_changes(segment: Segment) -
         stream.cancel()
 
     with_plant(segment, test)
+
+
+def test_in_virtual_time_originals_come_with_their_step_and_before_its_marker(instance: str) -> None:
+    async def test(served: Endpoint, models: dict[str, Model]) -> None:
+        stream = await served.subscriber("injector", "SIMLOG://step", "sim/count")
+        assert await message(stream) == ("sim/count", 0)
+        count_in, count_out = await shadow(served, "sim/count/out")
+        goal_in, goal_out = await shadow(served, "sim/goal/in")
+        await served.add("injector", count_out)
+        await served.add("injector", goal_out)
+        assert await message(stream) == (count_out, 0)
+        await write(served, count_in, 100)
+        await write(served, "sim/goal", 5)
+        assert await message(stream) == (goal_out, 5), "what is written comes at once"
+        await write(served, goal_in, 6)
+        for number in (1, 2):
+            await served.time.step(sim.StepRequest(), timeout=TIMEOUT_S)
+            expected = {(count_out, number)} | ({("sim/count", 100)} if number == 1 else set())
+            assert {await message(stream) for _ in expected} == expected
+            assert await message(stream) == ("SIMLOG://step", number)
+        assert (await read(served, "sim/reached"))[0][2] == 6
+        stream.cancel()
+
+    simulate(instance, test)
