@@ -180,7 +180,7 @@ class Declaration(Section, omit_defaults=True):
     values: Annotated[list[Any], Meta(min_length=1, max_length=256)] | None = None
     min: float | None = None
     max: float | None = None
-    amplitude: Annotated[float, Meta(gt=0)] | None = None
+    amplitude: Annotated[float, Meta(gt=0, le=1e300)] | None = None
     distribution: Literal["uniform", "gaussian"] | None = None
     delay_ms: Milliseconds | None = None
     delay_cycles: Annotated[int, Meta(ge=1)] | None = None

@@ -185,6 +185,8 @@ def _random(declaration: Declaration, target: Target, layout: Layout, _period_ns
         return lambda draw: RandomChoice(tables, draw)
     groups = _numbers(declaration, target, layout)
     least, most = declaration.min or 0.0, declaration.max or 0.0
+    if not math.isfinite(most - least):
+        raise ConfigError(f"max: {most:g} is too far from min, {least:g}")
     whole = any(group.element.base not in ("REAL", "LREAL") for group in groups)
     if whole and math.ceil(least) > math.floor(most):
         raise ConfigError(f"min: there is no whole number from {least:g} to {most:g}")

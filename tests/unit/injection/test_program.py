@@ -235,3 +235,53 @@ def test_a_large_target_is_refused_where_each_value_counts() -> None:
     compile_program(
         msgspec.convert({"name": "x", "target": "l", "operation": "freeze"}, Declaration), {"l": large}, {"l": 1}
     )
+
+
+numbers = st.one_of(st.integers(-(2**63), 2**64 - 1), floats, st.sampled_from([0, 1, -1, 1e308, -1e308, 5e-324]))
+OPERANDS: dict[str, st.SearchStrategy[dict[str, Any]]] = {
+    "set": st.fixed_dictionaries({"value": numbers}),
+    "offset": st.fixed_dictionaries({"value": numbers}),
+    "scale": st.fixed_dictionaries({"value": numbers}),
+    "clamp": st.tuples(numbers, numbers).map(lambda pair: {"min": min(pair), "max": max(pair)}),
+    "noise": st.fixed_dictionaries(
+        {"amplitude": st.floats(5e-324, 1e300), "distribution": st.sampled_from(["uniform", "gaussian"])}
+    ),
+    "random": st.tuples(numbers, numbers).map(lambda pair: {"min": min(pair), "max": max(pair)}),
+    "freeze": st.just({}),
+    "delay": st.one_of(
+        st.fixed_dictionaries({"delay_ms": st.floats(0.001, 1000)}),
+        st.fixed_dictionaries({"delay_cycles": st.integers(1, 20)}),
+    ),
+    "drop": st.just({}),
+    "flip": st.one_of(st.just({}), st.fixed_dictionaries({"bits": st.lists(st.integers(0, 15), min_size=1)})),
+}
+places = st.lists(st.tuples(st.integers(0, 3), st.binary(min_size=LAYOUT.size, max_size=LAYOUT.size)), max_size=6)
+
+
+@given(
+    st.sampled_from(sorted(OPERANDS)).flatmap(lambda name: st.tuples(st.just(name), OPERANDS[name])),
+    st.lists(
+        st.sampled_from([register.path for register in LAYOUT.registers] + ["*", "grid/1..2", "int.%X3"]), min_size=1
+    ),
+    places,
+)
+def test_whatever_is_not_refused_runs_over_any_bytes(
+    operation: tuple[str, dict[str, Any]], targets: list[str], images: list[tuple[int, bytes]]
+) -> None:
+    """An operation that failed would end the source's process. Warnings are errors here."""
+    name, keys = operation
+    try:
+        found = program([f"t/{target}" for target in targets], name, **keys)
+    except ConfigError:
+        return
+    running = found.operate(DRAW)
+    running.begin()
+    cycle = 0
+    for step, data in images:
+        cycle += step
+        image = np.frombuffer(data, np.uint8).copy()
+        if step % 2:
+            running.passed(image, Moment(1, cycle, cycle, cycle * 10_000_000))
+        running.apply(image, Moment(1, cycle, cycle, cycle * 10_000_000))
+        assert image.shape == (LAYOUT.size,)
+        assert image.dtype == np.uint8
