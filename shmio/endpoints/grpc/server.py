@@ -11,7 +11,7 @@ from typing import Any, Final
 from urllib.parse import quote
 
 import grpc
-from grpc_health.v1 import health, health_pb2, health_pb2_grpc
+from grpc_health.v1 import health, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
 from shmio.config import Address, Tls, UnixAddress
@@ -19,6 +19,7 @@ from shmio.config.tls import read_tls
 from shmio.config.unixsocket import SocketFile, clear
 from shmio.endpoints.grpc.doors import Listener
 from shmio.endpoints.grpc.gate import Calls, Gate
+from shmio.endpoints.grpc.health import Health
 from shmio.endpoints.grpc.services import Services
 from shmio.errors import EndpointError
 
@@ -28,8 +29,6 @@ LOOK_S: Final = 0.2
 
 log = logging.getLogger("shmio.grpc")
 
-_SERVING = health_pb2.HealthCheckResponse.SERVING
-_NOT_SERVING = health_pb2.HealthCheckResponse.NOT_SERVING
 OPTIONS = [
     ("grpc.so_reuseport", 0),  # else a second server would take the same port in silence
     ("grpc.max_receive_message_length", MAX_REQUEST_BYTES),
@@ -47,7 +46,7 @@ class Server:
         self.calls = Calls() if calls is None else calls
         """Those that are open, on all addresses."""
         self._services = services
-        self._health = health.aio.HealthServicer()
+        self._health = Health()
         self._servers: dict[grpc.aio.Server, None] = {}
         self._files: dict[str, SocketFile] = {}
         self._keepers: list[asyncio.Task[None]] = []
@@ -77,19 +76,19 @@ class Server:
             same = listener._replace(address=Address(host.host, port)) if isinstance(host, Address) else listener
             self._keepers.append(asyncio.create_task(self._keep(server, same, credentials, gid)))
         for service in (health.OVERALL_HEALTH, *self._services.names):
-            await self._health.set(service, _SERVING)
+            self._health.set(service, serving=True)
         return ports
 
     async def set_source(self, source: str, good: bool) -> None:
         """Show a source's quality as the health of ``source.<name>``."""
-        await self._health.set(f"source.{source}", _SERVING if good else _NOT_SERVING)
+        self._health.set(f"source.{source}", serving=good)
 
     async def stop(self) -> None:
         """Say so, end all streams, close."""
         for keeper in self._keepers:
             keeper.cancel()
         await asyncio.gather(*self._keepers, return_exceptions=True)
-        await self._health.enter_graceful_shutdown()
+        self._health.end()
         await asyncio.gather(*(server.stop(grace=0.2) for server in self._servers), *self._retiring)
         for file in self._files.values():
             file.remove()
