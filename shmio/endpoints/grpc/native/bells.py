@@ -34,7 +34,7 @@ class Bell:
 
     def _tell(self) -> None:
         self._told.set()  # before looking: what comes from now on rings again
-        for ring in self.listeners:
+        for ring in tuple(self.listeners):
             ring()
 
     def _run(self) -> None:
