@@ -284,6 +284,27 @@ def test_steps_of_another_program_are_delivered_likewise_and_acknowledged(instan
     simulate(instance, test)
 
 
+def test_a_first_step_that_is_over_before_the_endpoint_looks_is_delivered_too(instance: str) -> None:
+    async def test(served: Endpoint, models: Models) -> None:
+        stream = await served.subscriber("one", "sim/count", "SIMLOG://step")
+        slot = served.segment.processes.find("grpc")
+        slot.take()
+        with Segment.open(instance, writable=True) as other:
+            local = Coordinator(other)
+            stepping = asyncio.create_task(asyncio.to_thread(local.step))
+            await asyncio.sleep(0)  # the thread has begun
+            clock = served.segment.clock
+            while not (state := clock.read()).dt_ns or state.stepping:  # the event loop is busy until the step is over
+                clock.bell.wait(clock.bell.value(), 10_000_000)
+            done = await stepping
+            assert served.segment.clock.delivered(slot.index) == done.number
+            local.close()
+        got = await messages(stream, 3)
+        assert got == [("sim/count", 0.0), ("sim/count", 1.0), ("SIMLOG://step", float(done.number))]
+
+    simulate(instance, test, virtual=False)
+
+
 def test_one_that_does_not_read_ends_and_the_others_go_on(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(delivery, "PATIENCE_S", 2.0)
 
