@@ -13,6 +13,7 @@ from shmio.cli.readings import choose
 from shmio.client import BlockLayout, Client, Outcome, Update, connect
 from shmio.client import Quality as ClientQuality
 from shmio.client import Shadow as ClientShadow
+from shmio.config.address import UNIX, Address
 from shmio.errors import ConfigError, NotRunningError, PathError, RemoteError
 from shmio.layout.codec import Value
 from shmio.layout.model import Layout, Register
@@ -26,9 +27,11 @@ from shmio.segment.view import Reading
 
 @contextmanager
 def connected(options: argparse.Namespace) -> Iterator[Remote]:
-    """The instance that the options name. OSError: a file cannot be read."""
+    """The instance that the options name. ConfigError: they name none; OSError: a file cannot be read."""
     if options.config is not None or options.instance is not None:
         raise ConfigError("--host names the instance already: leave out -c and --instance")
+    if not options.host.startswith(UNIX):
+        Address.parse(options.host)
     token = options.token_file.read_text().strip() if options.token_file else None
     with connect(options.host, ca=options.ca, certificate=options.certificate, key=options.key, token=token) as client:
         yield Remote(client)

@@ -16,6 +16,8 @@ Texts = Annotated[list[Text], Meta(min_length=1)]
 DbNumber = Annotated[int, Meta(ge=1, le=65535)]
 Seconds = Annotated[float, Meta(ge=0, le=1e9)]
 Operand = bool | int | float | str | list[Any]
+ClockName = Literal["wall", "stepped"]
+DistributionName = Literal["uniform", "gaussian"]
 OperationName = Literal["set", "offset", "scale", "clamp", "noise", "random", "freeze", "delay", "drop", "flip"]
 RealtimePriority = Annotated[int, Meta(ge=1, le=99)]
 """Of SCHED_FIFO, sched(7)."""
@@ -35,7 +37,7 @@ class Instance(Section):
     log_dir: Text = "logs"
     group: Text | None = None
     ring_mb: Annotated[float, Meta(gt=0, le=65536)] = 64.0
-    clock: Literal["wall", "stepped"] = "wall"
+    clock: ClockName = "wall"
 
 
 class Source(Section):
@@ -181,7 +183,7 @@ class Declaration(Section, omit_defaults=True):
     min: float | None = None
     max: float | None = None
     amplitude: Annotated[float, Meta(gt=0, le=1e300)] | None = None
-    distribution: Literal["uniform", "gaussian"] | None = None
+    distribution: DistributionName | None = None
     delay_ms: Milliseconds | None = None
     delay_cycles: Annotated[int, Meta(ge=1)] | None = None
     bits: Annotated[list[Annotated[int, Meta(ge=0)]], Meta(min_length=1, max_length=64)] | None = None

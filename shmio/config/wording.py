@@ -5,16 +5,18 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from tomllib import TOMLDecodeError
-from typing import Any
+from typing import Any, get_args
 
 from msgspec import ValidationError
 
-from shmio.config.model import NAME_PATTERN, NAME_RULE
+from shmio.config.model import NAME_PATTERN, NAME_RULE, ClockName, DistributionName, OperationName
 
 MAX_LINE = 80
 _PLACE = re.compile(r"\(at line (\d+), column (\d+)\)\Z")
 _BARE = re.compile(r"[^\s,=#\[\]{}\"']+")
 _TEXT = re.compile(r"[^\W\d].*|.*[:/].*|\d+(?:\.\d+){2,}")  # a name, a path, an address
+_WORDS = {"clock": ClockName, "distribution": DistributionName, "operation": OperationName}
+"""Keys that take one of a few words."""
 _TYPES = {
     "int": "a whole number",
     "float": "a number",
@@ -34,6 +36,9 @@ def explain(error: ValidationError, key: str = "") -> str:
         return f"{path}.{missing[1]}: this key is needed".lstrip(".")
     if repr(NAME_PATTERN) in text:
         text = f"expected a name: {NAME_RULE}"
+    elif unknown := re.fullmatch(r"Invalid enum value ('.*')", text):
+        words = get_args(_WORDS[path.rpartition(".")[2]])
+        text = f"{unknown[1]} is none; there are: {', '.join(words)}"
     elif text.endswith("of length >= 1"):
         text = "must not be empty"
     text = re.sub(r"`([a-z]+(?: \| [a-z]+)*)`", _types, text)

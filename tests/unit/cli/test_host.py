@@ -119,6 +119,8 @@ def test_set_and_inject(segment: Segment, capsys: pytest.CaptureFixture[str]) ->
 def test_what_is_wrong_with_the_host(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["get", "--host", "127.0.0.1:1", "cell"]) == 1
     assert capsys.readouterr().err.startswith("127.0.0.1:1: no instance serves there, or it has ended")
+    assert main(["get", "--host", "nonsense", "cell"]) == 1
+    assert capsys.readouterr().err == "'nonsense' is not an address; expected host:port, such as 127.0.0.1:8089\n"
     assert main(["get", "--host", "127.0.0.1:1", "--instance", "x", "cell"]) == 1
     assert capsys.readouterr().err == "--host names the instance already: leave out -c and --instance\n"
     assert main(["get", "--host", "127.0.0.1:1", "--token-file", str(tmp_path / "none"), "cell"]) == 1

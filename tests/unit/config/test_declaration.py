@@ -51,7 +51,7 @@ def test_the_configuration_has_them_too(tmp_path: Path) -> None:
         ("value = 1.5", "", "injection[0].value: this key is needed for operation 'offset'"),
         ("value = 1.5", "value = nan", "injection[0].value: nan is no number"),
         ("value", "amplitude = 1\nvalue", "injection[0].amplitude: operation 'offset' has no such key"),
-        ('"offset"', '"ofset"', "injection[0].operation: "),
+        ('"offset"', '"ofset"', "injection[0].operation: 'ofset' is none; there are: set, offset, scale, clamp, noise"),
         ("end_s = 2.5", "end_s = 1", "injection[0].end_s: 1 is not after start_s, 1"),
         ("end_s = 2.5", "times = 2", "injection[0].times: how often it is active is for one with a condition"),
         ("end_s = 2.5", "probability = 0", "injection[0].probability: expected"),

@@ -116,6 +116,7 @@ def test_tls_files_are_relative_to_the_config(folder: Path) -> None:
     [
         ("[instance]", "[instanse]", r"instanse: unknown key; did you mean instance\?"),
         ("ring_mb", "ring_megabytes", r"instance\.ring_megabytes: unknown key"),
+        ("ring_mb = 8", 'clock = "walls"', r"instance\.clock: 'walls' is none; there are: wall, stepped"),
         ("ring_mb = 8", 'ring_mb = "8"', r"instance\.ring_mb: expected a number, got text"),
         ("ring_mb = 8", "ring_mb = 0", r"instance\.ring_mb: expected a number > 0"),
         ('name = "a50"\n', "", r"instance\.name: this key is needed"),
