@@ -5,12 +5,16 @@ from __future__ import annotations
 import gc
 import os
 import secrets
+import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from hypothesis import settings
+
+# Tests interrupt themselves and others; who runs in the background, or beside others, begins with SIGINT ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 settings.register_profile("unhurried", deadline=None)  # the machine may be busy with other things
 settings.load_profile("unhurried")
