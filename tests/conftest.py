@@ -9,6 +9,7 @@ import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import settings
@@ -50,14 +51,19 @@ def sockets() -> set[str]:
     return found
 
 
+def handlers() -> dict[signal.Signals, Any]:
+    return {sign: signal.getsignal(sign) for sign in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+
+
 def left_over(before: tuple[set[str], set[int], set[str]]) -> tuple[set[str], set[int], set[str]]:
     return segments() - before[0], children() - before[1], sockets() - before[2]
 
 
 @pytest.fixture(autouse=True)
 def nothing_left_behind() -> Iterator[None]:
-    """Fail a test that leaves a segment, a process or a socket."""
+    """Fail a test that leaves a segment, a process, a socket, or a signal in other hands."""
     before = segments(), children(), sockets()
+    heeded = handlers()
     yield
     left = left_over(before)
     deadline = time.monotonic() + 2.0
@@ -65,6 +71,10 @@ def nothing_left_behind() -> Iterator[None]:
         gc.collect()
         time.sleep(0.01)
         left = left_over(before)
+    now = handlers()
+    for sign, handler in heeded.items():
+        signal.signal(sign, handler)  # the next test is not to suffer
+    assert now == heeded, f"signals go elsewhere now: {now}"
     assert not any(left), f"left behind: segments {left[0]}, processes {left[1]}, sockets {left[2]}"
 
 

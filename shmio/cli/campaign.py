@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import secrets
-import signal
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -13,6 +12,7 @@ from typing import Final
 
 import msgspec
 
+from shmio.cli.interrupt import told_to_stop
 from shmio.cli.run import dumps
 from shmio.config import Declaration
 from shmio.config.campaign import read_campaign
@@ -20,6 +20,7 @@ from shmio.errors import CommandError
 from shmio.logs import printable
 from shmio.segment import Cursor, Event, EventKind
 from shmio.segment.attach import Attachment
+from shmio.segment.campaign import Laid
 
 TURN_S: Final = 0.2
 """How often it is told what has happened: the bells of several sources cannot be waited for at once."""
@@ -40,27 +41,34 @@ def run_campaign(cell: Attachment, options: argparse.Namespace) -> int:
         now_s = cell.block(cell.sources[0]).clock.read().present_ns / 1e9
         declarations = [_shifted(declaration, now_s) for declaration in declarations]
     cursors = {source: cell.block(source).events.cursor() for source in cell.sources}
-    over = threading.Event()
-    for sign in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(sign, lambda *_: over.set())
-    laid = {one.number: one for one in cell.declare(declarations, keep=options.keep)}
-    if any(declaration.seed is None for declaration in read):
-        print(dumps({"seed": seed}) if options.json else f"seed {seed}: --seed {seed} does the same again", flush=True)
+    with told_to_stop() as over:
+        laid = {one.number: one for one in cell.declare(declarations, keep=options.keep)}
+        if any(declaration.seed is None for declaration in read):
+            told = dumps({"seed": seed}) if options.json else f"seed {seed}: --seed {seed} does the same again"
+            print(told, flush=True)
+        try:
+            _follow(cursors, laid, over, options)
+        finally:
+            for one in () if options.keep else laid.values():
+                with suppress(CommandError):  # it was over, or somebody else has lifted it
+                    one.lift()
+    return 0
+
+
+def _follow(
+    cursors: Mapping[str, Cursor[Event]], laid: dict[int, Laid], over: threading.Event, options: argparse.Namespace
+) -> None:
+    """Tell what happens, until nothing is laid any more; what was lifted leaves ``laid``."""
     deadline_s = None if options.for_s is None else time.monotonic() + options.for_s
-    try:
-        while True:
-            ended = over.is_set() or options.keep or (deadline_s is not None and time.monotonic() > deadline_s)
-            for source, event in _news(cursors, laid):
-                _print(source, event, as_json=options.json)
-                if event.kind == EventKind.LIFTED:
-                    del laid[event.injection]
-            if ended or not laid:
-                return 0
-            over.wait(TURN_S)
-    finally:
-        for one in () if options.keep else laid.values():
-            with suppress(CommandError):  # it was over, or somebody else has lifted it
-                one.lift()
+    while True:
+        ended = over.is_set() or options.keep or (deadline_s is not None and time.monotonic() > deadline_s)
+        for source, event in _news(cursors, laid):
+            _print(source, event, as_json=options.json)
+            if event.kind == EventKind.LIFTED:
+                del laid[event.injection]
+        if ended or not laid:
+            return
+        over.wait(TURN_S)
 
 
 def _with_seed(declaration: Declaration, seed: int) -> Declaration:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import signal
-import threading
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import msgspec
 
 from shmio.cli.campaign import run_campaign
 from shmio.cli.cell import Cell
+from shmio.cli.interrupt import told_to_stop
 from shmio.cli.local import Local
 from shmio.cli.run import dumps
 from shmio.cli.set import Pairs, read_value, seconds
@@ -96,10 +95,8 @@ def _read(cell: Cell, path: str, text: str) -> tuple[Topic, Value]:
 
 def _wait(for_s: float | None) -> None:
     """Until Ctrl-C, SIGTERM or the time is over; then all is lifted."""
-    over = threading.Event()
-    for sign in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(sign, lambda *_: over.set())
-    over.wait(for_s)
+    with told_to_stop() as over:
+        over.wait(for_s)
 
 
 def _lift(cell: Cell, options: argparse.Namespace) -> int:

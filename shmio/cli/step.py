@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import math
-import signal
-import threading
 
 import msgspec
 
 from shmio.cli.cell import Cell
+from shmio.cli.interrupt import told_to_stop
 from shmio.cli.run import at_least, dumps
 from shmio.cli.supervise.status import clock_line
 from shmio.segment.status import clock_status
@@ -49,13 +48,11 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
 
 
 def _play(cell: Cell, rate: float, dt_ms: float | None) -> None:
-    over = threading.Event()
-    for sign in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(sign, lambda *_: over.set())
-    cell.play(rate, dt_ms)
-    while not over.wait(LOOK_S) and cell.clock.playing:
-        pass  # until it is told to stop, or a step fails
-    cell.pause()
+    with told_to_stop() as over:
+        cell.play(rate, dt_ms)
+        while not over.wait(LOOK_S) and cell.clock.playing:
+            pass  # until it is told to stop, or a step fails
+        cell.pause()
 
 
 def _above_zero(text: str) -> float:

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import argparse
 import logging
-import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from pathlib import Path
-from types import FrameType
 
+from shmio.cli.interrupt import told_to_stop
 from shmio.cli.target import instance_name
 from shmio.errors import ControlError, PathError, RecordingError
 from shmio.logs import printable
@@ -32,7 +30,7 @@ LOOK_S = 0.5
 def execute(arguments: argparse.Namespace) -> int:
     """Record until Ctrl-C, the time is over, or the instance ends."""
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
-    with Segment.open(instance_name(arguments)) as segment, _signals() as stopping:
+    with Segment.open(instance_name(arguments)) as segment, told_to_stop() as stopping:
         sources = arguments.sources
         for source in sources or ():
             if source not in segment.blocks:
@@ -93,23 +91,6 @@ def _sum_up(recorder: Recorder, path: Path) -> None:
     counters = recorder.counters
     size = f"{recorder.output.written / 1e6:.2f} MB"
     _say(f"{path}: {counters.frames} frames, {counters.events} events, {counters.missed} missed, {size}")
-
-
-@contextmanager
-def _signals() -> Iterator[threading.Event]:
-    """Ctrl-C, SIGTERM and a closed terminal end the recording; the file is closed in good order."""
-    stopping = threading.Event()
-
-    def stop(_number: int, _frame: FrameType | None) -> None:
-        # Not here: the main thread, which is interrupted, may hold the event's lock.
-        threading.Thread(target=stopping.set, daemon=True).start()
-
-    old = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield stopping
-    finally:
-        for number, handler in old.items():
-            signal.signal(number, handler)
 
 
 def _say(line: str) -> None:
