@@ -40,6 +40,12 @@ NEAR_S = 0.1
 """A cycle that is skipped so soon after a stall was skipped by it: the device and the network catch up, too."""
 
 
+def stolen_cpu_s() -> float:
+    """What the hypervisor has given to others of the time that this machine wanted to run, proc(5)."""
+    steal = Path("/proc/stat").read_text().split("\n", 1)[0].split()[8]
+    return int(steal) / os.sysconf("SC_CLK_TCK")
+
+
 @dataclass
 class Follower:
     """Reads every frame, in a thread."""
@@ -128,7 +134,7 @@ def soak(running: Instance, duration_s: float) -> list[str]:
         cores = sorted(os.sched_getaffinity(0))
         witnesses = [stack.enter_context(Child("witness.py", STALL_MS, core)) for core in cores]
         thread.start()
-        begun_s = time.monotonic()
+        begun_s, stolen_before_s = time.monotonic(), stolen_cpu_s()
         end_s = begun_s + duration_s
         while (rest_s := end_s - time.monotonic()) > 0:
             time.sleep(min(SAMPLE_S, rest_s))
@@ -138,6 +144,7 @@ def soak(running: Instance, duration_s: float) -> list[str]:
         thread.join()
         messages = int(subscribers.finish()["messages"])
         seen = [witness.finish() for witness in witnesses]
+    stolen_s = stolen_cpu_s() - stolen_before_s
     stalls = [(at_s, late_s) for one in seen for at_s, late_s in one["late"]]
     after = slots["cell"].counters
     rows, problems = [], []
@@ -168,7 +175,8 @@ def soak(running: Instance, duration_s: float) -> list[str]:
     longest_ms = max((late_s for _, late_s in stalls), default=0) * 1000
     print(
         f"the machine stood still for {STALL_MS:g} ms and more {len(stalls)} times, by the witnesses, {rank}; for "
-        f"{longest_ms:.0f} ms at most; {own} of {follower.skipped} skipped cycles came without that"
+        f"{longest_ms:.0f} ms at most; {own} of {follower.skipped} skipped cycles came without that; the hypervisor "
+        f"took {stolen_s:.1f} s of {os.cpu_count()} x {duration_s:.0f} s of the cores"
     )
     for name, value in (
         ("failed polls", failures),

@@ -138,12 +138,14 @@ class SourceLoop:
             if self.desk.waiting:
                 self._drain()
                 self._call(lambda: self.desk.carry_out(self._connector.write))
+            end_ns = self._schedule.due_ns(cycle + 1)
+            self._collect(end_ns, leave=self._connector.depth - 1)  # an answer that is late makes room within the cycle
             if len(self._under_way) < self._connector.depth:
                 self._under_way.append(self._asked(cycle))
                 self._call(self._connector.submit)
+                self._collect(end_ns)
             else:
                 self.counters.overruns += 1  # the device is behind by all that may be under way
-            self._collect(self._schedule.due_ns(cycle + 1))
         except ConnectorError as error:
             return self._fail(cycle, str(error) or "the connector gave no reason")
         return True
@@ -156,9 +158,9 @@ class SourceLoop:
         while self._under_way:
             self._collect(self._clock.now_ns() + round(self._connector.timeout_s * 1e9))
 
-    def _collect(self, until_ns: int) -> None:
-        """Publish the images that come until the next cycle is due."""
-        while self._under_way:
+    def _collect(self, until_ns: int, leave: int = 0) -> None:
+        """Publish the images that come until then, but for so many that may stay under way."""
+        while len(self._under_way) > leave:
             raw = self._call(lambda: self._connector.collect(until_ns))
             if raw is None:
                 return

@@ -310,11 +310,28 @@ def test_with_two_cycles_under_way_every_cycle_has_its_frame_though_answers_take
     assert all(b.publish_ns >= a.publish_ns for a, b in pairwise(frames))
 
 
-def test_with_one_cycle_under_way_what_the_device_cannot_keep_up_with_is_overrun(segment: Segment) -> None:
-    device, loop, frames = pipe(segment, 1, 3 * PERIOD_NS // 2)
+def test_with_one_cycle_under_way_a_late_answer_delays_the_next_cycle_and_skips_what_the_device_cannot_do(
+    segment: Segment,
+) -> None:
+    device, loop, frames = pipe(segment, 1, 17 * PERIOD_NS // 10)
     assert device.most == 1
-    assert [frame.cycle for frame in frames[:3]] == [1, 3, 5]
+    assert [frame.cycle for frame in frames[:6]] == [1, 2, 4, 6, 7, 9]  # asked at 1, 2.7, 4.4, 6.1, 7.8, 9.5
     assert loop.counters.overruns + loop.counters.polls == 98  # the last cycle was still under way
+
+
+def test_one_answer_that_is_late_by_less_than_a_period_skips_no_cycle(segment: Segment) -> None:
+    class Hiccup(Pipe):
+        def submit(self) -> None:
+            self.answer_ns = (19 if len(asked) == 4 else 1) * PERIOD_NS // 10
+            asked.append(self.clock.time_ns)
+            super().submit()
+
+    asked: list[int] = []
+    clock = VirtualClock(20 * PERIOD_NS)
+    loop = SourceLoop(Hiccup(clock, 0, 1), segment.writer("cell"), Schedule(0, PERIOD_NS), clock)
+    loop.run()
+    assert [at_ns / PERIOD_NS for at_ns in asked[:8]] == [1, 2, 3, 4, 5, 6.9, 7, 8]
+    assert loop.counters.overruns == 0
 
 
 def test_what_was_under_way_is_forgotten_with_its_connection(segment: Segment) -> None:
