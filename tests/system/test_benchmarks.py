@@ -111,3 +111,12 @@ def test_a_growing_load_is_measured_row_by_row() -> None:
     assert len(cells) == 11
     assert cells[6] > 0  # ms from due to frame
     assert cells[10] == 0  # frames that readers missed
+
+
+def test_what_neighbours_cost_is_measured() -> None:
+    found = re.findall(
+        r"^(alone|one never reads|50 come and go) +\d+\.\d+ +\d+\.\d+ +\d+\.\d+ +[1-9]\d*\.\d +[1-9]\d*\.\d$",
+        printed("neighbours"),
+        re.MULTILINE,
+    )
+    assert found == ["alone", "one never reads", "50 come and go"]
