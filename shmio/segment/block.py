@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from shmio.segment._atomics import FrameTuple
     from shmio.segment.clock import ClockPage
     from shmio.segment.commands import CommandQueues
+    from shmio.segment.link import Link
     from shmio.segment.standing import DeclaredCell, StandingCell
 
 Bytes = bytes | bytearray | memoryview
@@ -64,6 +65,15 @@ class Attributes:
     """Whether an injection may reach the device."""
     stepped: bool = False
     """Whether it lives on the instance's clock: in virtual time it publishes a frame for each step."""
+    outputs: tuple[str, ...] = ()
+    """Patterns of what a program elsewhere computes."""
+    inouts: tuple[str, ...] = ()
+    """Patterns of what it is given, and computes what that shows."""
+
+    @property
+    def remote(self) -> bool:
+        """Whether a program elsewhere computes registers of it."""
+        return bool(self.outputs or self.inouts)
 
 
 class Block:
@@ -85,6 +95,7 @@ class Block:
         retired: Callable[[], bool],
         section: int,
         clock: ClockPage,
+        link: Link | None = None,
     ) -> None:
         self.source = source
         self.section = section
@@ -99,6 +110,8 @@ class Block:
         """Those that the configuration has for it."""
         self.attributes = attributes
         self.clock = clock
+        self.link = link
+        """Toward the program elsewhere that computes it; None: it is no such block."""
         self._retired = retired
 
     @property

@@ -14,7 +14,7 @@ import msgspec
 
 from shmio import __version__
 from shmio.layout.model import Layout
-from shmio.segment import _atomics, commands, header
+from shmio.segment import _atomics, commands, header, link
 from shmio.segment.block import Attributes
 from shmio.segment.clock import ClockPage, page_size
 from shmio.segment.events import EVENT_SIZE, EVENT_SLOTS
@@ -24,7 +24,7 @@ from shmio.segment.shm import SharedObject
 from shmio.segment.standing import CELL_SIZE
 
 RING_SECONDS = 8
-SECTIONS_PER_BLOCK = 7
+SECTIONS_PER_BLOCK = 8  # of one that has all
 SPARE_SECTIONS = 40 * SECTIONS_PER_BLOCK
 OWN_SECTIONS = 1  # that are no block's: the clock page
 SPARE_PROCESSES = 16 + GUESTS
@@ -74,6 +74,9 @@ class BlockSpec:
             self.slots, self.slot_bytes, self.layout.size, 0, _atomics.RAW_OFFSET, effective, 0, 0,
             self.period_ns, self.stale_ns,
         )  # fmt: skip
+        linked = _RING.pack(
+            link.SLOTS, self.slot_bytes, self.layout.size, 0, _atomics.RAW_OFFSET, effective, 0, 0, 0, 0
+        )
         events = _RING.pack(EVENT_SLOTS, EVENT_STRIDE, EVENT_SIZE, 0, _atomics.RAW_OFFSET, 0, 0, 0, 0, 0)
         queues = commands.section_header(self.layout.size)
         return [
@@ -84,6 +87,7 @@ class BlockSpec:
             (SectionKind.SOURCE, len(attributes), attributes),
             (SectionKind.STANDING, CELL_SIZE, b""),
             (SectionKind.DECLARED, CELL_SIZE, bytes(8) + self.declared),
+            *([(SectionKind.LINK, *link.section(linked, self.slot_bytes))] if self.attributes.remote else []),
         ]
 
 

@@ -58,6 +58,7 @@ class SectionKind(IntEnum):
     STANDING = 6
     CLOCK = 7
     DECLARED = 8
+    LINK = 9
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,8 +14,12 @@ from shmio.segment.clock import ClockPage
 from shmio.segment.commands import CommandQueues
 from shmio.segment.events import EVENT_SIZE
 from shmio.segment.header import Header, SectionEntry, SectionKind
+from shmio.segment.link import Link
 from shmio.segment.shm import SharedObject
 from shmio.segment.standing import declared_cell, standing_cell
+
+FIRST_LINK = 2
+"""The lock of a block's link: so many bytes, and the index of its layout, after those of the process table."""
 
 _ATTRIBUTES = msgspec.json.Decoder(Attributes)  # as in layout/document.py: built before there are threads
 
@@ -35,9 +39,15 @@ def read_clock(shared: SharedObject, head: Header, entries: Sequence[SectionEntr
 
 
 def read_block(
-    memory: memoryview, head: Header, name: str, entries: Sequence[SectionEntry], layout_at: int, clock: ClockPage
+    shared: SharedObject,
+    memory: memoryview,
+    head: Header,
+    entries: Sequence[SectionEntry],
+    layout_at: int,
+    clock: ClockPage,
 ) -> Block:
-    """The block whose layout is the section of this index; ``name``: of the segment. FormatError."""
+    """The block whose layout is the section of this index. FormatError."""
+    name = shared.name
     described = entries[layout_at]
     parts = {
         entry.kind: entry for index, entry in enumerate(entries) if entry.layout == layout_at and index != layout_at
@@ -57,11 +67,14 @@ def read_block(
         queues = CommandQueues(memory, *part(SectionKind.COMMANDS))
         standing = standing_cell(memory, *part(SectionKind.STANDING))
         declared = declared_cell(memory, *part(SectionKind.DECLARED))
+        lock_byte = head.process_capacity + FIRST_LINK + layout_at
+        link = Link(shared, memory, *part(SectionKind.LINK), lock_byte) if attributes.remote else None
     except (LayoutError, ValueError, msgspec.MsgspecError) as error:
         raise FormatError(f"{name}: block {described.name}: {error}") from None
-    if frames.frame_size != layout.size or events.frame_size != EVENT_SIZE:
+    linked_size = layout.size if link is None else link.frame_size
+    if not frames.frame_size == linked_size == layout.size or events.frame_size != EVENT_SIZE:
         raise FormatError(f"{name}: block {described.name}: rings and layout differ in size")
     return Block(
         described.name, layout, frames, events, queues, standing, declared, attributes,
-        lambda: header.retired(memory, head, layout_at), layout_at, clock,
+        lambda: header.retired(memory, head, layout_at), layout_at, clock, link,
     )  # fmt: skip

@@ -99,9 +99,7 @@ class Segment:
     def _found(self, layout: int) -> Block:
         """The block whose layout is in this section; always the same object."""
         if layout not in self._known:
-            self._known[layout] = read_block(
-                self.memory, self.header, self.shared.name, self._entries, layout, self.clock
-            )
+            self._known[layout] = read_block(self.shared, self.memory, self.header, self._entries, layout, self.clock)
         return self._known[layout]
 
     @property
