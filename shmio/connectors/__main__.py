@@ -27,7 +27,6 @@ from shmio.worker import BEAT_S, Worker
 SWITCH_S = 0.0005  # the poll thread is not to wait Python's usual 5 ms for the others
 LAST_WORDS_S = 4.0  # less than a supervisor's patience with a process that is to stop
 HANG_MARGIN_S = 30.0  # beyond its time-outs: looking up a host name has none of ours
-COMPUTE_S = 1.0  # the time-out of what is computed
 
 
 class _Part(NamedTuple):
@@ -92,7 +91,12 @@ def _part(worker: Worker) -> _Part:
     stepped = SteppedLoop(
         source, writer, schedule, page_clock, writable, inputs=inputs, owner_of=owner_of, blocks=blocks
     )
-    return _Part(stepped, page_clock.stop, COMPUTE_S)
+
+    def stop() -> None:
+        page_clock.stop()
+        source.interrupt()
+
+    return _Part(stepped, stop, source.timeout_s)
 
 
 def _inputs(source: Computed, writer: BlockWriter, segment: Segment) -> Inputs | None:

@@ -11,6 +11,7 @@ import msgspec
 from shmio.layout.codec import Value
 from shmio.layout.model import Layout
 from shmio.layout.write import Write
+from shmio.segment import BlockWriter
 
 
 class Computed(ABC):
@@ -25,6 +26,9 @@ class Computed(ABC):
     prompt: ClassVar[bool] = False
     """Whether what is written is shown at once, without waiting for a cycle."""
 
+    timeout_s: float = 1.0
+    """How long a step is to take at most."""
+
     @abstractmethod
     def __init__(self, options: Any, layout: Layout) -> None:
         """``options`` is an instance of ``Options``. ConfigError when layout and options do not go together."""
@@ -34,8 +38,19 @@ class Computed(ABC):
         """The topic that each connected input is read from, by the input's path."""
         return {}
 
-    def connect(self, values: Mapping[str, Value]) -> None:  # noqa: B027  not every source has inputs
-        """Values of connected inputs for the next :meth:`step`; one that is left out keeps what it has."""
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Paths of the registers that may be connected."""
+        return ()
+
+    def connect(self, values: Mapping[str, Value], doubt: str) -> None:  # noqa: B027  not every source has inputs
+        """Values of connected inputs for the next :meth:`step`; one that is left out keeps what it has.
+
+        ``doubt``: why some are left out.
+        """
+
+    def attach(self, writer: BlockWriter) -> None:  # noqa: B027  most need nothing of it
+        """Take the writing side of the block; once, before the hooks below. SegmentError."""
 
     @abstractmethod
     def resume(self, image: bytes) -> None:
@@ -44,6 +59,13 @@ class Computed(ABC):
     @abstractmethod
     def begin(self) -> bytes:
         """The image before the first step; of a prompt source, as it is now."""
+
+    def news(self) -> bool:
+        """Whether :meth:`begin` has something else to say by now; asked between two steps."""
+        return False
+
+    def interrupt(self) -> None:  # noqa: B027  most never wait
+        """Have a step that waits for others end soon; from any thread."""
 
     @abstractmethod
     def write(self, writes: Sequence[Write]) -> list[str]:

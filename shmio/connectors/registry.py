@@ -21,6 +21,7 @@ GROUP = "shmio.connectors"
 
 BUILT_IN = {
     "memory": "shmio.connectors.memory:Memory",
+    "remote": "shmio.connectors.remote:Remote",
     "simulation": "shmio.connectors.simulation:Simulation",
     "s7": "shmio.connectors.s7.connector:S7Connector",
 }

@@ -39,7 +39,12 @@ class Simulation(Computed):
         """As configured."""
         return self._connections
 
-    def connect(self, values: Mapping[str, Value]) -> None:
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """As the model declares them."""
+        return self._runner.inputs
+
+    def connect(self, values: Mapping[str, Value], doubt: str) -> None:  # noqa: ARG002  no model asks for it
         """Give values to inputs."""
         self._runner.connect(values)
 

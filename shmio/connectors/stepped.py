@@ -86,6 +86,7 @@ class SteppedLoop:
     ) -> None:
         """``writable``: patterns of what commands may write. ``inputs``: of the source's connections, if it has any."""
         self._source = source
+        source.attach(writer)
         self._writer = writer
         self._page = writer.block.clock
         self._schedule = schedule
@@ -137,10 +138,7 @@ class SteppedLoop:
         elif state.stepping and last is not None and last.cycle < state.step:
             self._fail(state.step, RESTARTED)
         else:
-            try:
-                self._publish(self._source.begin(), self._writer.now_ns())
-            except ShmioError as error:
-                self._fail(state.step, str(error))
+            self._show(state.step)
 
     # ---- wall time -----------------------------------------------------------------------------------------------
 
@@ -185,6 +183,8 @@ class SteppedLoop:
         elif not state.stepping:
             self._handled = self._writer.cycle = state.step
             self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
+            if self._source.news():
+                self._show(state.step)
         wait_ns = None
         if self.desk.waiting:
             wait_ns = max(0, self._output.next_ns - self._clock.now_ns()) if self._source.prompt else 0
@@ -216,12 +216,19 @@ class SteppedLoop:
         doubt = ""
         if self._inputs is not None:
             values, doubt = self._inputs.read(self._handled if self._in_virtual_time else None)
-            self._source.connect(values)
+            self._source.connect(values, doubt)
         return self._source.step(time_ns, dt_ns), doubt
 
     @property
     def _in_virtual_time(self) -> bool:
         return self._writer.at_ns is not None
+
+    def _show(self, cycle: int) -> None:
+        """Publish how the source is without a step."""
+        try:
+            self._publish(self._source.begin(), self._writer.now_ns())
+        except ShmioError as error:
+            self._fail(cycle, str(error))
 
     def _carry_out(self) -> None:
         """Hand over all that was accepted."""

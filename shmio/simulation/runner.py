@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Final
-
-import numpy as np
-import numpy.typing as npt
 
 from shmio.errors import ConfigError, LayoutError, ModelError, PathError, ValueRangeError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import find
-from shmio.layout.write import Write, bits_of
+from shmio.layout.write import Write
 from shmio.simulation.declarations import Declaration, InOut, Input, Output, Parameter, place_declarations
 from shmio.simulation.failure import explain
+from shmio.simulation.images import Images
 from shmio.simulation.model import Model, declared, layout_of
 from shmio.simulation.ports import Ends, Port, RegisterPort, port_of
 
@@ -44,31 +42,29 @@ class ModelRunner:
         """
         self.name = f"{model.__module__}:{model.__qualname__}"
         self.layout = layout_of(model) if layout is None else layout
-        initial, _ = initial_frame(self.layout)
-        self._commanded, self._shown = bytearray(initial), initial
-        self._outputs: list[Register] = []
+        found = {declaration: self._find(model, declaration) for declaration in declared(model, Input, Output, InOut)}
+        outputs = [r for declaration in found if isinstance(declaration, Output) for r in found[declaration].values()]
+        both = [r for declaration in found if isinstance(declaration, InOut) for r in found[declaration].values()]
+        self._images = Images(self.layout, outputs, both)
+        self.computed = (*outputs, *both)
+        """The registers whose shown values the model computes."""
         self._inputs: dict[str, RegisterPort] = {}
         ports: dict[str, Port] = _parameters(model, parameters)
         ends: dict[str, Ends] = {}
-        both: list[Register] = []
-        for declaration in declared(model, Input, Output, InOut):
-            registers = self._find(model, declaration)
-            order = self.layout.byte_order
+        order = self.layout.byte_order
+        for declaration, registers in found.items():
             commanded, shown = (
-                port_of(declaration.path, registers, order, image) for image in (self._commanded, self._shown)
+                port_of(declaration.path, registers, order, image)
+                for image in (self._images.commanded, self._images.shown)
             )
             if isinstance(declaration, Output):
                 ports[declaration.name] = shown
-                self._outputs += registers.values()
                 continue
-            self._inputs |= {r.path: RegisterPort(r, order, self._commanded) for r in registers.values()}
+            self._inputs |= {r.path: RegisterPort(r, order, self._images.commanded) for r in registers.values()}
             if isinstance(declaration, InOut):
                 ends[declaration.name] = Ends(commanded, shown)
-                both += registers.values()
             else:
                 ports[declaration.name] = commanded
-        self._computed = _bits(self._outputs, self.layout.size)
-        self._given = ~_array(_bits((*self._outputs, *both), self.layout.size))
         self._model = model(ports, ends, seed)
         self._started = False
 
@@ -80,11 +76,11 @@ class ModelRunner:
     @property
     def image(self) -> bytes:
         """The whole block as it is shown."""
-        return bytes(self._shown)
+        return bytes(self._images.shown)
 
     def write(self, writes: Sequence[Write]) -> list[str]:
         """Command these bytes and bits, for the next step; of each "" or why it is refused: the model computes it."""
-        return [self._write(*write) for write in writes]
+        return self._images.write(writes)
 
     def connect(self, values: Mapping[str, object]) -> None:
         """Command values of inputs by their paths; an input that is left out keeps what it has.
@@ -103,7 +99,7 @@ class ModelRunner:
         if not self._started:
             self._run(self._model.start)
             self._started = True
-        return bytes(self._shown)
+        return self.image
 
     def step(self, time_ns: int, dt_ns: int) -> bytes:
         """Compute the image at ``time_ns``, ``dt_ns`` after the one before.
@@ -111,38 +107,26 @@ class ModelRunner:
         ModelError: the model's code failed, and the image is still the one before.
         """
         self.begin()
-        before = bytes(self._shown)
-        self._shown[:] = (_array(self._commanded) & self._given | _array(before) & ~self._given).tobytes()
+        before = self.image
+        self._images.shown[:] = self._images.with_given(before)
         self._run(self._model.step, time_ns / 1e9, dt_ns / 1e9, instead=before)
-        return bytes(self._shown)
+        return self.image
 
     def resume(self, image: bytes) -> None:
         """Go on from an image: it is what is shown, and what is commanded. LayoutError: it has another size."""
-        if len(image) != len(self._shown):
-            raise LayoutError(f"model {self.name}: its block has {len(self._shown)} bytes, the image {len(image)}")
-        self._shown[:] = self._commanded[:] = image
+        try:
+            self._images.resume(image)
+        except LayoutError as error:
+            raise LayoutError(f"model {self.name}: {error}") from None
 
     def _run(self, call: Callable[..., None], *arguments: float, instead: bytes | None = None) -> None:
         """Call the model's code; what it had computed when it failed is not shown."""
-        before = bytes(self._shown) if instead is None else instead
+        before = self.image if instead is None else instead
         try:
             call(*arguments)
         except (Exception, SystemExit) as error:
-            self._shown[:] = before
+            self._images.shown[:] = before
             raise ModelError(f"model {self.name}: {explain(error, self._model.__module__)}") from error
-
-    def _write(self, offset: int, mask: int, data: bytes) -> str:
-        stop = offset + len(data)
-        if stop > len(self._commanded):
-            return f"it is outside the block of {len(self._commanded)} bytes"
-        if self._computed[offset] & mask if mask else any(self._computed[offset:stop]):
-            hit = [r.path for r in self._outputs if r.offset < stop and offset < r.offset + r.size]
-            return f"the model computes {hit[0]}: it is an output, which nobody writes"
-        if mask:
-            self._commanded[offset] = self._commanded[offset] & ~mask | data[0] & mask
-        else:
-            self._commanded[offset:stop] = data
-        return ""
 
     def _find(self, model: type[Model], declaration: Declaration) -> dict[str, Register]:
         """The registers of a declaration, by their paths in it; ConfigError: the layout has none, or others."""
@@ -182,19 +166,6 @@ def _parameters(model: type[Model], given: Mapping[str, object]) -> dict[str, Po
     return ports
 
 
-def _bits(registers: Iterable[Register], size: int) -> bytes:
-    """An image of so many bytes in which the bits of all these registers are set."""
-    mask = bytearray(size)
-    for register in registers:
-        for at, bits in enumerate(bits_of(register), register.offset):
-            mask[at] |= bits
-    return bytes(mask)
-
-
 def _kind(register: Register) -> str:
     bounds = ",".join(f"{low}..{high}" for low, high in register.dims)
     return f"ARRAY[{bounds}] OF {register.type}" if bounds else register.type
-
-
-def _array(data: bytes | bytearray) -> npt.NDArray[np.uint8]:
-    return np.frombuffer(data, np.uint8)

@@ -113,10 +113,12 @@ def make_plan(
     declared: Mapping[str, bytes] | None = None,
     warnings: Sequence[str] = (),
     computed: Collection[str] = (),
+    remote: Mapping[str, tuple[Sequence[str], Sequence[str]]] | None = None,
 ) -> Plan:
     """Plan an instance. ``layouts``: of each source, by its name; ``emulated``: all blocks of each emulator.
 
-    ``computed``: the sources that live on the instance's clock. ``declared``: what the sources' processes get of the
+    ``computed``: the sources that live on the instance's clock. ``remote``: patterns of outputs and in-outs of those
+    that a program elsewhere computes, by the source's name. ``declared``: what the sources' processes get of the
     declared injections, by the source's name.
     ConfigError: too many processes.
     """
@@ -128,7 +130,13 @@ def make_plan(
             source.period_ns,
             source.stale_ns,
             ring_bytes,
-            Attributes(source.connector, tuple(source.writable), source.armed, source.name in computed),
+            Attributes(
+                source.connector,
+                tuple(source.writable),
+                source.armed,
+                source.name in computed,
+                *map(tuple, (remote or {}).get(source.name, ((), ()))),
+            ),
             (declared or {}).get(source.name, b""),
         )
         for source in config.source

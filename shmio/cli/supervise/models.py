@@ -15,7 +15,7 @@ from shmio.errors import ConfigError, PathError, ShmioError, ValueRangeError
 from shmio.layout.codec import codec
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
-from shmio.layout.topic import find, parse_topic
+from shmio.layout.topic import find, parse_topic, shorten
 
 PATIENCE_S: Final = 60.0
 
@@ -64,7 +64,7 @@ def _check_connection(
     source: str, path: str, text: str, inputs: tuple[str, ...], layouts: Mapping[str, Layout]
 ) -> None:
     if path not in inputs:
-        raise PathError(f"the model has no such input; there are: {', '.join(inputs) or 'none'}")
+        raise PathError(f"the model has no such input; there are: {shorten(', '.join(inputs), 400) or 'none'}")
     topic = parse_topic(text, layouts, source)
     if topic.source not in layouts:
         raise PathError(f"{text}: no source {topic.source!r}; there are: {', '.join(layouts)}")

@@ -51,7 +51,7 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
     try:
         check_host(config)
         check_listening(config)
-        layouts, computed = check_sources(config, files)
+        layouts, computed, remote = check_sources(config, files)
         emulated = {emulator.name: _check_emulator(i, emulator, files) for i, emulator in enumerate(config.emulator)}
         declared, described = check_injections(config, layouts)
         odd = [*_odd(config, layouts), *_not_served(config, layouts, emulated), *_unread(emulated)]
@@ -59,7 +59,15 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
         raise ConfigError(f"{file}: {named(str(error), msgspec.to_builtins(config))}") from None
     warnings = [*files.warnings, *(f"{file}: warning: {text}" for text in odd)]
     plan = make_plan(
-        config, layouts, emulated, config_file=file, mode=mode, declared=declared, warnings=warnings, computed=computed
+        config,
+        layouts,
+        emulated,
+        config_file=file,
+        mode=mode,
+        declared=declared,
+        warnings=warnings,
+        computed=computed,
+        remote=remote,
     )
     return Prepared(config, plan, layouts, emulated, described)
 
@@ -105,6 +113,8 @@ def _odd(config: Config, layouts: dict[str, Layout]) -> list[str]:
     odd = []
     for index, source in enumerate(config.source):
         key, layout = f"source[{index}]", layouts[source.name]
+        if source.connector == "remote" and config.grpc is None:
+            odd.append(f"{key}.connector: no model can connect to {source.name}, for there is no [grpc] section")
         for pattern in source.writable:
             try:
                 if not _covers(pattern, layout):

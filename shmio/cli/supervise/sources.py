@@ -5,6 +5,8 @@ Connectors are imported here, and only when they are asked: status and its like 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import msgspec
 
 from shmio.cli.supervise.layouts import LayoutFiles
@@ -14,8 +16,18 @@ from shmio.errors import ConfigError
 from shmio.layout.model import Layout
 
 
-def check_sources(config: Config, files: LayoutFiles) -> tuple[dict[str, Layout], list[str]]:
-    """The layout of each source, by its name, and which of them live on the instance's clock.
+class Sources(NamedTuple):
+    """What was found out about the sources, by their names."""
+
+    layouts: dict[str, Layout]
+    computed: list[str]
+    """Those that live on the instance's clock."""
+    remote: dict[str, tuple[list[str], list[str]]]
+    """Patterns of what a program elsewhere computes, of sources that have such: outputs, in-outs."""
+
+
+def check_sources(config: Config, files: LayoutFiles) -> Sources:
+    """Ask the connectors of all sources whether they can be as configured.
 
     Their ``options`` are complete and of their types from here on. ConfigError, LayoutError.
     """
@@ -25,6 +37,7 @@ def check_sources(config: Config, files: LayoutFiles) -> tuple[dict[str, Layout]
     layouts: dict[str, Layout] = {}
     inputs: dict[int, tuple[str, ...]] = {}
     computed = []
+    remote: dict[str, tuple[list[str], list[str]]] = {}
     for index, source in enumerate(config.source):
         key = f"source[{index}]"
         options = _options(index, source)
@@ -39,14 +52,18 @@ def check_sources(config: Config, files: LayoutFiles) -> tuple[dict[str, Layout]
             made = found(options, layout)
         except ConfigError as error:
             raise ConfigError(f"{key}.{error}") from None
-        if not isinstance(made, Computed):
+        if isinstance(made, Computed):
+            inputs[index] = made.inputs
+        else:
             made.close()
+        if source.connector == "remote":
+            remote[source.name] = source.options["outputs"], source.options["inouts"]
     for index, paths in inputs.items():
         from shmio.cli.supervise.models import check_connections  # noqa: PLC0415
 
         source = config.source[index]
-        check_connections(f"source[{index}]", source.name, source.options["connections"], paths, layouts)
-    return layouts, computed
+        check_connections(f"source[{index}]", source.name, source.options.get("connections", {}), paths, layouts)
+    return Sources(layouts, computed, remote)
 
 
 def _options(index: int, source: Source) -> msgspec.Struct:

@@ -101,6 +101,72 @@ def test_a_changed_model_is_seen_by_the_next_look(folder: Path) -> None:
     assert prepared.layouts["belt"].registers[0].type == "REAL"
 
 
+REMOTE = """
+[instance]
+name = "line"
+
+[[source]]
+name = "drive"
+connector = "remote"
+layout = "drive.toml"
+KEYS
+
+[[source]]
+name = "panel"
+connector = "memory"
+layout = "panel.toml"
+"""
+
+
+def remote(folder: Path, keys: str) -> Path:
+    (folder / "drive.toml").write_text('[registers]\ntarget = "LREAL"\n"axis/position" = "LREAL"\nlamps = "BYTE"\n')
+    file = folder / "supervisor.toml"
+    file.write_text(REMOTE.replace("KEYS", keys))
+    return file
+
+
+def test_a_source_whose_model_is_elsewhere_has_its_outputs_in_the_segment(folder: Path) -> None:
+    keys = 'outputs = ["axis"]\ninouts = ["lamps"]\nconnections = { target = "panel/limit" }\ntimeout_ms = 500'
+    prepared = prepare(remote(folder, keys + '\n[grpc]\nlisten = ["127.0.0.1:8089"]\n'))
+    drive, panel = prepared.plan.blocks
+    assert (drive.attributes.outputs, drive.attributes.inouts) == (("axis",), ("lamps",))
+    assert drive.attributes.stepped
+    assert (drive.attributes.remote, panel.attributes.remote) == (True, False)
+    assert prepared.plan.warnings == ()
+    job = next(job for job in prepared.plan.jobs if job.name == "drive")
+    assert job.config["options"]["timeout_ms"] == 500
+
+
+def test_without_an_endpoint_nobody_can_be_its_model(folder: Path) -> None:
+    (warning,) = prepare(remote(folder, 'outputs = ["axis"]')).plan.warnings
+    assert "no model can connect to drive, for there is no [grpc] section" in warning
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ("", "source[0].outputs: this key is needed"),
+        ('outputs = ["axes"]', "source[0].outputs: 'axes' names no register of drive"),
+        ('outputs = ["axis"]\ninouts = ["axis/position"]', "source[0].inouts: axis/position is among outputs, too"),
+        ('output = ["axis"]', "source[0].output: unknown key"),
+        ('outputs = ["axis"]\ntimeout_ms = 20000', "source[0].timeout_ms"),
+        (
+            'outputs = ["axis"]\nconnections = { "axis/position" = "panel/limit" }',
+            "source[0].connections.axis/position: the model has no such input; there are: target, lamps",
+        ),
+        (
+            'outputs = ["axis"]\nconnections = { target = "panel/lamps" }',
+            "panel/lamps is BOOL[], which does not fit an input of LREAL",
+        ),
+    ],
+)
+def test_what_is_wrong_with_it_is_said_with_its_key(folder: Path, keys: str, message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        prepare(remote(folder, keys))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize(
     ("model", "message"),
     [

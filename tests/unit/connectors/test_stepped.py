@@ -67,7 +67,7 @@ class Adder(Computed):
     def connections(self) -> Mapping[str, str]:
         return self._connections
 
-    def connect(self, values: Mapping[str, Value]) -> None:
+    def connect(self, values: Mapping[str, Value], doubt: str) -> None:
         if "other" in values:
             struct.pack_into(">I", self.image, 8, values["other"])
 
@@ -140,8 +140,9 @@ class Running:
         schedule = Schedule(own.header.started_ns, PERIOD_NS)
         self.cursor = own.blocks[name].cursor()
         writer = writer_of(own.blocks[name], own.clock_ns)
+        writable = writer.block.attributes.writable
         self.loop = SteppedLoop(
-            source, writer, schedule, self.clock, ("given",), inputs=inputs, blocks=lambda: own.blocks
+            source, writer, schedule, self.clock, writable, inputs=inputs, blocks=lambda: own.blocks
         )
         self._threads = [threading.Thread(target=run) for run in (self.loop.run, self.loop.desk.run)]
         for thread in self._threads:

@@ -1,0 +1,67 @@
+"""The two images of a block whose registers a model computes: what is commanded, and what is shown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from shmio.errors import LayoutError
+from shmio.layout.image import initial_frame
+from shmio.layout.model import Layout, Register
+from shmio.layout.write import Write, apply, bits_of
+
+
+class Images:
+    """Both images of one block, first with its initial values. The model computes outputs and what in-outs show.
+
+    ``commanded``: what others have written to inputs, to the ``/in`` of in-outs, and to registers that the model does
+    not know. ``shown``: what consumers see.
+    """
+
+    def __init__(self, layout: Layout, outputs: Sequence[Register], inouts: Sequence[Register] = ()) -> None:
+        """``outputs``: registers that nobody writes; ``inouts``: those with two ends."""
+        initial, _ = initial_frame(layout)
+        self.commanded, self.shown = bytearray(initial), initial
+        self._outputs = tuple(outputs)
+        self._computed = _bits(outputs, layout.size)
+        self._given = ~_array(_bits((*outputs, *inouts), layout.size))
+
+    def write(self, writes: Sequence[Write]) -> list[str]:
+        """Command these bytes and bits; of each "" or why it is refused: the model computes it."""
+        return [self._write(write) for write in writes]
+
+    def resume(self, image: bytes) -> None:
+        """Go on from an image: it is what is shown, and what is commanded. LayoutError: it has another size."""
+        if len(image) != len(self.shown):
+            raise LayoutError(f"its block has {len(self.shown)} bytes, the image {len(image)}")
+        self.shown[:] = self.commanded[:] = image
+
+    def with_given(self, image: bytes | bytearray) -> bytes:
+        """An image with what is commanded of all that the model does not compute."""
+        return (_array(self.commanded) & self._given | _array(image) & ~self._given).tobytes()
+
+    def _write(self, write: Write) -> str:
+        offset, mask, data = write
+        stop = offset + len(data)
+        if stop > len(self.commanded):
+            return f"it is outside the block of {len(self.commanded)} bytes"
+        if self._computed[offset] & mask if mask else any(self._computed[offset:stop]):
+            hit = [r.path for r in self._outputs if r.offset < stop and offset < r.offset + r.size]
+            return f"the model computes {hit[0]}: it is an output, which nobody writes"
+        apply(write, self.commanded)
+        return ""
+
+
+def _bits(registers: Iterable[Register], size: int) -> bytes:
+    """An image of so many bytes in which the bits of all these registers are set."""
+    mask = bytearray(size)
+    for register in registers:
+        for at, bits in enumerate(bits_of(register), register.offset):
+            mask[at] |= bits
+    return bytes(mask)
+
+
+def _array(data: bytes | bytearray) -> npt.NDArray[np.uint8]:
+    return np.frombuffer(data, np.uint8)
