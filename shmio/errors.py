@@ -21,6 +21,7 @@
     ├── RecordingError     a recording cannot be written, or is none that this version can read
     ├── EndpointError      an address cannot be served
     ├── RemoteError        an instance cannot be reached by gRPC, or does not answer as it should
+    │   └── LostError            nothing serves there at present; it may come back
     └── ControlError       the supervisor refused or did not answer
         └── UnreachableError     its socket cannot be connected to
 
@@ -120,6 +121,10 @@ class ModelError(ShmioError):
 
 class RemoteError(ShmioError):
     """An instance's endpoint cannot be reached, does not let us in, or does not answer as it should; names it."""
+
+
+class LostError(RemoteError):
+    """Nothing serves at this address, or the connection to it was lost; it may come back."""
 
 
 class RecordingError(ShmioError):

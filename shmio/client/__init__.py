@@ -19,7 +19,9 @@ from pathlib import Path
 from shmio.client import aio
 from shmio.client.calls import Clock, Injection, Lifted, Outcome, Target
 from shmio.client.layout import BlockLayout
+from shmio.client.model import Work
 from shmio.client.sync import Client, Subscription
+from shmio.client.sync_model import Simulation
 from shmio.client.sync_shadow import Shadow
 from shmio.client.table import Change, Column, Register, Table
 from shmio.client.update import Provenance, Quality, Snapshot, Update
@@ -37,11 +39,13 @@ __all__ = [
     "Quality",
     "Register",
     "Shadow",
+    "Simulation",
     "Snapshot",
     "Subscription",
     "Table",
     "Target",
     "Update",
+    "Work",
     "connect",
     "connect_aio",
 ]

@@ -9,10 +9,12 @@ from typing import Any, Self
 import grpc
 
 from shmio.client import calls, shadow
+from shmio.client.aio_model import Simulation, Step, serve
 from shmio.client.aio_shadow import Shadow
-from shmio.client.arrays import InjectResponse, ReadResponse, SubscribeResponse
+from shmio.client.arrays import InjectResponse, ReadResponse, SimulateResponse, SubscribeResponse
 from shmio.client.calls import Clock, Injection, Lifted, Outcome, Target
 from shmio.client.layout import BlockLayout, layouts
+from shmio.client.model import PATIENCE_S
 from shmio.client.update import Snapshot, Tables, Update
 from shmio.errors import CommandError
 from shmio.wire import shmio_v1_pb2 as wire
@@ -37,6 +39,9 @@ class Client:
             f"/{calls.SERVICE}/Read", wire.ReadRequest.SerializeToString, ReadResponse.FromString
         )
         self._inject: Any = self._channel.stream_stream(f"/{calls.SERVICE}/Inject", None, InjectResponse.FromString)
+        self._simulate: Any = self._channel.stream_stream(
+            f"/{calls.SERVICE}/Simulate", None, SimulateResponse.FromString
+        )
         self._subscribe = self._channel.unary_stream(
             f"/{calls.SERVICE}/Subscribe", wire.SubscribeRequest.SerializeToString, SubscribeResponse.FromString
         )
@@ -118,6 +123,22 @@ class Client:
         if left := [one for one in found if one.failure]:
             raise CommandError(f"{len(left)} of {len(found)} injections still stand: {left[0].failure}")
         return found
+
+    async def simulation(self, source: str, name: str = "") -> Simulation:
+        """As :meth:`shmio.client.Client.simulation`."""
+        return await Simulation.join(self._simulate, self.target, source, name)
+
+    async def simulate(
+        self,
+        source: str,
+        step: Step,
+        *,
+        name: str = "",
+        start: Callable[[Simulation], object] | None = None,
+        patience_s: float = PATIENCE_S,
+    ) -> None:
+        """As :meth:`shmio.client.Client.simulate`; ``step`` may be a coroutine function. Ends when it is cancelled."""
+        await serve(lambda: self.simulation(source, name), step, start, patience_s)
 
     async def clock(self) -> Clock:
         """How time stands."""

@@ -10,20 +10,36 @@ from typing import Any, Final, NoReturn
 import grpc
 import numpy as np
 
-from shmio.errors import CommandError, EndpointError, PathError, RemoteError, ShmioError, ValueRangeError
+from shmio.errors import (
+    CommandError,
+    ConflictError,
+    EndpointError,
+    LostError,
+    PathError,
+    RemoteError,
+    ShmioError,
+    ValueRangeError,
+)
 from shmio.wire import shmio_v1_pb2 as wire
 
 STEP_PATIENCE_S: Final = 60.0
 SERVICE: Final = wire.DESCRIPTOR.services_by_name["Shmio"].full_name
 WRITE_PATIENCE_S: Final = 30.0
 """Beyond its own time-out a write is given so long to be answered: a slow source has its cycles."""
-OPTIONS: Final = [("grpc.max_receive_message_length", 64 << 20), ("grpc.keepalive_time_ms", 20_000)]
+OPTIONS: Final = [
+    ("grpc.max_receive_message_length", 64 << 20),
+    ("grpc.keepalive_time_ms", 20_000),
+    # An endpoint that is started anew is found at once.
+    ("grpc.initial_reconnect_backoff_ms", 100),
+    ("grpc.max_reconnect_backoff_ms", 1_000),
+]
 
 _ERRORS: Final[Mapping[grpc.StatusCode, type[ShmioError]]] = {
     grpc.StatusCode.NOT_FOUND: PathError,
     grpc.StatusCode.INVALID_ARGUMENT: ValueRangeError,
     grpc.StatusCode.FAILED_PRECONDITION: CommandError,
     grpc.StatusCode.RESOURCE_EXHAUSTED: EndpointError,
+    grpc.StatusCode.ALREADY_EXISTS: ConflictError,
 }
 
 
@@ -61,7 +77,8 @@ class Target:
         code, details = error.code(), error.details() or ""
         if kind := _ERRORS.get(code):
             return kind(details)
-        return RemoteError(f"{self.address}: {_MEANING.get(code, code.name)}{f': {details}' if details else ''}")
+        told = LostError if code is grpc.StatusCode.UNAVAILABLE else RemoteError
+        return told(f"{self.address}: {_MEANING.get(code, code.name)}{f': {details}' if details else ''}")
 
     def fail(self, error: Any) -> NoReturn:
         """Raise that."""

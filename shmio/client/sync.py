@@ -9,9 +9,11 @@ from typing import Any, Self
 import grpc
 
 from shmio.client import calls, shadow
-from shmio.client.arrays import InjectResponse, ReadResponse, SubscribeResponse
+from shmio.client.arrays import InjectResponse, ReadResponse, SimulateResponse, SubscribeResponse
 from shmio.client.calls import Clock, Injection, Lifted, Outcome, Target
 from shmio.client.layout import BlockLayout, layouts
+from shmio.client.model import PATIENCE_S
+from shmio.client.sync_model import Simulation, Step, serve
 from shmio.client.sync_shadow import Shadow
 from shmio.client.update import Snapshot, Tables, Update
 from shmio.errors import CommandError
@@ -41,6 +43,10 @@ class Client:
             f"/{calls.SERVICE}/Read", wire.ReadRequest.SerializeToString, ReadResponse.FromString
         )
         self._inject: Any = self._channel.stream_stream(f"/{calls.SERVICE}/Inject", None, InjectResponse.FromString)
+        self._simulate: Any = self._channel.stream_stream(
+            f"/{calls.SERVICE}/Simulate", None, SimulateResponse.FromString
+        )
+        self._closed = False
         self._subscribe = self._channel.unary_stream(
             f"/{calls.SERVICE}/Subscribe", wire.SubscribeRequest.SerializeToString, SubscribeResponse.FromString
         )
@@ -138,6 +144,32 @@ class Client:
             raise CommandError(f"{len(left)} of {len(found)} injections still stand: {left[0].failure}")
         return found
 
+    def simulation(self, source: str, name: str = "") -> Simulation:
+        """Join a source of the connector ``remote`` as its model, to be told its steps and to answer them.
+
+        ``name``: for messages. PathError: no such source; CommandError: it has no model elsewhere; ConflictError: it
+        has another one already; LostError, RemoteError.
+        """
+        return Simulation(self._simulate, self.target, source, name)
+
+    def simulate(
+        self,
+        source: str,
+        step: Step,
+        *,
+        name: str = "",
+        start: Callable[[Simulation], object] | None = None,
+        patience_s: float = PATIENCE_S,
+    ) -> None:
+        """Be the model of a source until this client is closed, or its thread is interrupted.
+
+        ``step(time_s, dt_s, inputs)`` gives outputs by their paths, all or some; what it raises is the reason why the
+        step failed, which the log of ``shmio.client`` tells, too. ``start`` is called with the :class:`Simulation`
+        whenever it has joined. An instance that is not there, or goes, is waited for ``patience_s``. Errors as of
+        :meth:`simulation`.
+        """
+        serve(lambda: self.simulation(source, name), step, start, patience_s, lambda: self._closed)
+
     def clock(self) -> Clock:
         """How time stands."""
         return Clock.of((self._call(self._stub.GetStatus, wire.GetStatusRequest())).clock)
@@ -170,6 +202,7 @@ class Client:
 
     def close(self) -> None:
         """End all calls, and the connection."""
+        self._closed = True
         self._channel.close()
 
     def __enter__(self) -> Self:

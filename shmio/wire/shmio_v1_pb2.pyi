@@ -543,6 +543,74 @@ class Lifted(_message.Message):
     failure: str
     def __init__(self, source: _Optional[str] = ..., number: _Optional[int] = ..., name: _Optional[str] = ..., failure: _Optional[str] = ...) -> None: ...
 
+class SimulateRequest(_message.Message):
+    __slots__ = ("join", "done")
+    JOIN_FIELD_NUMBER: _ClassVar[int]
+    DONE_FIELD_NUMBER: _ClassVar[int]
+    join: Join
+    done: Done
+    def __init__(self, join: _Optional[_Union[Join, _Mapping]] = ..., done: _Optional[_Union[Done, _Mapping]] = ...) -> None: ...
+
+class Join(_message.Message):
+    __slots__ = ("source", "name")
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    source: str
+    name: str
+    def __init__(self, source: _Optional[str] = ..., name: _Optional[str] = ...) -> None: ...
+
+class Done(_message.Message):
+    __slots__ = ("step", "values", "assignments", "failure")
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    ASSIGNMENTS_FIELD_NUMBER: _ClassVar[int]
+    FAILURE_FIELD_NUMBER: _ClassVar[int]
+    step: int
+    values: Values
+    assignments: _containers.RepeatedCompositeFieldContainer[Assignment]
+    failure: str
+    def __init__(self, step: _Optional[int] = ..., values: _Optional[_Union[Values, _Mapping]] = ..., assignments: _Optional[_Iterable[_Union[Assignment, _Mapping]]] = ..., failure: _Optional[str] = ...) -> None: ...
+
+class SimulateResponse(_message.Message):
+    __slots__ = ("joined", "work")
+    JOINED_FIELD_NUMBER: _ClassVar[int]
+    WORK_FIELD_NUMBER: _ClassVar[int]
+    joined: Joined
+    work: Do
+    def __init__(self, joined: _Optional[_Union[Joined, _Mapping]] = ..., work: _Optional[_Union[Do, _Mapping]] = ...) -> None: ...
+
+class Joined(_message.Message):
+    __slots__ = ("inputs", "outputs", "values", "computed", "clock", "period_ns")
+    INPUTS_FIELD_NUMBER: _ClassVar[int]
+    OUTPUTS_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    COMPUTED_FIELD_NUMBER: _ClassVar[int]
+    CLOCK_FIELD_NUMBER: _ClassVar[int]
+    PERIOD_NS_FIELD_NUMBER: _ClassVar[int]
+    inputs: Table
+    outputs: Table
+    values: Values
+    computed: bool
+    clock: Clock
+    period_ns: int
+    def __init__(self, inputs: _Optional[_Union[Table, _Mapping]] = ..., outputs: _Optional[_Union[Table, _Mapping]] = ..., values: _Optional[_Union[Values, _Mapping]] = ..., computed: bool = ..., clock: _Optional[_Union[Clock, _Mapping]] = ..., period_ns: _Optional[int] = ...) -> None: ...
+
+class Do(_message.Message):
+    __slots__ = ("step", "time_ns", "dt_ns", "values", "invalid", "doubt")
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    DT_NS_FIELD_NUMBER: _ClassVar[int]
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    INVALID_FIELD_NUMBER: _ClassVar[int]
+    DOUBT_FIELD_NUMBER: _ClassVar[int]
+    step: int
+    time_ns: int
+    dt_ns: int
+    values: Values
+    invalid: Marks
+    doubt: str
+    def __init__(self, step: _Optional[int] = ..., time_ns: _Optional[int] = ..., dt_ns: _Optional[int] = ..., values: _Optional[_Union[Values, _Mapping]] = ..., invalid: _Optional[_Union[Marks, _Mapping]] = ..., doubt: _Optional[str] = ...) -> None: ...
+
 class GetStatusRequest(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...

@@ -64,6 +64,11 @@ class ShmioStub(object):
                 request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.InjectRequest.SerializeToString,
                 response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.InjectResponse.FromString,
                 _registered_method=True)
+        self.Simulate = channel.stream_stream(
+                '/shmio.v1.Shmio/Simulate',
+                request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.SimulateRequest.SerializeToString,
+                response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.SimulateResponse.FromString,
+                _registered_method=True)
         self.ListInjections = channel.unary_unary(
                 '/shmio.v1.Shmio/ListInjections',
                 request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.ListInjectionsRequest.SerializeToString,
@@ -146,6 +151,13 @@ class ShmioServicer(object):
 
     def Inject(self, request_iterator, context):
         """Lays an injection for as long as the stream is open: the original values come down, the altered ones go up.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def Simulate(self, request_iterator, context):
+        """Computes a source of the connector "remote" for as long as the stream is open: steps come down, outputs go up.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -239,6 +251,11 @@ def add_ShmioServicer_to_server(servicer, server):
                     servicer.Inject,
                     request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.InjectRequest.FromString,
                     response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.InjectResponse.SerializeToString,
+            ),
+            'Simulate': grpc.stream_stream_rpc_method_handler(
+                    servicer.Simulate,
+                    request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.SimulateRequest.FromString,
+                    response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.SimulateResponse.SerializeToString,
             ),
             'ListInjections': grpc.unary_unary_rpc_method_handler(
                     servicer.ListInjections,
@@ -443,6 +460,33 @@ class Shmio(object):
             '/shmio.v1.Shmio/Inject',
             shmio_dot_wire_dot_shmio__v1__pb2.InjectRequest.SerializeToString,
             shmio_dot_wire_dot_shmio__v1__pb2.InjectResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Simulate(request_iterator,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.stream_stream(
+            request_iterator,
+            target,
+            '/shmio.v1.Shmio/Simulate',
+            shmio_dot_wire_dot_shmio__v1__pb2.SimulateRequest.SerializeToString,
+            shmio_dot_wire_dot_shmio__v1__pb2.SimulateResponse.FromString,
             options,
             channel_credentials,
             insecure,

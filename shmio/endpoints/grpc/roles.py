@@ -24,7 +24,7 @@ _SERVICES: Final[Mapping[str, Mapping[str, str]]] = {
     },
     "shmio.v1.Shmio": {
         READ: "GetLayouts GetStatus Read Subscribe ListInjections WatchClock",
-        WRITE: "Write",
+        WRITE: "Write Simulate",
         INJECT: "Inject Lift LiftAll",
         CONTROL: "Step SetStepSize Play Pause",
     },

@@ -117,8 +117,10 @@ class Endpoint:
 
 
 @asynccontextmanager
-async def endpoint(segment: Segment, limits: Limits | None = None, before: int = 0) -> AsyncIterator[Endpoint]:
-    """``before``: pid of the process that was the endpoint before."""
+async def endpoint(
+    segment: Segment, limits: Limits | None = None, before: int = 0, port: int = 0
+) -> AsyncIterator[Endpoint]:
+    """``before``: pid of the process that was the endpoint before; ``port``: where it was."""
     tasks: set[asyncio.Task[None]] = set()
 
     def on_quality(source: str, good: bool) -> None:
@@ -131,7 +133,7 @@ async def endpoint(segment: Segment, limits: Limits | None = None, before: int =
     server = Server(service, Calls(limits))
     for source in feeds:
         await server.set_source(source, False)
-    ports = await server.start([LOOPBACK])
+    ports = await server.start([LOOPBACK._replace(address=Address("127.0.0.1", port))])
     for feed in feeds.values():
         feed.start()
     await service.stepper.start(before)

@@ -7,7 +7,16 @@ from typing import Any, Final, NoReturn
 
 import grpc
 
-from shmio.errors import CommandError, EndpointError, PathError, SegmentError, ShmioError, TimeError, ValueRangeError
+from shmio.errors import (
+    CommandError,
+    ConflictError,
+    EndpointError,
+    PathError,
+    SegmentError,
+    ShmioError,
+    TimeError,
+    ValueRangeError,
+)
 
 Context = grpc.aio.ServicerContext[Any, Any]
 
@@ -15,6 +24,7 @@ _STATUS: Final[Mapping[type[ShmioError], grpc.StatusCode]] = {
     PathError: grpc.StatusCode.NOT_FOUND,
     ValueRangeError: grpc.StatusCode.INVALID_ARGUMENT,
     CommandError: grpc.StatusCode.FAILED_PRECONDITION,
+    ConflictError: grpc.StatusCode.ALREADY_EXISTS,
     EndpointError: grpc.StatusCode.RESOURCE_EXHAUSTED,
     TimeError: grpc.StatusCode.FAILED_PRECONDITION,
     SegmentError: grpc.StatusCode.UNAVAILABLE,

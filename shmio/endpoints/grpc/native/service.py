@@ -18,6 +18,7 @@ from shmio.endpoints.grpc.native.follow import aged
 from shmio.endpoints.grpc.native.orders import Orders
 from shmio.endpoints.grpc.native.refusal import Context, refuse
 from shmio.endpoints.grpc.native.selection import Selections
+from shmio.endpoints.grpc.native.simulate import Simulations
 from shmio.endpoints.grpc.native.subscribe import Subscription
 from shmio.endpoints.grpc.native.views import AGE_NS, ORIGINALS, Selection, View
 from shmio.endpoints.grpc.stepper import Stepper
@@ -49,6 +50,7 @@ class NativeService:
         self._hold = stepper.hold
         stepper.also(self._deliver)
         self._orders = Orders(topics, feeds, self._selections, self._bells, writer)
+        self._simulations = Simulations(feeds, segment)
         self._open: set[Subscription] = set()
         self._ended_updates = 0
 
@@ -73,7 +75,9 @@ class NativeService:
             "Read": unary(self.read, wire.ReadRequest.FromString),
             "Subscribe": streaming(self.subscribe, wire.SubscribeRequest.FromString),
         }
-        return grpc.method_handlers_generic_handler(SERVICE, calls | self._orders.handlers() | self._clocks.handlers())
+        for part in (self._orders, self._simulations, self._clocks):
+            calls |= part.handlers()
+        return grpc.method_handlers_generic_handler(SERVICE, calls)
 
     async def get_layouts(self, request: wire.GetLayoutsRequest, context: Context) -> AsyncIterator[wire.LayoutPart]:
         """The layouts of these sources, or of all. NOT_FOUND: no such source."""
@@ -139,6 +143,7 @@ class NativeService:
     def move(self, sources: Collection[str]) -> None:
         """Have the streams of these sources go over to the blocks that there are by now."""
         self._orders.move()
+        self._simulations.move()
         for subscription in self._open:
             subscription.move(sources)
 

@@ -18,7 +18,7 @@ from shmio.wire import shmio_v1_pb2 as wire
 MAX_VALUES: Final = 4096
 """Of one command."""
 
-_FIELDS: Final = {column: wire.Values.DESCRIPTOR.fields_by_number[column].name for column in Column}
+FIELDS: Final = {column: wire.Values.DESCRIPTOR.fields_by_number[column].name for column in Column}
 _OUTCOMES: Final = {
     EventKind.WRITTEN: wire.Outcome.KIND_WRITTEN,
     EventKind.TAKEN: wire.Outcome.KIND_TAKEN,
@@ -77,7 +77,7 @@ def _plain(value: wire.Value, path: str) -> object:
 def packed(values: wire.Values, selection: Selection) -> dict[str, object]:
     """Values by path, of registers or of arrays' elements. ValueRangeError: not of this table."""
     found: dict[str, object] = {}
-    for column, name in _FIELDS.items():
+    for column, name in FIELDS.items():
         if not values.HasField(name):
             continue
         part = getattr(values, name)
@@ -100,10 +100,10 @@ def _path(selection: Selection, column: Column, slot: int) -> str:
     if not register.dims:
         return register.path
     flat = slot - selection.columns.places[place][1]
-    return "/".join((register.path, *map(str, _index(register, flat))))
+    return "/".join((register.path, *map(str, index_of(register, flat))))
 
 
-def _index(register: Register, flat: int) -> Iterator[int]:
+def index_of(register: Register, flat: int) -> Iterator[int]:
     """The declared indices of an array's element."""
     indices = []
     for low, high in reversed(register.dims):
