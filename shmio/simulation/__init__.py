@@ -1,7 +1,7 @@
 """Simulation models: small classes that compute a source's registers step by step. Pure; no I/O, no segment.
 
 A model declares what it reads and what it computes, and says in ``step`` how: docs/how-to/write-a-model.md shows one.
-``ModelRunner`` runs it on the image of a block.
+``ModelRunner`` runs it on the image of a block, ``ServedModel`` for an instance elsewhere.
 """
 
 from shmio.simulation.declarations import InOut, Input, Output, Parameter
@@ -9,5 +9,17 @@ from shmio.simulation.loading import load
 from shmio.simulation.model import Model, layout_of
 from shmio.simulation.ports import Ends
 from shmio.simulation.runner import ModelRunner
+from shmio.simulation.served import ServedModel
 
-__all__ = ["Ends", "InOut", "Input", "Model", "ModelRunner", "Output", "Parameter", "layout_of", "load"]
+__all__ = [
+    "Ends",
+    "InOut",
+    "Input",
+    "Model",
+    "ModelRunner",
+    "Output",
+    "Parameter",
+    "ServedModel",
+    "layout_of",
+    "load",
+]

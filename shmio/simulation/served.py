@@ -1,0 +1,112 @@
+"""A model that is served to an instance elsewhere: the same class that a source of connector "simulation" runs."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any, Protocol
+
+from shmio.errors import ModelError
+from shmio.layout.codec import codec
+from shmio.layout.write import bits_of
+from shmio.simulation.model import Model
+from shmio.simulation.runner import NOTHING, ModelRunner
+
+
+class Inputs(Protocol):
+    """What a model is given, by the registers' paths; None: no value."""
+
+    @property
+    def changed(self) -> Collection[str]:
+        """Paths of what is new."""
+
+    def __contains__(self, path: object, /) -> bool: ...
+
+    def __getitem__(self, path: str, /) -> Any: ...
+
+
+class Source(Protocol):
+    """What a program that has joined a source knows of it, as ``shmio.client.Simulation`` does."""
+
+    @property
+    def source(self) -> str:
+        """Its name."""
+
+    @property
+    def inputs(self) -> Inputs:
+        """What it gives."""
+
+    @property
+    def outputs(self) -> Mapping[str, Any]:
+        """What it shows, of what is to be computed."""
+
+    @property
+    def computed(self) -> bool:
+        """Whether a model has computed that."""
+
+
+class ServedModel:
+    """Computes a source of connector "remote": :meth:`shmio.client.Client.simulate` takes its ``step`` and ``start``.
+
+    It goes on from what the source shows, as a model does whose process takes the place of another.
+    """
+
+    def __init__(self, model: type[Model], parameters: Mapping[str, object] = NOTHING, seed: int = 0) -> None:
+        """ConfigError: there is no such parameter, or its value does not fit."""
+        self._runner = ModelRunner(model, None, parameters, seed)
+        layout = self._runner.layout
+        self._outputs = [
+            (register, codec(register, layout.byte_order), bits_of(register)) for register in self._runner.computed
+        ]
+        self._inputs = frozenset(self._runner.inputs)
+        self._begun = False
+        self._new: dict[str, None] = {}  # inputs that are to be given
+        self._sent: bytes | None = None
+
+    def start(self, joined: Source) -> None:
+        """Take what the source shows; again, when it has been joined again. ModelError: it lacks a register."""
+        for path in self._runner.inputs:
+            if path not in joined.inputs:
+                raise ModelError(self._lacks(path, joined, "gives to its model", "leave it out of outputs"))
+        for register, _, _ in self._outputs:
+            if register.path not in joined.outputs:
+                key = "inouts" if register.path in self._inputs else "outputs"
+                raise ModelError(self._lacks(register.path, joined, "has from its model", f"name it in {key}"))
+        if not self._begun and joined.computed:
+            image = bytearray(self._runner.image)
+            for register, encoder, _ in self._outputs:
+                value = joined.outputs[register.path]
+                if value is not None:
+                    encoder.encode_into(_plain(value), image)
+            self._runner.resume(bytes(image))
+
+    def step(self, time_s: float, dt_s: float, inputs: Inputs) -> dict[str, object]:
+        """Have the model compute; the outputs that differ from before. ModelError: its code failed."""
+        self._new.update(dict.fromkeys(path for path in inputs.changed if path in self._inputs))
+        self._runner.connect({path: value for path in self._new if (value := inputs[path]) is not None})
+        self._new.clear()
+        self._begun = True
+        image = self._runner.step(round(time_s * 1e9), round(dt_s * 1e9))
+        outputs = dict(self._changes(image))
+        self._sent = image
+        return outputs
+
+    def _changes(self, image: bytes) -> Iterator[tuple[str, object]]:
+        before = self._sent
+        for register, decoder, bits in self._outputs:
+            where = slice(register.offset, register.offset + register.size)
+            if before is None or _differ(image[where], before[where], bits):
+                yield register.path, decoder.decode(image)
+
+    def _lacks(self, path: str, joined: Source, what: str, remedy: str) -> str:
+        return (
+            f"model {self._runner.name}: {path} is no register that {joined.source} {what}: in the configuration of "
+            f"the instance, add it to the layout or {remedy}"
+        )
+
+
+def _differ(one: bytes, other: bytes, bits: bytes) -> bool:
+    return one != other and any((a ^ b) & own for a, b, own in zip(one, other, bits, strict=True))
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else value
