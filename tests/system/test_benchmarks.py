@@ -62,6 +62,15 @@ def printed(benchmark: str) -> str:
                 "a bare grpc.aio server, 101 ready messages in one stream": 1,
             },
         ),
+        (
+            "remote_model",
+            ROW,
+            {
+                "a model elsewhere, a program on the host steps": 1,
+                "the same in the instance, a program on the host steps": 1,
+                "a model elsewhere, a client of shmio.v1 steps, and has all values": 1,
+            },
+        ),
         ("command", SPREAD, {"shmio": 2, "python-snap7, without an instance": 2, "accepted to written": 1}),
     ],
     ids=lambda value: value if isinstance(value, str) else "",

@@ -1,0 +1,69 @@
+"""Steps a second of a source that a program elsewhere computes, by gRPC, beside the same class in the instance.
+
+100 registers that all change with each step. Who steps and the model are processes of their own.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+from common import Child, begin, report
+from counting import COUNT
+from instance import Instance, started
+from step import MODEL, local, remote
+
+from shmio import attach
+from shmio.segment import Quality
+
+REMOTE = """
+[[source]]
+name = "sim"
+connector = "remote"
+layout = "{layout}"
+outputs = ["**"]
+"""
+OURS = "a model elsewhere, a program on the host steps"
+
+
+@contextmanager
+def elsewhere() -> Iterator[Instance]:
+    """An instance whose model is a process of its own, which has joined."""
+    with ExitStack() as stack:
+        layout = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "counting.toml"
+        rows = [f'"values/r{index:02}" = "LREAL"\n' for index in range(COUNT)]
+        layout.write_text(f'[registers]\n{"".join(rows)}row = "ARRAY[1..{COUNT}] OF LREAL"\n')
+        running = stack.enter_context(started([], more=REMOTE.format(layout=layout), clock="stepped"))
+        stack.enter_context(Child("serving.py", running.grpc, "sim"))
+        with attach(running.segment.instance) as reader:
+            while reader.read("sim/row").quality is not Quality.GOOD:
+                reader.wait("sim", timeout_s=1.0)
+        yield running
+
+
+@contextmanager
+def here() -> Iterator[Instance]:
+    """An instance that has the model itself."""
+    with started([], more=MODEL, clock="stepped") as running:
+        yield running
+
+
+def main() -> None:
+    quick = begin("Steps of a model elsewhere, with 100 changing registers")
+    duration_s, rounds = (0.5, 1) if quick else (3.0, 5)
+    samples: dict[str, list[float]] = {}
+    for _ in range(rounds):
+        for where, instance in (("a model elsewhere", elsewhere), ("the same in the instance", here)):
+            with instance() as running, Child("stepping.py", running.grpc, "native") as client:
+                for who, sample in (
+                    ("a program on the host steps", local(running.segment.instance, duration_s)),
+                    ("a client of shmio.v1 steps, and has all values", remote(client, duration_s)),
+                ):
+                    samples.setdefault(f"{where}, {who}", []).append(sample())
+    report("steps a second", samples, OURS, "more")
+
+
+if __name__ == "__main__":
+    main()
