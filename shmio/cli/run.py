@@ -8,7 +8,8 @@ import json
 import os
 import sys
 from collections.abc import Callable
-from typing import Any
+from contextlib import suppress
+from typing import Any, TextIO
 
 from shmio.errors import ShmioError
 from shmio.logs import printable
@@ -37,6 +38,12 @@ def run(program: str, command: Callable[[], int | None]) -> int:
         _give_up_output()
         return 1
     return status
+
+
+def say(line: str, stream: TextIO | None = None) -> None:
+    """Print a line at once; a terminal that has gone away must not stop what runs."""
+    with suppress(OSError):
+        print(printable(line), file=stream or sys.stdout, flush=True)
 
 
 def _give_up_output() -> None:

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
-from importlib.metadata import entry_points
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -16,6 +15,9 @@ from shmio.config.wording import explain
 from shmio.connectors.base import Connector
 from shmio.connectors.computed import Computed
 from shmio.errors import ConfigError
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoints
 
 GROUP = "shmio.connectors"
 
@@ -29,7 +31,13 @@ BUILT_IN = {
 
 def names() -> list[str]:
     """All names that ``connector = "…"`` may have here."""
-    return sorted({*BUILT_IN, *(point.name for point in entry_points(group=GROUP))})
+    return sorted({*BUILT_IN, *(point.name for point in _offered())})
+
+
+def _offered() -> EntryPoints:
+    from importlib.metadata import entry_points  # noqa: PLC0415  ours are found without it
+
+    return entry_points(group=GROUP)
 
 
 def load(name: str) -> type[Connector] | type[Computed]:
@@ -38,7 +46,7 @@ def load(name: str) -> type[Connector] | type[Computed]:
         module, _, attribute = BUILT_IN[name].partition(":")
         found: Any = getattr(importlib.import_module(module), attribute)
     else:
-        points = [point for point in entry_points(group=GROUP) if point.name == name]
+        points = [point for point in _offered() if point.name == name]
         if not points:
             raise ConfigError(f"no connector {name!r}; there are: {', '.join(names())}")
         try:

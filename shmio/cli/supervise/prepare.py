@@ -9,7 +9,6 @@ from pathlib import Path
 import msgspec
 
 from shmio.cli.supervise.host import check_host
-from shmio.cli.supervise.injections import check_injections
 from shmio.cli.supervise.layouts import LayoutFiles
 from shmio.cli.supervise.ports import check_listening
 from shmio.cli.supervise.sources import check_sources
@@ -53,7 +52,7 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
         check_listening(config)
         layouts, computed, remote = check_sources(config, files)
         emulated = {emulator.name: _check_emulator(i, emulator, files) for i, emulator in enumerate(config.emulator)}
-        declared, described = check_injections(config, layouts)
+        declared, described = _check_injections(config, layouts)
         odd = [*_odd(config, layouts), *_not_served(config, layouts, emulated), *_unread(emulated)]
     except ConfigError as error:
         raise ConfigError(f"{file}: {named(str(error), msgspec.to_builtins(config))}") from None
@@ -76,6 +75,14 @@ def peer(source: Source) -> str:
     """The device of a checked source, as host:port where it has such; empty if not."""
     host, port = source.options.get("host"), source.options.get("port")
     return str(Address(host, port)) if host and port else str(host or "")
+
+
+def _check_injections(config: Config, layouts: dict[str, Layout]) -> tuple[dict[str, bytes], tuple[str, ...]]:
+    if not config.injection:
+        return {}, ()
+    from shmio.cli.supervise.injections import check_injections  # noqa: PLC0415
+
+    return check_injections(config, layouts)
 
 
 def _check_emulator(index: int, emulator: Emulator, files: LayoutFiles) -> tuple[Layout, ...]:

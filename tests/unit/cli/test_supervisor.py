@@ -303,11 +303,22 @@ TAKEN = "is the port of emulator[0].listen (127.0.0.1:1102) already; choose anot
 )
 def test_faults_are_named(example: Edit, old: str, new: str, error: str, capsys: pytest.CaptureFixture[str]) -> None:
     example(old, new)
-    for verb in (["check"], ["up"], ["up", "--detach"]):
-        assert main(verb) == 1
+    for verb in ("check", "up"):
+        assert main([verb]) == 1
         output = capsys.readouterr()
         assert output.err.startswith(f"supervisor.toml: {error}")
         assert output.err.count("\n") == 1
+
+
+def test_a_fault_that_a_detached_one_finds_is_told_here(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    example("period_ms = 20", "perid_ms = 20")
+    assert main(["up", "--detach"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("supervisor.toml: source[0].perid_ms: unknown key")
+    example("perid_ms", "period_ms")
+    Path("supervisor.toml").rename("other.toml")
+    assert main(["up", "--detach", "--mode", "replay", "-c", "other.toml"]) == 1
+    assert capsys.readouterr().err.startswith("--mode replay: this version")
 
 
 @pytest.mark.parametrize("address", ["127.0.0.2:1102", "[::1]:1102", "localhost:0"])

@@ -1,0 +1,158 @@
+"""The start of an instance, by the process that is its supervisor from then on."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import msgspec
+
+from shmio import logs
+from shmio.cli.run import say
+from shmio.cli.supervise import logdir
+from shmio.cli.supervise.ports import check_ports
+from shmio.cli.supervise.prepare import Prepared, peer, prepare
+from shmio.cli.supervise.up import Configured, Failed, Started, Told, headline
+from shmio.cli.target import ask
+from shmio.errors import AlreadyRunningError, ConfigError, ShmioError
+from shmio.logs import printable
+from shmio.segment import Segment, State, instances, leftover
+from shmio.segment.segment import refuse_second
+from shmio.supervisor import control
+from shmio.supervisor.main import Supervisor
+from shmio.supervisor.plan import MODES, Job, Plan
+
+WHERE_S = 5.0
+
+
+def foreground(file: Path, mode: str) -> int:
+    """Run it; return when it has stopped."""
+    prepared = _prepare(file, mode)
+    plan = prepared.plan
+    for warning in plan.warnings:
+        say(warning, sys.stderr)
+    _refuse(plan)
+    left_over = plan.instance in instances()
+    say(headline(plan.instance, plan.mode, None if left_over else plan.segment_bytes, plan.log_dir))
+    for line in _processes(prepared):
+        say(line)
+    say("Ctrl-C stops it, and so does closing the terminal")
+    console = logging.StreamHandler(sys.stderr)
+    console.setFormatter(_Console())
+    with logdir.held(plan.log_dir, plan.instance):
+        logs.setup(_log_file(plan), "supervisor")
+        logging.getLogger("shmio.supervisor").addHandler(console)
+        Supervisor(plan, replan=_replan(plan)).run()
+    return 0
+
+
+def detached(file: Path, mode: str, report: int) -> int:
+    """Run it, and tell who waits for it how the start went, through this descriptor."""
+    told = False
+
+    def tell(message: Told) -> None:
+        nonlocal told
+        if told:
+            return
+        told = not isinstance(message, Configured)
+        with suppress(OSError):  # who waited gave up
+            os.write(report, msgspec.json.encode(message) + b"\n")
+        if told:
+            os.close(report)
+
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        prepared = _prepare(file, mode)
+        plan = prepared.plan
+        tell(Configured(printable(str(_log_file(plan))), tuple(map(printable, plan.warnings))))
+        _refuse(plan)
+
+        def on_state(state: State) -> None:
+            if state is not State.STOPPING:
+                history, processes = ([*map(printable, lines)] for lines in (supervisor.history, _processes(prepared)))
+                tell(Started(plan.instance, history, processes))
+
+        with logdir.held(plan.log_dir, plan.instance):
+            logs.setup(_log_file(plan), "supervisor", streams=True)
+            with _log_file(plan).open("ab") as log:
+                for stream in (sys.stdout, sys.stderr):
+                    os.dup2(log.fileno(), stream.fileno())
+            supervisor = Supervisor(plan, replan=_replan(plan), on_state=on_state)
+            supervisor.run()
+    except ShmioError as error:
+        tell(Failed(printable(str(error))))
+        return 1
+    except OSError as error:
+        tell(Failed(printable(f"{error.filename}: {error.strerror}" if error.filename else str(error))))
+        return 1
+    tell(Failed("it was told to stop while it started"))
+    return 0
+
+
+def _prepare(file: Path, mode: str) -> Prepared:
+    if mode not in MODES:
+        raise ConfigError(f"--mode {mode}: this version of shmio has the modes {', '.join(MODES)} only")
+    return prepare(file, mode)
+
+
+def _log_file(plan: Plan) -> Path:
+    return plan.log_dir / "supervisor.log"
+
+
+def _refuse(plan: Plan) -> None:
+    """AlreadyRunningError; EndpointError when a port is taken, which those that a dead supervisor left may well be."""
+    try:
+        refuse_second(plan.instance)
+    except AlreadyRunningError as error:
+        raise AlreadyRunningError(f"{error}{_whose(plan)}") from None
+    if not leftover.living(plan.instance):
+        check_ports(plan)
+
+
+def _whose(plan: Plan) -> str:
+    """From which file the running instance of this name was started, and what to do about it."""
+    down = f"shmio-supervisor down --instance {plan.instance} stops it"
+    with suppress(ShmioError), Segment.open(plan.instance) as segment:
+        file = ask(segment, control.Where(), WHERE_S)["config"]
+        if file != str(plan.config_file):
+            return f", started from {file}: {down}; or give this one another instance.name"
+    return f"; {down}"
+
+
+def _replan(plan: Plan) -> Callable[[], Plan]:
+    """What a reload makes of the same file by then."""
+    return lambda: prepare(plan.config_file, plan.mode).plan
+
+
+def _processes(prepared: Prepared) -> Iterator[str]:
+    """What there will be, a line each."""
+    jobs = prepared.plan.jobs
+    width = max((len(job.name) for job in jobs), default=0)
+    for job in sorted(jobs, key=lambda job: job.rank):
+        yield f"  {job.name:<{width}}  {job.kind:<8}  {_describe(job, prepared)}"
+
+
+def _describe(job: Job, prepared: Prepared) -> str:
+    config = job.config
+    if job.kind == "source":
+        layout = prepared.layouts[job.name]
+        source = next(source for source in prepared.config.source if source.name == job.name)
+        device = f"{source.connector} {peer(source)}".rstrip()
+        return f"{device}, {layout.name}: {layout.size} bytes every {source.period_ms:g} ms"
+    if job.kind == "emulator":
+        return f"{config['kind']} on {config['listen']}, program {config['program']}"
+    if job.kind == "recorder":
+        return f"to {config['directory']}"
+    return f"on {', '.join(config['listen'])}"
+
+
+class _Console(logging.Formatter):
+    """A record's message alone."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(record.getMessage())
