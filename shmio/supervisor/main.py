@@ -10,15 +10,15 @@ from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from typing import Final
 
-from shmio.errors import SegmentError, ShmioError
+from shmio.errors import ShmioError
 from shmio.logs import fields
-from shmio.segment import Quality, Segment
+from shmio.segment import Segment
 from shmio.segment import State as InstanceState
-from shmio.segment.status import assess
 from shmio.supervisor import policy
 from shmio.supervisor.changer import Changer
 from shmio.supervisor.control import Answer, ControlServer, Reload, Request, Restart, Stop
 from shmio.supervisor.fleet import TICK_S, Fleet
+from shmio.supervisor.health import Health
 from shmio.supervisor.managed import brief, log
 from shmio.supervisor.notify import Notifier
 from shmio.supervisor.plan import MODULES, Plan
@@ -30,8 +30,6 @@ from shmio.supervisor.takeover import take_over
 
 START_TICK_S: Final = 0.01
 """How often it is looked while a process starts: its report has no bell to ring."""
-QUALITY_S: Final = 0.5
-"""How often the sources' quality is looked at, once the start is over."""
 NAME_S: Final = 1.0
 """How often it is made sure that the segment can still be found."""
 
@@ -59,13 +57,10 @@ class Supervisor:
         self._on_state = on_state
         self._notifier = Notifier()
         self._selector = selectors.DefaultSelector()
-        self._state = InstanceState.STARTING
         self._stopping = False
         self._started = False
         self._failure: str | None = None
         self._stop_answers: list[Answer] = []
-        self._qualities: list[Quality | None] = []
-        self._qualities_ns = 0
         self._found_ns = 0
         self._adopted: dict[str, int] = {}
         self.history: list[str] = []
@@ -92,6 +87,7 @@ class Supervisor:
             self._control = ControlServer(path, self._selector, self._handle)
             stack.callback(self._control.close)
             self._fleet = Fleet(self._segment, self._selector, self._limits, self._modules)
+            self._health = Health(self._segment, self._fleet, self._notifier, self._on_state)
             self._changer = Changer(self._fleet, self._segment, self._notifier, self._plan, self._replan, self._limits)
             if found:  # until all of it is ours, a failure leaves it for the next attempt
                 for slot, child in found.children:
@@ -224,7 +220,7 @@ class Supervisor:
         if self._stopping:
             self._fleet.stop_due()
             self._follow_stop()
-        self._tell(now_ns)
+        self._health.tell(now_ns, started=self._started, stopping=self._stopping)
         return self._stopping and policy.all_gone(self._fleet.ranked)
 
     def _follow_stop(self) -> None:
@@ -254,47 +250,4 @@ class Supervisor:
                 return
         self._fleet.start_due()
         since_ns = max((m.life.ready_ns or 0 for m in self._fleet), default=0)
-        self._started = policy.start_over(self._fleet.ranked, self._look(), since_ns, now_ns, self._limits)
-
-    def _look(self) -> list[Quality | None]:
-        """The quality of each source as of now."""
-        qualities: list[Quality | None] = []
-        for block in self._segment.blocks.values():
-            try:
-                frame = block.latest()
-            except SegmentError:
-                qualities.append(Quality.BAD)
-            else:
-                qualities.append(None if frame is None else block.assess(frame)[0])
-        return qualities
-
-    def _tell(self, now_ns: int) -> None:
-        """Publish the state of the instance, which is the supervisor's heartbeat too."""
-        state = InstanceState.STARTING
-        if self._stopping:
-            state = InstanceState.STOPPING
-        elif self._started:
-            if now_ns - self._qualities_ns >= QUALITY_S * 1e9 or len(self._qualities) != len(self._segment.blocks):
-                self._qualities, self._qualities_ns = self._look(), now_ns
-                for managed in self._fleet:
-                    managed.listen()
-            well = [m.life.state is State.RUNNING and not m.complaint for m in self._fleet]
-            state = assess(well, self._qualities)
-        self._segment.set_state(os.getpid(), state)
-        self._notifier.beat(now_ns)
-        if state is not self._state:
-            if self._state is InstanceState.STARTING and state is not InstanceState.STOPPING:
-                self._notifier.ready()
-            self._state = state
-            reasons = ", ".join(self._weak()) if state is InstanceState.DEGRADED else ""
-            told = f"{state}: {reasons}" if reasons else str(state)
-            log.info("instance %s", told)
-            self._notifier.status(told)
-            self._on_state(state)
-
-    def _weak(self) -> list[str]:
-        """What makes the instance degraded."""
-        weak = [f"{m.name} is not running" for m in self._fleet if m.life.state is not State.RUNNING]
-        weak += [f"{m.name}: {m.complaint}" for m in self._fleet if m.complaint]
-        named = zip(self._segment.blocks, self._qualities, strict=True)
-        return weak + [f"source {name} is bad" for name, quality in named if quality in (None, Quality.BAD)]
+        self._started = policy.start_over(self._fleet.ranked, self._health.look(), since_ns, now_ns, self._limits)
