@@ -12,23 +12,16 @@ import select
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Self
 
 from shmio.config.address import Address
 from shmio.testing.ports import reserved_port
 from shmio.testing.relay import Link, Pipe
-
-Edit = Callable[[bytes], bytes | None]
-Framing = Callable[[bytes | bytearray], int]
+from shmio.testing.tampering import Edit, Framing, Tampering, reference_edit, tpkt
 
 _CHUNK = 1 << 16
 _TIMEOUT_S = 10
-
-
-def tpkt(data: bytes | bytearray) -> int:
-    """Length of the frame that ``data`` begins with, ISO-on-TCP (RFC 1006); 0 if not known yet."""
-    return data[2] << 8 | data[3] if len(data) >= 4 else 0
 
 
 class FaultProxy:
@@ -48,12 +41,9 @@ class FaultProxy:
         """
         self._target = target
         self._up_s, self._down_s = up_s, down_s
-        self._framing = framing
-        self._edit: Edit | None = None
+        self._tampering = Tampering(framing)
         self._frozen = False
         self._left_bytes: int | None = None
-        self._held: list[bytes] = []
-        self._frame_held = threading.Event()
         self._links: list[Link] = []
         self._waiting: list[socket.socket] = []
         self.accepted = 0
@@ -96,10 +86,8 @@ class FaultProxy:
         """End all faults but the delay, which has its own method. Frames on hold are discarded."""
 
         def change() -> None:
-            self._edit = None
+            self._tampering.end()
             self._left_bytes = None
-            self._held.clear()
-            self._frame_held.clear()
             self._melt()
             self._listen()
 
@@ -152,20 +140,7 @@ class FaultProxy:
 
     def edit(self, change_frame: Edit, *, frames: int | None = None) -> None:
         """Pass frames through a function; None drops one. ``frames``: end after so many."""
-        left = frames
-
-        def edit(frame: bytes) -> bytes | None:
-            nonlocal left
-            if left is not None:
-                left -= 1
-                if not left:
-                    self._edit = None
-            return change_frame(frame)
-
-        def change() -> None:
-            self._edit = edit
-
-        self._do(change)
+        self._do(lambda: self._tampering.begin(change_frame, frames))
 
     def garble(self, data: bytes) -> None:
         """Send ``data`` in place of the next frame."""
@@ -173,36 +148,23 @@ class FaultProxy:
 
     def rewrite_reference(self, change: Callable[[int], int], *, frames: int | None = None) -> None:
         """Change the PDU reference of S7 answers."""
-
-        def edit(frame: bytes) -> bytes:
-            reference = change(int.from_bytes(frame[11:13], "big")) & 0xFFFF
-            return frame[:11] + reference.to_bytes(2, "big") + frame[13:]
-
-        self.edit(edit, frames=frames)
+        self.edit(reference_edit(change), frames=frames)
 
     def hold(self, *, frames: int | None = None) -> None:
         """Keep frames back, to be let go by ``release``: answers that come late."""
-
-        def keep(frame: bytes) -> None:
-            self._held.append(frame)
-            self._frame_held.set()
-
-        self.edit(keep, frames=frames)
+        self.edit(self._tampering.keep, frames=frames)
 
     def wait_held(self, timeout_s: float = _TIMEOUT_S) -> bool:
         """Wait until a frame is on hold; False if none came in time."""
-        return self._frame_held.wait(timeout_s)
+        return self._tampering.frame_held.wait(timeout_s)
 
     def release(self) -> None:
         """Stop holding, and send what was held to the newest connection, whichever it was meant for."""
 
         def change() -> None:
-            self._edit = None
-            if self._links:
-                for frame in self._held:
+            for frame in self._tampering.end():
+                if self._links:
                     self._links[-1].down.enqueue(frame, 0.0)
-            self._held.clear()
-            self._frame_held.clear()
 
         self._do(change)
 
@@ -302,22 +264,8 @@ class FaultProxy:
         elif pipe is pipe.link.up:
             pipe.enqueue(data, self._up_s)
         else:
-            for frame in self._edited(pipe, data):
+            for frame in self._tampering.passing(pipe.partial, data):
                 pipe.enqueue(frame, self._down_s)
-
-    def _edited(self, pipe: Pipe, data: bytes) -> Iterator[bytes]:
-        pipe.partial += data
-        while pipe.partial:
-            size = len(pipe.partial)
-            if self._edit is not None and self._framing is not None:
-                size = self._framing(pipe.partial)
-                if not 0 < size <= len(pipe.partial):
-                    return
-            frame = bytes(pipe.partial[:size])
-            del pipe.partial[:size]
-            passed = frame if self._edit is None else self._edit(frame)
-            if passed:
-                yield passed
 
     def _write(self, pipe: Pipe) -> None:
         limited = self._left_bytes is not None and pipe is pipe.link.down
