@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from hypothesis import settings
+from xdist.scheduler import LoadScopeScheduling
 
 # Tests interrupt themselves and others; who runs in the background, or beside others, begins with SIGINT ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -22,6 +23,44 @@ settings.load_profile("unhurried")
 
 SHM = Path("/dev/shm")
 PREFIX = f"test-{os.getpid()}-"
+ENDING_S = 0.05
+"""What ends by itself mostly has by then; else it may wait for the garbage collector."""
+
+
+ONE_AFTER_THE_OTHER = (
+    # the ports of the README
+    (
+        "tests/system/test_docs.py",
+        "tests/unit/cli/test_supervisor_cell.py::test_what_init_writes_for_a_block",
+    ),
+    # an instance that all of a module use
+    ("tests/system/test_inject.py",),
+    ("tests/system/test_inject_grpc.py",),
+    ("tests/system/test_running.py",),
+    ("tests/system/test_step.py",),
+    ("tests/system/test_write.py",),
+)
+"""Beginnings of the names of tests that share something, of which one process has to run all."""
+
+
+class Scheduling(LoadScopeScheduling):  # type: ignore[misc]
+    """Of the processes that run tests each gets one whenever it has time, or a whole group."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        """The group of a test. (The mark for that, xdist_group, has no effect with pytest 9.2.)"""
+        return next((group[0] for group in ONE_AFTER_THE_OTHER if nodeid.startswith(group)), nodeid)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Scheduling:
+    """Instead of those that --dist names."""
+    return Scheduling(config, log)
+
+
+def pytest_collection_finish() -> None:
+    """Have the garbage of each test found without going through all that there is before the first."""
+    gc.collect()
+    gc.freeze()
 
 
 def segments() -> set[str]:
@@ -66,10 +105,11 @@ def nothing_left_behind() -> Iterator[None]:
     heeded = handlers()
     yield
     left = left_over(before)
-    deadline = time.monotonic() + 2.0
-    while any(left) and time.monotonic() < deadline:  # what is just ending may end
-        gc.collect()
-        time.sleep(0.01)
+    begun_s = time.monotonic()
+    while any(left) and time.monotonic() - begun_s < 2.0:  # what is just ending may end
+        if time.monotonic() - begun_s > ENDING_S:
+            gc.collect()
+        time.sleep(0.005)
         left = left_over(before)
     now = handlers()
     for sign, handler in heeded.items():
@@ -78,9 +118,19 @@ def nothing_left_behind() -> Iterator[None]:
     assert not any(left), f"left behind: segments {left[0]}, processes {left[1]}, sockets {left[2]}"
 
 
-@pytest.fixture
-def instance() -> Iterator[str]:
-    """A name that no other instance has; whatever a failing test leaves of it is cleared."""
+def _named() -> Iterator[str]:
     name = PREFIX + secrets.token_hex(4)
     yield name
     (SHM / f"shmio-{name}").unlink(missing_ok=True)
+
+
+@pytest.fixture
+def instance() -> Iterator[str]:
+    """A name that no other instance has; whatever a failing test leaves of it is cleared."""
+    yield from _named()
+
+
+@pytest.fixture(scope="module")
+def shared_instance() -> Iterator[str]:
+    """The same for an instance that several tests of a module use."""
+    yield from _named()

@@ -1,8 +1,7 @@
-"""A whole cell on free ports, as its user has it: started and looked at through the commands alone."""
+"""A whole cell on free ports, as its user has it: started and stopped by the commands."""
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import subprocess
@@ -12,7 +11,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from shmio.config import Address
+from shmio.segment.status import read_status
 
 BIN = Path(sys.executable).parent
 PATIENCE_S = 30.0
@@ -78,8 +80,8 @@ class Cell:
             raise AssertionError(done.stderr)
 
     def status(self) -> dict[str, Any]:
-        """``status --json``."""
-        status: dict[str, Any] = json.loads(self.supervisor("status", "--json").stdout)
+        """What ``status --json`` prints, without a process for each look."""
+        status: dict[str, Any] = msgspec.to_builtins(read_status(self.instance, ""))
         return status
 
     def processes(self) -> dict[str, dict[str, Any]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -15,24 +15,38 @@ from shmio.testing.ports import reserved_port
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture
-def make_cell(tmp_path: Path, instance: str) -> Iterator[Callable[..., Cell]]:
-    """Write a cell's folder; whatever runs of it at the end of the test is stopped."""
+@contextmanager
+def _cells(folder: Path, instance: str) -> Iterator[Callable[..., Cell]]:
+    """What writes a cell's folder; whatever runs of it at the end is stopped."""
     with ExitStack() as stack:
         made: list[Cell] = []
 
         def make(period_ms: float = 20, config: str = CONFIG) -> Cell:
             plc, grpc = (stack.enter_context(reserved_port()) for _ in range(2))
-            shutil.copy(ROOT / "db201.db", tmp_path)
+            shutil.copy(ROOT / "db201.db", folder)
             text = config.format(instance=instance, period_ms=period_ms, plc=plc, grpc=grpc)
-            (tmp_path / "supervisor.toml").write_text(text)
-            cell = Cell(tmp_path, instance, grpc)
+            (folder / "supervisor.toml").write_text(text)
+            cell = Cell(folder, instance, grpc)
             made.append(cell)
             return cell
 
         yield make
         for cell in made:
             cell.supervisor("down")
+
+
+@pytest.fixture
+def make_cell(tmp_path: Path, instance: str) -> Iterator[Callable[..., Cell]]:
+    """Write a cell's folder, for this test alone."""
+    with _cells(tmp_path, instance) as make:
+        yield make
+
+
+@pytest.fixture(scope="module")
+def make_shared_cell(tmp_path_factory: pytest.TempPathFactory, shared_instance: str) -> Iterator[Callable[..., Cell]]:
+    """Write a cell's folder, for tests of one group that leave the cell as they find it."""
+    with _cells(tmp_path_factory.mktemp("cell"), shared_instance) as make:
+        yield make
 
 
 @pytest.fixture

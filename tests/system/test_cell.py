@@ -35,60 +35,21 @@ def five_values(address: str) -> list[float]:
     return values
 
 
-def test_another_process_receives_changing_values(cell: Cell) -> None:
-    values = five_values(str(cell.grpc))
-    assert len(set(values)) > 1
-    until(lambda: cell.status()["state"] == "running", "state running")
-    status = cell.status()
-    assert (status["instance"], status["mode"], status["segment"]) == (cell.instance, "live", f"shmio-{cell.instance}")
-    processes = {p["name"]: p for p in status["processes"]}
-    assert {name: (p["kind"], p["state"], p["restarts"]) for name, p in processes.items()} == {
-        "plc": ("emulator", "running", 0),
-        "cell": ("source", "running", 0),
-        "grpc": ("grpc", "running", 0),
-    }
-    assert processes["cell"]["quality"] == "good"
-    assert {"cycle", "rate_hz", "overruns", "pid", "uptime_s"} <= set(processes["cell"])
-
-
-def test_the_users_tool_reads_the_cell(cell: Cell) -> None:
-    until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")
-    listed = json.loads(cell.run("shmio", "list", "--json").stdout)
-    assert len(listed) == 22
-    got = json.loads(cell.run("shmio", "get", "--json", AXIS, "cell/Inputs/3").stdout)
-    assert set(got) == {AXIS, "cell/Inputs/3"}
-    assert set(got[AXIS]) == {"value", "quality", "reason", "provenance", "source_time", "age_s"}
-    assert (got[AXIS]["quality"], got[AXIS]["provenance"]) == ("good", "live")
-    watched = cell.run("shmio", "watch", "--json", "-n", "3", AXIS)
-    assert [json.loads(line)["path"] for line in watched.stdout.splitlines()] == [AXIS] * 3
-    wrong = cell.run("shmio", "get", "cell/Robot_800/Axs7_Pos")
-    assert (wrong.returncode, wrong.stdout) == (1, "")
-    assert "near: Robot_800/Axs6_Pos" in wrong.stderr
-    assert wrong.stderr.count("\n") == 1
-
-
 def test_ctrl_c_leaves_nothing(make_cell: Callable[[], Cell]) -> None:
     cell = make_cell()
-    with subprocess.Popen([BIN / "shmio-supervisor", "up"], cwd=cell.folder, stdout=subprocess.PIPE, text=True) as up:
+    pipe = subprocess.PIPE
+    with subprocess.Popen([BIN / "shmio-supervisor", "up"], cwd=cell.folder, stdout=pipe, stderr=pipe, text=True) as up:
         five_values(str(cell.grpc))
         pids = [process["pid"] for process in cell.status()["processes"]]
         up.send_signal(signal.SIGINT)
-        up.communicate(timeout=PATIENCE_S)
-    assert up.returncode == 0
+        _, errors = up.communicate(timeout=PATIENCE_S)
+    assert (up.returncode, "Traceback" in errors) == (0, False)
     assert cell.instance not in instances()
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids)
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection((cell.grpc.host, cell.grpc.port))
     after = cell.supervisor("status", "--json")
     assert (after.returncode, json.loads(after.stdout)["state"]) == (1, "stopped")
-
-
-def test_a_second_up_is_refused_with_the_pid(cell: Cell) -> None:
-    second = cell.supervisor("up")
-    assert second.returncode == 1
-    (line,) = second.stderr.splitlines()
-    (pid,) = [int(word.strip(".,;:()")) for word in line.split() if word.strip(".,;:()").isdigit()]
-    assert b"shmio" in Path(f"/proc/{pid}/cmdline").read_bytes()
 
 
 class Load:
@@ -176,8 +137,10 @@ def test_each_process_comes_back_and_no_other_is_touched(
     assert {incarnation for _, _, incarnation in load.cycles} == ({1, 2} if victim == "cell" else {1})
     if victim == "grpc":  # nothing else may lose a cycle
         cycles = [cycle for _, cycle, _ in load.cycles]
-        overruns = after["cell"]["overruns"] - before["cell"]["overruns"]
-        assert cycles[-1] - cycles[0] + 1 - len(cycles) <= overruns
+        lost = cycles[-1] - cycles[0] + 1 - len(cycles)
+        until(
+            lambda: cell.processes()["cell"]["overruns"] - before["cell"]["overruns"] >= lost, "why, in the next report"
+        )
 
 
 def test_a_frozen_process_is_replaced(cell: Cell) -> None:

@@ -13,8 +13,6 @@ import pytest
 
 from shmio.segment import instances
 
-pytestmark = pytest.mark.xdist_group("the ports of the README")
-
 ROOT = Path(__file__).parents[2]
 BLOCK = re.compile(r"^```sh( background)?\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 LINK = re.compile(r"\]\(([^)#:]+)(?:#[^)]*)?\)")

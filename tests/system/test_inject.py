@@ -7,7 +7,6 @@ import signal
 import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import grpc
 import pytest
@@ -22,22 +21,30 @@ from shmio.wire.simlog_v2_pb2 import PubRequest, SimlogMessage
 from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as SimlogV2Stub
 
 ARMED = CONFIG.replace('connector = "s7"\n', 'connector = "s7"\nwritable = ["Outputs"]\narmed = true\n')
-MEMORY = """
+OTHERS = """
 [[source]]
 name = "panel"
 connector = "memory"
 layout = "panel.toml"
 writable = ["**"]
+
+[[source]]
+name = "unarmed"
+connector = "s7"
+layout = "db201.db"
+writable = ["Outputs"]
+host = "127.0.0.1"
+port = {plc.port}
 """
 PLACE = "cell/Outputs/100"  # of no meaning to the controller's program
 POSITION = "cell/Robot_800/Axs1_Pos"
 
 
-@pytest.fixture
-def cell(make_cell: Callable[..., Cell], tmp_path: Path) -> Cell:
-    """The A50 cell, armed, and a memory."""
-    (tmp_path / "panel.toml").write_text('[registers]\nspeed = { type = "REAL", initial = 0.5 }\n')
-    cell = make_cell(config=ARMED + MEMORY)
+@pytest.fixture(scope="module")
+def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
+    """The A50 cell, armed, and not, and a memory; each test lifts what it lays."""
+    cell = make_shared_cell(config=ARMED + OTHERS)
+    (cell.folder / "panel.toml").write_text('[registers]\nspeed = { type = "REAL", initial = 0.5 }\n')
     cell.up()
     until(lambda: all(cell.processes()[name]["quality"] == "good" for name in ("cell", "panel")), "good quality")
     return cell
@@ -134,13 +141,13 @@ def test_a_program_injects(cell: Cell) -> None:
             shadow.lift()
 
 
-def test_a_source_that_is_not_armed_refuses(make_cell: Callable[..., Cell]) -> None:
-    cell = make_cell(config=ARMED.replace("armed = true\n", ""))
-    cell.up()
-    until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")
-    refused = cell.run("shmio", "inject", f"{PLACE}/in", "7")
+def test_a_source_that_is_not_armed_refuses(cell: Cell) -> None:
+    until(lambda: cell.processes()["unarmed"]["quality"] == "good", "good quality")
+    refused = cell.run("shmio", "inject", "unarmed/Outputs/100/in", "7")
     assert refused.returncode == 1
-    assert refused.stderr == "cell: an injection toward a device needs `armed = true` in the source's configuration\n"
+    assert refused.stderr == (
+        "unarmed: an injection toward a device needs `armed = true` in the source's configuration\n"
+    )
 
 
 def test_a_publisher_cannot_tell_that_an_injection_took_its_value(cell: Cell) -> None:

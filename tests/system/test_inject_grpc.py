@@ -23,23 +23,31 @@ from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
 from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as SimlogV2Stub
 
 ARMED = CONFIG.replace('connector = "s7"\n', 'connector = "s7"\nwritable = ["Outputs"]\narmed = true\n')
-MEMORY = """
+OTHERS = """
 [[source]]
 name = "sim"
 connector = "memory"
 layout = "joints.toml"
 writable = ["**"]
+
+[[source]]
+name = "unarmed"
+connector = "s7"
+layout = "db201.db"
+writable = ["Outputs"]
+host = "127.0.0.1"
+port = {plc.port}
 """
 JOINTS = '[registers]\n"joints/R3200/Link1/R/position" = "LREAL"\n"joints/Kuka.j1/R" = "REAL"\n'
 POSITION = "joints/R3200/Link1/R/position"
 PLACE = "cell/Outputs/100"  # of no meaning to the controller's program
 
 
-@pytest.fixture
-def cell(make_cell: Callable[..., Cell], tmp_path: Any) -> Cell:
-    """The A50 cell, armed, and a memory with the joints that old clients expect."""
-    (tmp_path / "joints.toml").write_text(JOINTS)
-    cell = make_cell(config=(ARMED + MEMORY).replace("[grpc]\n", '[grpc]\ndefault_source = "sim"\n'))
+@pytest.fixture(scope="module")
+def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
+    """The A50 cell, armed, and not, and a memory with the joints of old clients; each test lifts what it lays."""
+    cell = make_shared_cell(config=(ARMED + OTHERS).replace("[grpc]\n", '[grpc]\ndefault_source = "sim"\n'))
+    (cell.folder / "joints.toml").write_text(JOINTS)
     cell.up()
     until(lambda: all(cell.processes()[name]["quality"] == "good" for name in ("cell", "sim")), "good quality")
     return cell
@@ -179,19 +187,18 @@ def test_the_sources_own_process_goes_on_with_the_injections_of_clients(cell: Ce
         until(lambda: standing(local) == 0, "lifted")
 
 
-def test_a_source_that_is_not_armed_refuses_by_name(make_cell: Callable[..., Cell]) -> None:
-    cell = make_cell(config=ARMED.replace("armed = true\n", ""))
-    cell.up()
-    until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")
+def test_a_source_that_is_not_armed_refuses_by_name(cell: Cell) -> None:
+    until(lambda: cell.processes()["unarmed"]["quality"] == "good", "good quality")
+    place = "unarmed/Outputs/100"
     with client(cell) as (stub, other):
         with pytest.raises(grpc.RpcError) as refused:
-            next(inject(stub, f"{PLACE}/in", "s"))
+            next(inject(stub, f"{place}/in", "s"))
         assert refused.value.code() is grpc.StatusCode.FAILED_PRECONDITION
         reason = str(refused.value.details())
-        assert f"{PLACE}/in" in reason
+        assert f"{place}/in" in reason
         assert "needs `armed = true`" in reason
         with pytest.raises(grpc.RpcError) as refused:
-            other.Inject(v2.InjectRequest(targetPath=f"{PLACE}/in", shadowPathPrefix="p"), timeout=PATIENCE_S)
+            other.Inject(v2.InjectRequest(targetPath=f"{place}/in", shadowPathPrefix="p"), timeout=PATIENCE_S)
         assert refused.value.code() is grpc.StatusCode.FAILED_PRECONDITION
 
 

@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
+from functools import partial
 from typing import Any
 
 import pytest
@@ -82,28 +82,36 @@ class Gate(Model):
 '''
 
 
-@pytest.fixture
-def make_line(make_cell: Callable[..., Cell], tmp_path: Path) -> Callable[[str], Cell]:
-    """An instance with two models and a memory, running."""
-    (tmp_path / "line.py").write_text(MODELS)
-    (tmp_path / "panel.toml").write_text('[registers]\nlimit = { type = "LREAL", initial = 0.25 }\n')
-
-    def make(clock: str) -> Cell:
-        cell = make_cell(config=CONFIG.replace("CLOCK", clock))
-        cell.up()
-        until(
-            lambda: all(cell.processes()[name]["quality"] == "good" for name in ("belt", "gate", "panel")),
-            "good quality",
-        )
-        return cell
-
-    return make
+def start(make: Callable[..., Cell], clock: str) -> Cell:
+    """Start an instance with two models and a memory."""
+    cell = make(config=CONFIG.replace("CLOCK", clock))
+    (cell.folder / "line.py").write_text(MODELS)
+    (cell.folder / "panel.toml").write_text('[registers]\nlimit = { type = "LREAL", initial = 0.25 }\n')
+    cell.up()
+    until(
+        lambda: all(cell.processes()[name]["quality"] == "good" for name in ("belt", "gate", "panel")), "good quality"
+    )
+    return cell
 
 
 @pytest.fixture
-def line(make_line: Callable[[str], Cell]) -> Cell:
-    """One whose time stands at 0."""
-    return make_line("stepped")
+def make_line(make_cell: Callable[..., Cell]) -> Callable[[str], Cell]:
+    """What starts one for this test alone."""
+    return partial(start, make_cell)
+
+
+@pytest.fixture(scope="module")
+def shared_line(make_shared_cell: Callable[..., Cell]) -> Cell:
+    return start(make_shared_cell, "stepped")
+
+
+@pytest.fixture
+def line(shared_line: Cell) -> Cell:
+    """One whose time stands, and has stood from the start, at whatever step; the belt's speed is 1 from the next on."""
+    with shmio.attach(shared_line.instance, writable=True) as cell:
+        cell.write({"belt/speed": 1.0})
+        cell.step()
+    return shared_line
 
 
 def step(cell: Cell, *arguments: str) -> dict[str, Any]:
@@ -119,7 +127,8 @@ def get(cell: Cell, *paths: str) -> list[Any]:
     return [shown[path]["value"] for path in paths]
 
 
-def test_the_command_steps_and_tells_the_time(line: Cell) -> None:
+def test_the_command_steps_and_tells_the_time(make_line: Callable[[str], Cell]) -> None:
+    line = make_line("stepped")
     assert get(line, "belt/position", "gate/closed") == [0.0, False]
     clock = step(line)
     assert (clock["mode"], clock["step"], clock["time_s"], clock["step_size_ms"]) == ("virtual", 1, 0.05, 50)
@@ -150,9 +159,10 @@ def test_wall_time_goes_on_until_it_is_taken_over(make_line: Callable[[str], Cel
 
 
 def test_it_plays_until_it_is_interrupted(line: Cell) -> None:
+    begun_s = line.status()["clock"]["time_s"]
     with subprocess.Popen([BIN / "shmio", "step", "--play", "10"], cwd=line.folder, stdout=subprocess.PIPE) as player:
         try:
-            until(lambda: line.status()["clock"]["time_s"] > 1, "time runs")
+            until(lambda: line.status()["clock"]["time_s"] > begun_s + 1, "time runs")
             refused = line.run("shmio", "step")
             assert refused.returncode == 1
             assert f"another program (pid {player.pid}), which plays it" in refused.stderr
@@ -167,13 +177,14 @@ def test_it_plays_until_it_is_interrupted(line: Cell) -> None:
 
 def test_a_program_steps_and_plays(line: Cell) -> None:
     with shmio.attach(line.instance, writable=True) as cell:
-        assert not cell.clock.playing
+        begun = cell.clock
+        assert not begun.playing
         made = cell.step(dt_ms=20)
-        assert (made.number, made.time_ns) == (1, 20_000_000)
+        assert (made.number, made.time_ns) == (begun.step + 1, begun.time_ns + 20_000_000)
         cell.play(50)
         with pytest.raises(TimeError, match="pause it"):
             cell.step()
-        while cell.clock.time_ns < 500_000_000:
+        while cell.clock.time_ns < begun.time_ns + 500_000_000:
             cell.wait("belt", timeout_s=PATIENCE_S)
         cell.pause()
         stands = cell.clock
@@ -184,25 +195,25 @@ def test_a_program_steps_and_plays(line: Cell) -> None:
 
 
 def test_a_model_that_raises_fails_the_step_with_its_line(line: Cell) -> None:
-    step(line)
+    [position], number = get(line, "belt/position"), line.status()["clock"]["step"] + 1
     line.run("shmio", "set", "belt/speed", "-1")
     failed = line.run("shmio", "step")
     assert failed.returncode == 1
     assert failed.stderr == (
-        "step 2: belt: model line:Belt: ValueError: the belt cannot run backward (line.py, line 16)\n"
+        f"step {number}: belt: model line:Belt: ValueError: the belt cannot run backward (line.py, line 16)\n"
     )
     belt = line.processes()["belt"]
-    assert (belt["quality"], belt["cycle"]) == ("bad", 2)
+    assert (belt["quality"], belt["cycle"]) == ("bad", number)
     assert "the belt cannot run backward" in belt["reason"]
-    assert "step 2 failed: belt: " in line.status()["clock"]["note"]
+    assert f"step {number} failed: belt: " in line.status()["clock"]["note"]
     line.run("shmio", "set", "belt/speed", "1")
-    assert step(line)["step"] == 3
-    assert get(line, "belt/position") == [pytest.approx(0.2)]
+    assert step(line)["step"] == number + 1
+    assert get(line, "belt/position") == [pytest.approx(position + 0.1)]
 
 
 def test_a_model_that_is_killed_within_a_step_fails_it_and_goes_on_with_the_next(line: Cell) -> None:
-    step(line)
     with Attachment(Segment.open(line.instance, writable=True)) as cell:
+        [position], number = get(line, "belt/position"), cell.clock.step + 1
         cell.write({"belt/speed": 5000.0})
         pid = line.processes()["belt"]["pid"]
         with subprocess.Popen([BIN / "shmio", "step"], cwd=line.folder, stderr=subprocess.PIPE, text=True) as command:
@@ -210,31 +221,36 @@ def test_a_model_that_is_killed_within_a_step_fails_it_and_goes_on_with_the_next
             kill(pid)
             _, error = command.communicate(timeout=PATIENCE_S)
         assert command.returncode == 1
-        assert error == ("step 2: belt: its process was started anew within this step; it goes on with the next one\n")
+        assert error == (
+            f"step {number}: belt: its process was started anew within this step; it goes on with the next one\n"
+        )
         cell.write({"belt/speed": 1.0})
-        assert cell.step().number == 3
-        assert cell["belt/position"] == pytest.approx(0.2)
+        assert cell.step().number == number + 1
+        assert cell["belt/position"] == pytest.approx(position + 0.1)
 
 
 def test_a_model_that_is_stopped_is_named_after_the_hard_time_out(line: Cell) -> None:
+    [position], number = get(line, "belt/position"), line.status()["clock"]["step"] + 1
     pid = line.processes()["gate"]["pid"]
     with Segment.open(line.instance, writable=True) as segment:
         coordinator = Coordinator(segment, soft_s=0.05, hard_s=0.1)
         kill(pid, signal.SIGSTOP)
         try:
-            with pytest.raises(TimeError, match=rf"^step 1: gate: no answer within 0.1 s from pid {pid}$"):
+            with pytest.raises(TimeError, match=rf"^step {number}: gate: no answer within 0.1 s from pid {pid}$"):
                 coordinator.step()
         finally:
             kill(pid, signal.SIGCONT)
         coordinator.close()
-    assert step(line)["step"] == 2
-    assert get(line, "belt/position") == [pytest.approx(0.2)]
+    assert step(line)["step"] == number + 1
+    assert get(line, "belt/position") == [pytest.approx(position + 0.2)]
 
 
 def test_a_killed_program_that_played_leaves_time_standing(line: Cell) -> None:
     playing = "import shmio, sys, time; cell = shmio.attach(sys.argv[1], writable=True); cell.play(); time.sleep(3600)"
     with subprocess.Popen([sys.executable, "-c", playing, line.instance]) as player:
-        until(lambda: line.status()["clock"]["step"] > 3, "it plays")
+        until(lambda: line.status()["clock"]["playing"], "it plays")
+        begun = line.status()["clock"]["step"]
+        until(lambda: line.status()["clock"]["step"] > begun + 3, "time runs")
         player.kill()
     stands = line.status()["clock"]
     clock = step(line)

@@ -22,13 +22,13 @@ from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
 
 ROOT = Path(__file__).parents[2]
 WRITABLE = CONFIG.replace('connector = "s7"\n', 'connector = "s7"\nwritable = ["Outputs", "Robot_*/*"]\n')
-PLACE = "cell/Outputs/100"  # of no meaning to the controller's program
+PLACE = "cell/Outputs/100"  # those from here on are of no meaning to the controller's program
 
 
-@pytest.fixture
-def cell(make_cell: Callable[..., Cell]) -> Cell:
-    """The A50 cell with writable outputs, running and good."""
-    cell = make_cell(config=WRITABLE)
+@pytest.fixture(scope="module")
+def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
+    """The A50 cell with writable outputs, running and good; each test writes to places of its own."""
+    cell = make_shared_cell(config=WRITABLE)
     cell.up()
     until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")
     return cell
@@ -59,6 +59,11 @@ def counters(cell: Cell) -> dict[str, int]:
         return segment.processes.find("grpc").counters
 
 
+def counted(cell: Cell) -> int:
+    found = counters(cell)
+    return found["published"] + found["refused"]
+
+
 def test_what_is_set_comes_out_of_the_controller_for_every_subscriber(cell: Cell) -> None:
     with client(cell) as stub, subscribed(stub, PLACE) as out, subscribed(stub, f"{PLACE}/in") as into:
         assert next(out).value == "0"
@@ -70,25 +75,26 @@ def test_what_is_set_comes_out_of_the_controller_for_every_subscriber(cell: Cell
 
 
 def test_what_is_published_comes_out_of_the_controller_for_every_subscriber(cell: Cell) -> None:
-    with client(cell) as stub, subscribed(stub, PLACE) as out, shmio.attach(cell.instance) as local:
+    before, place = counters(cell), "cell/Outputs/103"
+    with client(cell) as stub, subscribed(stub, place) as out, shmio.attach(cell.instance) as local:
         assert next(out).value == "0"
         view = local.frame("cell")
-        stub.Publish(iter([message("cell/nothing", "1"), message(f"{PLACE}/in", "7.0")]), timeout=PATIENCE_S)
+        stub.Publish(iter([message("cell/nothing", "1"), message(f"{place}/in", "7.0")]), timeout=PATIENCE_S)
         assert next(out).value == "7"
         frames = local.stream("cell", timeout_s=PATIENCE_S)
-        assert next(frames)["Outputs/100"] == 7
-        assert view["Outputs/100"] == 0
-    until(lambda: (counters(cell)["published"], counters(cell)["refused"]) == (1, 1), "both counted")
+        assert next(frames)["Outputs/103"] == 7
+        assert view["Outputs/103"] == 0
+    until(lambda: [counters(cell)[name] - before[name] for name in ("published", "refused")] == [1, 1], "both counted")
     assert "publish refused: cell/nothing: no such register" in cell.logs()
 
 
 def test_the_example_publishes(cell: Cell) -> None:
     example = [sys.executable, str(ROOT / "examples/publish.py"), str(cell.grpc)]
-    words = [PLACE, "9", "cell/Outputs/101/in", "1.0E1"]
+    words = ["cell/Outputs/104", "9", "cell/Outputs/101/in", "1.0E1"]
     done = subprocess.run([*example, *words], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     with shmio.attach(cell.instance) as local:
-        until(lambda: (local[PLACE], local["cell/Outputs/101"]) == (9, 10), "the values")
+        until(lambda: (local["cell/Outputs/104"], local["cell/Outputs/101"]) == (9, 10), "the values")
     wrong = subprocess.run([*example, "cell/no", "9"], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert (wrong.returncode, wrong.stdout) == (1, "")
     assert "NOT_FOUND" in wrong.stderr
@@ -133,7 +139,7 @@ def test_without_its_controller_nothing_is_written_and_the_reason_is_told(make_c
 
 
 def test_a_stream_outlives_its_source(cell: Cell) -> None:
-    sent = 0
+    sent, before = 0, counters(cell)
 
     def numbered(value: str | None = None) -> PubRequest:
         nonlocal sent
@@ -142,7 +148,7 @@ def test_a_stream_outlives_its_source(cell: Cell) -> None:
 
     def values() -> Iterator[PubRequest]:
         source = cell.processes()["cell"]["pid"]
-        while counters(cell)["published"] < 20:
+        while counters(cell)["published"] < before["published"] + 20:
             yield numbered()
         kill(source)
         while not _good_again(cell):
@@ -153,7 +159,7 @@ def test_a_stream_outlives_its_source(cell: Cell) -> None:
         stub.Publish(values(), timeout=4 * PATIENCE_S)
         with subscribed(stub, PLACE) as out:
             assert "200" in (value.value for value in out)
-    until(lambda: counters(cell)["published"] + counters(cell)["refused"] == sent, "every message counted")
+    until(lambda: counted(cell) - before["published"] - before["refused"] == sent, "every message counted")
     assert cell.processes()["grpc"]["restarts"] == 0
 
 

@@ -11,8 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,8 @@ from typing import Any
 import pytest
 
 from shmio.segment import instances
+from shmio.segment.status import InstanceStatus, ProcessStatus, SourceStatus, read_status
+from shmio.testing.cell import until
 
 ROOT = Path(__file__).parents[3]
 DEADLINE_S = 60.0
@@ -67,13 +68,12 @@ class Cell:
         assert isinstance(found, dict)
         return found
 
-    def of(self, name: str) -> dict[str, Any]:
-        return next(process for process in self.status()["processes"] if process["name"] == name)
+    def look(self) -> InstanceStatus:
+        """The same without a process for it."""
+        return read_status(self.instance, "")
 
-    def until(self, condition: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + DEADLINE_S
-        while not condition():  # each look is a process of its own, which paces this loop
-            assert time.monotonic() < deadline, "waited in vain"
+    def of(self, name: str) -> SourceStatus | ProcessStatus:
+        return next(process for process in self.look().processes if process.name == name)
 
 
 @pytest.fixture
@@ -96,7 +96,7 @@ def test_a_day_in_the_life_of_the_cell(cell: Cell) -> None:
         ("grpc", "grpc", "running"),
         ("recorder", "recorder", "running"),
     ]
-    assert cell.of("cell")["quality"] == "good"
+    assert status["processes"][1]["quality"] == "good"
 
     refused = cell.run("up", status=1)
     assert refused.stderr == (
@@ -111,12 +111,12 @@ def test_a_day_in_the_life_of_the_cell(cell: Cell) -> None:
 
     pids = {process["name"]: process["pid"] for process in status["processes"]}
     os.kill(pids["plc"], signal.SIGKILL)
-    cell.until(lambda: cell.of("plc")["restarts"] == 1 and cell.status()["state"] == "running")
-    assert cell.of("cell")["pid"] == pids["cell"]
+    until(lambda: cell.of("plc").restarts == 1 and cell.look().state == "running", "running again")
+    assert cell.of("cell").pid == pids["cell"]
     assert "killed by SIGKILL" in cell.run("logs", "supervisor", status=0).stdout
 
     assert cell.run("restart", "cell", status=0).stdout == "cell runs again\n"
-    assert cell.of("cell")["pid"] != pids["cell"]
+    assert cell.of("cell").pid != pids["cell"]
     assert "there are: plc, cell, grpc, recorder" in cell.run("restart", "nobody", status=1).stderr
     file = cell.folder / "supervisor.toml"
     moved = file.rename(cell.folder / "elsewhere.toml")
@@ -137,11 +137,11 @@ def test_down_clears_what_a_killed_supervisor_left(cell: Cell) -> None:
     cell.run("up", "--detach", status=0)
     status = cell.status()
     os.kill(status["supervisor"]["pid"], signal.SIGKILL)
-    cell.until(lambda: cell.status()["supervisor"] is None)
+    until(lambda: cell.look().supervisor is None, "the supervisor's death")
     assert "supervisor of instance" in cell.run("restart", "cell", status=1).stderr
     lines = cell.run("down", status=0).stdout
     for process in status["processes"]:
-        assert f"stopped {process['name']}, pid {process['pid']}" in lines
+        assert f"stopped {process['name']}, pid {process['pid']}, which had lost its supervisor\n" in lines
     assert cell.instance not in instances()
     assert not list((cell.folder / "run" / "shmio").iterdir())
 
@@ -150,7 +150,7 @@ def test_up_tells_what_it_takes_over_of_a_killed_supervisor(cell: Cell) -> None:
     cell.run("up", "--detach", status=0)
     status = cell.status()
     os.kill(status["supervisor"]["pid"], signal.SIGKILL)
-    cell.until(lambda: cell.status()["supervisor"] is None)
+    until(lambda: cell.look().supervisor is None, "the supervisor's death")
     ours = "shmio-supervisor up takes them over, shmio-supervisor down stops them"
     assert ours in cell.run("status", status=0).stdout
     named = f"shmio-supervisor up -c FILE takes them over, shmio-supervisor down --instance {cell.instance} stops them"
@@ -159,16 +159,6 @@ def test_up_tells_what_it_takes_over_of_a_killed_supervisor(cell: Cell) -> None:
     for process in status["processes"]:
         assert f"took over {process['name']}, pid {process['pid']}, which had lost its supervisor\n" in lines
     cell.run("down", status=0)
-
-
-def test_down_tells_what_it_clears_of_a_killed_supervisor(cell: Cell) -> None:
-    cell.run("up", "--detach", status=0)
-    status = cell.status()
-    os.kill(status["supervisor"]["pid"], signal.SIGKILL)
-    cell.until(lambda: cell.status()["supervisor"] is None)
-    lines = cell.run("down", status=0).stdout
-    for process in status["processes"]:
-        assert f"stopped {process['name']}, pid {process['pid']}, which had lost its supervisor\n" in lines
 
 
 def test_the_logs_of_another_instance_are_left_alone(cell: Cell) -> None:
@@ -187,7 +177,7 @@ def test_a_block_without_a_number_is_played_and_read(cell: Cell) -> None:
     file = cell.folder / "supervisor.toml"
     file.write_text(file.read_text().replace('layout = "db201.db"', 'layout = ["db201.db"]\ndbNumber = 7'))
     cell.run("up", "--detach", status=0)
-    cell.until(lambda: bool(cell.of("cell")["quality"] == "good"))
+    until(lambda: bool(cell.status()["processes"][1]["quality"] == "good"), "good quality")
     cell.run("down", status=0)
 
 
@@ -212,14 +202,14 @@ def test_what_init_writes_for_a_block_runs_beside_a_running_cell(cell: Cell, ins
                 demo.bind(("127.0.0.1", port))
                 demo.listen()
         beside = copy.copy(cell)
-        beside.folder = own
+        beside.folder, beside.instance = own, name
         beside.run("init", "plc.ini", "my.db", status=0)
         assert "no faults found" in beside.run("check", status=0).stdout
         file = own / "supervisor.toml"
         assert not {"127.0.0.1:8089", "127.0.0.1:8090"} & set(re.findall(r'"([\d.:]+)"', file.read_text()))
         beside.run("up", "--detach", status=0)
         try:
-            assert beside.of("grpc")["state"] == "running"
+            assert beside.of("grpc").state == "running"
             file.write_text(
                 file.read_text().replace("# [recorder] ", "[recorder] ").replace("# directory", "directory")
             )
@@ -268,27 +258,25 @@ def test_a_left_over_segment_without_processes_hides_no_taken_port(cell: Cell) -
     assert error.startswith(f"grpc: cannot listen on 127.0.0.1:{port}: another program listens there; ")
 
 
-@pytest.mark.parametrize("name", ["plc", "grpc"])
-def test_a_port_that_another_instance_has_is_said_to_be_its(cell: Cell, name: str) -> None:
+def test_a_port_that_another_instance_has_is_said_to_be_its(cell: Cell) -> None:
     serve_on(cell, f"127.0.0.1:{free_port()}")
     cell.run("up", "--detach", status=0)
-    pid = cell.of(name)["pid"]
-    file = cell.folder / "supervisor.toml"
-    text = file.read_text().replace(f'"{cell.instance}"', f'"{cell.instance}-2"\nlog_dir = "logs-2"')
-    port = re.search(r'listen = "127.0.0.1:(\d+)"' if name == "plc" else r'listen = \["127.0.0.1:(\d+)"\]', text)
-    assert port is not None
-    if name == "grpc":
+    text = (cell.folder / "supervisor.toml").read_text()
+    text = text.replace(f'"{cell.instance}"', f'"{cell.instance}-2"\nlog_dir = "logs-2"')
+    for name, listen in (("plc", r'listen = "127.0.0.1:(\d+)"'), ("grpc", r'listen = \["127.0.0.1:(\d+)"\]')):
+        port = re.search(listen, text)
+        assert port is not None
+        (cell.folder / "second.toml").write_text(text)
+        assert cell.run("up", "-c", "second.toml", status=1).stderr == (
+            f"{name}: cannot listen on 127.0.0.1:{port[1]}: process {name} of instance {cell.instance}, pid "
+            f"{cell.of(name).pid}, listens there; choose another port, or stop that instance: shmio-supervisor down "
+            f"--instance {cell.instance}\n"
+        )
         text = text.replace('listen = "127.0.0.1:', f'listen = "127.0.0.1:{free_port()}" #')
-    (cell.folder / "second.toml").write_text(text)
-    error = cell.run("up", "-c", "second.toml", status=1).stderr
-    assert error == (
-        f"{name}: cannot listen on 127.0.0.1:{port[1]}: process {name} of instance {cell.instance}, pid {pid}, listens "
-        f"there; choose another port, or stop that instance: shmio-supervisor down --instance {cell.instance}\n"
-    )
     cell.run("down", status=0)
 
 
-@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("sign", [signal.SIGTERM, signal.SIGHUP])  # tests/system/test_cell.py has SIGINT
 def test_in_the_foreground_a_signal_stops_it_cleanly(cell: Cell, sign: signal.Signals) -> None:
     with subprocess.Popen(
         cell.command("up"),
