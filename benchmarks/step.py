@@ -58,7 +58,7 @@ def remote(client: Child, duration_s: float) -> Callable[[], float]:
 
 def main() -> None:
     quick = begin("Steps: a model with 100 changing registers")
-    duration_s, rounds = (0.5, 1) if quick else (3.0, 9)
+    duration_s, rounds = (0.1, 1) if quick else (3.0, 9)
     with ExitStack() as stack:
         running = stack.enter_context(started([], more=MODEL, clock="stepped"))
         contenders = {

@@ -6,7 +6,7 @@ import threading
 import time
 import traceback
 from collections import Counter, defaultdict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -84,7 +84,7 @@ class Suite:
         """End the run after the present round."""
         self._stopping.set()
 
-    def run(self, for_s: float, faults: list[Round] | None = None) -> Record:
+    def run(self, for_s: float, faults: Iterable[Round] | None = None) -> Record:
         """Run for so long, or through the rounds given; the record. What is left behind is a violation too."""
         begun_s = well_s = time.monotonic()
         with ExitStack() as stack:

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterable, Iterator
+from itertools import zip_longest
 from pathlib import Path
 
 import pytest
 
 from tests.faults import report, suite
-from tests.faults.schedule import DEVICE_FAULTS, SOURCES, SUPERVISOR, WEIGHTS, Fault, Round
+from tests.faults.schedule import DEVICE_FAULTS, SOURCES, SUPERVISOR, WEIGHTS, Fault, Round, rounds
 from tests.faults.suite import Record, Suite
 
 pytestmark = pytest.mark.timeout(400)
 
+SEED = 11
 SHORT_S = 0.3
+PIECE_S = 5.0
 NUMBER = 0x1234_5678
 TARGETS = {"kill": "fast", "hang": "grpc", "pause": "block", "restart": "plc", "torn": "fast", "relayout": "block"}
 
@@ -21,17 +26,21 @@ def one(*targets: tuple[str, str]) -> Round:
     return Round(tuple(Fault(kind, target, 0.0, SHORT_S, NUMBER) for kind, target in targets), 0.0)
 
 
-def run(folder: Path, instance: str, faults: list[Round] | None = None, for_s: float = 0.0) -> Record:
-    record = Suite(folder, instance, seed=11, say=print).run(for_s, faults)
+def run(folder: Path, instance: str, faults: Iterable[Round]) -> Record:
+    record = Suite(folder, instance, seed=SEED, say=print).run(0.0, faults)
     print(report.write(record))
     return record
 
 
 def test_each_kind_of_fault(tmp_path: Path, instance: str) -> None:
-    devices = [one(*((kind, f"device of {source}") for source in SOURCES)) for kind in DEVICE_FAULTS]
-    others = [kind for kind in WEIGHTS if kind not in DEVICE_FAULTS]
-    places = {kind: SUPERVISOR if kind.startswith(SUPERVISOR) else TARGETS.get(kind, kind) for kind in others}
-    record = run(tmp_path, instance, devices + [one(place) for place in places.items()])
+    """Two or three at a time, but for those of the supervisor."""
+    alone = [one((kind, SUPERVISOR)) for kind in WEIGHTS if kind.startswith(SUPERVISOR)]
+    others = [kind for kind in WEIGHTS if not (kind in DEVICE_FAULTS or kind.startswith(SUPERVISOR))]
+    together = []
+    for device, beside in zip_longest(DEVICE_FAULTS, others):  # there are more of devices
+        targets = [(device, f"device of {source}") for source in SOURCES]
+        together.append(one(*targets, *([(beside, TARGETS.get(beside, beside))] if beside else [])))
+    record = run(tmp_path, instance, together + alone)
     assert record.violations == []
     assert set(record.faults) == set(WEIGHTS)
     assert all(counts.values > 0 for counts in record.counts.values()), record.counts
@@ -39,17 +48,26 @@ def test_each_kind_of_fault(tmp_path: Path, instance: str) -> None:
     assert record.adopted + record.replaced == record.mid_kills == 1
 
 
-def test_a_piece_of_a_schedule(tmp_path: Path, instance: str) -> None:
-    record = run(tmp_path, instance, for_s=5.0)
-    assert record.violations == []
-    assert record.rounds > 0
+def test_a_piece_of_a_schedule_and_then_a_broken_promise(
+    tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process restarts although nothing was to restart it: that is told, and nothing of the rounds before."""
+    piece: list[Round] = []
 
+    def turns() -> Iterator[Round]:
+        begun_s = time.monotonic()
+        for turn in rounds(SEED):
+            if time.monotonic() - begun_s > PIECE_S:
+                break
+            piece.append(turn)
+            yield turn
+        monkeypatch.setattr(suite, "RESTARTING", set())
+        yield one(("kill", "grpc"))
+        yield one(("pause", "grpc"))
 
-def test_a_broken_promise_is_told(tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A process that restarts although nothing was to restart it."""
-    monkeypatch.setattr(suite, "RESTARTING", set())
-    record = run(tmp_path, instance, [one(("kill", "grpc")), one(("pause", "grpc"))])
+    record = run(tmp_path, instance, turns())
+    assert piece
     assert "grpc was not hit, but went from" in record.violations[0]
-    assert "seed 11" in record.violations[0]
+    assert f"seed {SEED}" in record.violations[0]
     assert "kill grpc" in record.violations[0]
-    assert record.rounds == 1, "it went on"
+    assert record.rounds == len(piece) + 1, "it went on"

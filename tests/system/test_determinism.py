@@ -80,10 +80,8 @@ def assert_same(first: Streams, second: Streams) -> None:
 @pytest.mark.timeout(300)
 def test_a_campaign_repeats_exactly(cell: Cell) -> None:
     first = campaign(cell)
-    assert_same(first, campaign(cell))
     assert_same(first, campaign(cell, beside=load))
-    assert_same(first, campaign(cell, pause_s=SLOW_S))
-    assert_same(first, campaign(cell, before=restarted))
+    assert_same(first, campaign(cell, before=restarted, pause_s=SLOW_S))
     # What is compared has in it what it should.
     two = [v2.SimlogMessage.FromString(message) for message in first["v2 two"]]
     assert [m.value.number_value for m in two if m.header.path == "SIMLOG://step"] == list(range(1, STEPS + 1))

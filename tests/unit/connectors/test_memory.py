@@ -26,7 +26,7 @@ name = { type = "STRING[8]", initial = "R3200" }
 locked = "INT"
 """
 LAYOUT = compile_sources([Source("cell.toml", TABLE)]).layouts[0]
-PERIOD_NS = 1_000_000_000
+PERIOD_NS = 200_000_000
 WRITABLE = ("position", "lamps", "name")
 
 

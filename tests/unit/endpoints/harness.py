@@ -54,6 +54,7 @@ STALE_NS = 60_000_000_000
 SOON_STALE_NS = 300_000_000
 TIMEOUT_S = 60
 """When a test gives up; nothing waits for it to pass."""
+LOOK_S = 0.001
 
 
 LOOPBACK = Listener(Address("127.0.0.1", 0), Door(Keys()))
@@ -113,7 +114,7 @@ class Endpoint:
         """Wait for what another thread brings about."""
         async with asyncio.timeout(TIMEOUT_S):
             while not await condition():  # noqa: ASYNC110  it is another thread's doing
-                await asyncio.sleep(0)
+                await asyncio.sleep(LOOK_S)  # which needs the interpreter for it
 
 
 @asynccontextmanager
