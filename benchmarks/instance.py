@@ -101,8 +101,10 @@ def instance(period_ms: float, *, more: str = "", priority: int | None = None) -
 
 
 @contextmanager
-def started(sources: Sequence[Polled], *, more: str = "", clock: str = "wall") -> Iterator[Instance]:
-    """Run an instance with these sources; ``more``: further sections of the configuration."""
+def started(
+    sources: Sequence[Polled], *, more: str = "", clock: str = "wall", until: State = State.RUNNING
+) -> Iterator[Instance]:
+    """Run an instance with these sources; ``more``: further sections of the configuration. ``until``: this state."""
     name = f"bench-{os.getpid()}"
     with ExitStack() as stack:
         grpc = stack.enter_context(reserved_port())
@@ -117,7 +119,7 @@ def started(sources: Sequence[Polled], *, more: str = "", clock: str = "wall") -
             stderr=subprocess.STDOUT,
         )
         stack.callback(_stop, supervisor)
-        segment = _when_running(name, supervisor)
+        segment = _when(until, name, supervisor)
         if segment is None:
             output.seek(0)
             raise SystemExit(f"the instance does not start:\n{output.read()}")
@@ -131,13 +133,13 @@ def _stop(supervisor: subprocess.Popen[bytes]) -> None:
     supervisor.wait(30)
 
 
-def _when_running(name: str, supervisor: subprocess.Popen[bytes]) -> Segment | None:
-    """Wait until all processes run and the source's first frame is there; None if that does not come."""
+def _when(state: State, name: str, supervisor: subprocess.Popen[bytes]) -> Segment | None:
+    """Wait until all processes run and, if RUNNING, the sources' first frames are there; None if that does not come."""
     deadline_s = time.monotonic() + START_S
     while time.monotonic() < deadline_s and supervisor.poll() is None:
         with contextlib.suppress(NotRunningError):
             segment = Segment.open(name)
-            if segment.supervisor[1] is State.RUNNING:
+            if segment.supervisor[1] is state:
                 return segment
             segment.close()
         time.sleep(0.05)

@@ -16,7 +16,7 @@ from instance import Instance, started
 from step import MODEL, local, remote
 
 from shmio import attach
-from shmio.segment import Quality
+from shmio.segment import Quality, State
 
 REMOTE = """
 [[source]]
@@ -35,7 +35,9 @@ def elsewhere() -> Iterator[Instance]:
         layout = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "counting.toml"
         rows = [f'"values/r{index:02}" = "LREAL"\n' for index in range(COUNT)]
         layout.write_text(f'[registers]\n{"".join(rows)}row = "ARRAY[1..{COUNT}] OF LREAL"\n')
-        running = stack.enter_context(started([], more=REMOTE.format(layout=layout), clock="stepped"))
+        running = stack.enter_context(
+            started([], more=REMOTE.format(layout=layout), clock="stepped", until=State.DEGRADED)
+        )
         stack.enter_context(Child("serving.py", running.grpc, "sim"))
         with attach(running.segment.instance) as reader:
             while reader.read("sim/row").quality is not Quality.GOOD:

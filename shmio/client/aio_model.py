@@ -71,6 +71,7 @@ class Simulation(Member, AsyncIterator[Work]):
 
     async def compute(self, work: Work, step: Step, rejoining: model.Rejoining) -> None:
         """Answer a step with what a program's code says to it, and with what that raises."""
+        rejoining.heed(self._part, work)
         try:
             found = step(work.time_s, work.dt_s, work.inputs)
             outputs = await found if inspect.isawaitable(found) else found

@@ -54,16 +54,17 @@ class Values(Mapping[str, Any]):
 class Work:
     """A step to be done. ``time_s``: simulation time after it; ``dt_s``: by how much it moves that.
 
-    ``doubt``: why inputs may not be right; empty, if they are.
+    ``doubt``: why inputs may not be right; ``refused``: why the answer before counts for nothing; else both are empty.
     """
 
-    __slots__ = ("doubt", "dt_ns", "inputs", "step", "time_ns")
+    __slots__ = ("doubt", "dt_ns", "inputs", "refused", "step", "time_ns")
 
     def __init__(self, found: Any, inputs: Values) -> None:
         self.step: int = found.step
         self.time_ns: int = found.time_ns
         self.dt_ns: int = found.dt_ns
         self.doubt: str = found.doubt
+        self.refused: str = found.refused
         self.inputs = inputs
 
     @property
@@ -187,6 +188,11 @@ class Rejoining:
         # Who was cut off is for a while still taken for connected.
         again = isinstance(error, LostError) or (self._joined and isinstance(error, ConflictError))
         return again and time.monotonic() - self._lost_s < self._patience_s
+
+    def heed(self, part: Part, work: Work) -> None:
+        """The log tells what the endpoint says of the answer before."""
+        if work.refused:
+            log.warning("%s: %s", part.source, work.refused)
 
     def answer(self, part: Part, work: Work, outputs: Mapping[str, object] | None) -> bytes:
         """The answer with what was computed; after another joining with all that was before. Errors as of ``done``."""

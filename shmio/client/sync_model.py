@@ -67,6 +67,7 @@ class Simulation(Member, Iterator[Work]):
 
     def compute(self, work: Work, step: Step, rejoining: model.Rejoining) -> None:
         """Answer a step with what a program's code says to it, and with what that raises."""
+        rejoining.heed(self._part, work)
         try:
             answer = rejoining.answer(self._part, work, step(work.time_s, work.dt_s, work.inputs))
         except Exception as error:  # noqa: BLE001  whatever it is, the step has failed with it

@@ -596,20 +596,22 @@ class Joined(_message.Message):
     def __init__(self, inputs: _Optional[_Union[Table, _Mapping]] = ..., outputs: _Optional[_Union[Table, _Mapping]] = ..., values: _Optional[_Union[Values, _Mapping]] = ..., computed: bool = ..., clock: _Optional[_Union[Clock, _Mapping]] = ..., period_ns: _Optional[int] = ...) -> None: ...
 
 class Do(_message.Message):
-    __slots__ = ("step", "time_ns", "dt_ns", "values", "invalid", "doubt")
+    __slots__ = ("step", "time_ns", "dt_ns", "values", "invalid", "doubt", "refused")
     STEP_FIELD_NUMBER: _ClassVar[int]
     TIME_NS_FIELD_NUMBER: _ClassVar[int]
     DT_NS_FIELD_NUMBER: _ClassVar[int]
     VALUES_FIELD_NUMBER: _ClassVar[int]
     INVALID_FIELD_NUMBER: _ClassVar[int]
     DOUBT_FIELD_NUMBER: _ClassVar[int]
+    REFUSED_FIELD_NUMBER: _ClassVar[int]
     step: int
     time_ns: int
     dt_ns: int
     values: Values
     invalid: Marks
     doubt: str
-    def __init__(self, step: _Optional[int] = ..., time_ns: _Optional[int] = ..., dt_ns: _Optional[int] = ..., values: _Optional[_Union[Values, _Mapping]] = ..., invalid: _Optional[_Union[Marks, _Mapping]] = ..., doubt: _Optional[str] = ...) -> None: ...
+    refused: str
+    def __init__(self, step: _Optional[int] = ..., time_ns: _Optional[int] = ..., dt_ns: _Optional[int] = ..., values: _Optional[_Union[Values, _Mapping]] = ..., invalid: _Optional[_Union[Marks, _Mapping]] = ..., doubt: _Optional[str] = ..., refused: _Optional[str] = ...) -> None: ...
 
 class GetStatusRequest(_message.Message):
     __slots__ = ()

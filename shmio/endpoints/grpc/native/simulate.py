@@ -141,6 +141,7 @@ class Simulation:
         self._asked: Ask | None = None  # what the model has in hand
         self._given: Decoded | None = None
         self._image: bytearray | None = None  # with the outputs as the model has set them
+        self._refused = ""
 
     @property
     def _link(self) -> Link:
@@ -218,7 +219,9 @@ class Simulation:
         """A serialised ``Do``: all inputs at first, then those that differ from what the model has."""
         before, now = self._given, self._inputs.columns.decode(ask.commanded)
         self._given = now
-        work = wire.Do(step=ask.step, time_ns=ask.time_ns, dt_ns=ask.dt_ns, doubt=ask.doubt).SerializeToString()
+        work = wire.Do(
+            step=ask.step, time_ns=ask.time_ns, dt_ns=ask.dt_ns, doubt=ask.doubt, refused=self._refused
+        ).SerializeToString()
         if values := pack(now, before):
             work += field(_VALUES, values)
         if before is None or now.invalid != before.invalid:
@@ -246,6 +249,9 @@ class Simulation:
         if ask is None or done.step != ask.step:
             asked = "none is to be done" if ask is None else f"step {ask.step} is to be done"
             raise ValueRangeError(f"an answer to step {done.step}, and {asked}")
+        now_ns = time.monotonic_ns()
+        late_ms = (now_ns - ask.until_ns) // 1_000_000
+        self._refused = f"step {ask.step}: the answer came {late_ms} ms too late" if late_ms >= 0 else ""
         image = bytearray(ask.shown if self._image is None else self._image)
         failure = " ".join(done.failure.split()) if done.HasField("failure") else None
         if failure is None:
@@ -254,9 +260,10 @@ class Simulation:
                 self._fill.assigned(done.assignments, image)
             except (PathError, ValueRangeError) as error:
                 failure = str(error)
+                self._refused = f"step {ask.step}: {failure}"
             else:
                 self._image = image
-        self._link.answer(ask, time.monotonic_ns(), image, None if failure is None else printable(failure))
+        self._link.answer(ask, now_ns, image, None if failure is None else printable(failure))
         self._asked = None
         self._news.set()
 

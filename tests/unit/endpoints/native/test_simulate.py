@@ -195,7 +195,8 @@ def test_a_step_fails_with_what_is_wrong_and_the_next_goes_on(instance: str, giv
         code, text = await refusal(task)
         assert (code, reason in text) == (Status.FAILED_PRECONDITION, True), text
         task = stepping(served)
-        await model.work()
+        refused = (await model.work()).refused
+        assert refused == "" if "failure" in given else refused.startswith("step 1: "), refused
         await model.done(2, assignments=assigned(**{"axis/count": 2}))
         await task
         assert (await read(served))["axis/count"] == 2
@@ -221,6 +222,7 @@ def test_what_it_has_set_too_late_is_shown_with_the_next_step(instance: str) -> 
             task = stepping(served)
             work = await model.work()
             assert work.step == number, "no step that nobody waits for"
+            assert number > 3 or "step 1: the answer came " in work.refused
             await model.done(number)
             try:
                 await task
@@ -450,6 +452,9 @@ def test_outputs_that_cannot_be_fail_the_step(
             good.set()
             cell.step()
             assert cell["drive/axis/count"] == 1
+            if outputs == {"axis/count": 70_000}:
+                last = [record.getMessage() for record in caplog.records if record.name == "shmio.client"][-1]
+                assert last.startswith("drive: step 2: axis/count: "), "the next step has told it"
 
     with_client(instance, test)
 
