@@ -23,8 +23,6 @@ settings.load_profile("unhurried")
 
 SHM = Path("/dev/shm")
 PREFIX = f"test-{os.getpid()}-"
-ENDING_S = 0.05
-"""What ends by itself mostly has by then; else it may wait for the garbage collector."""
 
 
 ONE_AFTER_THE_OTHER = (
@@ -104,13 +102,10 @@ def nothing_left_behind() -> Iterator[None]:
     before = segments(), children(), sockets()
     heeded = handlers()
     yield
-    left = left_over(before)
-    begun_s = time.monotonic()
-    while any(left) and time.monotonic() - begun_s < 2.0:  # what is just ending may end
-        if time.monotonic() - begun_s > ENDING_S:
-            gc.collect()
-        time.sleep(0.005)
-        left = left_over(before)
+    deadline = time.monotonic() + 2.0
+    while any(left := left_over(before)) and time.monotonic() < deadline:  # what is just ending may end
+        if not gc.collect():
+            time.sleep(0.005)
     now = handlers()
     for sign, handler in heeded.items():
         signal.signal(sign, handler)  # the next test is not to suffer

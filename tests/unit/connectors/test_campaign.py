@@ -37,6 +37,7 @@ from shmio.segment import (
 from shmio.segment.commander import Commander
 from shmio.segment.standing import declared_document
 from shmio.segment.view import reading
+from shmio.testing.cell import until
 
 TABLE = b"""
 [registers]
@@ -497,7 +498,7 @@ def test_the_configuration_may_change_while_the_process_runs(make: Callable[...,
     ]
     rig.block.declared.write(declared_document(changed))
     rig.block.commands.wake()
-    rig.settle()
+    until(lambda: "new" in {standing.name for standing in rig.block.standing.read()}, "laid, the last thing it does")
     rig.poll({"axis/1": 2})
     assert (rig.sees("axis/1"), rig.sees("flags"), rig.sees("speed")) == (1, 0, 2)
     after = {standing.name: standing.id for standing in rig.block.standing.read()}

@@ -7,7 +7,7 @@ import pytest
 from shmio.layout.model import Layout, Register
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def db201() -> Layout:
     """DB201 with the printed names, some of which have a space for the underscore."""
     registers = [

@@ -28,7 +28,7 @@ def watch(layout: Layout, begin_s: float, end_s: float) -> list[bytes]:
     return frames
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def film(db201: Layout) -> list[bytes]:
     return watch(db201, 0, CYCLE_S + 1)
 

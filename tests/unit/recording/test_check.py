@@ -19,7 +19,7 @@ from shmio.recording.records import MAGIC, Record
 from shmio.segment import Frame, Segment
 from tests.unit.recording.harness import publish, recorder
 
-any_change = settings(max_examples=300, suppress_health_check=[HealthCheck.function_scoped_fixture])
+any_change = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def found_in(file: Path) -> Findings:
