@@ -32,7 +32,7 @@ setup(
         Extension(
             "shmio.segment._atomics",
             ["shmio/segment/_atomics.c"],
-            depends=["shmio/segment/queue.h", "shmio/segment/ring.h"],
+            depends=["shmio/segment/queue.h", "shmio/segment/relay.h", "shmio/segment/ring.h"],
             define_macros=[("Py_LIMITED_API", "0x030B0000")],
             py_limited_api=True,
             extra_compile_args=flags,

@@ -1,12 +1,13 @@
-/* Python binding of ring.h and queue.h (limited API: one build serves CPython 3.11 and later).
+/* Python binding of ring.h, relay.h and queue.h (limited API: one build serves CPython 3.11 and later).
  *
- * Everything here runs under the GIL except the wait on a doorbell. A Ring keeps its buffer exported, so the mapping
+ * Everything here runs under the GIL except the wait on a doorbell and a relay. A Ring keeps its buffer exported, so the mapping
  * cannot be closed under it.
  */
 #include <Python.h>
 #include <stdlib.h>
 
 #include "queue.h"
+#include "relay.h"
 #include "ring.h"
 
 /* ---- Ring ---------------------------------------------------------------------------------------------------------- */
@@ -224,6 +225,37 @@ static PyObject *Ring_wait(Ring *self, PyObject *args)
     return Ring_ready(self) ? wait_on(&ring_head(&self->ring)->doorbell, seen, timeout_ns) : NULL;
 }
 
+/* The relay in a buffer, which its caller has to release; NULL with an exception. */
+static relay *relay_in(PyObject *object, Py_buffer *buffer)
+{
+    if (PyObject_GetBuffer(object, buffer, PyBUF_WRITABLE) < 0) return NULL;
+    if (buffer->len == sizeof(relay) && (uintptr_t)buffer->buf % _Alignof(relay) == 0) return buffer->buf;
+    PyBuffer_Release(buffer);
+    PyErr_Format(PyExc_ValueError, "a relay has %zu bytes, and is aligned", sizeof(relay));
+    return NULL;
+}
+
+static PyObject *relay_on(const a32 *word, PyObject *object, int descriptor, long long turn_ns)
+{
+    Py_buffer buffer;
+    relay *shared = relay_in(object, &buffer);
+    if (!shared) return NULL;
+    Py_BEGIN_ALLOW_THREADS
+    relay_run(shared, word, descriptor, turn_ns);
+    Py_END_ALLOW_THREADS
+    PyBuffer_Release(&buffer);
+    Py_RETURN_NONE;
+}
+
+static PyObject *Ring_relay(Ring *self, PyObject *args)
+{
+    PyObject *shared;
+    int descriptor;
+    long long turn_ns;
+    if (!PyArg_ParseTuple(args, "OiL", &shared, &descriptor, &turn_ns)) return NULL;
+    return Ring_ready(self) ? relay_on(&ring_head(&self->ring)->doorbell, shared, descriptor, turn_ns) : NULL;
+}
+
 static PyObject *Ring_get(Ring *self, void *field)
 {
     if (!Ring_ready(self)) return NULL;
@@ -259,6 +291,7 @@ static PyMethodDef Ring_methods[] = {
     METHOD(Ring, doorbell, METH_NOARGS, "Value of the futex word; read it before looking for news."),
     METHOD(Ring, wake, METH_NOARGS, "Ring the doorbell without a frame: there is other news."),
     METHOD(Ring, wait, METH_VARARGS, "Wait until the doorbell differs from `seen`, at most `timeout_ns`."),
+    METHOD(Ring, relay, METH_VARARGS, "Tell an event loop of each ring of the doorbell, until it is stopped."),
     {0},
 };
 
@@ -390,6 +423,46 @@ static PyObject *atomics_bell_wait(PyObject *module, PyObject *args)
     PyObject *value = at ? wait_on(at, seen, timeout_ns) : NULL; /* the buffer is held meanwhile */
     PyBuffer_Release(&buffer);
     return value;
+}
+
+static PyObject *atomics_bell_relay(PyObject *module, PyObject *args)
+{
+    (void)module;
+    Py_buffer buffer;
+    Py_ssize_t offset;
+    PyObject *shared;
+    int descriptor;
+    long long turn_ns;
+    if (!PyArg_ParseTuple(args, "y*nOiL", &buffer, &offset, &shared, &descriptor, &turn_ns)) return NULL;
+    const a32 *at = (const a32 *)(void *)place(&buffer, offset, 4, 4);
+    PyObject *result = at ? relay_on(at, shared, descriptor, turn_ns) : NULL; /* the buffer is held meanwhile */
+    PyBuffer_Release(&buffer);
+    return result;
+}
+
+static PyObject *atomics_relay_heard(PyObject *module, PyObject *args)
+{
+    (void)module;
+    Py_buffer buffer;
+    PyObject *object;
+    int descriptor;
+    if (!PyArg_ParseTuple(args, "Oi", &object, &descriptor)) return NULL;
+    relay *shared = relay_in(object, &buffer);
+    if (!shared) return NULL;
+    relay_heard(shared, descriptor);
+    PyBuffer_Release(&buffer);
+    Py_RETURN_NONE;
+}
+
+static PyObject *atomics_relay_stop(PyObject *module, PyObject *object)
+{
+    (void)module;
+    Py_buffer buffer;
+    relay *shared = relay_in(object, &buffer);
+    if (!shared) return NULL;
+    relay_stop(shared);
+    PyBuffer_Release(&buffer);
+    Py_RETURN_NONE;
 }
 
 /* The queue at `offset`, whose data are `capacity` bytes, or NULL with an exception. */
@@ -524,6 +597,9 @@ static PyMethodDef functions[] = {
     METHOD(atomics, bell, METH_VARARGS, "Value of a futex word; read it before looking for news."),
     METHOD(atomics, bell_ring, METH_VARARGS, "Bump a futex word and wake all who wait on it."),
     METHOD(atomics, bell_wait, METH_VARARGS, "Wait until a futex word differs from `seen`, at most `timeout_ns`."),
+    METHOD(atomics, bell_relay, METH_VARARGS, "Tell an event loop of each ring of a futex word, until it is stopped."),
+    METHOD(atomics, relay_heard, METH_VARARGS, "Say that the event loop is about to look at what the bell rings for."),
+    METHOD(atomics, relay_stop, METH_O, "Have a relay return; it tells nothing more."),
     METHOD(atomics, queue_push, METH_VARARGS, "Put a record into a queue; False when there is no room."),
     METHOD(atomics, queue_pop, METH_VARARGS, "Take the oldest record, None if there is none; ValueError: it was broken, all is dropped."),
     METHOD(atomics, changed, METH_VARARGS, "Indices in a table of (offset, size, mask, index) whose bytes differ between two images."),
@@ -540,7 +616,8 @@ static int module_exec(PyObject *module)
     return PyModule_AddIntConstant(module, "RING_HEADER_SIZE", RING_HEADER_SIZE) < 0 ||
                    PyModule_AddIntConstant(module, "QUEUE_HEADER_SIZE", QUEUE_HEADER_SIZE) < 0 ||
                    PyModule_AddIntConstant(module, "RAW_OFFSET", RAW_OFFSET) < 0 ||
-                   PyModule_AddIntConstant(module, "REASON_SIZE", REASON_SIZE) < 0
+                   PyModule_AddIntConstant(module, "REASON_SIZE", REASON_SIZE) < 0 ||
+                   PyModule_AddIntConstant(module, "RELAY_SIZE", sizeof(relay)) < 0
                ? -1
                : 0;
 }

@@ -94,6 +94,10 @@ class Bell:
         """Wait until the value differs from ``seen``, or for so long (negative: for ever); the value then."""
         return _atomics.bell_wait(self._memory, self._offset, seen, timeout_ns)
 
+    def relay(self, shared: bytearray, descriptor: int, turn_ns: int) -> None:
+        """What the thread of a :class:`~shmio.segment.relay.Relay` does."""
+        _atomics.bell_relay(self._memory, self._offset, shared, descriptor, turn_ns)
+
 
 class ClockPage:
     """The section of one segment; several threads may use it, to write it is the owner of time's alone."""
