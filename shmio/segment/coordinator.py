@@ -6,14 +6,15 @@ import logging
 import os
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Final
 
-from shmio.errors import SegmentError, TimeError, ValueRangeError
+from shmio.errors import TimeError, ValueRangeError
+from shmio.segment.answers import Wait, answer, silence
 from shmio.segment.block import Block
 from shmio.segment.clock import ClockMode, ClockState
-from shmio.segment.frame import Quality
 from shmio.segment.processes import ProcessSlot
 from shmio.segment.segment import Segment
 
@@ -122,29 +123,45 @@ class Coordinator:
         time-out, or a participant has failed; then the step's number and time are used up. ValueRangeError: not within
         1 us and 1 h.
         """
-        with self._turn:
-            self.take_over()
-            before = self.read()
-            dt_ns = before.step_size_ns if dt_ns is None else dt_ns
-            check_step(dt_ns)
-            step = Step(before.step + 1, before.time_ns + dt_ns, dt_ns)
-            participants = self._participants()
-            asked = before._replace(step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
-            problem = "it was broken off"
-            try:
-                self._write(asked)
-                self._ring([block.source for block in participants])
-                problem = self._await_frames(step.number, participants, asked)
-            finally:
-                note = f"step {step.number} failed: {problem}" if problem else ""
-                done = before.done if problem else step.number
-                self._write(asked._replace(done=done, stepping=False, note=note))
-            if not problem:
-                self._deliver(step)
-                problem = self._await_delivery(step.number)
-            if problem:
-                raise TimeError(f"step {step.number}: {problem}")
-            return step
+        with self._turn, closing(self.stepping(dt_ns)) as stepping:
+            while True:
+                try:
+                    block, seen, rest_ns = next(stepping)
+                except StopIteration as over:
+                    step: Step = over.value
+                    return step
+                if block is None:
+                    self._segment.clock.delivered_bell.wait(seen, rest_ns)
+                else:
+                    block.ring.wait(seen, rest_ns)
+
+    def stepping(self, dt_ns: int | None = None) -> Generator[Wait, None, Step]:
+        """:meth:`step` for an event loop: it yields what to wait for, and looks again when it is asked to go on.
+
+        Whoever does not go on to its end has to close it. Nothing else of this coordinator may be called meanwhile.
+        """
+        self.take_over()
+        before = self.read()
+        dt_ns = before.step_size_ns if dt_ns is None else dt_ns
+        check_step(dt_ns)
+        step = Step(before.step + 1, before.time_ns + dt_ns, dt_ns)
+        participants = self._participants()
+        asked = before._replace(step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
+        problem = "it was broken off"
+        try:
+            self._write(asked)
+            self._ring([block.source for block in participants])
+            problem = yield from self._await_frames(step.number, participants, asked)
+        finally:
+            note = f"step {step.number} failed: {problem}" if problem else ""
+            done = before.done if problem else step.number
+            self._write(asked._replace(done=done, stepping=False, note=note))
+        if not problem:
+            self._deliver(step)
+            problem = yield from self._await_delivery(step.number)
+        if problem:
+            raise TimeError(f"step {step.number}: {problem}")
+        return step
 
     def delivered(self, slot: ProcessSlot, step: int) -> None:
         """Tell that the process in this slot, which is the caller's, has delivered a step and its marker.
@@ -201,7 +218,9 @@ class Coordinator:
             if slot.name in sources:
                 self._segment.clock.slot_bell(slot.index).ring()
 
-    def _await_frames(self, number: int, participants: Sequence[Block], asked: ClockState) -> str:
+    def _await_frames(
+        self, number: int, participants: Sequence[Block], asked: ClockState
+    ) -> Generator[Wait, None, str]:
         """Wait for the frame of each for this step; who has failed or not answered, and why; empty: nobody."""
         begun_ns = time.monotonic_ns()
         waiting = list(participants)
@@ -210,25 +229,26 @@ class Coordinator:
         while waiting:
             block = waiting[0]
             seen = block.ring.doorbell()  # before looking
-            answer = _answer(block, number)
-            if answer is not None:
+            found = answer(block, number)
+            if found is not None:
                 waiting.remove(block)
-                problems += [f"{block.source}: {answer}"] if answer else []
+                problems += [f"{block.source}: {found}"] if found else []
                 continue
             passed_ns = time.monotonic_ns() - begun_ns
             if passed_ns >= self._hard_ns:
-                problems += [self._silence(block) for block in waiting if _answer(block, number) is None]
+                silent = [block for block in waiting if answer(block, number) is None]
+                problems += [silence(self._segment, block, self._hard_ns) for block in silent]
                 return "; ".join(problems)
             if passed_ns >= self._soft_ns and not told:
                 told = True
-                silent = [block.source for block in waiting if _answer(block, number) is None]
-                note = f"step {number} waits for {', '.join(silent)}"
+                names = [block.source for block in waiting if answer(block, number) is None]
+                note = f"step {number} waits for {', '.join(names)}"
                 log.warning(note)
                 self._write(asked._replace(note=note))
-            block.ring.wait(seen, (self._hard_ns if told else min(self._soft_ns, self._hard_ns)) - passed_ns)
+            yield Wait(block, seen, (self._hard_ns if told else min(self._soft_ns, self._hard_ns)) - passed_ns)
         return "; ".join(problems)
 
-    def _await_delivery(self, number: int) -> str:
+    def _await_delivery(self, number: int) -> Generator[Wait, None, str]:
         """Wait until the other dispatchers have delivered a step; who has not, or empty."""
         clock, begun_ns, told = self._segment.clock, time.monotonic_ns(), False
         while True:
@@ -244,7 +264,7 @@ class Coordinator:
                 told = True
                 log.warning("step %d waits for its delivery by %s", number, names)
             # In turns: one that dies rings no bell.
-            clock.delivered_bell.wait(seen, min(self._soft_ns, self._hard_ns - passed_ns))
+            yield Wait(None, seen, min(self._soft_ns, self._hard_ns - passed_ns))
 
     def _owes(self, slot: ProcessSlot, number: int) -> bool:
         """Whether another process delivers steps, lives, and has not delivered this one yet."""
@@ -253,34 +273,10 @@ class Coordinator:
         last = self._segment.clock.delivered(slot.index)
         return last is not None and last < number and slot.alive()  # our own lock does not count as one held
 
-    def _silence(self, block: Block) -> str:
-        """What is known of a participant that has not answered."""
-        what = f"{block.source}: no answer within {self._hard_ns / 1e9:g} s"
-        for slot in self._segment.processes:
-            if slot.name == block.source:
-                if slot.alive():
-                    return f"{what} from pid {slot.report.pid}"
-                told = slot.supervised
-                return f"{what}: its process does not run ({told.phase}{told.note and f': {told.note}'})"
-        return what
-
     def _owner(self, pid: int) -> str:
         """Who owns time, as far as the page and the process table tell."""
         names = [slot.name for slot in self._segment.processes if pid and slot.report.pid == pid and slot.alive()]
         return f"{names[0]} (pid {pid})" if names else f"another program (pid {pid})"
-
-
-def _answer(block: Block, number: int) -> str | None:
-    """A participant's answer to a step: empty when it is done, why it failed, None as long as there is none."""
-    if block.retired:
-        return ""  # a reload has ended it
-    try:
-        frame = block.latest()
-    except SegmentError as error:
-        return str(error)
-    if frame is None or frame.cycle < number:
-        return None
-    return frame.reason or "it gave no reason" if frame.quality is Quality.BAD else ""
 
 
 def check_step(dt_ns: float) -> None:

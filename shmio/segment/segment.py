@@ -126,12 +126,17 @@ class Segment:
         """Changes whenever a reload adds or ends blocks; then :meth:`refresh` has something to do."""
         return header.table_state(self.memory)[0]
 
+    @property
+    def outdated(self) -> bool:
+        """Whether :meth:`refresh` has something to do, which may take a second for a big layout."""
+        return self.generation != self._generation
+
     def refresh(self) -> bool:
         """Look again what blocks there are, if a reload has changed that. Blocks that go on stay the same objects.
 
         The process table is read anew too. FormatError.
         """
-        if self.generation == self._generation:
+        if not self.outdated:
             return False
         self.blocks = self._find_blocks()
         self.processes = ProcessTable(self.shared, self.memory, self.header)

@@ -196,6 +196,17 @@ def test_who_does_not_answer_is_named_and_the_number_is_used_up(instance: str) -
                 assert Coordinator(segment).step().number == 2
 
 
+def test_a_step_that_is_not_waited_for_to_its_end_is_broken_off(instance: str) -> None:
+    with built(instance, spec("a")) as segment:
+        stepping = Coordinator(segment).stepping()
+        assert next(stepping).block is segment.blocks["a"]
+        assert segment.clock.read().stepping
+        stepping.close()
+        state = segment.clock.read()
+        assert (state.stepping, state.step, state.done) == (False, 1, 0)
+        assert state.note == "step 1 failed: it was broken off"
+
+
 def latest_cycle(segment: Segment, source: str) -> int:
     frame = segment.blocks[source].latest()
     return 0 if frame is None else frame.cycle
