@@ -11,6 +11,7 @@ import msgspec
 
 from shmio import worker
 from shmio.config import Address, Grpc, load
+from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.doors import Doors
 from shmio.endpoints.grpc.feeds import Feeds
 from shmio.endpoints.grpc.hold import Hold
@@ -55,8 +56,9 @@ async def _serve(worker: Worker) -> None:
         task.add_done_callback(tasks.discard)
 
     hold = Hold()
-    feeds = Feeds(worker.segment, writer, loop, on_quality, hold)
-    services = Services(worker.segment, worker.slot, hold, feeds, config.default_source)
+    bells = Bells()
+    feeds = Feeds(worker.segment, writer, bells, on_quality, hold)
+    services = Services(worker.segment, worker.slot, hold, bells, feeds, config.default_source)
     server = Server(services)
     feeds.start()
     await services.stepper.start(worker.before.pid)
@@ -80,7 +82,7 @@ async def _serve(worker: Worker) -> None:
                 services.move(changed)
             reading = None
         if not (feeds.alive and services.stepper.alive and server.alive):
-            raise RuntimeError("a thread ended that should not have; the endpoint starts anew")
+            raise RuntimeError("something ended that should not have; the endpoint starts anew")
         streams, dropped, published, refused = services.counters
         worker.report((streams, feeds.messages + services.updates, dropped, published, refused))
         try:
@@ -93,8 +95,7 @@ async def _serve(worker: Worker) -> None:
     await services.stepper.stop()
     await server.stop()
     await _calls_end()
-    feeds.join()
-    services.stepper.join()
+    bells.close()
 
 
 async def _calls_end() -> None:

@@ -11,6 +11,7 @@ from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.hold import Hold, Moment
 from shmio.endpoints.grpc.outbox import Outboxes
 from shmio.errors import SegmentError
+from shmio.segment.clock import ClockState
 from shmio.segment.coordinator import Step
 
 PATIENCE_S: Final = 4.0
@@ -51,8 +52,7 @@ class Delivery:
                 return False
             for feed in list(self._feeds.values()):
                 if feed.block.attributes.stepped:
-                    await feed.inlet.caught_up()
-            await asyncio.sleep(0)  # what was shown before it was held is delivered then
+                    feed.inlet.catch_up()
             self._hold.moment = Moment(step.number, step.time_ns)
             for feed in list(self._feeds.values()):
                 try:
@@ -60,7 +60,14 @@ class Delivery:
                 except SegmentError as error:
                     log.warning("step %d: %s", step.number, str(error))
             await self._outboxes.taken(PATIENCE_S)
-            await asyncio.gather(*(other(step) for other in self.others))
+            for other in self.others:
+                await other(step)
             mark()
             await self._outboxes.taken(PATIENCE_S)
             return True
+
+
+def before(state: ClockState) -> Moment:
+    """What is delivered when time is found virtual: on a busy machine its first step may be over, and waits for us."""
+    first = bool(state.dt_ns) and state.step == state.done
+    return Moment(state.done - first, state.present_ns - first * state.dt_ns)

@@ -51,8 +51,7 @@ class Echo:
 
     A subject is shown when a command has written all of it. One of which only a part is written, as an array's
     element, is shown when that is known to be all, with the rest as of the frame before the command. A command whose
-    first events nobody followed is passed over: it could only be shown in part. ``listen``, ``leave`` and ``fail``
-    belong to the event loop's thread, ``follow`` and ``skip`` to that of the events.
+    first events nobody followed is passed over: it could only be shown in part.
     """
 
     def __init__(self, block: Block, stamp: Callable[[Event], tuple[int, int]]) -> None:

@@ -1,15 +1,14 @@
-"""Follows one block in a thread: one change scan for each frame, one encoding for each change, whoever listens."""
+"""Follows one block: one change scan for each frame, one encoding for each change, whoever listens."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import threading
 from collections.abc import Callable, Iterable, Sized
 from typing import NamedTuple
 
+from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.channel import Channel, Listener
-from shmio.endpoints.grpc.courier import Courier
 from shmio.endpoints.grpc.hold import Hold, Moment, Still
 from shmio.endpoints.grpc.inlet import Inlet
 from shmio.endpoints.grpc.subject import Subject
@@ -19,10 +18,13 @@ from shmio.segment.scan import ChangeScan
 log = logging.getLogger("shmio.grpc")
 
 CATCH_UP_FRAMES = 32
-"""A feed that is further behind than this goes on with the newest frame: what it skips is conflated, not lost."""
+"""A feed that is further behind than this goes on with the newest frame: what it skips is conflated, not lost.
 
-WAIT_S = 0.2
-"""Longest wait for a frame before age is looked at."""
+So does one that nobody listens to.
+"""
+
+TURN_FRAMES = 8
+"""So many are shown before streams have their turn."""
 
 
 class _Table(NamedTuple):
@@ -36,31 +38,29 @@ class Feed:
     """Delivers the changes of one block's registers to listeners while quality is good.
 
     On recovery from bad quality every register is delivered again. While it is held, which a block on the instance's
-    clock is in virtual time, nothing is delivered but by :meth:`step`. All but the thread of the feed belongs to the
-    event loop's; it only reads the table that :meth:`listen` and :meth:`leave` replace.
+    clock is in virtual time, nothing is delivered but by :meth:`step`. For the event loop's thread.
     """
 
     def __init__(
         self,
         block: Block,
         writer: int,
-        loop: asyncio.AbstractEventLoop,
+        bells: Bells,
         on_quality: Callable[[str, bool], None],
         hold: Hold | None = None,
     ) -> None:
         """``writer``: the command queue of this process. ``hold``: virtual time; default: there is none."""
         self.block = block
-        self.inlet = Inlet(block, writer, loop, self._stamp)
+        self.inlet = Inlet(block, writer, bells, self._stamp)
         """The other direction."""
         self.messages = 0
         self._hold = hold or Hold()
         self._held = self._hold.on and block.attributes.stepped
-        self._turn = threading.Lock()  # around each frame that is looked at, so that none is after it was held
         self._stepped = False  # since it is held
         self._shown: Frame | Still | None = None  # what listeners have seen; None while quality is bad
         self._good = False  # as last told
-        self._loop = loop
-        self._courier = Courier(loop)
+        self._loop = asyncio.get_running_loop()
+        self._bells = bells
         self._on_quality = on_quality
         self._channels: dict[Subject, Channel] = {}
         self._free: list[int] = []  # slots
@@ -68,35 +68,34 @@ class Feed:
         self._outdated = False
         self._owed: dict[Listener, Channel] = {}  # joined while there was no good value
         _ = block.layout.members("")  # builds what paths are looked up in, before the first client waits for it
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"feed-{block.source}", daemon=True)
+        self._cursor = block.cursor()
+        self._following = False
+        self._again = False  # whether the loop is about to look without a bell
 
     @property
     def alive(self) -> bool:
         """Whether the block is being followed, as long as there is something to come."""
-        return (self._thread.is_alive() or self.block.retired) and self.inlet.alive
+        return (self._following or self.block.retired) and self.inlet.alive
 
     @property
     def over(self) -> bool:
-        """Whether nothing is left of it: neither a thread nor a stream."""
-        return not (self._thread.is_alive() or self._channels) and self.inlet.over
+        """Whether nothing is left of it: neither does it follow the block, nor has it a stream."""
+        return not (self._following or self._channels) and self.inlet.over
 
     def start(self) -> None:
         """Begin to follow the block."""
+        newest = self.block.latest()
         if self._held:
-            self._adopt(self.block.latest())
-        self._thread.start()
-        self.inlet.start()
+            self._adopt(newest)
+        self._cursor = self.block.cursor(after=newest.number - 1 if newest else 0)
+        self._following = True
+        self.inlet.start()  # it hears first: what was written before a frame is told before it
+        self._bells.join(self.block, self._look)
 
     def stop(self) -> None:
-        """Tell the thread to end; it does within ``WAIT_S``."""
-        self._stopping.set()
+        """Follow it no more."""
+        self._end()
         self.inlet.stop()
-
-    def join(self) -> None:
-        """Wait until the thread has ended."""
-        self._thread.join()
-        self.inlet.join()
 
     def listen(self, subject: Subject, listener: Listener) -> None:
         """Join a subject's listeners; the current value is delivered at once, or as soon as it is good."""
@@ -129,12 +128,8 @@ class Feed:
             self._settle()
 
     def hold(self) -> None:
-        """Show nothing any more but by :meth:`step`, if the block is on the instance's clock.
-
-        What was shown before is delivered when the event loop has had a turn.
-        """
-        with self._turn:
-            self._held = self.block.attributes.stepped
+        """Show nothing any more but by :meth:`step`, if the block is on the instance's clock."""
+        self._held = self.block.attributes.stepped
 
     def step(self) -> None:
         """Show what differs between the values shown last and the newest frame, as of the step that is delivered.
@@ -184,15 +179,6 @@ class Feed:
                 listener.deliver(message)
         self._owed.clear()
 
-    def _deliver(self, frame: int, batch: list[tuple[Channel, Sized]]) -> None:
-        """Hand a frame's messages to all who have not seen that frame yet."""
-        for channel, message in batch:
-            for listener in channel.listeners:
-                if frame > listener.since:
-                    self._owed.pop(listener, None)
-                    listener.deliver(message)
-        self._settle()
-
     def _turn_bad(self, frame: int) -> None:
         """Quality is bad from ``frame`` on, for all who have not joined later."""
         for channel in self._channels.values():
@@ -210,30 +196,46 @@ class Feed:
         self._table = _Table(tuple(slots), scan, apart)
         self._outdated = False
 
-    # ---- the feed's own thread ---------------------------------------------------------------------------------
+    # ---- what the source publishes -----------------------------------------------------------------------------
 
-    def _run(self) -> None:
+    def _end(self) -> None:
+        if self._following:
+            self._following = False
+            self._bells.leave(self.block, self._look)
+
+    def _look(self) -> None:
+        """Take the frames that have come, a few at a time; if there are none, look at the age of the last one."""
+        if not self._following:
+            return  # it has left while the bell rang
         try:
             self._follow()
         except Exception:
             log.exception("the feed of %s failed", self.block.source)
+            self._end()
+
+    def _look_again(self) -> None:
+        self._again = False
+        self._look()
 
     def _follow(self) -> None:
         block = self.block
-        newest = block.latest()
-        cursor = block.cursor(after=newest.number - 1 if newest else 0)
-        while not self._stopping.is_set():
-            if cursor.behind > CATCH_UP_FRAMES:
-                cursor = block.cursor(after=block.ring.head() - 1)
-            retired = block.retired
-            frame = cursor.next(timeout_s=min(WAIT_S, block.stale_ns / 1e9))
-            if frame is None and retired:
-                return
-            with self._turn:
-                if self._held:
-                    self._look(frame)
-                else:
-                    self._take(frame)
+        if self._cursor.behind > (CATCH_UP_FRAMES if self._channels else 1):
+            self._cursor = block.cursor(after=block.ring.head() - 1)
+        retired = block.retired  # before looking: what was published before the end is still shown
+        take = self._regard if self._held else self._take
+        for count in range(TURN_FRAMES):
+            frame = self._cursor.poll()
+            if frame is not None:
+                take(frame)
+                continue
+            if not count:
+                take(None)
+            if retired:
+                self._end()
+            return
+        if not self._again:
+            self._again = True
+            self._loop.call_soon(self._look_again)
 
     def _take(self, frame: Frame | None) -> None:
         """Show a frame if it is good, and turn bad if it is not, or none came for too long."""
@@ -245,32 +247,37 @@ class Feed:
         if shown is not None and (stale or (frame is not None and not good)):
             since = shown.number + 1 if frame is None else frame.number
             shown = self._shown = None
-            self._courier.post(self._turn_bad, since)
+            self._turn_bad(since)
             self._tell(good=False)
         if frame is not None and good:
             self._tell(good=True)
             self._show(shown, frame)
             self._shown = frame
 
-    def _look(self, frame: Frame | None) -> None:
+    def _regard(self, frame: Frame | None) -> None:
         """Tell quality at once also while values wait for a step."""
         if frame is not None:
             self._tell(good=frame.quality is not Quality.BAD)
-            if not self._stepped and self._shown is None:
-                self._courier.post(self._adopt, frame)
+            self._adopt(frame)
 
     def _tell(self, *, good: bool) -> None:
         if good != self._good:
             self._good = good
-            self._courier.post(self._on_quality, self.block.source, good)
+            self._on_quality(self.block.source, good)
 
     def _show(self, shown: Frame | Still | None, frame: Frame) -> None:
-        """Encode what has changed since the frame shown before; everything, if there is none."""
-        news = self._news(shown, frame)
-        batch = [(channel, message) for channel in news if (message := channel.encode(frame)) is not None]
-        if batch or self._owed:
-            self.messages += len(batch)
-            self._courier.post(self._deliver, frame.number, batch)
+        """Give what has changed since the frame shown before, or everything, to all who have not seen the frame yet."""
+        for channel in self._news(shown, frame):
+            message = channel.encode(frame)
+            if message is None:
+                continue
+            self.messages += 1
+            for listener in channel.listeners:
+                if frame.number > listener.since:
+                    self._owed.pop(listener, None)
+                    listener.deliver(message)
+        if self._owed:
+            self._settle()
 
     def _news(self, shown: Frame | Still | None, frame: Frame) -> list[Channel]:
         """The channels whose bytes have changed since then; all, if nothing was shown."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Iterator, Mapping
 
+from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.hold import Hold
 from shmio.segment import Segment
@@ -17,7 +18,7 @@ class Feeds(Mapping[str, Feed]):
         self,
         segment: Segment,
         writer: int,
-        loop: asyncio.AbstractEventLoop,
+        bells: Bells,
         on_quality: Callable[[str, bool], None],
         hold: Hold | None = None,
     ) -> None:
@@ -28,7 +29,7 @@ class Feeds(Mapping[str, Feed]):
         self._segment = segment
         self._generation = -1  # of the segment when it was last read
         self._writer = writer
-        self._loop = loop
+        self._bells = bells
         self._on_quality = on_quality
         self._hold = hold
         self._feeds: dict[str, Feed] = {}
@@ -58,7 +59,7 @@ class Feeds(Mapping[str, Feed]):
         """Begin to follow all blocks that are not followed yet."""
         for source, block in self._segment.blocks.items():
             if source not in self._feeds:
-                feed = self._feeds[source] = Feed(block, self._writer, self._loop, self._on_quality, self._hold)
+                feed = self._feeds[source] = Feed(block, self._writer, self._bells, self._on_quality, self._hold)
                 self._on_quality(source, False)
                 feed.start()
 
@@ -75,7 +76,7 @@ class Feeds(Mapping[str, Feed]):
         over = [name for name, feed in self._feeds.items() if self._segment.blocks.get(name) is not feed.block]
         for name in over:
             feed = self._feeds.pop(name)
-            self._ended.append(feed)  # its threads end by themselves, when all is read
+            self._ended.append(feed)  # it ends by itself, when all is read
             self._on_quality(name, False)
         self.start()
         return [name for name in before | self._feeds if before.get(name) is not self._feeds.get(name)]
@@ -94,11 +95,6 @@ class Feeds(Mapping[str, Feed]):
         self._ended = [feed for feed in self._ended if feed not in over]
 
     def stop(self) -> None:
-        """Tell all threads to end."""
+        """Follow nothing any more."""
         for feed in (*self._feeds.values(), *self._ended):
             feed.stop()
-
-    def join(self) -> None:
-        """Wait until they have."""
-        for feed in (*self._feeds.values(), *self._ended):
-            feed.join()

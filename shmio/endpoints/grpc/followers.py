@@ -29,7 +29,7 @@ News = Diverted | Event
 
 
 class Followers:
-    """By the number of their injection. ``gather`` and ``skip`` are the events' thread's, all else is the loop's."""
+    """By the number of their injection."""
 
     def __init__(self) -> None:
         self._followers: dict[int, Follower] = {}

@@ -1,19 +1,18 @@
-"""The way into one block: sends values, follows the block's events in a thread, and tells what became of each."""
+"""The way into one block: sends values, follows the block's events, and tells what became of each."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from typing import Final, Unpack
 
-from shmio.endpoints.grpc.echo import Echo, Message
-from shmio.endpoints.grpc.followers import Follower, Followers, News
+from shmio.endpoints.grpc.bells import Bells
+from shmio.endpoints.grpc.echo import Echo
+from shmio.endpoints.grpc.followers import Follower, Followers
 from shmio.endpoints.grpc.pending import Cost, Done, Pending
-from shmio.endpoints.grpc.progress import Progress
 from shmio.errors import CommandError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
@@ -27,8 +26,7 @@ log = logging.getLogger("shmio.grpc")
 MAX_OPEN: Final = 512
 """Events that may be outstanding: a quarter of the ring, so that none is overwritten before it is read."""
 BATCH: Final = 32
-"""Most events that are handed to the event loop at once, so that streams get their turn in between."""
-WAIT_S: Final = 0.2
+"""Most events that are looked at at once, so that streams get their turn in between."""
 
 _RETIRED: Final = "the source was changed or removed by a reload"
 
@@ -36,14 +34,14 @@ _RETIRED: Final = "the source was changed or removed by a reload"
 class Inlet:
     """Sends values to a block's source, in order, and keeps no more under way than it can hear the end of.
 
-    All but the thread belongs to the event loop.
+    For the event loop's thread.
     """
 
     def __init__(
         self,
         block: Block,
         writer: int,
-        loop: asyncio.AbstractEventLoop,
+        bells: Bells,
         stamp: Callable[[Event], tuple[int, int]],
     ) -> None:
         """``writer``: the command queue of this process. ``stamp``: see :class:`Echo`."""
@@ -51,7 +49,8 @@ class Inlet:
         self.stamp = stamp
         self.echo = Echo(block, stamp)
         self._writer = writer
-        self._loop = loop
+        self._bells = bells
+        self._loop = asyncio.get_running_loop()
         self._commander = Commander(block, writer)
         self._prepared = False
         self._preparing = asyncio.Lock()
@@ -64,33 +63,30 @@ class Inlet:
         self._freed: asyncio.Future[None] | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._cursor = block.events.cursor()
-        self._progress = Progress(loop, self._cursor.last)
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name=f"inlet-{block.source}", daemon=True)
+        self._missed = 0  # events, as last told
+        self._following = False
+        self._again = False  # whether the loop is about to look without a bell
 
     @property
     def alive(self) -> bool:
         """Whether the block's events are being followed, as long as there are any."""
-        return self._thread.is_alive() or self.block.retired
+        return self._following or self.block.retired
 
     @property
     def over(self) -> bool:
-        """Whether nothing is left of it: no thread, no value under way, no stream."""
-        return not (self._thread.is_alive() or self._pending or self._turn.locked() or self.echo.busy)
+        """Whether nothing is left of it: it follows no events, and has no value under way and no stream."""
+        return not (self._following or self._pending or self._turn.locked() or self.echo.busy)
 
     def start(self) -> None:
         """Begin to follow the events."""
-        self._thread.start()
+        self._following = True
+        self._bells.join(self.block, self._look)
 
     def stop(self) -> None:
-        """Tell the thread to end; it does within ``WAIT_S``."""
-        self._stopping.set()
+        """Follow them no more."""
+        self._end_following()
         if self._timer is not None:
             self._timer.cancel()
-
-    def join(self) -> None:
-        """Wait until the thread has ended."""
-        self._thread.join()
 
     def ready(self, values: Mapping[str, object]) -> bool:
         """Whether :meth:`send`, or :meth:`give`, would not have to wait."""
@@ -156,9 +152,11 @@ class Inlet:
         if self._timer is None:
             self._set_timer()
 
-    async def caught_up(self) -> None:
-        """Wait until what has been told so far is delivered, to those who listen to what is written too."""
-        await self._progress.reached(self.block.events.head() if self._thread.is_alive() else 0)
+    def catch_up(self) -> None:
+        """Deliver what has been told so far, to those who listen to what is written too."""
+        newest = self.block.events.head()
+        while self._following and self._cursor.last < newest:
+            self._look()
 
     async def _prepare(self) -> None:
         if not self._prepared:
@@ -176,19 +174,17 @@ class Inlet:
 
     # ---- what the source says --------------------------------------------------------------------------------
 
-    def _on_events(self, events: list[Event], messages: list[Message], news: list[News]) -> None:
-        for channel, message in messages:
+    def _heed(self, event: Event) -> None:
+        for channel, message in self.echo.follow(event):
             for listener in channel.listeners:
                 listener.deliver(message)
-        for item in news:
+        for item in self._followers.gather(event):
             self._followers.tell(item)
-        for event in events:
-            if event.kind == EventKind.STARTED:
-                self._restarted(event)
-            elif pending := self._pending.get(event.command):
-                self._silent = False
-                self._hear(event, pending)
-        self._free()
+        if event.kind == EventKind.STARTED:
+            self._restarted(event)
+        elif event.writer == self._writer and (pending := self._pending.get(event.command)):
+            self._silent = False
+            self._hear(event, pending)
 
     def _hear(self, event: Event, pending: Pending) -> None:
         if not pending.taken:
@@ -196,7 +192,10 @@ class Inlet:
         if end := pending.hear(event):
             self._end(event.command, *end)
 
-    def _missed(self, reason: str) -> None:
+    def _miss(self, count: int) -> None:
+        reason = f"{count} events of source {self.block.source} were missed"
+        self.echo.skip()
+        self._followers.skip()
         self.echo.fail(reason)
         self._followers.fail(reason)
 
@@ -252,42 +251,44 @@ class Inlet:
         self._free()
         self._set_timer()
 
-    # ---- the thread ------------------------------------------------------------------------------------------
+    # ---- the events ------------------------------------------------------------------------------------------
 
-    def _run(self) -> None:
+    def _end_following(self) -> None:
+        if self._following:
+            self._following = False
+            self._bells.leave(self.block, self._look)
+
+    def _look(self) -> None:
+        """Heed the events that have come, a few at a time."""
+        if not self._following:
+            return  # it has left while the bell rang
         try:
             self._follow()
         except Exception:
             log.exception("the events of %s cannot be followed", self.block.source)
+            self._end_following()
+
+    def _look_again(self) -> None:
+        self._again = False
+        self._look()
 
     def _follow(self) -> None:
-        cursor = self._cursor
-        missed = 0
-        while not self._stopping.is_set():
-            retired = self.block.retired
-            event = cursor.next(WAIT_S)
-            if event is None:
-                self._progress.tell(cursor.last)
-                if retired:
-                    self._loop.call_soon_threadsafe(self._retired)
-                    return
+        retired = self.block.retired  # before looking: what was told before the end is still heeded
+        for count in range(BATCH):
+            event = self._cursor.poll()
+            if (missed := self._cursor.missed - self._missed) > 0:
+                self._missed += missed
+                self._miss(missed)
+            if event is not None:
+                self._heed(event)
                 continue
-            ours: list[Event] = []
-            messages: list[Message] = []
-            news: list[News] = []
-            for left in reversed(range(BATCH)):
-                if cursor.missed != missed:
-                    self.echo.skip()
-                    self._followers.skip()
-                    reason = f"{cursor.missed - missed} events of source {self.block.source} were missed"
-                    self._loop.call_soon_threadsafe(self._missed, reason)
-                    missed = cursor.missed
-                messages += self.echo.follow(event)
-                news += self._followers.gather(event)
-                if event.writer == self._writer or event.kind == EventKind.STARTED:
-                    ours.append(event)
-                if not left or (event := cursor.poll()) is None:
-                    break
-            if ours or messages or news:
-                self._loop.call_soon_threadsafe(self._on_events, ours, messages, news)
-            self._progress.tell(cursor.last)
+            if count:
+                self._free()
+            if retired:
+                self._end_following()
+                self._retired()
+            return
+        self._free()
+        if not self._again:
+            self._again = True
+            self._loop.call_soon(self._look_again)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterator, Sized
 from contextlib import contextmanager
@@ -11,6 +12,7 @@ from typing import Any, Final
 
 from shmio.endpoints.grpc.feed import CATCH_UP_FRAMES, Feed
 from shmio.endpoints.grpc.load import Load, Total
+from shmio.endpoints.grpc.pace import LATE_S, Pace
 from shmio.endpoints.grpc.subject import Subject
 from shmio.segment.events import EVENT_SLOTS
 
@@ -39,38 +41,43 @@ class Outbox:
         """Why it ended; empty: it did not fail."""
         self.on_failure: Callable[[], object] | None = None
         """Called then: the stream itself may wait for its client, who does not read, for ever."""
-        self._waiting: OrderedDict[int, tuple[_Lane, Sized]] = OrderedDict()
+        self._waiting: OrderedDict[int, tuple[_Lane, Sized, float]] = OrderedDict()  # and since when
         self._next = 0
         self._waiter: asyncio.Future[None] | None = None
         self._ended = False
         self._owed = 0  # messages up to this number are waited for
         self._taken = 0  # those before this number have left, or were dropped
         self._told: asyncio.Future[None] | None = None
+        self.pace = Pace()
 
-    def add(self, lane: _Lane, message: Sized) -> int:
-        """Take a message; its number."""
+    def add(self, lane: _Lane, message: Sized, now_s: float = 0.0) -> int:
+        """Take a message; its number. ``now_s``: for :meth:`since`."""
         number = self._next
         self._next = number + 1
-        self._waiting[number] = lane, message
+        self._waiting[number] = lane, message, now_s
         lane.load.add(message)
         if self._waiter is not None:
             self._wake()
         return number
 
+    def since(self, number: int) -> float:
+        """When one that waits was added."""
+        return self._waiting[number][2]
+
     def drop(self, number: int) -> None:
         """Drop one that waits."""
-        lane, message = self._waiting.pop(number)
+        lane, message, _ = self._waiting.pop(number)
         lane.load.remove(message)
         self.dropped += 1
 
     def clear(self) -> None:
         """Drop all that waits."""
-        for lane, _ in list(self._waiting.values()):
+        for lane, _, _ in list(self._waiting.values()):
             lane.drop()
 
     def close(self) -> None:
         """Its stream is over: what waits is nobody's, and was not dropped for being too much; nothing is owed."""
-        for lane, message in self._waiting.values():
+        for lane, message, _ in self._waiting.values():
             lane.load.remove(message)
         self._waiting.clear()
         self._owed = 0
@@ -131,7 +138,7 @@ class Outbox:
                 await self._waiter
             finally:
                 self._waiter = None
-        _, (lane, message) = waiting.popitem(last=False)
+        _, (lane, message, _) = waiting.popitem(last=False)
         return lane.take(message)
 
     def _wake(self) -> None:
@@ -169,11 +176,11 @@ class _Lane:
         self._add(message)
         self._outbox.owe()
 
-    def _add(self, message: Sized) -> None:
+    def _add(self, message: Sized, now_s: float = 0.0) -> None:
         if self._outbox.failure:
             self._outbox.dropped += 1
         else:
-            self._numbers.append(self._outbox.add(self, message))
+            self._numbers.append(self._outbox.add(self, message, now_s))
 
 
 class StateLane(_Lane):
@@ -190,9 +197,15 @@ class StateLane(_Lane):
     def deliver(self, message: Sized) -> None:
         """Add a message, in place of the topic's that wait if they are too many."""
         waits = len(self._numbers)  # of a client that keeps up nothing does, and this is all
+        outbox, numbers, now_s = self._outbox, self._numbers, time.monotonic()
+        outbox.pace.offer(now_s)
         if waits >= TOPIC_BOUND or (self.load.count and self.load.full(message, STATE_BOUND)):
             self.drop()
-        self._add(message)
+        elif waits and outbox.pace.behind:
+            while numbers and now_s > outbox.since(numbers[0]) + LATE_S:
+                outbox.drop(numbers.popleft())
+        outbox.pace.lose(waits - len(numbers))
+        self._add(message, now_s)
 
     def lose(self) -> None:
         """What waits must not be sent any more."""

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping
 
 import grpc
 
+from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.hold import Hold
 from shmio.endpoints.grpc.native.service import NativeService
@@ -25,9 +26,15 @@ class Services:
     """What a server offers on each of its addresses."""
 
     def __init__(
-        self, segment: Segment, slot: ProcessSlot, hold: Hold, feeds: Mapping[str, Feed], default_source: str | None
+        self,
+        segment: Segment,
+        slot: ProcessSlot,
+        hold: Hold,
+        bells: Bells,
+        feeds: Mapping[str, Feed],
+        default_source: str | None,
     ) -> None:
-        """``slot``: this process's in the table. ``hold``: that of the feeds.
+        """``slot``: this process's in the table. ``hold``, ``bells``: those of the feeds.
 
         ``default_source``: that of paths which name none; default: the only one.
         """
@@ -37,9 +44,9 @@ class Services:
         self._outboxes = Outboxes()
         self._shadows = Shadows(topics)
         self._publisher = Publisher(topics, self._shadows)
-        self.stepper = Stepper(segment, slot, hold, feeds, self._outboxes, self._publisher)
+        self.stepper = Stepper(segment, slot, hold, bells, feeds, self._outboxes, self._publisher)
         """The instance's time."""
-        self._native = NativeService(topics, feeds, segment, slot.writer, self.stepper)
+        self._native = NativeService(topics, feeds, bells, segment, slot.writer, self.stepper)
         self._services = (
             self._native,
             SimlogV1(topics, self._publisher, self._outboxes, self._shadows, self.stepper),

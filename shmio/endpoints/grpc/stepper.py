@@ -4,29 +4,28 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import threading
-from collections.abc import Awaitable, Callable, Coroutine, Mapping
-from contextlib import suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
+from contextlib import asynccontextmanager, suppress
 from functools import partial
 from typing import Any, Final, TypeVar
 
-from shmio.endpoints.grpc.delivery import Delivery
-from shmio.endpoints.grpc.errand import Errands
+from shmio.endpoints.grpc.bells import Bell, Bells
+from shmio.endpoints.grpc.delivery import Delivery, before
+from shmio.endpoints.grpc.driver import Driver
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.hold import Hold, Moment, Status
 from shmio.endpoints.grpc.marks import Marks
 from shmio.endpoints.grpc.outbox import Outboxes
 from shmio.endpoints.grpc.publish import Publisher
-from shmio.errors import ShmioError, TimeError, ValueRangeError
+from shmio.errors import ShmioError, TimeError
 from shmio.segment import ProcessSlot, Segment
 from shmio.segment.clock import ClockState
-from shmio.segment.coordinator import MAX_STEP_NS, MIN_STEP_NS, Coordinator, Step
+from shmio.segment.coordinator import Coordinator, Step, check_step
 
 REST_S: Final = 1.0
 """Time is given up when nobody has moved it for so long, so that others can."""
 LATE_S: Final = 0.5
 """Who plays catches up with what it is late, up to this."""
-TURN_NS: Final = 200_000_000
 
 _Result = TypeVar("_Result")
 
@@ -36,7 +35,7 @@ log = logging.getLogger("shmio.grpc")
 class Stepper:
     """Moves time for clients, one at a time, and has each step delivered, whichever process makes it.
 
-    For the event loop's thread, but for two threads of its own: one that moves time, and one that hears of others.
+    For the event loop's thread.
     """
 
     def __init__(
@@ -44,6 +43,7 @@ class Stepper:
         segment: Segment,
         slot: ProcessSlot,
         hold: Hold,
+        bells: Bells,
         feeds: Mapping[str, Feed],
         outboxes: Outboxes,
         publisher: Publisher,
@@ -51,6 +51,7 @@ class Stepper:
         """``slot``: this process's in the table."""
         self.marks = Marks(hold, self._now, lambda: self._clock.read().step_size_ns / 1e9)
         """Tells steps and time."""
+        self._segment = segment
         self._clock = segment.clock
         self._slot = slot
         self.hold = hold
@@ -58,8 +59,8 @@ class Stepper:
         self._delivery = Delivery(hold, feeds, outboxes)
         self._publisher = publisher
         self._loop = asyncio.get_running_loop()
-        self._errands = Errands("time", self._loop)
         self._coordinator = Coordinator(segment)
+        self._driver = Driver(self._coordinator, segment.clock, bells)
         self._turn = asyncio.Lock()  # one moves time
         self._owns = False
         self._changing = asyncio.Lock()  # one begins to play, or ends
@@ -72,19 +73,19 @@ class Stepper:
         self._player: asyncio.Task[None] | None = None
         self._woken = asyncio.Event()  # the player is
         self._tasks: set[asyncio.Task[Any]] = set()
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._follow, name="clock", daemon=True)
+        self._page: Bell | None = None  # rings when it is written
         state = self._clock.read()
         if state.virtual:
             self._delivery.begin(Moment(state.done, state.present_ns))
         self._told = self.status[1:]
         self._coordinator.delivered(slot, state.done)
 
-    async def start(self, before: int = 0) -> None:
+    async def start(self, predecessor: int = 0) -> None:
         """Begin to follow time; go on playing if the process before this one, by its pid, did when it died."""
-        self._thread.start()
+        self._page = Bell(self._clock.bell, "clock")
+        self._page.listeners[self._look] = None
         state = self._clock.read()
-        if state.playing and state.owner == before:  # what another program that died has played stands
+        if state.playing and state.owner == predecessor:  # what another program that died has played stands
             try:
                 await self.play(state.dt_ns or None, state.rate)
             except TimeError as error:
@@ -93,7 +94,7 @@ class Stepper:
     @property
     def alive(self) -> bool:
         """Whether time is being followed, and played if it should be."""
-        return self._thread.is_alive() and (self._player is None or not self._player.done())
+        return self._page is not None and (self._player is None or not self._player.done())
 
     def also(self, deliver: Callable[[Step], Awaitable[None]]) -> None:
         """Have each step delivered to others, too, before it is over."""
@@ -111,7 +112,7 @@ class Stepper:
     async def set_step_size(self, dt_ns: int) -> None:
         """How far a step goes that does not say it itself; takes time over. ValueRangeError, TimeError."""
         _check(dt_ns)
-        await self._do(self._move(partial(self._coordinator.set_step_size, dt_ns)))
+        await self._do(self._change(partial(self._coordinator.set_step_size, dt_ns)))
 
     async def step(self, dt_ns: int | None = None, peer: str = "") -> Step:
         """Move time on, by the step size unless it is told; return when all streams have taken the step's marker.
@@ -135,8 +136,7 @@ class Stepper:
         return await self._do(self._end_play(end))
 
     async def stop(self) -> None:
-        """Move nothing more, and end the threads. A successor goes on with what is played."""
-        self._stopping.set()
+        """Move nothing more. A successor goes on with what is played."""
         self.marks.stop()
         if self._rest is not None:
             self._rest.cancel()
@@ -144,15 +144,12 @@ class Stepper:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)
-        if self._player is None and not self._errands.busy:
-            await self._errands.call(self._coordinator.close)
-        self._errands.stop()
-
-    def join(self) -> None:
-        """Wait until the threads have ended, but for one that a step holds up."""
-        self._thread.join()
-        if not self._errands.busy:
-            self._errands.join()
+        if self._player is None:
+            self._coordinator.close()
+        self._driver.stop()
+        if self._page is not None:
+            self._page.stop()
+            self._page.join()
 
     # ---- moving time ---------------------------------------------------------------------------------------------
 
@@ -171,26 +168,45 @@ class Stepper:
             await self._publisher.settle(peer)
         if self._player is not None:
             raise TimeError("time is played at present: pause it before it can be stepped")
-        return await self._move(partial(self._coordinator.step, dt_ns))
+        return await self._make(dt_ns)
 
-    async def _move(self, call: Callable[[], _Result], *, alive: bool = True) -> _Result:
-        """Take time over, call the coordinator beside the event loop, and deliver the step if it was one."""
+    async def _make(self, dt_ns: int | None) -> Step:
+        """Make a step, and deliver it."""
+        async with self._moved():
+            step = await self._driver.step(dt_ns)
+            self._alive = True
+            await self._deliver(step)
+            return step
+
+    async def _change(self, call: Callable[[], None], *, alive: bool = True) -> None:
+        """Have the coordinator change how time is moved."""
+        async with self._moved():
+            call()
+            self._alive = alive
+
+    @asynccontextmanager
+    async def _moved(self) -> AsyncIterator[None]:
+        """Time is ours, and nobody else's turn."""
         async with self._turn:
             self._moving = asyncio.current_task()
             try:
+                if self._segment.outdated:
+                    await asyncio.to_thread(self._segment.refresh)
                 if not self._owns:
-                    await self._errands.call(self._coordinator.take_over)
-                    self._owns = True
+                    self._coordinator.take_over()
+                    self._own(True)
                     self._look()
-                done = await self._errands.call(call)
-                self._alive = alive
-                if isinstance(done, Step):
-                    await self._deliver(done)
-                return done
+                yield
             finally:
                 self._moving = None
                 self._look()
                 self._set_rest()
+
+    def _own(self, owns: bool) -> None:
+        """Nobody but the owner writes the page."""
+        self._owns = owns
+        if self._page is not None:
+            (self._page.mute if owns else self._page.unmute)()
 
     def _set_rest(self) -> None:
         if self._rest is not None:
@@ -204,8 +220,8 @@ class Stepper:
     async def _release(self) -> None:
         async with self._turn:
             if self._player is None:
-                self._owns = False
-                await self._errands.call(self._coordinator.close)
+                self._own(False)
+                self._coordinator.close()
 
     # ---- playing ---------------------------------------------------------------------------------------------------
 
@@ -213,7 +229,7 @@ class Stepper:
         _check(dt_ns)
         async with self._changing:
             self._play_dt_ns, self._rate = dt_ns, rate
-            await self._move(partial(self._coordinator.set_playing, True, rate))
+            await self._change(partial(self._coordinator.set_playing, True, rate))
             if self._player is None:
                 self._player = self._loop.create_task(self._play())
         return self.status
@@ -224,7 +240,7 @@ class Stepper:
             self._woken.set()
             if player is not None:
                 await player
-            await self._move(partial(self._coordinator.set_playing, False), alive=not end)
+            await self._change(partial(self._coordinator.set_playing, False), alive=not end)
         return self.status
 
     async def _play(self) -> None:
@@ -233,17 +249,16 @@ class Stepper:
         self._woken.clear()
         while self._player is asyncio.current_task():
             try:
-                await self._move(partial(self._coordinator.step, self._play_dt_ns))
+                await self._make(self._play_dt_ns)
                 reason = ""
             except ShmioError as error:
-                before, reason = reason, str(error)
-                if reason != before:
+                last, reason = reason, str(error)
+                if reason != last:
                     log.warning("playing: %s", reason)
             dt_s = (self._play_dt_ns or self._clock.read().step_size_ns) / 1e9
             due_s = max(due_s + dt_s / self._rate, self._loop.time() - LATE_S)
-            if (wait_s := due_s - self._loop.time()) > 0:
-                with suppress(TimeoutError):
-                    await asyncio.wait_for(self._woken.wait(), wait_s)
+            with suppress(TimeoutError):  # others have their turn even if it is late
+                await asyncio.wait_for(self._woken.wait(), max(0.0, due_s - self._loop.time()))
 
     # ---- delivering ------------------------------------------------------------------------------------------------
 
@@ -260,7 +275,7 @@ class Stepper:
         """Heed what the page says by now."""
         state = self._clock.read()
         if state.virtual and not self.hold.on:
-            self._delivery.begin(_before(state))
+            self._delivery.begin(before(state))
         if state.done > self.hold.moment.number and not self._moving:
             self._spawn(self._deliver(Step(state.done, state.present_ns, state.dt_ns)))
         elif self._status(state)[1:] != self._told:
@@ -278,28 +293,8 @@ class Stepper:
     def _now(self) -> Moment:
         return self.hold.moment if self.hold.on else Moment(0, self._clock.read().time_ns)
 
-    # ---- the thread ------------------------------------------------------------------------------------------------
-
-    def _follow(self) -> None:
-        """Hear of what other processes do with time."""
-        heeded: tuple[object, ...] = ()
-        while not self._stopping.is_set():
-            seen = self._clock.bell.value()
-            state = self._clock.read()
-            news = state.mode, state.done, state.step_size_ns, state.playing
-            if news != heeded and not self._moving:
-                heeded = news
-                self._loop.call_soon_threadsafe(self._look)
-            self._clock.bell.wait(seen, TURN_NS)
-
-
-def _before(state: ClockState) -> Moment:
-    """What is delivered when time is found virtual: on a busy machine its first step may be over, and waits for us."""
-    first = bool(state.dt_ns) and state.step == state.done
-    return Moment(state.done - first, state.present_ns - first * state.dt_ns)
-
 
 def _check(dt_ns: int | None) -> None:
     """ValueRangeError: no step goes so far, and nothing has been taken over for it."""
-    if dt_ns is not None and not MIN_STEP_NS <= dt_ns <= MAX_STEP_NS:
-        raise ValueRangeError(f"a step is from 1 us to 1 h, not {dt_ns / 1e6:g} ms")
+    if dt_ns is not None:
+        check_step(dt_ns)

@@ -16,6 +16,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from shmio.config import Address
 from shmio.endpoints.grpc.access import Door, Keys
+from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.doors import Listener
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.gate import Calls, Limits
@@ -70,8 +71,11 @@ def image(
 class Endpoint:
     """A served segment, and a client of it."""
 
-    def __init__(self, segment: Segment, feeds: dict[str, Feed], service: Services, server: Server, port: int) -> None:
+    def __init__(
+        self, segment: Segment, bells: Bells, feeds: dict[str, Feed], service: Services, server: Server, port: int
+    ) -> None:
         self.segment = segment
+        self.bells = bells
         self.feeds = feeds
         self.service = service
         self.server = server
@@ -127,10 +131,10 @@ async def endpoint(
     def on_quality(source: str, good: bool) -> None:
         tasks.add(asyncio.get_running_loop().create_task(server.set_source(source, good)))
 
-    loop = asyncio.get_running_loop()
     hold = Hold()
-    feeds = {name: Feed(block, WRITER, loop, on_quality, hold) for name, block in segment.blocks.items()}
-    service = Services(segment, segment.processes.find("grpc"), hold, feeds, next(iter(feeds)))
+    bells = Bells()
+    feeds = {name: Feed(block, WRITER, bells, on_quality, hold) for name, block in segment.blocks.items()}
+    service = Services(segment, segment.processes.find("grpc"), hold, bells, feeds, next(iter(feeds)))
     server = Server(service, Calls(limits))
     for source in feeds:
         await server.set_source(source, False)
@@ -138,18 +142,17 @@ async def endpoint(
     for feed in feeds.values():
         feed.start()
     await service.stepper.start(before)
-    served = Endpoint(segment, feeds, service, server, ports[0])
+    served = Endpoint(segment, bells, feeds, service, server, ports[0])
     try:
         yield served
     finally:
         await served.channel.close()
         for feed in feeds.values():
             feed.stop()
-            feed.join()
         await service.stepper.stop()
         await server.stop()
-        service.stepper.join()
         await asyncio.gather(*tasks)
+        bells.close()
 
 
 def serve(segment: Segment, test: Callable[[Endpoint], Awaitable[None]], limits: Limits | None = None) -> None:

@@ -9,6 +9,7 @@ import weakref
 
 import pytest
 
+from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.feeds import Feeds
 from shmio.endpoints.grpc.hold import Hold, Moment
 from shmio.endpoints.grpc.subject import Subject
@@ -21,7 +22,8 @@ from tests.unit.endpoints.test_grpc import STEP, Recorder
 
 def test_what_a_reload_ended_is_forgotten_when_its_streams_are_gone(segment: Segment, instance: str) -> None:
     async def run(opened: Segment) -> None:
-        feeds = Feeds(opened, WRITER, asyncio.get_running_loop(), lambda source, good: None)
+        bells = Bells()
+        feeds = Feeds(opened, WRITER, bells, lambda source, good: None)
         feeds.start()
         old = feeds["cell"]
         stream = Recorder()
@@ -37,7 +39,6 @@ def test_what_a_reload_ended_is_forgotten_when_its_streams_are_gone(segment: Seg
             while feeds["cell"] is old:
                 await feeds.follow()
                 await asyncio.sleep(0)
-        old.join()
         await feeds.follow()
         assert old in feeds._ended  # a stream has not gone over yet
         old.leave(STEP, stream)
@@ -51,7 +52,7 @@ def test_what_a_reload_ended_is_forgotten_when_its_streams_are_gone(segment: Seg
         assert feeds.messages == counted
         assert feeds.alive
         feeds.stop()
-        feeds.join()
+        bells.close()
 
     with Segment.open(instance, writable=True) as opened:
         asyncio.run(run(opened))
@@ -61,7 +62,8 @@ def test_the_loop_goes_on_while_a_new_layout_is_read(segment: Segment, instance:
     """Whatever is read of the segment is read by another thread than that of the streams."""
 
     async def run(opened: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-        feeds = Feeds(opened, WRITER, asyncio.get_running_loop(), lambda source, good: None)
+        bells = Bells()
+        feeds = Feeds(opened, WRITER, bells, lambda source, good: None)
         feeds.start()
         await feeds.follow()
         going_on, begun, refresh = threading.Event(), asyncio.Event(), opened.refresh
@@ -83,7 +85,7 @@ def test_the_loop_goes_on_while_a_new_layout_is_read(segment: Segment, instance:
             assert await following == ["second"]
         assert list(feeds) == ["cell", "second"]
         feeds.stop()
-        feeds.join()
+        bells.close()
 
     with Segment.open(instance, writable=True) as opened, pytest.MonkeyPatch.context() as monkeypatch:
         asyncio.run(run(opened, monkeypatch))
@@ -94,9 +96,9 @@ COUNT = Subject("raw", "count", (MODEL_LAYOUT.registers[0],), lambda picture: by
 
 def test_a_model_that_a_reload_changes_in_virtual_time_is_shown_step_by_step_too(instance: str) -> None:
     async def run(opened: Segment) -> None:
-        hold = Hold()
+        bells, hold = Bells(), Hold()
         hold.on, hold.moment = True, Moment(6, 0)
-        feeds = Feeds(opened, WRITER, asyncio.get_running_loop(), lambda source, good: None, hold)
+        feeds = Feeds(opened, WRITER, bells, lambda source, good: None, hold)
         feeds.start()
         attributes = Attributes("simulation", ("goal",), stepped=True)
         spec = BlockSpec("sim", MODEL_LAYOUT, 10_000_000, STALE_NS, 1 << 20, attributes)
@@ -117,7 +119,7 @@ def test_a_model_that_a_reload_changes_in_virtual_time_is_shown_step_by_step_too
         assert stream.got == [bytes((6, 1)), bytes((7, 3))]
         feeds["sim"].leave(COUNT, stream)
         feeds.stop()
-        feeds.join()
+        bells.close()
 
     with stepped_segment(instance, "sim") as segment:
         asyncio.run(run(segment))

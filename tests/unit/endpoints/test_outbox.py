@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 from contextlib import ExitStack
+from types import SimpleNamespace
 
 import pytest
 
-from shmio.endpoints.grpc import load
+from shmio.endpoints.grpc import load, pace
 from shmio.endpoints.grpc import outbox as module
 from shmio.endpoints.grpc.outbox import TOPIC_BOUND, EventLane, Outbox, Outboxes, StateLane
 
@@ -37,6 +38,35 @@ def test_a_slow_reader_gets_the_newest_value_and_the_loss_is_counted() -> None:
         await asyncio.sleep(0)
         lane.deliver(b"x")
         assert await popped == b"x"
+
+    asyncio.run(test())
+
+
+def test_one_that_is_far_behind_is_given_no_value_that_has_waited_as_long_as_it_is(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async def test() -> None:
+        outbox, now_s = Outbox(), 100.0
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now_s))
+        lane, other = StateLane(outbox), StateLane(outbox)
+
+        async def offered() -> list[bytes]:
+            """What is left of four values, of which two come at once."""
+            nonlocal now_s
+            for letter in (b"a", b"b", b"c"):
+                lane.deliver(letter)
+                now_s += 1.5 * pace.LATE_S if letter != b"b" else 0
+            other.deliver(b"d")
+            return await rest(outbox)
+
+        assert await offered() == [b"a", b"b", b"c", b"d"]
+        for number in range(3 * TOPIC_BOUND):
+            lane.deliver(bytes([number]))
+        await rest(outbox)
+        now_s += pace.WINDOW_S
+        assert await offered() == [b"b", b"c", b"d"]
+        now_s += pace.WINDOW_S
+        assert await offered() == [b"a", b"b", b"c", b"d"], "it has lost no more than one in three"
 
     asyncio.run(test())
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Final, Protocol, Unpack
 
-from shmio.endpoints.grpc.native.bells import Bells
+from shmio.endpoints.grpc.bells import Bells
 from shmio.errors import CommandError
 from shmio.layout.model import Register
 from shmio.layout.write import bits_of

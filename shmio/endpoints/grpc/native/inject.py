@@ -9,8 +9,8 @@ from typing import Final
 
 import numpy as np
 
+from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.encoding import field
-from shmio.endpoints.grpc.native.bells import Bells
 from shmio.endpoints.grpc.native.columns import pack, pack_slots
 from shmio.endpoints.grpc.native.desk import Desk, End
 from shmio.endpoints.grpc.native.selection import MAX_PATTERNS, Selections

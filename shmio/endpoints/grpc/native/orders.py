@@ -8,9 +8,9 @@ from typing import Any, Final
 
 import grpc
 
+from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.native import describe
-from shmio.endpoints.grpc.native.bells import Bells
 from shmio.endpoints.grpc.native.desk import Desk
 from shmio.endpoints.grpc.native.inject import Injection
 from shmio.endpoints.grpc.native.refusal import Context, refuse

@@ -8,11 +8,11 @@ from typing import Any, Final
 
 import grpc
 
+from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.delivery import PATIENCE_S
 from shmio.endpoints.grpc.encoding import field, number
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.native import describe
-from shmio.endpoints.grpc.native.bells import Bells
 from shmio.endpoints.grpc.native.clock import Clocks
 from shmio.endpoints.grpc.native.follow import aged
 from shmio.endpoints.grpc.native.orders import Orders
@@ -39,13 +39,19 @@ class NativeService:
     name = SERVICE
 
     def __init__(
-        self, topics: Topics, feeds: Mapping[str, Feed], segment: Segment, writer: int, stepper: Stepper
+        self,
+        topics: Topics,
+        feeds: Mapping[str, Feed],
+        bells: Bells,
+        segment: Segment,
+        writer: int,
+        stepper: Stepper,
     ) -> None:
         """``writer``: the command queue of this process."""
         self._feeds = feeds
         self._segment = segment
         self._selections = Selections(topics)
-        self._bells = Bells()
+        self._bells = bells
         self._clocks = Clocks(segment, stepper)
         self._hold = stepper.hold
         stepper.also(self._deliver)

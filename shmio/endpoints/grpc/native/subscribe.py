@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import math
 from collections import deque
-from collections.abc import AsyncIterator, Collection, Iterator
+from collections.abc import AsyncIterator, Collection
+from functools import partial
 from typing import Final
 
+from shmio.endpoints.grpc.bells import Bells, Ring
 from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.hold import Hold
-from shmio.endpoints.grpc.native.bells import Bells
 from shmio.endpoints.grpc.native.follow import EveryFrame, Follower, Latest
 from shmio.endpoints.grpc.native.selection import Selections
 from shmio.endpoints.grpc.native.views import View
@@ -61,6 +62,7 @@ class Subscription:
         self._request = request
         self._wanted = selections.resolve(request.patterns)
         self._followers: dict[str, Follower] = {}
+        self._rings: dict[str, Ring] = {}  # what their bells call
         self._moved: dict[str, None] = {}
         self._turn = 0
         self._news = asyncio.Event()
@@ -97,24 +99,26 @@ class Subscription:
         """Serialised SubscribeResponses, without end. EndpointError: a step has waited too long to be read."""
         while not self.late:
             self._news.clear()  # before looking
-            if batch := b"".join(self._batch()):
+            batch, whole = self._batch()
+            if self._marks and whole and not self._moved:
+                step, sent = self._marks.popleft()
+                try:
+                    yield batch + field(STEP, wire.Step(number=step.number, time_ns=step.time_ns).SerializeToString())
+                finally:
+                    _set(sent)
+            elif batch:
                 yield batch
             elif self._moved:
                 source = next(iter(self._moved))
                 del self._moved[source]
                 yield await self._go_over(source)
-            elif self._marks:
-                step, sent = self._marks.popleft()
-                try:
-                    yield field(STEP, wire.Step(number=step.number, time_ns=step.time_ns).SerializeToString())
-                finally:
-                    _set(sent)
             else:
                 await self._wait()
         raise EndpointError("a step has waited too long to be read: this client is too slow for how time is stepped")
 
-    def _batch(self) -> Iterator[bytes]:
-        """What there is at present, up to a bound; of each block in turn."""
+    def _batch(self) -> tuple[bytes, bool]:
+        """What there is at present, up to a bound, of each block in turn; whether it is all there is."""
+        parts: list[bytes] = []
         size, now_s = 0, self._clock()
         waiting = deque(follower for follower in self._followers.values() if self._open(follower))
         waiting.rotate(self._turn)
@@ -127,12 +131,18 @@ class Subscription:
             waiting.rotate(-1)
             self.updates += 1
             size += len(update)
-            yield field(UPDATES, update)
+            parts.append(field(UPDATES, update))
+        return b"".join(parts), not waiting
 
     def _open(self, follower: Follower) -> bool:
         """Whether a block may be shown now: on the instance's clock, in virtual time, only when a step is over."""
         held = self._hold.on and follower.view.block.attributes.stepped
         return not held or bool(self._marks) or not follower.begun
+
+    def _ring(self, follower: Follower) -> None:
+        """Its block has something new."""
+        if self._open(follower):
+            self._news.set()
 
     async def _wait(self) -> None:
         due_s = min((follower.due_s for follower in self._followers.values()), default=math.inf)
@@ -164,12 +174,13 @@ class Subscription:
         else:
             follower = Latest(view, 1 / request.max_rate_hz if request.max_rate_hz else 0.0, request.deadband)
         self._followers[view.block.source] = follower
-        self._bells.join(view.block, self._news.set)
+        ring = self._rings[view.block.source] = partial(self._ring, follower)
+        self._bells.join(view.block, ring)
         return field(TABLES, view.table)
 
     def _leave(self, source: str) -> None:
         follower = self._followers.pop(source)
-        self._bells.leave(follower.view.block, self._news.set)
+        self._bells.leave(follower.view.block, self._rings.pop(source))
 
 
 def _set(sent: asyncio.Future[None]) -> None:

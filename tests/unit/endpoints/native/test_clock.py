@@ -45,10 +45,13 @@ def test_all_that_a_step_changes_comes_before_its_marker_and_that_before_the_cal
             clock = await step(served, 20)
             assert (clock.virtual, clock.step, clock.time_ns) == (True, number, number * 20 * MS)
             told: dict[str, Any] = {}
-            while not (message := await next_message(call)).HasField("step"):
+            over = False
+            while not over:
+                message = await next_message(call)
                 for update in message.updates:
                     assert update.cycle == number
                     told |= values(tables[update.table].registers, update.values)
+                over = message.HasField("step")
             assert told == {"count": number, "doubled": 2 * number}
             assert (message.step.number, message.step.time_ns) == (number, number * 20 * MS)
         await step_v1(served)  # whoever steps

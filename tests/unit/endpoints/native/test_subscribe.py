@@ -276,10 +276,8 @@ def reload(served: Endpoint, layout: Layout | None) -> None:
     served.segment.change(block, ["cell"])
     old = served.feeds.pop("cell")
     old.stop()
-    old.join()
     if layout:
-        loop = asyncio.get_running_loop()
-        feed = served.feeds["cell"] = Feed(served.segment.blocks["cell"], WRITER, loop, lambda *_: None)
+        feed = served.feeds["cell"] = Feed(served.segment.blocks["cell"], WRITER, served.bells, lambda *_: None)
         feed.start()
         served.writer = served.segment.writer("cell")
     served.service.move(["cell"])

@@ -1,0 +1,84 @@
+"""Wakes the event loop when a block has something new: one bell for each block, whoever listens."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+
+from shmio.segment import Block
+from shmio.segment.relay import TURN_NS, Relay, Word
+
+Ring = Callable[[], object]
+
+
+class Bell:
+    """Rings for one word in shared memory, at first too, and now and then. For the event loop's thread."""
+
+    def __init__(self, word: Word, name: str, turn_ns: int = TURN_NS) -> None:
+        """``turn_ns``: it rings after so long without a ring, too."""
+        self.listeners: dict[Ring, None] = {}  # in the order in which they came
+        self._loop = asyncio.get_running_loop()
+        self._relay = Relay(word, name, turn_ns)
+        self.unmute()
+
+    @property
+    def alive(self) -> bool:
+        """Whether it rings, or is about to end."""
+        return self._relay.alive
+
+    def mute(self) -> None:
+        """Ring not, whatever happens, until :meth:`unmute`; which rings. Costs nobody anything meanwhile."""
+        self._loop.remove_reader(self._relay.descriptor)
+
+    def unmute(self) -> None:
+        """Ring again."""
+        self._loop.add_reader(self._relay.descriptor, self._ring)
+
+    def stop(self) -> None:
+        """Ring no more."""
+        self.mute()
+        self._relay.stop()
+
+    def join(self) -> None:
+        """Wait until nothing of it is left, after :meth:`stop`."""
+        self._relay.join()
+
+    def _ring(self) -> None:
+        self._relay.heard()
+        for ring in tuple(self.listeners):
+            ring()
+
+
+class Bells:
+    """Those of all blocks that are followed; for the event loop's thread."""
+
+    def __init__(self) -> None:
+        self._bells: dict[int, Bell] = {}
+        self._stopped: list[Bell] = []
+
+    def join(self, block: Block, ring: Ring) -> None:
+        """Have ``ring`` called when there is a frame or an event, and now and then."""
+        bell = self._bells.get(block.section)
+        if bell is None:
+            bell = Bell(block.ring, f"bell-{block.source}", min(TURN_NS, block.stale_ns))
+            self._bells[block.section] = bell
+        bell.listeners[ring] = None
+
+    def leave(self, block: Block, ring: Ring) -> None:
+        """The last one takes the bell with it."""
+        bell = self._bells.get(block.section)
+        if bell is None:
+            return  # all are closed
+        bell.listeners.pop(ring, None)
+        if not bell.listeners:
+            bell.stop()
+            del self._bells[block.section]
+            self._stopped = [stopped for stopped in self._stopped if stopped.alive] + [bell]
+
+    def close(self) -> None:
+        """Ring no more, and wait until nothing is left of it."""
+        for bell in self._bells.values():
+            bell.stop()
+        for bell in (*self._bells.values(), *self._stopped):
+            bell.join()
+        self._bells.clear()
