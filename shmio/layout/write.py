@@ -51,12 +51,19 @@ def bits_of(register: Register) -> bytes:
     return bytes([1 << register.bit])
 
 
+def covering(registers: Iterable[Register], size: int) -> bytes:
+    """An image of ``size`` bytes in which the bits of these registers are set."""
+    mask = bytearray(size)
+    for register in registers:
+        for at, bits in enumerate(bits_of(register), register.offset):
+            mask[at] |= bits
+    return bytes(mask)
+
+
 def cover(layout: Layout, patterns: Iterable[str]) -> bytes:
     """An image of the layout's size in which the bits of all that the patterns name are set; PathError."""
-    mask = bytearray(layout.size)
-    for pattern in patterns:
-        for register in chosen(layout, pattern):
-            _add(mask, register)
+    named = (register for pattern in patterns for register in chosen(layout, pattern))
+    mask = bytearray(covering(named, layout.size))
     for register in layout.registers:
         if register.type == "BOOL" and register.dims:
             _fill_rows(mask, register)
@@ -120,11 +127,6 @@ def _elements(layout: Layout, register: Register) -> Iterator[Register]:
             if index[place] <= high:
                 break
             index[place] = low
-
-
-def _add(mask: bytearray, register: Register) -> None:
-    for at, bits in enumerate(bits_of(register), register.offset):
-        mask[at] |= bits
 
 
 def _fill_rows(mask: bytearray, register: Register) -> None:

@@ -98,17 +98,25 @@ class Commander:
         writes = [self._encode(find(self.block.layout, path), path, value) for path, value in values.items()]
         return self.outcomes(self._send(tuple(values), writes, timeout_s, CommandKind.SHADOW, injection))
 
-    def give(self, injection: int, values: Mapping[str, object], timeout_s: float | None = None) -> Ticket:
-        """Send values as an injection's, neighbours joined: items are not values. Errors as of :meth:`shadow`."""
+    def joined(self, values: Mapping[str, object], raw: Iterable[Write] = ()) -> list[Write]:
+        """The writes of values and of ``raw`` bytes, neighbours as one. PathError, ValueRangeError."""
         image, bits = bytearray(self.block.layout.size), bytearray(self.block.layout.size)
         ranges = []
+        writes = list(raw)
+        covers = [write._replace(data=b"\xff" * len(write.data)) for write in writes]
         for path, value in values.items():
             register = find(self.block.layout, path)
             write = self._encode(register, path, value)
+            writes.append(write)
+            covers.append(write._replace(data=bits_of(register)))
+        for write, covered in zip(writes, covers, strict=True):
             apply(write, image)
-            apply(write._replace(data=bits_of(register)), bits)
+            apply(covered, bits)
             ranges.append((write.offset, write.offset + len(write.data)))
-        writes = merge(image, bits, ranges)
+        return merge(image, bits, ranges)
+
+    def give(self, injection: int, writes: Sequence[Write], timeout_s: float | None = None) -> Ticket:
+        """Send what :meth:`joined` gives as an injection's: items are not values. CommandError: not sent."""
         return self._send(("",) * len(writes), writes, timeout_s, CommandKind.SHADOW, injection)
 
     def inject(self, patterns: Iterable[str], timeout_s: float | None = None, **laid: Unpack[Laid]) -> int:
@@ -120,13 +128,16 @@ class Commander:
         bits = cover(self.block.layout, patterns)
         if not any(bits):
             raise PathError(f"{self.block.source}: {', '.join(patterns)} names no register")
-        ticket = self.lay(bits, timeout_s, **laid)
+        ticket = self.lay(merge(bits, bits, [(0, len(bits))]), timeout_s, **laid)
         self._expect(ticket, EventKind.INJECTED)
         return ticket.number
 
-    def lay(self, bits: bytes, timeout_s: float | None = None, **laid: Unpack[Laid]) -> Ticket:
-        """Ask for an injection over these bits, whose number is the ticket's. CommandError: not sent. Never waits."""
-        return self._send(("",), merge(bits, bits, [(0, len(bits))]), timeout_s, CommandKind.INJECT, **laid)
+    def lay(self, bits: Sequence[Write], timeout_s: float | None = None, **laid: Unpack[Laid]) -> Ticket:
+        """Ask for an injection over what these writes would set, whose number is the ticket's. Never waits.
+
+        CommandError: not sent.
+        """
+        return self._send(("",), bits, timeout_s, CommandKind.INJECT, **laid)
 
     def declare(self, declaration: Declaration, timeout_s: float | None = None, *, keep: bool = False) -> int:
         """Lay an injection that the source runs by itself; its number. It goes with this process, unless ``keep``.

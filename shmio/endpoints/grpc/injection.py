@@ -3,31 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Final, NamedTuple, cast
+from typing import NamedTuple, cast
 
-import numpy as np
-
+from shmio.endpoints.grpc import desk
+from shmio.endpoints.grpc.beneath import Beneath
 from shmio.endpoints.grpc.echo import Listener
 from shmio.endpoints.grpc.feed import Feed
+from shmio.endpoints.grpc.followers import Follower
 from shmio.endpoints.grpc.outbox import EventLane, Finish, Outbox, StateLane
-from shmio.endpoints.grpc.pending import Done, End
+from shmio.endpoints.grpc.pending import Done, End, worst
 from shmio.endpoints.grpc.shape import Shape
 from shmio.endpoints.grpc.subject import Encode, Source, Subject
 from shmio.errors import CommandError, PathError
 from shmio.layout.topic import Topic, find
-from shmio.layout.write import encode
-from shmio.logs import fields
+from shmio.layout.write import covering, encode
 from shmio.segment import DONE, Direction, EventKind
 from shmio.segment.diverted import Diverted, apply
 from shmio.segment.scan import ChangeScan
-
-log = logging.getLogger("shmio.grpc")
-
-RETRY_S: Final = 0.25
-"""How soon a source that has not lifted an injection is told again."""
 
 Leave = Callable[[], None]
 
@@ -69,7 +63,7 @@ class _Tap:
                 listener.fail(reason)
 
 
-class Injection:
+class Injection(Follower):
     """One, from being laid until it is lifted, by whomever. For the event loop, but what a feed calls.
 
     It is laid over the registers of ``shape``, which is what ``target`` names in the layout of ``feed``. Its
@@ -88,13 +82,11 @@ class Injection:
         self.ends: dict[object, Callable[[], object]] = {}
         """What is called when it is over, by whom it is for."""
         frame = feed.block.latest()
-        self._originals = bytearray(frame.image if frame else bytes(feed.block.layout.size))  # as far as diverted
-        self._gifts = bytearray(self._originals)
-        self._inner: tuple[bytes, bytes] | None = None  # over /out: bits that injections further in give, and values
+        self._beneath = Beneath(feed.block, frame.image if frame else b"")
+        self._gifts = bytearray(self._beneath.given)
         self._scan = ChangeScan(shape.registers)
         self._subjects: dict[Subject, None] = {}
         self._diverted, self._given = _Tap(), _Tap()
-        self._number = 0
         self._laid = asyncio.get_running_loop().create_task(self._lay(name))
         self._laid.add_done_callback(lambda laid: laid.cancelled() or laid.exception())  # told to who waits, if any
         self._lifting: asyncio.Task[None] | None = None
@@ -110,11 +102,12 @@ class Injection:
         try:
             if self.feed.block.retired:
                 raise CommandError("the source was changed or removed by a reload")
-            answer, done = _answer()
-            self._number = self.feed.inlet.lay(self.shape.registers, self, done, direction=direction, name=name)
-            kind, reason = await answer
+            answer = desk.Answer()
+            bits = covering(self.shape.registers, self.feed.block.layout.size)
+            self._beneath.number = self.feed.inlet.lay(bits, self, answer.done, direction=direction, name=name)
+            ((kind, reason),) = await answer
             if kind is not EventKind.INJECTED:
-                raise CommandError(reason)
+                raise CommandError(f"{kind}: {reason}")
         except CommandError as error:
             self._finish(str(error))
             raise CommandError(f"{self.target}: {error}") from None
@@ -130,28 +123,14 @@ class Injection:
                 self._have_it_lifted()
 
     def _have_it_lifted(self) -> None:
-        self._lifting = asyncio.get_running_loop().create_task(self._lift())
+        lifting = desk.have_lifted(self.feed.inlet, self._beneath.number, str(self.target))
+        self._lifting = asyncio.get_running_loop().create_task(lifting)
 
     def _finish(self, reason: str) -> None:
         self.over = self.over or reason
         ends, self.ends = self.ends, {}
         for call in ends.values():
             call()
-
-    async def _lift(self) -> None:
-        """Have the source lift it, for as long as that takes: nobody else will while this process lives."""
-        block = self.feed.block
-        while not block.retired and any(one.id == self._number for one in block.standing.read()):
-            answer, done = _answer()
-            try:
-                self.feed.inlet.lift(self._number, done)
-            except CommandError:  # no room in the queue
-                await asyncio.sleep(RETRY_S)
-                continue
-            kind, reason = await answer
-            if kind is not EventKind.LIFTED:
-                log.warning("an injection is not lifted yet: %s", reason, extra=fields(topic=str(self.target)))
-                await asyncio.sleep(RETRY_S)
 
     # ---- what its clients give ---------------------------------------------------------------------------------
 
@@ -180,12 +159,12 @@ class Injection:
             if accepted is not None:
                 accepted()
 
-        def on_done(kind: EventKind, reason: str) -> None:
-            if kind in DONE:
+        def on_done(ends: Sequence[End]) -> None:
+            if worst(ends)[0] in DONE:
                 show()
-            done(kind, reason)
+            done(ends)
 
-        await self.feed.inlet.give(self._number, values, on_done, on_accepted)
+        await self.feed.inlet.give(self._beneath.number, values, on_done, on_accepted)
 
     def _show_gifts(self, values: Mapping[str, object]) -> None:
         layout = self.feed.block.layout
@@ -222,25 +201,10 @@ class Injection:
         return None if frame is None else self._original(frame)
 
     def _original(self, frame: Source) -> Shown:
-        inner = self._inner
-        if inner is None:
-            return Shown(frame.number, frame.clock_ns, frame.raw)
-        raw, bits, values = (np.frombuffer(part, np.uint8) for part in (frame.raw, *inner))
-        return Shown(frame.number, frame.clock_ns, (raw ^ (raw ^ values) & bits).tobytes())
+        return Shown(frame.number, frame.clock_ns, self._beneath.image(frame.raw))
 
     def _changed(self, shown: Source, frame: Source) -> bool:
         return bool(self._scan.changed(self._original(shown).image, self._original(frame).image))
-
-    def _stack(self) -> None:
-        """Look what clients' injections lie beneath it by now; what shmio runs by itself is not in originals."""
-        bits = bytearray(len(self._originals))
-        for one in self.feed.block.standing.read():
-            if one.id == self._number:
-                break
-            for offset, size, mask in one.ranges if one.direction == "out" and one.running is None else ():
-                for at in range(offset, min(offset + size, len(bits))):
-                    bits[at] |= mask
-        self._inner = (bytes(bits), bytes(self._originals)) if any(bits) else None
 
     def _tell_again(self) -> None:
         for subject in self._subjects:
@@ -250,19 +214,16 @@ class Injection:
 
     def divert(self, diverted: Diverted) -> None:
         """A command's values went to it."""
-        apply(self._originals, diverted.writes)
+        self._beneath.divert(diverted.writes)
         if self.inward:
-            self._diverted.show(Shown(*self.feed.inlet.stamp(diverted.event), bytes(self._originals)))
+            self._diverted.show(Shown(*self.feed.inlet.stamp(diverted.event), bytes(self._beneath.given)))
         else:
-            self._stack()
+            self._beneath.restack()
             self._tell_again()
 
     def restack(self) -> None:
         """An injection was laid or lifted, on the same source."""
-        before = self._inner
-        if not self.inward:
-            self._stack()
-        if self._inner != before:
+        if not self.inward and self._beneath.restack():
             self._tell_again()
 
     def lifted(self, reason: str) -> None:
@@ -272,14 +233,3 @@ class Injection:
     def fail(self, reason: str) -> None:
         """What comes next is not all there was."""
         self._diverted.fail(reason)
-
-
-def _answer() -> tuple[asyncio.Future[End], Done]:
-    """What becomes of a command, to be waited for; and what is to be called with it."""
-    answer: asyncio.Future[End] = asyncio.get_running_loop().create_future()
-
-    def done(kind: EventKind, reason: str) -> None:
-        if not answer.done():
-            answer.set_result((kind, reason))
-
-    return answer, done

@@ -1,38 +1,37 @@
-"""The way into one block: sends values, follows the block's events, and tells what became of each."""
+"""The way into one block: sends values and what is to become of injections, and tells what became of each."""
 
 from __future__ import annotations
 
 import asyncio
-import logging
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Final, Unpack
 
+import msgspec
+
+from shmio.config import Declaration
 from shmio.endpoints.grpc.bells import Bells
+from shmio.endpoints.grpc.ear import Ear
 from shmio.endpoints.grpc.echo import Echo
 from shmio.endpoints.grpc.followers import Follower, Followers
 from shmio.endpoints.grpc.pending import Cost, Done, Pending
 from shmio.errors import CommandError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
-from shmio.layout.write import bits_of
+from shmio.layout.write import Write, merge
 from shmio.segment import Block, Event, EventKind
 from shmio.segment.commander import PATIENCE_S, Commander, Ticket
 from shmio.segment.commands import Laid
 
-log = logging.getLogger("shmio.grpc")
-
 MAX_OPEN: Final = 512
 """Events that may be outstanding: a quarter of the ring, so that none is overwritten before it is read."""
-BATCH: Final = 32
-"""Most events that are looked at at once, so that streams get their turn in between."""
 
 _RETIRED: Final = "the source was changed or removed by a reload"
 
 
 class Inlet:
-    """Sends values to a block's source, in order, and keeps no more under way than it can hear the end of.
+    """Sends commands to a block's source, in order, and keeps no more under way than it can hear the end of.
 
     For the event loop's thread.
     """
@@ -48,45 +47,46 @@ class Inlet:
         self.block = block
         self.stamp = stamp
         self.echo = Echo(block, stamp)
+        self.followers = Followers()
         self._writer = writer
-        self._bells = bells
         self._loop = asyncio.get_running_loop()
         self._commander = Commander(block, writer)
         self._prepared = False
         self._preparing = asyncio.Lock()
         self._pending: dict[int, Pending] = {}
-        self._followers = Followers()
         self._untaken_bytes = 0  # of records that may still lie in the queue
         self._open_events = 0
         self._silent = False
         self._turn = asyncio.Lock()  # who waits for room is served in order
         self._freed: asyncio.Future[None] | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._cursor = block.events.cursor()
-        self._missed = 0  # events, as last told
-        self._following = False
-        self._again = False  # whether the loop is about to look without a bell
+        self._ear = Ear(
+            block, bells, heed=self._heed, heeded=self._free, missed=self._missed, retired=self._retired
+        )
 
     @property
     def alive(self) -> bool:
         """Whether the block's events are being followed, as long as there are any."""
-        return self._following or self.block.retired
+        return self._ear.alive or self.block.retired
 
     @property
     def over(self) -> bool:
         """Whether nothing is left of it: it follows no events, and has no value under way and no stream."""
-        return not (self._following or self._pending or self._turn.locked() or self.echo.busy)
+        return not (self._ear.alive or self._pending or self._turn.locked() or self.echo.busy or self.followers.busy)
 
     def start(self) -> None:
         """Begin to follow the events."""
-        self._following = True
-        self._bells.join(self.block, self._look)
+        self._ear.start()
 
     def stop(self) -> None:
         """Follow them no more."""
-        self._end_following()
+        self._ear.stop()
         if self._timer is not None:
             self._timer.cancel()
+
+    def catch_up(self) -> None:
+        """Deliver what has been told so far, to those who listen to what is written too."""
+        self._ear.catch_up()
 
     def ready(self, values: Mapping[str, object]) -> bool:
         """Whether :meth:`send`, or :meth:`give`, would not have to wait."""
@@ -97,39 +97,68 @@ class Inlet:
         await self._prepare()
         return all(map(self._commander.is_writable, registers))
 
-    async def send(self, values: Mapping[str, object], done: Done, accepted: Callable[[], None] | None = None) -> None:
+    async def send(
+        self,
+        values: Mapping[str, object],
+        done: Done,
+        accepted: Callable[[], None] | None = None,
+        *,
+        timeout_s: float | None = None,
+        until_accepted: bool = False,
+    ) -> None:
         """Send values of registers, by path, as one command as soon as there is room.
 
         ``done`` is called once, when the end of all is known, a bounded time later; ``accepted`` before, if the source
         accepts them. CommandError: one is not writable, or the source is silent; ValueRangeError: neither is called.
         """
-        await self._send(partial(self._commander.submit, values), self._cost(values), done, accepted)
+        submit = partial(self._commander.submit, values, timeout_s)
+        await self._send(submit, self._cost(values), done, accepted, until_accepted=until_accepted)
 
     async def give(
-        self, injection: int, values: Mapping[str, object], done: Done, accepted: Callable[[], None] | None = None
+        self,
+        injection: int,
+        values: Mapping[str, object],
+        done: Done,
+        accepted: Callable[[], None] | None = None,
+        *,
+        raw: Sequence[Write] = (),
     ) -> None:
-        """The same for values as an injection's; ``accepted`` is called of one over ``/in`` only."""
-        await self._send(partial(self._commander.give, injection, values), self._cost(values), done, accepted)
+        """The same for values, and ``raw`` bytes, as an injection's; items are not values.
 
-    def lay(self, registers: Collection[Register], follower: Follower, done: Done, **laid: Unpack[Laid]) -> int:
-        """Have an injection laid over registers; its number. Never waits. CommandError: not sent."""
-        bits = bytearray(self.block.layout.size)
-        for register in registers:
-            for at, own in enumerate(bits_of(register), register.offset):
-                bits[at] |= own
-        ticket = self._commander.lay(bytes(bits), **laid)
-        cost = Cost.of([register.size for register in registers], laid.get("name", ""))
+        ``accepted`` is called of one over ``/in`` only.
+        """
+        writes = self._commander.joined(values, raw)
+        cost = Cost.of([len(write.data) for write in writes])
+        await self._send(partial(self._commander.give, injection, writes), cost, done, accepted)
+
+    def lay(self, bits: bytes, follower: Follower, done: Done, **laid: Unpack[Laid]) -> int:
+        """Have an injection laid over these bits; its number. Never waits. CommandError: not sent."""
+        writes = merge(bits, bits, [(0, len(bits))])
+        cost = Cost.of([len(write.data) for write in writes], laid.get("name", ""))
+        return self._lay(self._commander.lay(writes, **laid), cost, follower, done)
+
+    def declare(self, declaration: Declaration, follower: Follower, done: Done, *, keep: bool) -> int:
+        """Have an injection laid that the source runs by itself; its number. Never waits. CommandError: not sent."""
+        cost = Cost.of([len(msgspec.json.encode(declaration))], declaration.name)
+        return self._lay(self._commander.ask_to_declare(declaration, keep=keep), cost, follower, done)
+
+    def _lay(self, ticket: Ticket, cost: Cost, follower: Follower, done: Done) -> int:
         self._follow_up(ticket, cost, done)
-        self._followers.add(ticket.number, follower)
+        self.followers.add(ticket.number, follower)
         return ticket.number
 
     def lift(self, injection: int, done: Done) -> None:
-        """Have an injection lifted, whose follower is told nothing more. Never waits. CommandError: not sent."""
-        self._followers.remove(injection)
+        """Have an injection lifted. Never waits. CommandError: not sent."""
         self._follow_up(self._commander.ask_to_lift(injection), Cost.of(()), done)
 
     async def _send(
-        self, submit: Callable[[], Ticket], cost: Cost, done: Done, accepted: Callable[[], None] | None
+        self,
+        submit: Callable[[], Ticket],
+        cost: Cost,
+        done: Done,
+        accepted: Callable[[], None] | None,
+        *,
+        until_accepted: bool = False,
     ) -> None:
         async with self._turn:
             await self._prepare()
@@ -142,21 +171,25 @@ class Inlet:
                 raise CommandError(
                     f"source {self.block.source} does not answer; shmio-supervisor status says how it fares"
                 )
-            self._follow_up(submit(), cost, done, accepted)
+            self._follow_up(submit(), cost, done, accepted, until_accepted=until_accepted)
 
-    def _follow_up(self, ticket: Ticket, cost: Cost, done: Done, accepted: Callable[[], None] | None = None) -> None:
-        items = set(range(len(ticket.paths)))
-        self._pending[ticket.number] = Pending(ticket.incarnation, ticket.until_ns, cost, items, done, accepted)
+    def _follow_up(
+        self,
+        ticket: Ticket,
+        cost: Cost,
+        done: Done,
+        accepted: Callable[[], None] | None = None,
+        *,
+        until_accepted: bool = False,
+    ) -> None:
+        self._pending[ticket.number] = Pending(
+            ticket.incarnation, ticket.until_ns, cost, len(ticket.paths), done, accepted, until_accepted,
+            open_events=cost.events,
+        )  # fmt: skip
         self._untaken_bytes += cost.record_bytes
         self._open_events += cost.events
         if self._timer is None:
             self._set_timer()
-
-    def catch_up(self) -> None:
-        """Deliver what has been told so far, to those who listen to what is written too."""
-        newest = self.block.events.head()
-        while self._following and self._cursor.last < newest:
-            self._look()
 
     async def _prepare(self) -> None:
         if not self._prepared:
@@ -164,7 +197,7 @@ class Inlet:
                 await asyncio.to_thread(self._commander.prepare)
                 self._prepared = True
 
-    def _cost(self, values: Mapping[str, object]) -> Cost:
+    def _cost(self, values: Collection[str]) -> Cost:
         """What a command with these costs; PathError."""
         return Cost.of([find(self.block.layout, path).size for path in values])
 
@@ -178,8 +211,8 @@ class Inlet:
         for channel, message in self.echo.follow(event):
             for listener in channel.listeners:
                 listener.deliver(message)
-        for item in self._followers.gather(event):
-            self._followers.tell(item)
+        for item in self.followers.gather(event):
+            self.followers.tell(item)
         if event.kind == EventKind.STARTED:
             self._restarted(event)
         elif event.writer == self._writer and (pending := self._pending.get(event.command)):
@@ -189,42 +222,50 @@ class Inlet:
     def _hear(self, event: Event, pending: Pending) -> None:
         if not pending.taken:
             self._untaken_bytes -= pending.cost.record_bytes
-        if end := pending.hear(event):
-            self._end(event.command, *end)
+        if pending.open_events:
+            pending.open_events -= 1
+            self._open_events -= 1
+        if pending.hear(event):
+            self._end(event.command)
 
-    def _miss(self, count: int) -> None:
+    def _missed(self, count: int) -> None:
+        """Ends of commands may be among it, too: these are not waited for longer than it takes to come."""
         reason = f"{count} events of source {self.block.source} were missed"
         self.echo.skip()
-        self._followers.skip()
+        self.followers.skip()
         self.echo.fail(reason)
-        self._followers.fail(reason)
+        self.followers.fail(reason)
+        self._hurry(list(self._pending.values()))
 
     def _restarted(self, event: Event) -> None:
         """A successor rejects what its predecessor had not taken; of what it had taken nobody knows."""
         self._silent = False
-        soon_ns = time.monotonic_ns() + round(PATIENCE_S * 1e9)
-        for number, pending in list(self._pending.items()):
-            if pending.incarnation == event.incarnation:
-                continue
+        before = [
+            (number, pending) for number, pending in self._pending.items() if pending.incarnation != event.incarnation
+        ]
+        for number, pending in before:
             if pending.taken:
-                reason = "the source was restarted meanwhile; it is not known whether the value was written"
-                self._end(number, EventKind.UNKNOWN, reason)
-            else:
-                pending.until_ns = min(pending.until_ns, soon_ns)
+                self._end(number, "the source was restarted meanwhile; it is not known whether the value was written")
+        self._hurry([pending for _, pending in before if not pending.taken])
+
+    def _hurry(self, some: Sequence[Pending]) -> None:
+        soon_ns = time.monotonic_ns() + round(PATIENCE_S * 1e9)
+        for pending in some:
+            pending.until_ns = min(pending.until_ns, soon_ns)
         self._set_timer()
 
     def _retired(self) -> None:
         for number in list(self._pending):
-            self._end(number, EventKind.UNKNOWN, _RETIRED)
-        self._followers.end(_RETIRED)
+            self._end(number, _RETIRED)
+        self.followers.end(_RETIRED)
         self._free()
 
-    def _end(self, number: int, kind: EventKind, reason: str) -> None:
+    def _end(self, number: int, missing: str = "") -> None:
         pending = self._pending.pop(number)
-        self._open_events -= pending.cost.events
+        self._open_events -= pending.open_events
         if not pending.taken:
             self._untaken_bytes -= pending.cost.record_bytes
-        pending.done(kind, reason)
+        pending.finish(missing)
 
     def _free(self) -> None:
         if self._freed is not None and not self._freed.done():
@@ -246,49 +287,6 @@ class Inlet:
         for number, pending in list(self._pending.items()):
             if pending.until_ns <= now_ns:
                 self._silent |= not pending.taken
-                reason = "the source gave no answer in time; it is not known whether the value was written"
-                self._end(number, EventKind.UNKNOWN, reason)
+                self._end(number, "the source gave no answer in time; it is not known whether the value was written")
         self._free()
         self._set_timer()
-
-    # ---- the events ------------------------------------------------------------------------------------------
-
-    def _end_following(self) -> None:
-        if self._following:
-            self._following = False
-            self._bells.leave(self.block, self._look)
-
-    def _look(self) -> None:
-        """Heed the events that have come, a few at a time."""
-        if not self._following:
-            return  # it has left while the bell rang
-        try:
-            self._follow()
-        except Exception:
-            log.exception("the events of %s cannot be followed", self.block.source)
-            self._end_following()
-
-    def _look_again(self) -> None:
-        self._again = False
-        self._look()
-
-    def _follow(self) -> None:
-        retired = self.block.retired  # before looking: what was told before the end is still heeded
-        for count in range(BATCH):
-            event = self._cursor.poll()
-            if (missed := self._cursor.missed - self._missed) > 0:
-                self._missed += missed
-                self._miss(missed)
-            if event is not None:
-                self._heed(event)
-                continue
-            if count:
-                self._free()
-            if retired:
-                self._end_following()
-                self._retired()
-            return
-        self._free()
-        if not self._again:
-            self._again = True
-            self._loop.call_soon(self._look_again)

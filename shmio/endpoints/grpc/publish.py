@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Final, NamedTuple
@@ -12,7 +12,7 @@ from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError
 
 from shmio.endpoints.grpc.arrivals import Arrivals
-from shmio.endpoints.grpc.pending import Done
+from shmio.endpoints.grpc.pending import Done, End, worst
 from shmio.endpoints.grpc.refusals import Refusals
 from shmio.endpoints.grpc.shadows import Shadows, Way
 from shmio.endpoints.grpc.shape import Shape, shape
@@ -179,7 +179,8 @@ class Publisher:
             if not answer.done():
                 answer.set_result((EventKind.ACCEPTED, ""))
 
-        def ended(kind: EventKind, reason: str) -> None:
+        def ended(ends: Sequence[End]) -> None:
+            kind, reason = worst(ends)
             if kind in DONE:
                 self.published += 1
                 accepted()  # which nobody said, if an injection took all of it
@@ -220,7 +221,7 @@ class Publisher:
         try:
             await way.send(done, accepted)
         except ShmioError as error:
-            done(EventKind.REJECTED, str(error))
+            done([(EventKind.REJECTED, str(error))])
 
     def _keep(self, sending: Coroutine[None, None, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(sending)
@@ -228,7 +229,8 @@ class Publisher:
         task.add_done_callback(self._waiting.discard)
         return task
 
-    def _ended(self, value: _Value, path: str, peer: str, kind: EventKind, reason: str) -> None:
+    def _ended(self, value: _Value, path: str, peer: str, ends: Sequence[End]) -> None:
+        kind, reason = worst(ends)
         if kind in DONE:
             self.published += 1
         else:
