@@ -31,6 +31,11 @@ class Provenance(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     PROVENANCE_REPLAYED: _ClassVar[Provenance]
     PROVENANCE_INJECTED: _ClassVar[Provenance]
 
+class Direction(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    DIRECTION_OUT: _ClassVar[Direction]
+    DIRECTION_IN: _ClassVar[Direction]
+
 class Mode(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     MODE_LATEST: _ClassVar[Mode]
@@ -40,11 +45,6 @@ class Format(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     FORMAT_VALUES: _ClassVar[Format]
     FORMAT_FRAMES: _ClassVar[Format]
-
-class Direction(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
-    __slots__ = ()
-    DIRECTION_OUT: _ClassVar[Direction]
-    DIRECTION_IN: _ClassVar[Direction]
 COLUMN_UNSPECIFIED: Column
 COLUMN_BOOL: Column
 COLUMN_INT32: Column
@@ -60,12 +60,12 @@ PROVENANCE_LIVE: Provenance
 PROVENANCE_SIMULATED: Provenance
 PROVENANCE_REPLAYED: Provenance
 PROVENANCE_INJECTED: Provenance
+DIRECTION_OUT: Direction
+DIRECTION_IN: Direction
 MODE_LATEST: Mode
 MODE_EVERY_FRAME: Mode
 FORMAT_VALUES: Format
 FORMAT_FRAMES: Format
-DIRECTION_OUT: Direction
-DIRECTION_IN: Direction
 
 class GetLayoutsRequest(_message.Message):
     __slots__ = ("sources",)
@@ -139,8 +139,28 @@ class Bounds(_message.Message):
     high: int
     def __init__(self, low: _Optional[int] = ..., high: _Optional[int] = ...) -> None: ...
 
+class Range(_message.Message):
+    __slots__ = ("offset", "size", "mask")
+    OFFSET_FIELD_NUMBER: _ClassVar[int]
+    SIZE_FIELD_NUMBER: _ClassVar[int]
+    MASK_FIELD_NUMBER: _ClassVar[int]
+    offset: int
+    size: int
+    mask: int
+    def __init__(self, offset: _Optional[int] = ..., size: _Optional[int] = ..., mask: _Optional[int] = ...) -> None: ...
+
+class Piece(_message.Message):
+    __slots__ = ("offset", "data", "mask")
+    OFFSET_FIELD_NUMBER: _ClassVar[int]
+    DATA_FIELD_NUMBER: _ClassVar[int]
+    MASK_FIELD_NUMBER: _ClassVar[int]
+    offset: int
+    data: bytes
+    mask: int
+    def __init__(self, offset: _Optional[int] = ..., data: _Optional[bytes] = ..., mask: _Optional[int] = ...) -> None: ...
+
 class Table(_message.Message):
-    __slots__ = ("number", "source", "section", "hash", "size", "registers", "slots")
+    __slots__ = ("number", "source", "section", "hash", "size", "registers", "slots", "direction", "ranges")
     NUMBER_FIELD_NUMBER: _ClassVar[int]
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     SECTION_FIELD_NUMBER: _ClassVar[int]
@@ -148,6 +168,8 @@ class Table(_message.Message):
     SIZE_FIELD_NUMBER: _ClassVar[int]
     REGISTERS_FIELD_NUMBER: _ClassVar[int]
     SLOTS_FIELD_NUMBER: _ClassVar[int]
+    DIRECTION_FIELD_NUMBER: _ClassVar[int]
+    RANGES_FIELD_NUMBER: _ClassVar[int]
     number: int
     source: str
     section: int
@@ -155,7 +177,9 @@ class Table(_message.Message):
     size: int
     registers: _containers.RepeatedCompositeFieldContainer[Register]
     slots: _containers.RepeatedScalarFieldContainer[int]
-    def __init__(self, number: _Optional[int] = ..., source: _Optional[str] = ..., section: _Optional[int] = ..., hash: _Optional[bytes] = ..., size: _Optional[int] = ..., registers: _Optional[_Iterable[_Union[Register, _Mapping]]] = ..., slots: _Optional[_Iterable[int]] = ...) -> None: ...
+    direction: Direction
+    ranges: _containers.RepeatedCompositeFieldContainer[Range]
+    def __init__(self, number: _Optional[int] = ..., source: _Optional[str] = ..., section: _Optional[int] = ..., hash: _Optional[bytes] = ..., size: _Optional[int] = ..., registers: _Optional[_Iterable[_Union[Register, _Mapping]]] = ..., slots: _Optional[_Iterable[int]] = ..., direction: _Optional[_Union[Direction, str]] = ..., ranges: _Optional[_Iterable[_Union[Range, _Mapping]]] = ...) -> None: ...
 
 class Values(_message.Message):
     __slots__ = ("bools", "int32s", "int64s", "uint64s", "floats", "doubles", "texts")
@@ -238,7 +262,7 @@ class Marks(_message.Message):
     def __init__(self, registers: _Optional[_Iterable[int]] = ...) -> None: ...
 
 class Update(_message.Message):
-    __slots__ = ("table", "frame", "cycle", "incarnation", "clock_ns", "source_ns", "quality", "reason", "provenance", "missed", "whole", "values", "originals", "invalid", "injected", "image", "original", "age_ns")
+    __slots__ = ("table", "frame", "cycle", "incarnation", "clock_ns", "source_ns", "quality", "reason", "provenance", "missed", "whole", "values", "originals", "invalid", "injected", "image", "original", "age_ns", "pieces")
     TABLE_FIELD_NUMBER: _ClassVar[int]
     FRAME_FIELD_NUMBER: _ClassVar[int]
     CYCLE_FIELD_NUMBER: _ClassVar[int]
@@ -257,6 +281,7 @@ class Update(_message.Message):
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     ORIGINAL_FIELD_NUMBER: _ClassVar[int]
     AGE_NS_FIELD_NUMBER: _ClassVar[int]
+    PIECES_FIELD_NUMBER: _ClassVar[int]
     table: int
     frame: int
     cycle: int
@@ -275,7 +300,8 @@ class Update(_message.Message):
     image: bytes
     original: bytes
     age_ns: int
-    def __init__(self, table: _Optional[int] = ..., frame: _Optional[int] = ..., cycle: _Optional[int] = ..., incarnation: _Optional[int] = ..., clock_ns: _Optional[int] = ..., source_ns: _Optional[int] = ..., quality: _Optional[_Union[Quality, str]] = ..., reason: _Optional[str] = ..., provenance: _Optional[_Union[Provenance, str]] = ..., missed: _Optional[int] = ..., whole: bool = ..., values: _Optional[_Union[Values, _Mapping]] = ..., originals: _Optional[_Union[Values, _Mapping]] = ..., invalid: _Optional[_Union[Marks, _Mapping]] = ..., injected: _Optional[_Union[Marks, _Mapping]] = ..., image: _Optional[bytes] = ..., original: _Optional[bytes] = ..., age_ns: _Optional[int] = ...) -> None: ...
+    pieces: _containers.RepeatedCompositeFieldContainer[Piece]
+    def __init__(self, table: _Optional[int] = ..., frame: _Optional[int] = ..., cycle: _Optional[int] = ..., incarnation: _Optional[int] = ..., clock_ns: _Optional[int] = ..., source_ns: _Optional[int] = ..., quality: _Optional[_Union[Quality, str]] = ..., reason: _Optional[str] = ..., provenance: _Optional[_Union[Provenance, str]] = ..., missed: _Optional[int] = ..., whole: bool = ..., values: _Optional[_Union[Values, _Mapping]] = ..., originals: _Optional[_Union[Values, _Mapping]] = ..., invalid: _Optional[_Union[Marks, _Mapping]] = ..., injected: _Optional[_Union[Marks, _Mapping]] = ..., image: _Optional[bytes] = ..., original: _Optional[bytes] = ..., age_ns: _Optional[int] = ..., pieces: _Optional[_Iterable[_Union[Piece, _Mapping]]] = ...) -> None: ...
 
 class ReadRequest(_message.Message):
     __slots__ = ("patterns", "originals", "tables")
@@ -330,12 +356,14 @@ class Step(_message.Message):
     def __init__(self, number: _Optional[int] = ..., time_ns: _Optional[int] = ...) -> None: ...
 
 class Ended(_message.Message):
-    __slots__ = ("source", "reason")
+    __slots__ = ("source", "reason", "direction")
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
+    DIRECTION_FIELD_NUMBER: _ClassVar[int]
     source: str
     reason: str
-    def __init__(self, source: _Optional[str] = ..., reason: _Optional[str] = ...) -> None: ...
+    direction: Direction
+    def __init__(self, source: _Optional[str] = ..., reason: _Optional[str] = ..., direction: _Optional[_Union[Direction, str]] = ...) -> None: ...
 
 class Value(_message.Message):
     __slots__ = ("boolean", "integer", "unsigned", "number", "text", "list")
@@ -418,30 +446,38 @@ class InjectRequest(_message.Message):
     def __init__(self, lay: _Optional[_Union[Lay, _Mapping]] = ..., shadow: _Optional[_Union[Shadow, _Mapping]] = ...) -> None: ...
 
 class Lay(_message.Message):
-    __slots__ = ("patterns", "priority", "name", "keep", "lifetime_ms", "quiet")
+    __slots__ = ("patterns", "priority", "name", "keep", "lifetime_ms", "quiet", "source", "ranges", "direction")
     PATTERNS_FIELD_NUMBER: _ClassVar[int]
     PRIORITY_FIELD_NUMBER: _ClassVar[int]
     NAME_FIELD_NUMBER: _ClassVar[int]
     KEEP_FIELD_NUMBER: _ClassVar[int]
     LIFETIME_MS_FIELD_NUMBER: _ClassVar[int]
     QUIET_FIELD_NUMBER: _ClassVar[int]
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    RANGES_FIELD_NUMBER: _ClassVar[int]
+    DIRECTION_FIELD_NUMBER: _ClassVar[int]
     patterns: _containers.RepeatedScalarFieldContainer[str]
     priority: int
     name: str
     keep: bool
     lifetime_ms: int
     quiet: bool
-    def __init__(self, patterns: _Optional[_Iterable[str]] = ..., priority: _Optional[int] = ..., name: _Optional[str] = ..., keep: bool = ..., lifetime_ms: _Optional[int] = ..., quiet: bool = ...) -> None: ...
+    source: str
+    ranges: _containers.RepeatedCompositeFieldContainer[Range]
+    direction: Direction
+    def __init__(self, patterns: _Optional[_Iterable[str]] = ..., priority: _Optional[int] = ..., name: _Optional[str] = ..., keep: bool = ..., lifetime_ms: _Optional[int] = ..., quiet: bool = ..., source: _Optional[str] = ..., ranges: _Optional[_Iterable[_Union[Range, _Mapping]]] = ..., direction: _Optional[_Union[Direction, str]] = ...) -> None: ...
 
 class Shadow(_message.Message):
-    __slots__ = ("sequence", "values", "assignments")
+    __slots__ = ("sequence", "values", "assignments", "pieces")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     VALUES_FIELD_NUMBER: _ClassVar[int]
     ASSIGNMENTS_FIELD_NUMBER: _ClassVar[int]
+    PIECES_FIELD_NUMBER: _ClassVar[int]
     sequence: int
     values: Values
     assignments: _containers.RepeatedCompositeFieldContainer[Assignment]
-    def __init__(self, sequence: _Optional[int] = ..., values: _Optional[_Union[Values, _Mapping]] = ..., assignments: _Optional[_Iterable[_Union[Assignment, _Mapping]]] = ...) -> None: ...
+    pieces: _containers.RepeatedCompositeFieldContainer[Piece]
+    def __init__(self, sequence: _Optional[int] = ..., values: _Optional[_Union[Values, _Mapping]] = ..., assignments: _Optional[_Iterable[_Union[Assignment, _Mapping]]] = ..., pieces: _Optional[_Iterable[_Union[Piece, _Mapping]]] = ...) -> None: ...
 
 class InjectResponse(_message.Message):
     __slots__ = ("laid", "originals", "answers")
@@ -469,6 +505,172 @@ class Answer(_message.Message):
     outcome: Outcome
     def __init__(self, sequence: _Optional[int] = ..., outcome: _Optional[_Union[Outcome, _Mapping]] = ...) -> None: ...
 
+class DeclareRequest(_message.Message):
+    __slots__ = ("declarations", "keep")
+    DECLARATIONS_FIELD_NUMBER: _ClassVar[int]
+    KEEP_FIELD_NUMBER: _ClassVar[int]
+    declarations: _containers.RepeatedCompositeFieldContainer[Declaration]
+    keep: bool
+    def __init__(self, declarations: _Optional[_Iterable[_Union[Declaration, _Mapping]]] = ..., keep: bool = ...) -> None: ...
+
+class Declaration(_message.Message):
+    __slots__ = ("name", "targets", "set", "offset", "scale", "clamp", "noise", "random", "freeze", "delay", "drop", "flip", "probability", "start_s", "end_s", "when", "for_s", "times", "priority", "seed")
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    TARGETS_FIELD_NUMBER: _ClassVar[int]
+    SET_FIELD_NUMBER: _ClassVar[int]
+    OFFSET_FIELD_NUMBER: _ClassVar[int]
+    SCALE_FIELD_NUMBER: _ClassVar[int]
+    CLAMP_FIELD_NUMBER: _ClassVar[int]
+    NOISE_FIELD_NUMBER: _ClassVar[int]
+    RANDOM_FIELD_NUMBER: _ClassVar[int]
+    FREEZE_FIELD_NUMBER: _ClassVar[int]
+    DELAY_FIELD_NUMBER: _ClassVar[int]
+    DROP_FIELD_NUMBER: _ClassVar[int]
+    FLIP_FIELD_NUMBER: _ClassVar[int]
+    PROBABILITY_FIELD_NUMBER: _ClassVar[int]
+    START_S_FIELD_NUMBER: _ClassVar[int]
+    END_S_FIELD_NUMBER: _ClassVar[int]
+    WHEN_FIELD_NUMBER: _ClassVar[int]
+    FOR_S_FIELD_NUMBER: _ClassVar[int]
+    TIMES_FIELD_NUMBER: _ClassVar[int]
+    PRIORITY_FIELD_NUMBER: _ClassVar[int]
+    SEED_FIELD_NUMBER: _ClassVar[int]
+    name: str
+    targets: _containers.RepeatedScalarFieldContainer[str]
+    set: Value
+    offset: Value
+    scale: Value
+    clamp: Clamp
+    noise: Noise
+    random: Random
+    freeze: Freeze
+    delay: Delay
+    drop: Drop
+    flip: Flip
+    probability: float
+    start_s: float
+    end_s: float
+    when: str
+    for_s: float
+    times: int
+    priority: int
+    seed: int
+    def __init__(self, name: _Optional[str] = ..., targets: _Optional[_Iterable[str]] = ..., set: _Optional[_Union[Value, _Mapping]] = ..., offset: _Optional[_Union[Value, _Mapping]] = ..., scale: _Optional[_Union[Value, _Mapping]] = ..., clamp: _Optional[_Union[Clamp, _Mapping]] = ..., noise: _Optional[_Union[Noise, _Mapping]] = ..., random: _Optional[_Union[Random, _Mapping]] = ..., freeze: _Optional[_Union[Freeze, _Mapping]] = ..., delay: _Optional[_Union[Delay, _Mapping]] = ..., drop: _Optional[_Union[Drop, _Mapping]] = ..., flip: _Optional[_Union[Flip, _Mapping]] = ..., probability: _Optional[float] = ..., start_s: _Optional[float] = ..., end_s: _Optional[float] = ..., when: _Optional[str] = ..., for_s: _Optional[float] = ..., times: _Optional[int] = ..., priority: _Optional[int] = ..., seed: _Optional[int] = ...) -> None: ...
+
+class Clamp(_message.Message):
+    __slots__ = ("min", "max")
+    MIN_FIELD_NUMBER: _ClassVar[int]
+    MAX_FIELD_NUMBER: _ClassVar[int]
+    min: float
+    max: float
+    def __init__(self, min: _Optional[float] = ..., max: _Optional[float] = ...) -> None: ...
+
+class Noise(_message.Message):
+    __slots__ = ("amplitude", "distribution")
+    class Distribution(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+        __slots__ = ()
+        DISTRIBUTION_UNIFORM: _ClassVar[Noise.Distribution]
+        DISTRIBUTION_GAUSSIAN: _ClassVar[Noise.Distribution]
+    DISTRIBUTION_UNIFORM: Noise.Distribution
+    DISTRIBUTION_GAUSSIAN: Noise.Distribution
+    AMPLITUDE_FIELD_NUMBER: _ClassVar[int]
+    DISTRIBUTION_FIELD_NUMBER: _ClassVar[int]
+    amplitude: float
+    distribution: Noise.Distribution
+    def __init__(self, amplitude: _Optional[float] = ..., distribution: _Optional[_Union[Noise.Distribution, str]] = ...) -> None: ...
+
+class Random(_message.Message):
+    __slots__ = ("values", "min", "max")
+    VALUES_FIELD_NUMBER: _ClassVar[int]
+    MIN_FIELD_NUMBER: _ClassVar[int]
+    MAX_FIELD_NUMBER: _ClassVar[int]
+    values: _containers.RepeatedCompositeFieldContainer[Value]
+    min: float
+    max: float
+    def __init__(self, values: _Optional[_Iterable[_Union[Value, _Mapping]]] = ..., min: _Optional[float] = ..., max: _Optional[float] = ...) -> None: ...
+
+class Freeze(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class Delay(_message.Message):
+    __slots__ = ("ms", "cycles")
+    MS_FIELD_NUMBER: _ClassVar[int]
+    CYCLES_FIELD_NUMBER: _ClassVar[int]
+    ms: float
+    cycles: int
+    def __init__(self, ms: _Optional[float] = ..., cycles: _Optional[int] = ...) -> None: ...
+
+class Drop(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
+class Flip(_message.Message):
+    __slots__ = ("bits",)
+    BITS_FIELD_NUMBER: _ClassVar[int]
+    bits: _containers.RepeatedScalarFieldContainer[int]
+    def __init__(self, bits: _Optional[_Iterable[int]] = ...) -> None: ...
+
+class DeclareResponse(_message.Message):
+    __slots__ = ("declared", "happenings")
+    DECLARED_FIELD_NUMBER: _ClassVar[int]
+    HAPPENINGS_FIELD_NUMBER: _ClassVar[int]
+    declared: Declared
+    happenings: _containers.RepeatedCompositeFieldContainer[Happening]
+    def __init__(self, declared: _Optional[_Union[Declared, _Mapping]] = ..., happenings: _Optional[_Iterable[_Union[Happening, _Mapping]]] = ...) -> None: ...
+
+class Declared(_message.Message):
+    __slots__ = ("injections",)
+    INJECTIONS_FIELD_NUMBER: _ClassVar[int]
+    injections: _containers.RepeatedCompositeFieldContainer[Laying]
+    def __init__(self, injections: _Optional[_Iterable[_Union[Laying, _Mapping]]] = ...) -> None: ...
+
+class Laying(_message.Message):
+    __slots__ = ("source", "number", "name", "seed")
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
+    SEED_FIELD_NUMBER: _ClassVar[int]
+    source: str
+    number: int
+    name: str
+    seed: int
+    def __init__(self, source: _Optional[str] = ..., number: _Optional[int] = ..., name: _Optional[str] = ..., seed: _Optional[int] = ...) -> None: ...
+
+class Happening(_message.Message):
+    __slots__ = ("source", "number", "kind", "clock_ns", "utc_ns", "frame", "cycle", "run", "text")
+    class Kind(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+        __slots__ = ()
+        KIND_UNKNOWN: _ClassVar[Happening.Kind]
+        KIND_INJECTED: _ClassVar[Happening.Kind]
+        KIND_ACTIVATED: _ClassVar[Happening.Kind]
+        KIND_DEACTIVATED: _ClassVar[Happening.Kind]
+        KIND_LIFTED: _ClassVar[Happening.Kind]
+    KIND_UNKNOWN: Happening.Kind
+    KIND_INJECTED: Happening.Kind
+    KIND_ACTIVATED: Happening.Kind
+    KIND_DEACTIVATED: Happening.Kind
+    KIND_LIFTED: Happening.Kind
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    NUMBER_FIELD_NUMBER: _ClassVar[int]
+    KIND_FIELD_NUMBER: _ClassVar[int]
+    CLOCK_NS_FIELD_NUMBER: _ClassVar[int]
+    UTC_NS_FIELD_NUMBER: _ClassVar[int]
+    FRAME_FIELD_NUMBER: _ClassVar[int]
+    CYCLE_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    TEXT_FIELD_NUMBER: _ClassVar[int]
+    source: str
+    number: int
+    kind: Happening.Kind
+    clock_ns: int
+    utc_ns: int
+    frame: int
+    cycle: int
+    run: int
+    text: str
+    def __init__(self, source: _Optional[str] = ..., number: _Optional[int] = ..., kind: _Optional[_Union[Happening.Kind, str]] = ..., clock_ns: _Optional[int] = ..., utc_ns: _Optional[int] = ..., frame: _Optional[int] = ..., cycle: _Optional[int] = ..., run: _Optional[int] = ..., text: _Optional[str] = ...) -> None: ...
+
 class ListInjectionsRequest(_message.Message):
     __slots__ = ("sources",)
     SOURCES_FIELD_NUMBER: _ClassVar[int]
@@ -482,7 +684,7 @@ class ListInjectionsResponse(_message.Message):
     def __init__(self, injections: _Optional[_Iterable[_Union[Injection, _Mapping]]] = ...) -> None: ...
 
 class Injection(_message.Message):
-    __slots__ = ("source", "number", "direction", "priority", "keep", "name", "pid", "ranges")
+    __slots__ = ("source", "number", "direction", "priority", "keep", "name", "pid", "ranges", "running", "writer")
     SOURCE_FIELD_NUMBER: _ClassVar[int]
     NUMBER_FIELD_NUMBER: _ClassVar[int]
     DIRECTION_FIELD_NUMBER: _ClassVar[int]
@@ -491,6 +693,8 @@ class Injection(_message.Message):
     NAME_FIELD_NUMBER: _ClassVar[int]
     PID_FIELD_NUMBER: _ClassVar[int]
     RANGES_FIELD_NUMBER: _ClassVar[int]
+    RUNNING_FIELD_NUMBER: _ClassVar[int]
+    WRITER_FIELD_NUMBER: _ClassVar[int]
     source: str
     number: int
     direction: Direction
@@ -499,17 +703,37 @@ class Injection(_message.Message):
     name: str
     pid: int
     ranges: _containers.RepeatedCompositeFieldContainer[Range]
-    def __init__(self, source: _Optional[str] = ..., number: _Optional[int] = ..., direction: _Optional[_Union[Direction, str]] = ..., priority: _Optional[int] = ..., keep: bool = ..., name: _Optional[str] = ..., pid: _Optional[int] = ..., ranges: _Optional[_Iterable[_Union[Range, _Mapping]]] = ...) -> None: ...
+    running: Running
+    writer: int
+    def __init__(self, source: _Optional[str] = ..., number: _Optional[int] = ..., direction: _Optional[_Union[Direction, str]] = ..., priority: _Optional[int] = ..., keep: bool = ..., name: _Optional[str] = ..., pid: _Optional[int] = ..., ranges: _Optional[_Iterable[_Union[Range, _Mapping]]] = ..., running: _Optional[_Union[Running, _Mapping]] = ..., writer: _Optional[int] = ...) -> None: ...
 
-class Range(_message.Message):
-    __slots__ = ("offset", "size", "mask")
-    OFFSET_FIELD_NUMBER: _ClassVar[int]
-    SIZE_FIELD_NUMBER: _ClassVar[int]
-    MASK_FIELD_NUMBER: _ClassVar[int]
-    offset: int
-    size: int
-    mask: int
-    def __init__(self, offset: _Optional[int] = ..., size: _Optional[int] = ..., mask: _Optional[int] = ...) -> None: ...
+class Running(_message.Message):
+    __slots__ = ("declaration", "state", "seed", "runs", "cycle", "time_ns")
+    class State(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+        __slots__ = ()
+        STATE_UNSPECIFIED: _ClassVar[Running.State]
+        STATE_WAITING: _ClassVar[Running.State]
+        STATE_ACTIVE: _ClassVar[Running.State]
+        STATE_OVER: _ClassVar[Running.State]
+        STATE_LIFTED: _ClassVar[Running.State]
+    STATE_UNSPECIFIED: Running.State
+    STATE_WAITING: Running.State
+    STATE_ACTIVE: Running.State
+    STATE_OVER: Running.State
+    STATE_LIFTED: Running.State
+    DECLARATION_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    SEED_FIELD_NUMBER: _ClassVar[int]
+    RUNS_FIELD_NUMBER: _ClassVar[int]
+    CYCLE_FIELD_NUMBER: _ClassVar[int]
+    TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    declaration: Declaration
+    state: Running.State
+    seed: int
+    runs: int
+    cycle: int
+    time_ns: int
+    def __init__(self, declaration: _Optional[_Union[Declaration, _Mapping]] = ..., state: _Optional[_Union[Running.State, str]] = ..., seed: _Optional[int] = ..., runs: _Optional[int] = ..., cycle: _Optional[int] = ..., time_ns: _Optional[int] = ...) -> None: ...
 
 class LiftRequest(_message.Message):
     __slots__ = ("source", "number")

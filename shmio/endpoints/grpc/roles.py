@@ -25,7 +25,7 @@ _SERVICES: Final[Mapping[str, Mapping[str, str]]] = {
     "shmio.v1.Shmio": {
         READ: "GetLayouts GetStatus Read Subscribe ListInjections WatchClock",
         WRITE: "Write Simulate",
-        INJECT: "Inject Lift LiftAll",
+        INJECT: "Inject Declare Lift LiftAll",
         CONTROL: "Step SetStepSize Play Pause",
     },
     "com.ttsnetwork.simulator3.SimServerAPI": {

@@ -18,7 +18,6 @@ from shmio.endpoints.grpc.simlog_v2 import SimlogV2
 from shmio.endpoints.grpc.simserver import SimServer
 from shmio.endpoints.grpc.stepper import Stepper
 from shmio.endpoints.grpc.topics import Topics
-from shmio.errors import SegmentError
 from shmio.segment import ProcessSlot, Segment
 
 
@@ -38,15 +37,13 @@ class Services:
 
         ``default_source``: that of paths which name none; default: the only one.
         """
-        if slot.writer is None:
-            raise SegmentError("the segment has no command queue for this process")
         topics = Topics(feeds, default_source)
         self._outboxes = Outboxes()
         self._shadows = Shadows(topics)
         self._publisher = Publisher(topics, self._shadows)
         self.stepper = Stepper(segment, slot, hold, bells, feeds, self._outboxes, self._publisher)
         """The instance's time."""
-        self._native = NativeService(topics, feeds, bells, segment, slot.writer, self.stepper)
+        self._native = NativeService(topics, feeds, bells, segment, self.stepper)
         self._services = (
             self._native,
             SimlogV1(topics, self._publisher, self._outboxes, self._shadows, self.stepper),

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import msgspec
+
 from shmio.endpoints.grpc.native.clock import clock
 from shmio.endpoints.grpc.native.views import describe
+from shmio.messages import declaration_to_wire
 from shmio.segment import Block, Segment
-from shmio.segment.standing import Standing
+from shmio.segment.standing import Running, Standing
 from shmio.segment.status import ProcessStatus, SourceStatus, status_of
 from shmio.wire import shmio_v1_pb2 as wire
 
@@ -54,7 +57,22 @@ def injection(block: Block, one: Standing) -> wire.Injection:
         keep=one.keep,
         name=one.name,
         pid=one.pid,
+        writer=one.writer,
         ranges=[wire.Range(offset=offset, size=size, mask=mask) for offset, size, mask in one.ranges],
+        running=None if one.running is None else _running(one.running),
+    )
+
+
+def _running(running: Running) -> wire.Running:
+    """How a declared one is."""
+    declaration = running.declaration
+    return wire.Running(
+        declaration=declaration_to_wire(msgspec.to_builtins(declaration), declaration.name),
+        state=f"STATE_{running.state.upper()}",
+        seed=running.seed,
+        runs=running.runs,
+        cycle=running.cycle,
+        time_ns=running.time_ns,
     )
 
 

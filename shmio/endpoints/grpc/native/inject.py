@@ -3,22 +3,25 @@
 from __future__ import annotations
 
 import asyncio
-from collections import deque
 from collections.abc import AsyncIterator, Mapping, Sequence
 from typing import Final
 
-import numpy as np
-
+from shmio.endpoints.grpc import desk
+from shmio.endpoints.grpc.beneath import Beneath
 from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.encoding import field
+from shmio.endpoints.grpc.followers import Follower
 from shmio.endpoints.grpc.native.columns import pack, pack_slots
-from shmio.endpoints.grpc.native.desk import Desk, End
-from shmio.endpoints.grpc.native.selection import MAX_PATTERNS, Selections
+from shmio.endpoints.grpc.native.selection import Selections
+from shmio.endpoints.grpc.native.target import Ranges, raw_writes, target_of
 from shmio.endpoints.grpc.native.values import assigned, outcome, packed
 from shmio.endpoints.grpc.native.views import VALUES, head
+from shmio.endpoints.grpc.native.waiting import Waiting
+from shmio.endpoints.grpc.native.written import head_of
+from shmio.endpoints.grpc.pending import End
 from shmio.endpoints.grpc.topics import Topics
-from shmio.errors import PathError, ShmioError, ValueRangeError
-from shmio.layout.topic import Topic, shorten
+from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
+from shmio.layout.write import Write, covering
 from shmio.segment import DONE, Direction, EventKind, Frame
 from shmio.segment.commands import MAX_NAME_BYTES
 from shmio.segment.diverted import Diverted, apply
@@ -26,62 +29,78 @@ from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_OPEN: Final = 32
 """Values of one stream that are under way; what comes beyond waits."""
-MAX_WAITING: Final = 4096
-"""What was written over ``/in`` and waits to be read."""
 MAX_LIFETIME_MS: Final = 86_400_000
-RETRY_S: Final = 0.25
-"""How soon a source that has not lifted an injection is told again."""
 
 _ORIGINALS, _ANSWERS = (wire.InjectResponse.DESCRIPTOR.fields_by_name[name].number for name in ("originals", "answers"))
 
 
-class Injection:
-    """One call of Inject. It is a follower of its block's events."""
+class Injection(Follower):
+    """One call of Inject."""
 
     def __init__(self, topics: Topics, selections: Selections, bells: Bells, lay: wire.Lay) -> None:
         """PathError, ValueRangeError: as of the request."""
+        _check(lay)
         self._topics = topics
         self._selections = selections
         self._bells = bells
         self._lay = lay
         self.over = ""
-        """Why it stands no more, if it was somebody else who lifted it, or nobody reads what it stands over."""
-        self._ended = False
-        self._wanted, self._direction = _target(topics, lay)
+        """Why it has to end, if it was somebody else who lifted it, or nobody reads what it stands over."""
+        self._lifted = self._ended = False
+        self._lifting: asyncio.Task[None] | None = None
+        self._target = target_of(topics, lay)
         self._news = asyncio.Event()
-        self._waiting: deque[bytes] = deque()  # serialised fields of an InjectResponse
+        self._waiting = Waiting()  # serialised fields of an InjectResponse
         self.failure: ShmioError | None = None
         """What is wrong with what the client sends."""
         self._giving: set[asyncio.Task[None]] = set()
         self._room = asyncio.Semaphore(MAX_OPEN)
         self._shown: Frame | None = None
         self._shown_image = b""
-        self._inner: tuple[bytes, bytes] | None = None  # over /out: bits that injections further in give, and values
-        self._diverted = bytearray()
         self._timer: asyncio.TimerHandle | None = None
-        self.number = 0
 
     @property
     def source(self) -> str:
         """Whose registers it stands over."""
-        return next(iter(self._wanted))
+        return self._target.place.source
 
-    async def open(self, desk: Desk) -> bytes:
+    @property
+    def _inward(self) -> bool:
+        return self._target.place.inward
+
+    async def open(self) -> bytes:
         """Lay it; the first message. PathError, ValueRangeError, CommandError, EndpointError."""
-        view = await self._selections.registers(self._wanted)
-        self._view, self._desk = view, desk
-        self._diverted = bytearray(view.block.layout.size)
+        self._view = view = await self._selections.registers({self._target.place: self._target.topics})
+        size = view.block.layout.size
+        self._ranges = Ranges(self._target.ranges, size)
+        registers = covering(view.registers, size)
+        self._bits = bytes(a | b for a, b in zip(registers, self._ranges.bits, strict=True))
+        self._beneath = Beneath(view.block)
+        self._inlet = self._selections.inlet(self.source)
+        if self._inlet.block is not view.block:
+            raise CommandError(f"{self.source}: it was changed by a reload in this very moment; try again")
         lay = self._lay
-        self.number = await desk.lay(
-            view.registers, self, direction=self._direction, priority=lay.priority, keep=lay.keep, name=lay.name
+        self._beneath.number = await desk.lay(
+            self._inlet,
+            self._bits,
+            self,
+            direction=Direction.IN if self._inward else Direction.OUT,
+            priority=lay.priority,
+            keep=lay.keep,
+            name=lay.name,
         )
         self.restack()
         if lay.lifetime_ms:
             self._timer = asyncio.get_running_loop().call_later(lay.lifetime_ms / 1000, self._end)
-        if self._direction is Direction.OUT and not lay.quiet:
+        if self._originals:
             self._bells.join(view.block, self._news.set)
-        laid = wire.Laid(number=self.number).SerializeToString() + field(2, view.table)
-        return field(1, laid)
+        laid = wire.Laid(number=self._beneath.number).SerializeToString()
+        return field(1, laid + field(2, view.table + self._ranges.table))
+
+    @property
+    def _originals(self) -> bool:
+        """Whether it looks at frames."""
+        return not (self._inward or self._lay.quiet)
 
     async def close(self) -> None:
         """Lift it, unless it is to be kept. It goes on until the source has: nobody else would."""
@@ -89,13 +108,18 @@ class Injection:
             task.cancel()
         if self._timer is not None:
             self._timer.cancel()
-        if self._direction is Direction.OUT and not self._lay.quiet:
+        if self._originals:
             self._bells.leave(self._view.block, self._news.set)
-        self._desk.forget(self.number)
-        if self._lay.keep or self.over:
-            return
-        while await self._desk.lift(self.number):  # noqa: ASYNC110  the source has to be told again
-            await asyncio.sleep(RETRY_S)
+        number = self._beneath.number
+        if self._lay.keep or self._lifted:
+            self._inlet.followers.remove(number)
+        else:
+            self._lifting = self._lifting or self._lift()
+            await self._lifting
+
+    def _lift(self) -> asyncio.Task[None]:
+        name = f"{self.source}: {self._lay.name}"
+        return asyncio.get_running_loop().create_task(desk.have_lifted(self._inlet, self._beneath.number, name))
 
     def _end(self) -> None:
         self._ended = True
@@ -106,8 +130,7 @@ class Injection:
         while True:
             self._news.clear()  # before looking
             if self._waiting:
-                batch, self._waiting = b"".join(self._waiting), deque()
-                yield batch
+                yield self._waiting.all()
             elif original := self._original():
                 yield field(_ORIGINALS, original)
             elif self._ended or self.over:
@@ -142,7 +165,8 @@ class Injection:
 
     async def _give(self, shadow: wire.Shadow) -> None:
         try:
-            ends: Sequence[End] = await self._desk.give(self.number, self._values(shadow))
+            values, raw = self._values(shadow)
+            ends: Sequence[End] = await desk.give(self._inlet, self._beneath.number, values, raw)
         except ShmioError as error:
             if not shadow.sequence:
                 raise
@@ -153,119 +177,96 @@ class Injection:
 
     def _answer(self, shadow: wire.Shadow, end: End) -> None:
         answer = wire.Answer(sequence=shadow.sequence, outcome=outcome(*end))
-        self._waiting.append(field(_ANSWERS, answer.SerializeToString()))
-        self._news.set()
+        self._tell(field(_ANSWERS, answer.SerializeToString()))
 
-    def _values(self, shadow: wire.Shadow) -> Mapping[str, object]:
+    def _values(self, shadow: wire.Shadow) -> tuple[Mapping[str, object], Sequence[Write]]:
         values = packed(shadow.values, self._view) if shadow.HasField("values") else {}
         if shadow.assignments:
             source, named = assigned(shadow.assignments, self._topics)
             if source != self.source:
                 raise PathError(f"the injection is over {self.source}, the values are for {source}")
             values |= named
-        if not values:
+        raw = raw_writes(shadow.pieces, self._bits)
+        if not (values or raw):
             raise ValueRangeError("no value is given")
-        return values
+        return values, raw
 
     # ---- down: what it stands over -----------------------------------------------------------------------------
 
     def _original(self) -> bytes | None:
         """Over ``/out``: what differs in the newest image beneath it from the one shown before."""
-        if self._direction is Direction.IN or self._lay.quiet:
+        if not self._originals:
             return None
         block, shown = self._view.block, self._shown
         frame = block.latest() if shown is None or block.ring.head() != shown.number else shown
         if frame is None:
             return None
-        image = self._beneath(frame)
+        image = self._beneath.image(frame.raw)
         if shown is not None and image == self._shown_image and frame.quality == shown.quality:
             self._shown = frame
             return None
-        columns = self._view.columns
-        old = columns.decode(self._shown_image) if shown is not None and shown.source_ns else None
-        values = pack(columns.decode(image), old) if frame.source_ns else b""
+        before = self._shown_image if shown is not None and shown.source_ns else None
+        body = b""
+        if frame.source_ns:
+            columns = self._view.columns
+            values = pack(columns.decode(image), None if before is None else columns.decode(before))
+            body = (field(VALUES, values) if values else b"") + self._ranges.differing(image, before)
         quality = shown is None or frame.quality != shown.quality
         self._shown, self._shown_image = frame, image
-        if not values and not quality:
-            return None
-        return head(self._view.number, frame, whole=old is None) + (field(VALUES, values) if values else b"")
-
-    def _beneath(self, frame: Frame) -> bytes:
-        """An image as this injection finds it: what the source delivers, or injections further in give."""
-        if self._inner is None:
-            return frame.raw
-        raw, bits, values = (np.frombuffer(part, np.uint8) for part in (frame.raw, *self._inner))
-        return (raw ^ (raw ^ values) & bits).tobytes()
+        return head(self._view.number, frame, whole=before is None) + body if body or quality else None
 
     def divert(self, diverted: Diverted) -> None:
         """A command's values went to it: over ``/in`` what was written, over ``/out`` what others further in give."""
-        apply(self._diverted, diverted.writes)
-        if self._direction is Direction.OUT:
+        self._beneath.divert(diverted.writes)
+        if not self._inward:
             self.restack()
-            return
-        if self._lay.quiet:
-            return
-        if len(self._waiting) >= MAX_WAITING:
-            self.over = f"{MAX_WAITING} messages wait to be read: the client is too slow for what is written"
-            self._news.set()
-            return
-        mask = bytearray(len(self._diverted))
-        apply(mask, (write._replace(data=b"\xff" * len(write.data)) for write in diverted.writes))
-        columns = self._view.columns
-        values = pack_slots(columns.decode(bytes(self._diverted)), columns.touched(bytes(mask)))
-        event = diverted.event
-        update = wire.Update(
-            table=self._view.number,
-            frame=event.frame,
-            cycle=event.cycle,
-            incarnation=event.incarnation,
-            clock_ns=event.clock_ns,
-            source_ns=event.utc_ns,
-            quality=wire.QUALITY_GOOD,
-        ).SerializeToString()
-        self._waiting.append(field(_ORIGINALS, update + field(VALUES, values)))
+        elif not self._lay.quiet:
+            mask = bytearray(len(self._bits))
+            apply(mask, (write._replace(data=b"\xff" * len(write.data)) for write in diverted.writes))
+            image, touched = bytes(self._beneath.given), bytes(mask)
+            columns = self._view.columns
+            values = pack_slots(columns.decode(image), columns.touched(touched))
+            body = (field(VALUES, values) if values else b"") + self._ranges.touched(image, touched)
+            self._tell(field(_ORIGINALS, head_of(self._view.number, diverted.event) + body))
+
+    def _tell(self, message: bytes) -> None:
+        if not self.over and (reason := self._waiting.add(message)):
+            self._give_up(reason)
+        self._news.set()
+
+    def _give_up(self, reason: str) -> None:
+        """Have it lifted at once: a client that does not read holds up the stream's end."""
+        self.over = self.over or reason
+        if self._beneath.number and not (self._lay.keep or self._lifted):
+            self._lifting = self._lifting or self._lift()
         self._news.set()
 
     def restack(self) -> None:
         """An injection was laid or lifted, on the same source."""
-        if not self.number:  # it is not known yet which is this one
-            return
-        bits = np.zeros(len(self._diverted), np.uint8)
-        for one in self._view.block.standing.read():
-            if one.id == self.number:
-                break
-            if one.direction == "out":
-                for offset, size, mask in one.ranges:
-                    bits[offset : offset + size] |= mask
-        self._inner = (bits.tobytes(), bytes(self._diverted)) if bits.any() else None
-        self._news.set()
+        if not self._inward:
+            self._beneath.restack()
+            self._news.set()
 
     def lifted(self, reason: str) -> None:
         """It was lifted, and not by this stream."""
+        self._lifted = True
         self.over = f"it was lifted: {reason}" if reason != "lifted" else "somebody has lifted it"
         self._news.set()
 
+    def fail(self, reason: str) -> None:
+        """What comes next is not all there was: over ``/out`` frames have it."""
+        if self._inward and not self._lay.quiet:
+            self._give_up(reason)
 
-def _target(topics: Topics, lay: wire.Lay) -> tuple[Mapping[str, Sequence[Topic]], Direction]:
-    """What it is to stand over. PathError, ValueRangeError."""
-    if not lay.patterns:
-        raise ValueRangeError("no pattern is given: an injection stands over something")
-    if len(lay.patterns) > MAX_PATTERNS:
-        raise ValueRangeError(f"{len(lay.patterns)} patterns, {MAX_PATTERNS} are the most: use stars, or structures")
+
+def _check(lay: wire.Lay) -> None:
+    """ValueRangeError: options that are none, or do not go together."""
     if len(lay.name.encode()) > MAX_NAME_BYTES:
         raise ValueRangeError(f"name: at most {MAX_NAME_BYTES} bytes")
     if lay.lifetime_ms > MAX_LIFETIME_MS:
         raise ValueRangeError(f"lifetime_ms: at most {MAX_LIFETIME_MS}, a day")
     if lay.keep and lay.lifetime_ms:
         raise ValueRangeError("keep and lifetime_ms: what is kept stays until somebody lifts it")
-    found = [topics.topic(pattern) for pattern in lay.patterns]
-    if len({topic.source for topic in found}) > 1:
-        raise PathError("one injection is over one source: lay one for each, with a stream each")
-    directions = {topic.direction or "out" for topic in found}
-    if len(directions) > 1:
-        raise PathError(f"{shorten(lay.patterns[0])}, …: an injection is over /out or over /in, not over both")
-    direction = Direction.IN if directions == {"in"} else Direction.OUT
-    return {found[0].source: tuple(dict.fromkeys(found))}, direction
 
 
 def _worst(ends: Sequence[End]) -> End:

@@ -1,4 +1,4 @@
-"""The calls of shmio.v1 that have a source do something: Write, Inject, and those about injections."""
+"""The calls of shmio.v1 that have a source do something: Write, Inject, Declare, and those about injections."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ from typing import Any, Final
 
 import grpc
 
+from shmio.endpoints.grpc import desk
 from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.native import describe
-from shmio.endpoints.grpc.native.desk import Desk
+from shmio.endpoints.grpc.native.declare import Campaign
 from shmio.endpoints.grpc.native.inject import Injection
 from shmio.endpoints.grpc.native.refusal import Context, refuse
 from shmio.endpoints.grpc.native.selection import Selections
@@ -24,24 +25,20 @@ from shmio.segment.standing import Standing
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_INJECTIONS: Final = 256
-"""Inject calls that may be open at once."""
+"""Calls of Inject and Declare that may be open at once."""
 MAX_TIMEOUT_MS: Final = 86_400_000
 
 
 class Orders:
     """A part of the service."""
 
-    def __init__(
-        self, topics: Topics, feeds: Mapping[str, Feed], selections: Selections, bells: Bells, writer: int
-    ) -> None:
-        """``writer``: the command queue of this process."""
+    def __init__(self, topics: Topics, feeds: Mapping[str, Feed], selections: Selections, bells: Bells) -> None:
         self._topics = topics
         self._feeds = feeds
         self._selections = selections
         self._bells = bells
-        self._writer = writer
-        self._desks: dict[int, Desk] = {}  # by the section of their block
-        self._injections: set[Injection] = set()
+        self._open: set[Injection | Campaign] = set()
+        self._turn = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
@@ -50,6 +47,7 @@ class Orders:
         return {
             "Write": unary(self.write, wire.WriteRequest.FromString, wire.WriteResponse.SerializeToString),
             "Inject": grpc.stream_stream_rpc_method_handler(self.inject, wire.InjectRequest.FromString),
+            "Declare": grpc.unary_stream_rpc_method_handler(self.declare, wire.DeclareRequest.FromString),
             "ListInjections": unary(
                 self.list_injections,
                 wire.ListInjectionsRequest.FromString,
@@ -70,7 +68,8 @@ class Orders:
                 raise ValueRangeError(f"timeout_ms: at most {MAX_TIMEOUT_MS}, a day")
             source, values = assigned(request.values, self._topics)
             timeout_s = request.timeout_ms / 1000 or None
-            ends = await self._desk(source).write(values, timeout_s, until_accepted=request.until_accepted)
+            inlet = self._topics.feed(source).inlet
+            ends = await desk.write(inlet, values, timeout_s, until_accepted=request.until_accepted)
             return wire.WriteResponse(outcomes=[outcome(*end) for end in ends])
         except ShmioError as error:
             await refuse(context, error)
@@ -86,7 +85,7 @@ class Orders:
         taking: asyncio.Task[None] | None = None
         try:
             injection = await self._injection(requests)
-            opening = asyncio.get_running_loop().create_task(injection.open(self._desk(injection.source)))
+            opening = asyncio.get_running_loop().create_task(injection.open())
             yield await asyncio.shield(opening)
             taking = asyncio.get_running_loop().create_task(injection.take(requests))
             taking.add_done_callback(injection.taken)
@@ -109,23 +108,50 @@ class Orders:
 
     async def _injection(self, requests: AsyncIterator[wire.InjectRequest]) -> Injection:
         """What the first message asks for. PathError, ValueRangeError, EndpointError."""
-        if len(self._injections) >= MAX_INJECTIONS:
-            raise EndpointError(f"{MAX_INJECTIONS} calls of Inject are open, the most there may be")
+        self._check_room()
         async for request in requests:
             if request.WhichOneof("what") == "lay":
                 injection = Injection(self._topics, self._selections, self._bells, request.lay)
-                self._injections.add(injection)
+                self._open.add(injection)
                 return injection
             break
         raise ValueRangeError("the first message of Inject lays an injection, all others give values")
 
-    async def _close(self, injection: Injection, opening: asyncio.Task[bytes]) -> None:
+    def _check_room(self) -> None:
+        """EndpointError."""
+        if len(self._open) >= MAX_INJECTIONS:
+            raise EndpointError(f"{MAX_INJECTIONS} calls of Inject and Declare are open, the most there may be")
+
+    async def _close(self, one: Injection | Campaign, opening: asyncio.Task[bytes]) -> None:
         try:
             await asyncio.wait((opening,))
             if not opening.cancelled() and opening.exception() is None:
-                await injection.close()
+                await one.close()
         finally:
-            self._injections.discard(injection)
+            self._open.discard(one)
+
+    async def declare(self, request: wire.DeclareRequest, context: Context) -> AsyncIterator[bytes]:
+        """Lay injections that their sources run, all or none, as long as the stream is open, or for good; their record.
+
+        INVALID_ARGUMENT: what is wrong with which key; FAILED_PRECONDITION: a source refuses it, and says why;
+        RESOURCE_EXHAUSTED: too many streams; ABORTED: the record is not read, or would have a gap.
+        """
+        opening: asyncio.Task[bytes] | None = None
+        try:
+            self._check_room()
+            campaign = Campaign(self._feeds, request, self._turn)
+            self._open.add(campaign)
+            opening = asyncio.get_running_loop().create_task(campaign.open())
+            yield await asyncio.shield(opening)
+            async for message in campaign.messages():
+                yield message
+        except ShmioError as error:
+            await refuse(context, error)
+        finally:
+            if opening is not None:
+                self._spawn(self._close(campaign, opening))
+        if campaign.over:
+            await context.abort(grpc.StatusCode.ABORTED, campaign.over)
 
     async def list_injections(
         self, request: wire.ListInjectionsRequest, context: Context
@@ -143,7 +169,7 @@ class Orders:
         """Lift one. NOT_FOUND: there is no such injection; FAILED_PRECONDITION: the source does not answer."""
         try:
             (block,) = self.blocks([request.source])
-            standing = [one for one in block.standing.read() if one.id == request.number]
+            standing = [one for one in block.standing.read() if one.id == request.number and not one.lifted]
             if not standing:
                 raise PathError(f"{request.source}: there is no injection {request.number}; ListInjections lists them")
             lifted = await self._lift(block, standing[0])
@@ -159,12 +185,12 @@ class Orders:
             blocks = self.blocks(request.sources)
         except ShmioError as error:
             await refuse(context, error)
-        standing = [(block, one) for block in blocks for one in block.standing.read()]
+        standing = [(block, one) for block in blocks for one in block.standing.read() if not one.lifted]
         lifted = await asyncio.gather(*(self._lift(block, one) for block, one in standing))
         return wire.LiftResponse(lifted=lifted)
 
     async def _lift(self, block: Block, one: Standing) -> wire.Lifted:
-        failure = await self._desk(block.source).lift(one.id)
+        failure = await desk.lift(self._feeds[block.source].inlet, one.id)
         return wire.Lifted(source=block.source, number=one.id, name=one.name, failure=failure)
 
     def blocks(self, sources: Collection[str]) -> list[Block]:
@@ -174,19 +200,8 @@ class Orders:
                 raise PathError(f"no source {shorten(source)!r}; there are: {', '.join(self._feeds)}")
         return [self._feeds[source].block for source in dict.fromkeys(sources) or self._feeds]
 
-    def _desk(self, source: str) -> Desk:
-        block = self._topics.feed(source).block
-        desk = self._desks.get(block.section)
-        if desk is None:
-            desk = self._desks[block.section] = Desk(block, self._writer, self._bells)
-        return desk
-
     def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
         return task
-
-    def move(self) -> None:
-        """A reload has ended some blocks."""
-        self._desks = {section: desk for section, desk in self._desks.items() if not desk.block.retired}

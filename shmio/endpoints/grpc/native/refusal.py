@@ -9,6 +9,7 @@ import grpc
 
 from shmio.errors import (
     CommandError,
+    ConfigError,
     ConflictError,
     EndpointError,
     PathError,
@@ -23,6 +24,7 @@ Context = grpc.aio.ServicerContext[Any, Any]
 _STATUS: Final[Mapping[type[ShmioError], grpc.StatusCode]] = {
     PathError: grpc.StatusCode.NOT_FOUND,
     ValueRangeError: grpc.StatusCode.INVALID_ARGUMENT,
+    ConfigError: grpc.StatusCode.INVALID_ARGUMENT,
     CommandError: grpc.StatusCode.FAILED_PRECONDITION,
     ConflictError: grpc.StatusCode.ALREADY_EXISTS,
     EndpointError: grpc.StatusCode.RESOURCE_EXHAUSTED,

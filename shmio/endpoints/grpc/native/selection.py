@@ -6,9 +6,10 @@ import asyncio
 import itertools
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from typing import Final
+from typing import Final, NamedTuple
 from weakref import WeakValueDictionary
 
+from shmio.endpoints.grpc.inlet import Inlet
 from shmio.endpoints.grpc.native.views import Frames, Selection, View
 from shmio.endpoints.grpc.topics import Topics
 from shmio.errors import EndpointError, PathError, ValueRangeError
@@ -28,10 +29,17 @@ MAX_ALL_ELEMENTS: Final = 1 << 22
 KEPT: Final = 16
 """Views that are kept though nobody has them, for who reads the same again and again."""
 
-Wanted = Mapping[str, Sequence[Topic]]
-"""Topics by their source."""
 
-_Key = tuple[int, tuple[str, ...]]
+class Place(NamedTuple):
+    """A source, and which way: ``inward``, what is written to it."""
+
+    source: str
+    inward: bool = False
+
+
+Wanted = Mapping[Place, Sequence[Topic]]
+
+_Key = tuple[int, bool, tuple[str, ...]]
 
 
 class Selections:
@@ -44,60 +52,67 @@ class Selections:
         self._kept: OrderedDict[_Key, View] = OrderedDict()
         self._turn = asyncio.Lock()
 
-    def resolve(self, patterns: Sequence[str]) -> Wanted:
-        """What a call's patterns say. PathError, ValueRangeError."""
+    def resolve(self, patterns: Sequence[str], *, inward: bool = False) -> Wanted:
+        """What a call's patterns say; ``inward``: whether ``/in`` may be among them. PathError, ValueRangeError."""
         if not patterns:
             raise ValueRangeError("no pattern is given: a path, structure, glob, or a source's name for all it has")
         if len(patterns) > MAX_PATTERNS:
             raise ValueRangeError(f"{len(patterns)} patterns, {MAX_PATTERNS} are the most: use stars, or structures")
-        wanted: dict[str, dict[Topic, None]] = {}
+        wanted: dict[Place, dict[Topic, None]] = {}
         for pattern in patterns:
             topic = self._topics.topic(pattern)
-            if topic.direction == "in":
+            if topic.direction == "in" and not inward:
                 raise PathError(f"{shorten(pattern)}: what goes into a source is not read here; leave out /in")
-            wanted.setdefault(topic.source, {})[topic] = None
-        return {source: tuple(topics) for source, topics in wanted.items()}
+            wanted.setdefault(Place(topic.source, topic.direction == "in"), {})[topic] = None
+        return {place: tuple(topics) for place, topics in wanted.items()}
+
+    def inlet(self, source: str) -> Inlet:
+        """The way into a source as of now; PathError: a reload has removed it."""
+        return self._topics.feed(source).inlet
 
     async def select(self, wanted: Wanted, *, frames: bool = False) -> list[View]:
-        """One for each source, in this order.
+        """One for each place, in this order; ``frames``: raw ones.
 
         PathError: no such register; ValueRangeError: too much for one call; EndpointError: for all clients together.
         """
         views = []
         budget = _Budget()
-        for source, topics in wanted.items():
-            views.append(view := await self._view(source, () if frames else topics, budget))
+        for place, topics in wanted.items():
+            views.append(view := await self._view(place, () if frames else topics, budget))
             budget.take(view)
         return views
 
     async def registers(self, wanted: Wanted) -> Selection:
-        """That of the one source there is."""
-        ((source, topics),) = wanted.items()
-        view = await self._view(source, topics, _Budget())
-        if not isinstance(view, Selection):  # topics are never none
-            raise PathError(f"{source}: no register is named")
+        """That of the one place there is; of no registers, if no topic is named."""
+        ((place, topics),) = wanted.items()
+        if not topics:
+            block = self._topics.feed(place.source).block
+            return Selection(next(self._numbers), block, (), inward=place.inward)
+        view = await self._view(place, topics, _Budget())
+        if not isinstance(view, Selection):  # as raw frames are: of no topics
+            raise PathError(f"{place.source}: no register is named")
         return view
 
-    async def _view(self, source: str, topics: Sequence[Topic], budget: _Budget) -> View:
+    async def _view(self, place: Place, topics: Sequence[Topic], budget: _Budget) -> View:
         """``topics``: none for raw frames."""
-        block = self._topics.feed(source).block
-        key = block.section, tuple(topic.path for topic in topics)
+        block = self._topics.feed(place.source).block
+        key = block.section, place.inward, tuple(topic.path for topic in topics)
         if (view := self._known.get(key)) is None:
             async with self._turn:  # one at a time, and not on the loop: a large layout and its patterns take seconds
                 view = self._known.get(key)
                 if view is None:
-                    view = self._known[key] = await self._make(block, topics, budget)
+                    view = self._known[key] = await self._make(block, topics, budget, inward=place.inward)
         self._kept[key] = view
         self._kept.move_to_end(key)
         while len(self._kept) > KEPT:
             self._kept.popitem(last=False)
         return view
 
-    async def _make(self, block: Block, topics: Sequence[Topic], budget: _Budget) -> View:
+    async def _make(self, block: Block, topics: Sequence[Topic], budget: _Budget, *, inward: bool) -> View:
         number = next(self._numbers)
         if not topics:
             return Frames(number, block)
-        view = await asyncio.to_thread(_select, number, block, topics, budget)
+        view = await asyncio.to_thread(_select, number, block, topics, budget, inward=inward)
         if self._elements + view.elements > MAX_ALL_ELEMENTS:
             self._kept.clear()
         if self._elements + view.elements > MAX_ALL_ELEMENTS:
@@ -141,7 +156,7 @@ class _Budget:
             )
 
 
-def _select(number: int, block: Block, topics: Sequence[Topic], budget: _Budget) -> Selection:
+def _select(number: int, block: Block, topics: Sequence[Topic], budget: _Budget, *, inward: bool) -> Selection:
     chosen: dict[str, Register] = {}
     elements = 0
     for topic in topics:
@@ -155,6 +170,6 @@ def _select(number: int, block: Block, topics: Sequence[Topic], budget: _Budget)
                 chosen[register.path] = register
                 elements += register.count
         budget.check(len(chosen), elements)
-    selection = Selection(number, block, list(chosen.values()))
+    selection = Selection(number, block, list(chosen.values()), inward=inward)
     _ = selection.table
     return selection

@@ -39,15 +39,8 @@ class NativeService:
     name = SERVICE
 
     def __init__(
-        self,
-        topics: Topics,
-        feeds: Mapping[str, Feed],
-        bells: Bells,
-        segment: Segment,
-        writer: int,
-        stepper: Stepper,
+        self, topics: Topics, feeds: Mapping[str, Feed], bells: Bells, segment: Segment, stepper: Stepper
     ) -> None:
-        """``writer``: the command queue of this process."""
         self._feeds = feeds
         self._segment = segment
         self._selections = Selections(topics)
@@ -55,7 +48,7 @@ class NativeService:
         self._clocks = Clocks(segment, stepper)
         self._hold = stepper.hold
         stepper.also(self._deliver)
-        self._orders = Orders(topics, feeds, self._selections, self._bells, writer)
+        self._orders = Orders(topics, feeds, self._selections, self._bells)
         self._simulations = Simulations(feeds, segment)
         self._open: set[Subscription] = set()
         self._ended_updates = 0
@@ -148,7 +141,6 @@ class NativeService:
 
     def move(self, sources: Collection[str]) -> None:
         """Have the streams of these sources go over to the blocks that there are by now."""
-        self._orders.move()
         self._simulations.move()
         for subscription in self._open:
             subscription.move(sources)

@@ -13,8 +13,9 @@ from shmio.endpoints.grpc.bells import Bells, Ring
 from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.hold import Hold
 from shmio.endpoints.grpc.native.follow import EveryFrame, Follower, Latest
-from shmio.endpoints.grpc.native.selection import Selections
-from shmio.endpoints.grpc.native.views import View
+from shmio.endpoints.grpc.native.selection import Place, Selections
+from shmio.endpoints.grpc.native.views import Selection, View
+from shmio.endpoints.grpc.native.written import Inward
 from shmio.errors import EndpointError, PathError, ValueRangeError
 from shmio.segment.coordinator import Step
 from shmio.wire import shmio_v1_pb2 as wire
@@ -60,10 +61,13 @@ class Subscription:
         self._selections = selections
         self._bells = bells
         self._request = request
-        self._wanted = selections.resolve(request.patterns)
-        self._followers: dict[str, Follower] = {}
-        self._rings: dict[str, Ring] = {}  # what their bells call
-        self._moved: dict[str, None] = {}
+        self._wanted = selections.resolve(request.patterns, inward=True)
+        if request.format == wire.FORMAT_FRAMES and any(place.inward for place in self._wanted):
+            raise ValueRangeError("what is written has no raw frames: leave out /in, or ask for the format VALUES")
+        self._followers: dict[Place, Follower] = {}
+        self._inward: dict[Place, Inward] = {}
+        self._rings: dict[Place, Ring] = {}  # what their bells call
+        self._moved: dict[Place, None] = {}
         self._turn = 0
         self._news = asyncio.Event()
         self._clock = asyncio.get_running_loop().time
@@ -71,18 +75,18 @@ class Subscription:
     async def open(self) -> bytes:
         """Join all blocks; the tables. PathError, ValueRangeError, EndpointError."""
         views = await self._selections.select(self._wanted, frames=self._request.format == wire.FORMAT_FRAMES)
-        return b"".join(map(self._join, views))
+        return b"".join(map(self._join, self._wanted, views))
 
     def close(self) -> None:
         """Leave them."""
         while self._marks:
             _set(self._marks.popleft()[1])
-        for source in list(self._followers):
-            self._leave(source)
+        for place in self._wanted:
+            self._leave(place)
 
     def move(self, sources: Collection[str]) -> None:
         """A reload has changed these sources."""
-        self._moved |= dict.fromkeys(source for source in self._wanted if source in sources)
+        self._moved |= dict.fromkeys(place for place in self._wanted if place.source in sources)
         self._news.set()
 
     def mark(self, step: Step) -> asyncio.Future[None]:
@@ -96,8 +100,14 @@ class Subscription:
         return sent
 
     async def messages(self) -> AsyncIterator[bytes]:
-        """Serialised SubscribeResponses, without end. EndpointError: a step has waited too long to be read."""
+        """Serialised SubscribeResponses, without end.
+
+        EndpointError: a step, or what was written, has waited too long to be read.
+        """
         while not self.late:
+            for inward in self._inward.values():
+                if inward.failure:
+                    raise EndpointError(inward.failure)
             self._news.clear()  # before looking
             batch, whole = self._batch()
             if self._marks and whole and not self._moved:
@@ -109,17 +119,25 @@ class Subscription:
             elif batch:
                 yield batch
             elif self._moved:
-                source = next(iter(self._moved))
-                del self._moved[source]
-                yield await self._go_over(source)
+                place = next(iter(self._moved))
+                del self._moved[place]
+                yield await self._go_over(place)
             else:
                 await self._wait()
         raise EndpointError("a step has waited too long to be read: this client is too slow for how time is stepped")
 
     def _batch(self) -> tuple[bytes, bool]:
-        """What there is at present, up to a bound, of each block in turn; whether it is all there is."""
+        """What there is at present, up to a bound, first what was written, then of each block in turn.
+
+        And whether it is all there is.
+        """
         parts: list[bytes] = []
         size, now_s = 0, self._clock()
+        for inward in self._inward.values():
+            while size < BATCH_BYTES and (written := inward.next()) is not None:
+                self.updates += 1
+                size += len(written)
+                parts.append(field(UPDATES, written))
         waiting = deque(follower for follower in self._followers.values() if self._open(follower))
         waiting.rotate(self._turn)
         self._turn += 1  # else one with long updates would hide the others
@@ -132,7 +150,7 @@ class Subscription:
             self.updates += 1
             size += len(update)
             parts.append(field(UPDATES, update))
-        return b"".join(parts), not waiting
+        return b"".join(parts), not (waiting or any(inward.waits for inward in self._inward.values()))
 
     def _open(self, follower: Follower) -> bool:
         """Whether a block may be shown now: on the instance's clock, in virtual time, only when a step is over."""
@@ -155,32 +173,38 @@ class Subscription:
         finally:
             handle.cancel()
 
-    async def _go_over(self, source: str) -> bytes:
+    async def _go_over(self, place: Place) -> bytes:
         """Follow the block that a source has by now, or say that it has none; all of the old one was sent."""
-        if source in self._followers:
-            self._leave(source)
+        self._leave(place)
         try:
-            views = await self._selections.select(
-                {source: self._wanted[source]}, frames=self._request.format == wire.FORMAT_FRAMES
+            (view,) = await self._selections.select(
+                {place: self._wanted[place]}, frames=self._request.format == wire.FORMAT_FRAMES
             )
+            return self._join(place, view)
         except PathError as error:
-            return field(ENDED, wire.Ended(source=source, reason=str(error)).SerializeToString())
-        return b"".join(map(self._join, views))
+            direction = wire.DIRECTION_IN if place.inward else wire.DIRECTION_OUT
+            ended = wire.Ended(source=place.source, reason=str(error), direction=direction)
+            return field(ENDED, ended.SerializeToString())
 
-    def _join(self, view: View) -> bytes:
+    def _join(self, place: Place, view: View) -> bytes:
         request = self._request
+        if place.inward and isinstance(view, Selection):
+            self._inward[place] = Inward(view.writes, self._selections.inlet(place.source), self._news.set)
+            return field(TABLES, view.table)
         if request.mode == wire.MODE_EVERY_FRAME:
             follower: Follower = EveryFrame(view)
         else:
             follower = Latest(view, 1 / request.max_rate_hz if request.max_rate_hz else 0.0, request.deadband)
-        self._followers[view.block.source] = follower
-        ring = self._rings[view.block.source] = partial(self._ring, follower)
+        self._followers[place] = follower
+        ring = self._rings[place] = partial(self._ring, follower)
         self._bells.join(view.block, ring)
         return field(TABLES, view.table)
 
-    def _leave(self, source: str) -> None:
-        follower = self._followers.pop(source)
-        self._bells.leave(follower.view.block, self._rings.pop(source))
+    def _leave(self, place: Place) -> None:
+        if inward := self._inward.pop(place, None):
+            inward.leave()
+        if follower := self._followers.pop(place, None):
+            self._bells.leave(follower.view.block, self._rings.pop(place))
 
 
 def _set(sent: asyncio.Future[None]) -> None:

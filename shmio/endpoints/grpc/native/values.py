@@ -12,6 +12,7 @@ from shmio.errors import CommandError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.text import from_text, wire_type
 from shmio.layout.topic import shorten
+from shmio.messages import value_from_wire
 from shmio.segment import EventKind
 from shmio.wire import shmio_v1_pb2 as wire
 
@@ -61,17 +62,7 @@ def plain(value: wire.Value, register: Register) -> object:
     """A value as Python has it; ValueRangeError: there is none, or no text of its type."""
     if value.WhichOneof("kind") == "text" and (register.dims or wire_type(register) != "string"):
         return from_text(value.text, register)
-    return _plain(value, register.path)
-
-
-def _plain(value: wire.Value, path: str) -> object:
-    kind = value.WhichOneof("kind")
-    if kind is None:
-        raise ValueRangeError(f"{path}: no value is given")
-    if kind == "list":
-        return [_plain(item, path) for item in value.list.values]
-    found: object = getattr(value, kind)
-    return found
+    return value_from_wire(value, register.path)
 
 
 def packed(values: wire.Values, selection: Selection) -> dict[str, object]:

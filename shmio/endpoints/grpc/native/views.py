@@ -11,6 +11,7 @@ import numpy as np
 
 from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.native.columns import Column, Columns, Decoded, column_of, merge, pack
+from shmio.endpoints.grpc.native.written import Writes
 from shmio.layout.model import Register
 from shmio.segment import Block, Frame
 from shmio.wire import shmio_v1_pb2 as wire
@@ -38,8 +39,10 @@ class Message(NamedTuple):
 class Selection:
     """Registers of one block as one table, and what becomes of its frames. For the event loop's thread, once made."""
 
-    def __init__(self, number: int, block: Block, registers: Sequence[Register]) -> None:
+    def __init__(self, number: int, block: Block, registers: Sequence[Register], *, inward: bool = False) -> None:
+        """``inward``: it is about what is written to them."""
         self.number = number
+        self.inward = inward
         self.block = block
         self.registers = tuple(registers)
         self.elements = sum(register.count for register in registers)
@@ -47,6 +50,11 @@ class Selection:
         self._decoded: OrderedDict[int, Decoded] = OrderedDict()
         self._updates: OrderedDict[tuple[int, int], Message] = OrderedDict()
         self._marks: OrderedDict[int, Marks] = OrderedDict()
+
+    @cached_property
+    def writes(self) -> Writes:
+        """What becomes of what is written to them."""
+        return Writes(self.number, self.block, self.registers, self.columns)
 
     @cached_property
     def table(self) -> bytes:
@@ -58,6 +66,7 @@ class Selection:
             hash=self.block.layout.hash,
             size=self.block.layout.size,
             slots=[0, *self.columns.sizes.values()],
+            direction=wire.DIRECTION_IN if self.inward else wire.DIRECTION_OUT,
         )
         for register, (column, slot) in zip(self.registers, self.columns.places, strict=True):
             describe(register, table.registers.add(), column, slot)

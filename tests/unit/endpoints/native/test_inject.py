@@ -11,7 +11,7 @@ import grpc
 import numpy as np
 import pytest
 
-from shmio.client import Client, Column, Provenance, connect, connect_aio
+from shmio.client import Client, Column, Piece, Provenance, connect, connect_aio
 from shmio.errors import CommandError, PathError, RemoteError, ValueRangeError
 from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as wire
@@ -267,5 +267,121 @@ def test_with_asyncio(segment: Segment) -> None:
             assert await cell.lift_all() == []
             with pytest.raises(PathError):
                 await cell.inject("cell/nothing")
+
+    with_plant(segment, test)
+
+
+def test_bytes_and_bits_by_ranges(segment: Segment) -> None:
+    def test(cell: Client, device: Plant, _: Endpoint) -> None:
+        device.memory[26:30] = b"\1\2\3\4"
+        seen(cell, "cell/long/4", 4)
+        with cell.inject(ranges=[(26, 3), (10, 1, 0x0F)], source="cell", originals=True) as shadow:
+            assert shadow.table.ranges == ((26, 3, 0xFF), (10, 1, 0x0F))
+            assert shadow.table.registers == ()
+            first = next(shadow)
+            assert [tuple(piece) for piece in first.pieces] == [(26, b"\1\2\3", 0xFF), (10, b"\0", 0x0F)]
+            (one,) = cell.injections()
+            assert one.ranges == ((10, 1, 0x0F), (26, 3, 0xFF))
+            (outcome,) = shadow.set(raw=[(27, b"\x22\x33"), Piece(10, b"\xff")])
+            assert outcome.kind == "shadowed"
+            assert cell["cell/long"][:4].tolist() == [1, 0x22, 0x33, 4]
+            assert cell["cell/inputs/0"] == 0x0F
+            device.memory[10:12] = b"\xa5\1"
+            device.memory[28] = 9
+            pieces: dict[int, bytes] = {}
+            while set(pieces) != {28, 10}:
+                pieces |= dict(_pieces(next(shadow)))
+            assert pieces == {28: b"\x09", 10: b"\x05"}
+            (outcome,) = shadow.set(raw=[(10, b"\0", 1)])
+            assert outcome.done
+            assert cell["cell/inputs/0"] == 0xAE
+            for wrong in ((25, b"\0"), (28, b"\0\0"), (10, b"\0", 0x10), (10, b"\0", 0x1FF), (5000, b"\0"), (26, b"")):
+                (outcome,) = shadow.set(raw=[wrong])
+                assert (outcome.kind, "is not over all" in outcome.text) == ("rejected", True)
+        assert cell["cell/inputs/0"] == 0xA5
+
+    with_client(segment, test)
+
+
+def _pieces(update: Any) -> list[tuple[int, bytes]]:
+    return [(piece.offset, piece.data) for piece in update.pieces]
+
+
+def test_ranges_over_in_beside_registers(segment: Segment) -> None:
+    def test(cell: Client, device: Plant, _: Endpoint) -> None:
+        with cell.inject("cell/step/in", ranges=[(26, 600)], originals=True) as shadow:
+            assert (shadow.table.direction, shadow.table.ranges) == ("in", ((26, 600, 0xFF),))
+            cell.write({"cell/long/3": 7, "cell/step": 5})
+            update = next(shadow)
+            assert (_pieces(update), update.changed, update["cell/step"]) == ([(28, b"\7")], ["cell/step"], 5)
+            ends = shadow.set({"cell/step": 6}, raw=[(26, bytes(range(200)))])
+            assert [one.kind for one in ends] == ["written", "written"]
+            assert device.memory[26:226] == bytes(range(200))
+            assert device.memory[13] == 6
+
+    with_client(segment, test)
+
+
+def test_a_whole_section_of_a_block(segment: Segment) -> None:
+    def test(cell: Client, device: Plant, _: Endpoint) -> None:
+        device.memory[13] = 3
+        seen(cell, "cell/step", 3)
+        size = segment.blocks["cell"].layout.size
+        with cell.inject(ranges=[(0, size)], source="cell", originals=True) as shadow:
+            (piece,) = next(shadow).pieces
+            assert (piece.offset, piece.data) == (0, bytes(device.memory))
+            image = bytearray(piece.data)
+            image[13] = 4
+            assert shadow.set(raw=[(0, bytes(image))])[0].done
+            assert cell["cell/step"] == 4
+
+    with_client(segment, test)
+
+
+def test_what_is_no_range(segment: Segment) -> None:
+    def test(cell: Client, _: Plant, __: Endpoint) -> None:
+        for ranges, message in (
+            ([(0, 0)], "are none"),
+            ([(600, 29)], "not all in the block"),
+            ([(1 << 31, 1 << 31)], "not all in the block"),
+            ([(0, 1, 0x100)], "bits that a byte has not"),
+            ([(0, 1)] * 300, "256 are the most"),
+        ):
+            with pytest.raises(ValueRangeError, match=message):
+                cell.inject(ranges=ranges, source="cell")
+        with pytest.raises(PathError, match="is not a source's name"):
+            cell.inject(ranges=[(0, 1)], source="cell/step")
+        with pytest.raises(PathError, match="whose bytes they are"):
+            cell.inject(ranges=[(0, 1)])
+        with pytest.raises(CommandError, match="not writable"):
+            cell.inject(ranges=[(626, 1)], source="cell/in")
+        assert cell.injections() == []
+
+    with_client(segment, test)
+
+
+def test_what_a_declared_one_makes_is_not_an_original(segment: Segment) -> None:
+    """And does not hide the source's own value either."""
+
+    def test(cell: Client, device: Plant, _: Endpoint) -> None:
+        struct.pack_into(">f", device.memory, 0, 1.5)
+        offset = {"name": "x", "target": "cell/axis/position", "operation": "offset", "value": 5}
+        with cell.declare([offset]), cell.inject("cell/axis/position", originals=True) as shadow:
+            while (found := next(shadow)["cell/axis/position"]) != 1.5:
+                assert found == 0.0
+
+    with_client(segment, test)
+
+
+def test_events_that_were_missed_end_what_cannot_be_told_in_full(segment: Segment) -> None:
+    async def test(served: Endpoint, _: Plant) -> None:
+        async with connect_aio(f"127.0.0.1:{served.port}") as cell:
+            outward, inward = await cell.inject("cell/axis"), await cell.inject("cell/step/in", originals=True)
+            served.feeds["cell"].inlet.followers.fail("3 events of source cell were missed")
+            with pytest.raises(RemoteError, match="3 events of source cell were missed"):
+                await drain_aio(inward)
+            (one,) = await cell.injections()
+            assert one.number == outward.number
+            await outward.close()
 
     with_plant(segment, test)

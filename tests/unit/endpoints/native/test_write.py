@@ -10,7 +10,7 @@ from typing import Any
 import grpc
 import pytest
 
-from shmio.client.calls import to_wire
+from shmio.messages import value_to_wire
 from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as wire
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, refusal
@@ -23,7 +23,7 @@ KINDS = wire.Outcome
 
 
 def assignments(values: dict[str, Any]) -> list[wire.Assignment]:
-    return [wire.Assignment(path=path, value=to_wire(value, path)) for path, value in values.items()]
+    return [wire.Assignment(path=path, value=value_to_wire(value, path)) for path, value in values.items()]
 
 
 def write(served: Endpoint, values: dict[str, Any], **options: Any) -> Any:
@@ -150,7 +150,7 @@ def test_values_that_are_none_and_too_many(segment: Segment) -> None:
         assert (await refusal(stub(served).Write(bare, timeout=TIMEOUT_S)))[0] is Status.INVALID_ARGUMENT
         late = wire.WriteRequest(values=assignments({"cell/step": 1}), timeout_ms=1 << 31)
         assert "timeout_ms" in (await refusal(stub(served).Write(late, timeout=TIMEOUT_S)))[1]
-        deep = to_wire([[[[[[[[1]]]]]]]], "x")
+        deep = value_to_wire([[[[[[[[1]]]]]]]], "x")
         nested = wire.WriteRequest(values=[wire.Assignment(path="cell/step", value=deep)])
         assert (await refusal(stub(served).Write(nested, timeout=TIMEOUT_S)))[0] is Status.INVALID_ARGUMENT
 

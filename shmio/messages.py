@@ -1,0 +1,139 @@
+"""Values and declared injections as messages of ``shmio.v1`` and as Python, or TOML, has them; for both of its ends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+from shmio.errors import ValueRangeError
+from shmio.wire import shmio_v1_pb2 as wire
+
+_OPERATIONS: Final[Mapping[str, Mapping[str, str]]] = {
+    "set": {"value": ""},
+    "offset": {"value": ""},
+    "scale": {"value": ""},
+    "clamp": {"min": "min", "max": "max"},
+    "noise": {"amplitude": "amplitude", "distribution": "distribution"},
+    "random": {"values": "values", "min": "min", "max": "max"},
+    "freeze": {},
+    "delay": {"delay_ms": "ms", "delay_cycles": "cycles"},
+    "drop": {},
+    "flip": {"bits": "bits"},
+}
+"""Each operation's own keys, and their fields in its message; of those with just a value, that is the message."""
+_COMMON: Final = ("probability", "start_s", "end_s", "when", "for_s", "times", "seed", "priority")
+_DISTRIBUTIONS: Final = {"uniform": wire.Noise.DISTRIBUTION_UNIFORM, "gaussian": wire.Noise.DISTRIBUTION_GAUSSIAN}
+
+
+def value_to_wire(value: object, path: str) -> wire.Value:
+    """A value of Python or numpy; ValueRangeError: of no kind that goes by wire. ``path``: for the message."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, bool):
+        return wire.Value(boolean=value)
+    if isinstance(value, int):
+        if -(1 << 63) <= value < 1 << 63:
+            return wire.Value(integer=value)
+        if 0 <= value < 1 << 64:
+            return wire.Value(unsigned=value)
+        raise ValueRangeError(f"{path}: {value} has more than 64 bits")
+    if isinstance(value, float):
+        return wire.Value(number=value)
+    if isinstance(value, str):
+        return wire.Value(text=value)
+    if isinstance(value, (list, tuple)):
+        return wire.Value(list=wire.List(values=[value_to_wire(item, path) for item in value]))
+    raise ValueRangeError(f"{path}: a {type(value).__name__} is no value of a register")
+
+
+def value_from_wire(value: wire.Value, path: str) -> object:
+    """The same as Python has it; ValueRangeError: there is none."""
+    kind = value.WhichOneof("kind")
+    if kind is None:
+        raise ValueRangeError(f"{path}: no value is given")
+    if kind == "list":
+        return [value_from_wire(item, path) for item in value.list.values]
+    found: object = getattr(value, kind)
+    return found
+
+
+def declaration_to_wire(table: Mapping[str, Any], key: str) -> wire.Declaration:
+    """An ``[[injection]]`` table. ValueRangeError: a key that it cannot have, or a value that cannot be sent.
+
+    ``key``: of the table, for the message.
+    """
+    left = dict(table)
+    operation = left.pop("operation", None)
+    own = _OPERATIONS.get(operation) if isinstance(operation, str) else None
+    if own is None:
+        raise ValueRangeError(f"{key}.operation: {operation!r} is none; there are: {', '.join(_OPERATIONS)}")
+    target = left.pop("target", [])
+    try:
+        found = wire.Declaration(name=left.pop("name", ""), targets=[target] if isinstance(target, str) else target)
+        for name in _COMMON:
+            if (value := left.pop(name, None)) is not None:
+                setattr(found, name, value)
+        given = {name: value for name in own if (value := left.pop(name, None)) is not None}
+        if own.get("value") is None:
+            part = getattr(found, str(operation))
+            part.SetInParent()
+            for name, value in given.items():
+                _set(part, own[name], value, f"{key}.{name}")
+        elif "value" in given:
+            getattr(found, str(operation)).CopyFrom(value_to_wire(given["value"], f"{key}.value"))
+        else:
+            raise ValueRangeError(f"{key}.value: this key is needed for operation {operation!r}")
+    except ValueRangeError:
+        raise
+    except (TypeError, ValueError) as error:
+        raise ValueRangeError(f"{key}: {error}") from None
+    if left:
+        raise ValueRangeError(f"{key}.{next(iter(left))}: operation {operation!r} has no such key")
+    return found
+
+
+def _set(part: Any, field: str, value: Any, key: str) -> None:
+    if field == "values":
+        part.values.extend(value_to_wire(item, key) for item in value)
+    elif field == "bits":
+        part.bits.extend(value)
+    elif field == "distribution":
+        if value not in _DISTRIBUTIONS:
+            raise ValueRangeError(f"{key}: {value!r} is none; there are: {', '.join(_DISTRIBUTIONS)}")
+        part.distribution = _DISTRIBUTIONS[value]
+    else:
+        setattr(part, field, value)
+
+
+def declaration_from_wire(found: wire.Declaration, key: str) -> dict[str, Any]:
+    """The table, of which nothing is checked. ValueRangeError: a value is missing. ``key``: for the message."""
+    targets = list(found.targets)
+    table: dict[str, Any] = {"name": found.name, "target": targets[0] if len(targets) == 1 else targets}
+    operation = found.WhichOneof("operation")
+    if operation is not None:
+        table["operation"] = operation
+        table |= _own(getattr(found, operation), operation, key)
+    for name in _COMMON:
+        if name == "priority":
+            table |= {name: found.priority} if found.priority else {}
+        elif found.HasField(name):
+            table[name] = getattr(found, name)
+    return table
+
+
+def _own(part: Any, operation: str, key: str) -> dict[str, Any]:
+    if "value" in _OPERATIONS[operation]:
+        return {"value": value_from_wire(part, f"{key}.value")}
+    if operation == "noise":
+        words = {number: word for word, number in _DISTRIBUTIONS.items()}
+        noise = {"amplitude": part.amplitude}
+        return noise | ({"distribution": words.get(part.distribution, "?")} if part.distribution else {})
+    own: dict[str, Any] = {}
+    for name, field in _OPERATIONS[operation].items():
+        if field == "values":
+            own |= {name: [value_from_wire(item, f"{key}.values") for item in part.values]} if part.values else {}
+        elif field == "bits":
+            own |= {name: list(part.bits)} if part.bits else {}
+        elif part.HasField(field):
+            own[name] = getattr(part, field)
+    return own
