@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from typing import NamedTuple, Protocol
 
+from shmio.config import Declaration
 from shmio.layout.model import Layout, Register
 from shmio.segment.clock import ClockState
 from shmio.segment.commander import Outcome
@@ -42,6 +43,28 @@ class Shadow(Protocol):
         """Give values by path; what became of each."""
 
 
+class Happened(NamedTuple):
+    """What was done with a declared injection: ``what``, at which time of the instance's clock."""
+
+    time_s: float
+    cycle: int
+    source: str
+    number: int
+    what: str
+    text: str
+
+
+class Campaign(Protocol):
+    """Declared injections that were laid."""
+
+    @property
+    def stands(self) -> bool:
+        """Whether any of it does, by what :meth:`news` has told."""
+
+    def news(self) -> list[Happened]:
+        """What has happened since it was asked last, or was laid."""
+
+
 class Cell(Protocol):
     """An instance. Errors are those of :mod:`shmio.errors`."""
 
@@ -64,6 +87,9 @@ class Cell(Protocol):
     def inject(self, *paths: str, priority: int, keep: bool, name: str) -> AbstractContextManager[Shadow]:
         """Lay an injection, for the time of a ``with`` block unless it is to be kept."""
 
+    def declare(self, declarations: Sequence[Declaration], *, keep: bool) -> AbstractContextManager[Campaign]:
+        """Lay declared injections, all or none, for the time of a ``with`` block unless they are to be kept."""
+
     def injections(self) -> dict[str, tuple[Standing, ...]]:
         """What stands at present, by source; the innermost first."""
 
@@ -77,10 +103,10 @@ class Cell(Protocol):
     def clock(self) -> ClockState:
         """How time stands."""
 
-    def step(self, dt_ms: float | None) -> None:
+    def step(self, dt_s: float | None) -> None:
         """Move time by one step."""
 
-    def play(self, rate: float, dt_ms: float | None) -> None:
+    def play(self, rate: float, dt_s: float | None) -> None:
         """Have time step by itself."""
 
     def pause(self) -> None:

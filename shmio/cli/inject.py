@@ -12,7 +12,6 @@ import msgspec
 from shmio.cli.campaign import run_campaign
 from shmio.cli.cell import Cell
 from shmio.cli.interrupt import told_to_stop
-from shmio.cli.local import Local
 from shmio.cli.run import dumps
 from shmio.cli.set import Pairs, read_value, seconds
 from shmio.errors import CommandError, PathError, ValueRangeError
@@ -49,9 +48,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
     if options.file is not None:
         if options.pairs:
             raise CommandError("give --file, or PATH VALUE, not both")
-        if not isinstance(cell, Local):
-            raise CommandError("--file: what a file declares is laid on the host of the instance; leave out --host")
-        return run_campaign(cell.attachment, options)
+        return run_campaign(cell, options)
     if options.list or not options.pairs:
         _list(cell, as_json=options.json)
         return 0

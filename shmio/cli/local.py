@@ -5,13 +5,15 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Final
 
-from shmio.cli.cell import News, Selected
+from shmio.cli.cell import Happened, News, Selected
 from shmio.cli.readings import choose
-from shmio.errors import NotRunningError, PathError
+from shmio.config import Declaration
+from shmio.errors import CommandError, NotRunningError, PathError
 from shmio.layout.model import Layout, Register
-from shmio.segment import Block, Frame, Quality
+from shmio.segment import Block, Cursor, Event, EventKind, Frame, Quality
 from shmio.segment.attach import Attachment
 from shmio.segment.clock import ClockState
 from shmio.segment.commander import Outcome
@@ -22,6 +24,8 @@ from shmio.segment.view import Reading, reading
 IDLE_S: Final = 0.5
 WAITING_FRAMES: Final = 64
 """Changes of so many frames may wait for a slow terminal; a block further behind goes on with its newest frame."""
+
+_TOLD: Final = frozenset({EventKind.INJECTED, EventKind.ACTIVATED, EventKind.DEACTIVATED, EventKind.LIFTED})
 
 _Changes = list[tuple[Block, Register, Reading]]
 
@@ -104,6 +108,10 @@ class Local:
         """Lay an injection, for the time of a ``with`` block unless it is to be kept."""
         return self.attachment.inject(*paths, priority=priority, keep=keep, name=name)
 
+    def declare(self, declarations: Sequence[Declaration], *, keep: bool) -> LocalCampaign:
+        """Lay declared injections, all or none, for the time of a ``with`` block unless they are to be kept."""
+        return LocalCampaign(self.attachment, declarations, keep=keep)
+
     def injections(self) -> dict[str, tuple[Standing, ...]]:
         """What stands at present, by source; the innermost first."""
         return self.attachment.injections()
@@ -121,17 +129,51 @@ class Local:
         """How time stands."""
         return self.attachment.clock
 
-    def step(self, dt_ms: float | None) -> None:
+    def step(self, dt_s: float | None) -> None:
         """Move time by one step."""
-        self.attachment.step(dt_ms)
+        self.attachment.step(dt_s)
 
-    def play(self, rate: float, dt_ms: float | None) -> None:
+    def play(self, rate: float, dt_s: float | None) -> None:
         """Have time step by itself."""
-        self.attachment.play(rate, dt_ms)
+        self.attachment.play(rate, dt_s)
 
     def pause(self) -> None:
         """Have it step no more by itself."""
         self.attachment.pause()
+
+
+class LocalCampaign:
+    """Declared injections as a :class:`shmio.cli.cell.Campaign`; they are laid when it is made."""
+
+    def __init__(self, cell: Attachment, declarations: Sequence[Declaration], *, keep: bool) -> None:
+        self._keep = keep
+        self._cursors = {source: cell.block(source).events.cursor() for source in cell.sources}
+        self._laid = {one.number: one for one in cell.declare(declarations, keep=keep)}
+
+    @property
+    def stands(self) -> bool:
+        """Whether any of it does."""
+        return bool(self._laid)
+
+    def news(self) -> list[Happened]:
+        """What has happened since."""
+        return [happened for source, cursor in self._cursors.items() for happened in self._of(source, cursor)]
+
+    def _of(self, source: str, cursor: Cursor[Event]) -> Iterator[Happened]:
+        while (event := cursor.next(0)) is not None:
+            if event.kind in _TOLD and event.injection in self._laid and event.offset == 0:  # of parts the first
+                time_s, what = event.clock_ns / 1e9, str(EventKind(event.kind))
+                yield Happened(time_s, event.cycle, source, event.injection, what, event.text)
+                if event.kind == EventKind.LIFTED:
+                    del self._laid[event.injection]
+
+    def __enter__(self) -> LocalCampaign:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for one in () if self._keep else self._laid.values():
+            with suppress(CommandError):  # it was over, or somebody else has lifted it
+                one.lift()
 
 
 def _follow(block: Block, registers: list[Register], news: queue.Queue[_Changes]) -> None:

@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 import argparse
+import queue
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from functools import cached_property
 from typing import Any
 
-from shmio.cli.cell import News, Selected, Shadow
+import msgspec
+
+from shmio.cli.cell import Campaign, Happened, News, Selected, Shadow
 from shmio.cli.readings import choose
-from shmio.client import BlockLayout, Client, Outcome, Update, connect
+from shmio.client import BlockLayout, Client, Happening, Outcome, Update, connect
+from shmio.client import Campaign as ClientCampaign
 from shmio.client import Quality as ClientQuality
+from shmio.client import Running as ClientRunning
 from shmio.client import Shadow as ClientShadow
+from shmio.config import Declaration
 from shmio.config.address import UNIX, Address
-from shmio.errors import ConfigError, NotRunningError, PathError, RemoteError
+from shmio.errors import ConfigError, NotRunningError, PathError, RemoteError, ShmioError
 from shmio.layout.codec import Value
 from shmio.layout.model import Layout, Register
 from shmio.layout.types import element_type
 from shmio.segment import EventKind, Quality
 from shmio.segment.clock import ClockMode, ClockState
 from shmio.segment.commander import Outcome as LocalOutcome
-from shmio.segment.standing import Standing
+from shmio.segment.standing import Running, Standing
 from shmio.segment.view import Reading
 
 
@@ -105,11 +112,20 @@ class Remote:
         """Lay an injection, for the time of a ``with`` block unless it is to be kept."""
         return self._lay(self._client.inject(*paths, priority=priority, keep=keep, name=name, originals=False))
 
+    @contextmanager
+    def declare(self, declarations: Sequence[Declaration], *, keep: bool) -> Iterator[Campaign]:
+        """Lay declared injections, all or none, for the time of a ``with`` block unless they are to be kept."""
+        with self._client.declare(map(msgspec.to_builtins, declarations), keep=keep) as campaign:
+            yield _RemoteCampaign(campaign)
+
     def injections(self) -> dict[str, tuple[Standing, ...]]:
         """What stands at present, by source; the innermost first."""
         found: dict[str, tuple[Standing, ...]] = {}
         for one in self._client.injections():
-            standing = Standing(one.number, one.direction, one.priority, one.keep, one.name, 0, one.pid, one.ranges)
+            standing = Standing(
+                one.number, one.direction, one.priority, one.keep, one.name, one.writer, one.pid,
+                one.ranges, None if one.running is None else _running(one.running),
+            )  # fmt: skip
             found[one.source] = (*found.get(one.source, ()), standing)
         return found
 
@@ -130,13 +146,13 @@ class Remote:
             mode, now.step, now.time_ns, 0, now.step, now.step_size_ns, now.playing, now.rate, note=now.note
         )
 
-    def step(self, dt_ms: float | None) -> None:
+    def step(self, dt_s: float | None) -> None:
         """Move time by one step."""
-        self._client.step(None if dt_ms is None else dt_ms / 1000)
+        self._client.step(dt_s)
 
-    def play(self, rate: float, dt_ms: float | None) -> None:
+    def play(self, rate: float, dt_s: float | None) -> None:
         """Have time step by itself."""
-        self._client.play(None if dt_ms is None else dt_ms / 1000, rate)
+        self._client.play(rate, dt_s)
 
     def pause(self) -> None:
         """Have it step no more by itself."""
@@ -150,6 +166,51 @@ class _RemoteShadow:
 
     def set(self, values: Mapping[str, object]) -> list[LocalOutcome]:
         return _outcomes(self._shadow.set(values))
+
+
+class _RemoteCampaign:
+    """Declared injections as a :class:`shmio.cli.cell.Campaign`; a thread reads the record."""
+
+    def __init__(self, campaign: ClientCampaign) -> None:
+        self._names = {one.number: one.name for one in campaign.declared}
+        self._left = set(self._names)
+        self._told: queue.SimpleQueue[Happening | ShmioError] = queue.SimpleQueue()
+        unheard = set(self._names)
+        while unheard:  # that each was laid is told with the first answer
+            happening = next(campaign)
+            unheard.discard(happening.number)
+            self._told.put(happening)
+        threading.Thread(target=self._read, args=(campaign,), daemon=True).start()  # it ends with the stream
+
+    def _read(self, campaign: ClientCampaign) -> None:
+        try:
+            for happening in campaign:
+                self._told.put(happening)
+        except ShmioError as error:
+            self._told.put(error)
+
+    @property
+    def stands(self) -> bool:
+        """Whether any of it does."""
+        return bool(self._left)
+
+    def news(self) -> list[Happened]:
+        """What has happened since. RemoteError: the instance has ended."""
+        found = []
+        while not self._told.empty():
+            one = self._told.get()
+            if isinstance(one, ShmioError):
+                raise one
+            if one.what == "lifted":
+                self._left.discard(one.number)
+            text = one.text or self._names[one.number]
+            found.append(Happened(one.clock_ns / 1e9, one.cycle, one.source, one.number, one.what, text))
+        return found
+
+
+def _running(found: ClientRunning) -> Running:
+    declaration = msgspec.convert(found.declaration, Declaration)
+    return Running(declaration, found.state, found.seed, found.runs, found.cycle, found.time_ns)
 
 
 def _outcomes(found: Sequence[Outcome]) -> list[LocalOutcome]:

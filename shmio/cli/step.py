@@ -35,21 +35,22 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
     """Step, play or pause, and tell the time then. TimeError, ValueRangeError."""
+    dt_s = None if options.dt_ms is None else options.dt_ms / 1000
     if options.play is not None:
-        _play(cell, options.play, options.dt_ms)
+        _play(cell, options.play, dt_s)
     elif options.pause:
         cell.pause()
     else:
         for _ in range(options.count):
-            cell.step(options.dt_ms)
+            cell.step(dt_s)
     clock = clock_status(cell.clock)
     print(dumps(msgspec.to_builtins(clock)) if options.json else clock_line(clock))
     return 0
 
 
-def _play(cell: Cell, rate: float, dt_ms: float | None) -> None:
+def _play(cell: Cell, rate: float, dt_s: float | None) -> None:
     with told_to_stop() as over:
-        cell.play(rate, dt_ms)
+        cell.play(rate, dt_s)
         while not over.wait(LOOK_S) and cell.clock.playing:
             pass  # until it is told to stop, or a step fails
         cell.pause()

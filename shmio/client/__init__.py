@@ -17,27 +17,34 @@ from os import PathLike
 from pathlib import Path
 
 from shmio.client import aio
-from shmio.client.calls import Clock, Injection, Lifted, Outcome, Target
+from shmio.client.calls import Clock, Outcome, Target
+from shmio.client.injections import Declared, Happening, Injection, Lifted, Running
 from shmio.client.layout import BlockLayout
 from shmio.client.model import Work
 from shmio.client.sync import Client, Subscription
+from shmio.client.sync_campaign import Campaign
 from shmio.client.sync_model import Simulation
 from shmio.client.sync_shadow import Shadow
 from shmio.client.table import Change, Column, Register, Table
-from shmio.client.update import Provenance, Quality, Snapshot, Update
+from shmio.client.update import Piece, Provenance, Quality, Snapshot, Update
 
 __all__ = [
     "BlockLayout",
+    "Campaign",
     "Change",
     "Client",
     "Clock",
     "Column",
+    "Declared",
+    "Happening",
     "Injection",
     "Lifted",
     "Outcome",
+    "Piece",
     "Provenance",
     "Quality",
     "Register",
+    "Running",
     "Shadow",
     "Simulation",
     "Snapshot",

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from typing import Any, Self
 
 import grpc
 
-from shmio.client import calls, shadow
+from shmio.client import calls, injections, shadow
+from shmio.client.aio_campaign import Campaign
 from shmio.client.aio_model import Simulation, Step, serve
 from shmio.client.aio_shadow import Shadow
 from shmio.client.arrays import InjectResponse, ReadResponse, SimulateResponse, SubscribeResponse
-from shmio.client.calls import Clock, Injection, Lifted, Outcome, Target
+from shmio.client.calls import Clock, Outcome, Target
+from shmio.client.injections import Injection, Lifted
 from shmio.client.layout import BlockLayout, layouts
 from shmio.client.model import PATIENCE_S
 from shmio.client.update import Snapshot, Tables, Update
@@ -92,6 +94,8 @@ class Client:
     async def inject(
         self,
         *patterns: str,
+        ranges: shadow.Ranges = (),
+        source: str = "",
         priority: int = 0,
         keep: bool = False,
         name: str = "",
@@ -99,7 +103,10 @@ class Client:
         originals: bool = False,
     ) -> Shadow:
         """As :meth:`shmio.client.Client.inject`."""
-        first = shadow.lay(patterns, priority=priority, keep=keep, name=name, for_s=for_s, originals=originals)
+        first = shadow.lay(
+            patterns, ranges=ranges, source=source, priority=priority, keep=keep, name=name, for_s=for_s,
+            originals=originals,
+        )  # fmt: skip
         call = self._inject(metadata=self.target.metadata)
         try:
             await call.write(first)
@@ -108,10 +115,20 @@ class Client:
             self.target.fail(error)
         return Shadow(call, shadow.Held(found), self.target)
 
+    async def declare(self, declarations: Iterable[Mapping[str, Any]], *, keep: bool = False) -> Campaign:
+        """As :meth:`shmio.client.Client.declare`."""
+        request = injections.declare_request(declarations, keep=keep)
+        call = self._stub.Declare(request, metadata=self.target.metadata)
+        try:
+            first = await call.read()
+        except grpc.RpcError as error:
+            self.target.fail(error)
+        return Campaign(call, first, self, keep=keep)
+
     async def injections(self, *sources: str) -> list[Injection]:
         """What stands at present, on these sources or all; of each the innermost first."""
         request = wire.ListInjectionsRequest(sources=sources)
-        return calls.injections(await self._call(self._stub.ListInjections, request))
+        return injections.injections(await self._call(self._stub.ListInjections, request))
 
     async def lift(self, source: str, number: int) -> None:
         """Lift an injection, whoever laid it. PathError: there is none; CommandError: the source does not answer."""
@@ -119,7 +136,7 @@ class Client:
 
     async def lift_all(self, *sources: str) -> list[Lifted]:
         """The emergency: lift all of these sources, or of all, whoever laid them. CommandError: some still stand."""
-        found = calls.lifted(await self._call(self._stub.LiftAll, wire.LiftAllRequest(sources=sources)))
+        found = injections.lifted(await self._call(self._stub.LiftAll, wire.LiftAllRequest(sources=sources)))
         if left := [one for one in found if one.failure]:
             raise CommandError(f"{len(left)} of {len(found)} injections still stand: {left[0].failure}")
         return found
@@ -156,7 +173,7 @@ class Client:
         """How far a step goes that does not say it; takes time over. CommandError, ValueRangeError."""
         return Clock.of(await self._call(self._stub.SetStepSize, wire.SetStepSizeRequest(dt_ns=calls.ns(dt_s))))
 
-    async def play(self, dt_s: float | None = None, rate: float = 1.0) -> Clock:
+    async def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
         """Have time step by itself, ``rate`` times as fast as real time. CommandError, ValueRangeError."""
         return Clock.of(await self._call(self._stub.Play, wire.PlayRequest(dt_ns=calls.ns(dt_s), rate=rate)))
 

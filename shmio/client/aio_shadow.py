@@ -34,12 +34,15 @@ class Shadow(AsyncIterator[Update]):
         self._reading = asyncio.get_running_loop().create_task(self._read())
 
     async def set(
-        self, values: Mapping[str, object] | None = None, arrays: shadow.Arrays | None = None
+        self,
+        values: Mapping[str, object] | None = None,
+        arrays: shadow.Arrays | None = None,
+        raw: shadow.Raw = (),
     ) -> list[Outcome]:
         """As :meth:`shmio.client.Shadow.set`."""
-        values = values or {}
+        values, raw = values or {}, list(raw)
         self._check()
-        sequence, data = self._held.request(values, arrays, answered=True)
+        sequence, data = self._held.request(values, arrays, raw, answered=True)
         answer = self._answers[sequence] = asyncio.get_running_loop().create_future()
         await self._write(data)
         try:
@@ -48,12 +51,17 @@ class Shadow(AsyncIterator[Update]):
             raise RemoteError(f"{self._target.address}: it did not answer in time") from None
         finally:
             self._answers.pop(sequence, None)
-        return shadow.ends(values, arrays, outcome)
+        return shadow.ends(values, outcome, more=bool(arrays or raw))
 
-    async def send(self, values: Mapping[str, object] | None = None, arrays: shadow.Arrays | None = None) -> None:
+    async def send(
+        self,
+        values: Mapping[str, object] | None = None,
+        arrays: shadow.Arrays | None = None,
+        raw: shadow.Raw = (),
+    ) -> None:
         """As :meth:`shmio.client.Shadow.send`."""
         self._check()
-        await self._write(self._held.request(values or {}, arrays, answered=False)[1])
+        await self._write(self._held.request(values or {}, arrays, raw, answered=False)[1])
 
     async def __anext__(self) -> Update:
         """The next original, waited for; ends when it is over. Asked for with ``originals``."""

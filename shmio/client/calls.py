@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Final, NoReturn
 
 import grpc
-import numpy as np
 
 from shmio.errors import (
     CommandError,
@@ -20,6 +19,7 @@ from shmio.errors import (
     ShmioError,
     ValueRangeError,
 )
+from shmio.messages import value_to_wire
 from shmio.wire import shmio_v1_pb2 as wire
 
 STEP_PATIENCE_S: Final = 60.0
@@ -146,28 +146,7 @@ def write_request(values: Mapping[str, object], timeout_s: float | None, *, unti
 
 def assignments(values: Mapping[str, object]) -> list[Any]:
     """Values by path; ValueRangeError."""
-    return [wire.Assignment(path=path, value=to_wire(value, path)) for path, value in values.items()]
-
-
-def to_wire(value: object, path: str) -> Any:
-    """A value of Python or numpy; ValueRangeError."""
-    if isinstance(value, (np.ndarray, np.generic)):
-        value = value.tolist()
-    if isinstance(value, bool):
-        return wire.Value(boolean=value)
-    if isinstance(value, int):
-        if -(1 << 63) <= value < 1 << 63:
-            return wire.Value(integer=value)
-        if 0 <= value < 1 << 64:
-            return wire.Value(unsigned=value)
-        raise ValueRangeError(f"{path}: {value} has more than 64 bits")
-    if isinstance(value, float):
-        return wire.Value(number=value)
-    if isinstance(value, str):
-        return wire.Value(text=value)
-    if isinstance(value, (list, tuple)):
-        return wire.Value(list=wire.List(values=[to_wire(item, path) for item in value]))
-    raise ValueRangeError(f"{path}: a {type(value).__name__} is no value of a register")
+    return [wire.Assignment(path=path, value=value_to_wire(value, path)) for path, value in values.items()]
 
 
 def outcomes(paths: Iterable[str], found: Any) -> list[Outcome]:
@@ -182,35 +161,6 @@ def outcomes(paths: Iterable[str], found: Any) -> list[Outcome]:
 def _kind(kind: int) -> str:
     known = wire.Outcome.Kind.values()
     return wire.Outcome.Kind.Name(kind).removeprefix("KIND_").lower() if kind in known else "unknown"
-
-
-@dataclass(frozen=True, slots=True)
-class Injection:
-    """An injection that stands. ``direction``: out or in; ``ranges``: (offset, size, mask) of what it covers."""
-
-    source: str
-    number: int
-    direction: str
-    priority: int
-    keep: bool
-    name: str
-    pid: int
-    ranges: tuple[tuple[int, int, int], ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Lifted:
-    """An injection that was to be lifted. ``failure``: why it still stands; empty: it does not."""
-
-    source: str
-    number: int
-    name: str
-    failure: str
-
-
-def lifted(found: Any) -> list[Lifted]:
-    """Of an answer."""
-    return [Lifted(one.source, one.number, one.name, one.failure) for one in found.lifted]
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,17 +179,6 @@ class Clock:
     def of(cls, found: Any) -> Clock:
         """From the wire."""
         return cls(found.virtual, found.step, found.time_ns, found.step_size_ns, found.playing, found.rate, found.note)
-
-
-def injections(found: Any) -> list[Injection]:
-    """Of a list's answer."""
-    return [
-        Injection(
-            one.source, one.number, "in" if one.direction == wire.DIRECTION_IN else "out", one.priority, one.keep,
-            one.name, one.pid, tuple((part.offset, part.size, part.mask) for part in one.ranges),
-        )
-        for one in found.injections
-    ]  # fmt: skip
 
 
 def status(found: Any) -> dict[str, Any]:

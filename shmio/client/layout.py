@@ -9,8 +9,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from shmio.client.table import Array, Register
-from shmio.errors import PathError, RemoteError
+from shmio.client.table import Array, Register, unknown
+from shmio.errors import RemoteError
 
 _NUMBERS: Final = {
     "BYTE": "u1", "WORD": "u2", "DWORD": "u4", "LWORD": "u8", "USINT": "u1", "UINT": "u2", "UDINT": "u4", "ULINT": "u8",
@@ -57,7 +57,8 @@ class BlockLayout:
         """One register of a raw frame as :meth:`array` has it, a BOOL and arrays of them as bools. PathError."""
         place = self.places.get(path.removeprefix(f"{self.source}/"), self.places.get(path))
         if place is None:
-            raise PathError(f"{path}: no such register in {self.source}")
+            paths = [f"{self.source}/{register.path}" for register in self.registers]
+            raise unknown(path, paths, f"the registers of {self.source}")
         register = self.registers[place]
         if register.type != "BOOL":
             return self.array(image)[register.path]

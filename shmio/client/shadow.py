@@ -12,7 +12,7 @@ from shmio.client import calls
 from shmio.client.arrays import InjectRequest
 from shmio.client.calls import Outcome
 from shmio.client.table import DTYPES, FIELDS, Array, Column, Table
-from shmio.client.update import Tables, Update
+from shmio.client.update import Piece, Tables, Update
 from shmio.errors import RemoteError, ValueRangeError
 from shmio.wire import shmio_v1_pb2 as wire
 
@@ -22,10 +22,22 @@ MAX_WAITING: Final = 4096
 Given = Array | list[Any]
 Arrays = Mapping[Column, Given | tuple[Given, Given]]
 """Values of whole columns as in the table, or (slots, values)."""
+Raw = Iterable[Piece | tuple[int, bytes] | tuple[int, bytes, int]]
+"""(offset, bytes), or (offset, bytes, mask): see :class:`Piece`."""
+Ranges = Iterable[tuple[int, int] | tuple[int, int, int]]
+"""(offset, size), or (offset, size, mask): these bits of these bytes of a frame."""
 
 
 def lay(
-    patterns: Iterable[str], *, priority: int, keep: bool, name: str, for_s: float | None, originals: bool
+    patterns: Iterable[str],
+    *,
+    ranges: Ranges,
+    source: str,
+    priority: int,
+    keep: bool,
+    name: str,
+    for_s: float | None,
+    originals: bool,
 ) -> bytes:
     """The first message. ValueRangeError."""
     if for_s is not None and not 0 < for_s <= 86_400:
@@ -35,6 +47,10 @@ def lay(
     request.lay.patterns.extend(patterns)
     request.lay.priority, request.lay.keep, request.lay.name = priority, keep, name
     request.lay.lifetime_ms, request.lay.quiet = lifetime_ms, not originals
+    request.lay.source = source.removesuffix("/in").removesuffix("/out")
+    request.lay.direction = wire.DIRECTION_IN if source.endswith("/in") else wire.DIRECTION_OUT
+    for offset, size, *mask in ranges:
+        request.lay.ranges.add(offset=offset, size=size, mask=mask[0] if mask else 0)
     return bytes(request.SerializeToString())
 
 
@@ -52,7 +68,9 @@ class Held:
         self._sequence = 0
         self._waiting: deque[Any] = deque()
 
-    def request(self, values: Mapping[str, object], arrays: Arrays | None, *, answered: bool) -> tuple[int, bytes]:
+    def request(
+        self, values: Mapping[str, object], arrays: Arrays | None, raw: Raw, *, answered: bool
+    ) -> tuple[int, bytes]:
         """A message with values, and its sequence number. ValueRangeError."""
         request = InjectRequest()
         shadow = request.shadow
@@ -61,6 +79,8 @@ class Held:
             shadow.sequence = self._sequence
         for column, given in (arrays or {}).items():
             self._fill(getattr(shadow.values, FIELDS[column]), column, given)
+        for offset, content, *mask in raw:
+            shadow.pieces.add(offset=offset, data=content, mask=mask[0] if mask else 0)
         data = bytes(request.SerializeToString())
         if values:
             more = wire.InjectRequest(shadow=wire.Shadow(assignments=calls.assignments(values)))
@@ -99,7 +119,7 @@ class Held:
             yield Update(self.table, update)
 
 
-def ends(values: Mapping[str, object], arrays: Arrays | None, outcome: Any) -> list[Outcome]:
-    """An answer for each value; one for all that went as arrays."""
-    paths = [*values, *([""] if arrays else [])]
+def ends(values: Mapping[str, object], outcome: Any, *, more: bool) -> list[Outcome]:
+    """An answer for each value; ``more``: one for all that went as arrays or raw bytes."""
+    paths = [*values, *([""] if more else [])]
     return calls.outcomes(paths, [outcome])

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Self
 
 import grpc
 
-from shmio.client import calls, shadow
+from shmio.client import calls, injections, shadow
 from shmio.client.arrays import InjectResponse, ReadResponse, SimulateResponse, SubscribeResponse
-from shmio.client.calls import Clock, Injection, Lifted, Outcome, Target
+from shmio.client.calls import Clock, Outcome, Target
+from shmio.client.injections import Injection, Lifted
 from shmio.client.layout import BlockLayout, layouts
 from shmio.client.model import PATIENCE_S
+from shmio.client.sync_campaign import Campaign
 from shmio.client.sync_model import Simulation, Step, serve
 from shmio.client.sync_shadow import Shadow
 from shmio.client.update import Snapshot, Tables, Update
@@ -114,6 +116,8 @@ class Client:
     def inject(
         self,
         *patterns: str,
+        ranges: shadow.Ranges = (),
+        source: str = "",
         priority: int = 0,
         keep: bool = False,
         name: str = "",
@@ -123,15 +127,29 @@ class Client:
         """Lay a shadow over registers, elements, slices, structures or patterns of one source, all /out or all /in.
 
         It is lifted when it is closed, at the end of its ``with`` block, when this program ends, or ``for_s`` later;
-        with ``keep`` only when somebody lifts it. ``originals``: iterate over it for what it stands over. PathError,
+        with ``keep`` only when somebody lifts it. ``originals``: iterate over it for what it stands over. ``ranges``:
+        bytes and bits of a frame besides, or alone: then ``source`` says whose, as ``cell`` or ``cell/in``. PathError,
         ValueRangeError; CommandError: the source refuses it.
         """
-        first = shadow.lay(patterns, priority=priority, keep=keep, name=name, for_s=for_s, originals=originals)
+        first = shadow.lay(
+            patterns, ranges=ranges, source=source, priority=priority, keep=keep, name=name, for_s=for_s,
+            originals=originals,
+        )  # fmt: skip
         return Shadow(self._inject, first, self.target, self._timeout_s)
+
+    def declare(self, declarations: Iterable[Mapping[str, Any]], *, keep: bool = False) -> Campaign:
+        """Lay injections that their sources run by themselves, all or none: tables as ``[[injection]]`` has them.
+
+        They are lifted when it is closed, at the end of its ``with`` block, or when this program ends; with ``keep``
+        when they are over, or somebody lifts them. Iterate over it for what is done with them. ValueRangeError: one
+        that cannot be; CommandError: a source refuses it.
+        """
+        request = injections.declare_request(declarations, keep=keep)
+        return Campaign(self._stub.Declare(request, metadata=self.target.metadata), self, keep=keep)
 
     def injections(self, *sources: str) -> list[Injection]:
         """What stands at present, on these sources or all; of each the innermost first."""
-        return calls.injections(self._call(self._stub.ListInjections, wire.ListInjectionsRequest(sources=sources)))
+        return injections.injections(self._call(self._stub.ListInjections, wire.ListInjectionsRequest(sources=sources)))
 
     def lift(self, source: str, number: int) -> None:
         """Lift an injection, whoever laid it. PathError: there is none; CommandError: the source does not answer."""
@@ -139,7 +157,7 @@ class Client:
 
     def lift_all(self, *sources: str) -> list[Lifted]:
         """The emergency: lift all of these sources, or of all, whoever laid them. CommandError: some still stand."""
-        found = calls.lifted(self._call(self._stub.LiftAll, wire.LiftAllRequest(sources=sources)))
+        found = injections.lifted(self._call(self._stub.LiftAll, wire.LiftAllRequest(sources=sources)))
         if left := [one for one in found if one.failure]:
             raise CommandError(f"{len(left)} of {len(found)} injections still stand: {left[0].failure}")
         return found
@@ -186,7 +204,7 @@ class Client:
         """How far a step goes that does not say it; takes time over. CommandError, ValueRangeError."""
         return Clock.of(self._call(self._stub.SetStepSize, wire.SetStepSizeRequest(dt_ns=calls.ns(dt_s))))
 
-    def play(self, dt_s: float | None = None, rate: float = 1.0) -> Clock:
+    def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
         """Have time step by itself, ``rate`` times as fast as real time. CommandError, ValueRangeError."""
         return Clock.of(self._call(self._stub.Play, wire.PlayRequest(dt_ns=calls.ns(dt_s), rate=rate)))
 

@@ -43,27 +43,37 @@ class Shadow(Iterator[Update]):
         self._thread = threading.Thread(target=self._read, name=f"shadow-{self.number}", daemon=True)
         self._thread.start()
 
-    def set(self, values: Mapping[str, object] | None = None, arrays: shadow.Arrays | None = None) -> list[Outcome]:
-        """Give values by path, or by the columns of ``table``, and wait until consumers see them, or what became of it.
+    def set(
+        self,
+        values: Mapping[str, object] | None = None,
+        arrays: shadow.Arrays | None = None,
+        raw: shadow.Raw = (),
+    ) -> list[Outcome]:
+        """Give values by path, by the columns of ``table``, or as raw bytes; wait for what became of them.
 
         PathError, ValueRangeError; CommandError: it was lifted; RemoteError.
         """
-        values = values or {}
+        values, raw = values or {}, list(raw)
         with self._turn:
             self._check()
-            sequence, data = self._held.request(values, arrays, answered=True)
+            sequence, data = self._held.request(values, arrays, raw, answered=True)
             self._requests.put(data)
             if not self._turn.wait_for(lambda: sequence in self._answers or self._over, calls.WRITE_PATIENCE_S):
                 raise RemoteError(f"{self._target.address}: it did not answer in time")
             if sequence not in self._answers:
                 self._check()
-            return shadow.ends(values, arrays, self._answers.pop(sequence))
+            return shadow.ends(values, self._answers.pop(sequence), more=bool(arrays or raw))
 
-    def send(self, values: Mapping[str, object] | None = None, arrays: shadow.Arrays | None = None) -> None:
+    def send(
+        self,
+        values: Mapping[str, object] | None = None,
+        arrays: shadow.Arrays | None = None,
+        raw: shadow.Raw = (),
+    ) -> None:
         """The same without waiting. A value that is wrong ends the injection, which the next call tells."""
         with self._turn:
             self._check()
-            self._requests.put(self._held.request(values or {}, arrays, answered=False)[1])
+            self._requests.put(self._held.request(values or {}, arrays, raw, answered=False)[1])
 
     def __next__(self) -> Update:
         """The next original, waited for; ends when it is over. Asked for with ``originals``."""

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
@@ -11,6 +12,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from shmio.errors import PathError, RemoteError
+from shmio.wire import shmio_v1_pb2 as wire
 
 Array = np.ndarray[Any, np.dtype[Any]]
 
@@ -45,6 +47,8 @@ FIELDS: Final = {
     Column.DOUBLE: "doubles",
     Column.TEXT: "texts",
 }
+_NEAR_CANDIDATES: Final = 500
+_SHOWN: Final = 200
 MAX_SLOTS: Final = 1 << 22
 """A table with more is none of ours."""
 
@@ -94,6 +98,13 @@ class Register:
             raise RemoteError(f"{found.path}: {error}") from None
 
 
+def unknown(path: str, paths: Sequence[str], what: str) -> PathError:
+    """The error about a path that is not among these."""
+    near = difflib.get_close_matches(path, paths[:_NEAR_CANDIDATES], n=3)
+    like = f"; near: {', '.join(near)}" if near else ""
+    return PathError(f"{path[:_SHOWN]}: not among {what}{like}")
+
+
 class Change(NamedTuple):
     """Elements of a column as they came: ``values[i]`` is that of ``slots[i]``. The arrays cannot be written to."""
 
@@ -114,6 +125,10 @@ class Table:
         self.size: int = found.size
         """Of a frame, in bytes."""
         self.hash: bytes = found.hash
+        self.direction = "in" if found.direction == wire.DIRECTION_IN else "out"
+        """``in``: its updates tell what is written to the registers."""
+        self.ranges = tuple((one.offset, one.size, one.mask) for one in found.ranges)
+        """(offset, size, mask) of what an injection is over besides the registers."""
         self.registers = tuple(map(Register.of, found.registers))
         sizes = dict(zip(Column, found.slots[1:], strict=False))
         if sum(sizes.values()) > MAX_SLOTS:
@@ -150,7 +165,7 @@ class Table:
         if found is None:
             found = self.places.get(path.removeprefix(f"{self.source}/"))
         if found is None:
-            raise PathError(f"{path}: not among the registers of {self.source} that were asked for")
+            raise unknown(path, self.paths, f"the registers of {self.source} that were asked for")
         return found
 
     def value(self, place: int, arrays: Mapping[Column, Array] | None = None) -> Any:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from enum import IntEnum
-from typing import Any
+from typing import Any, NamedTuple
 
 from shmio.client.arrays import SubscribeResponse
-from shmio.client.table import Array, Change, Column, Table
-from shmio.errors import PathError, QualityError, RemoteError
+from shmio.client.table import Array, Change, Column, Table, unknown
+from shmio.errors import QualityError, RemoteError
+from shmio.wire import shmio_v1_pb2 as wire
 
 
 class Quality(IntEnum):
@@ -34,19 +35,28 @@ class Provenance(IntEnum):
         return self.name.lower()
 
 
+class Piece(NamedTuple):
+    """Raw bytes of a frame from ``offset`` on. ``mask``: which bits of each are meant; in what is given 0 for all."""
+
+    offset: int
+    data: bytes
+    mask: int = 0
+
+
 class Update:
-    """One frame of a source, or what has become of the one before.
+    """One frame of a source, or what has become of the one before; of a table of ``in``, what a command has written.
 
     ``changes`` has what came, ``table.arrays`` all values by now; ``update[path]`` is the value of a register by now.
     Times in ns: ``clock_ns`` since the instance's start, ``source_ns`` UTC of the values, 0 if there never were any.
     ``marked``: it says anew which registers are invalid, or injected. ``missed``: with every frame, frames lost between
     the update before and this one. ``ended``: a reload has taken away the source, or all that was asked of it.
     ``image``, ``raw``: with raw frames, as consumers see them, and as delivered. ``age_ns``: with reads.
+    ``pieces``: of an injection over ranges, what differs in these.
     """
 
     __slots__ = (
         "_originals", "age_ns", "changes", "clock_ns", "cycle", "ended", "frame", "image", "incarnation", "marked",
-        "missed",        "provenance", "quality", "raw", "reason", "source_ns", "table", "whole",
+        "missed", "pieces", "provenance", "quality", "raw", "reason", "source_ns", "table", "whole",
     )  # fmt: skip
 
     def __init__(self, table: Table, found: Any) -> None:
@@ -65,6 +75,7 @@ class Update:
         self.image: bytes = found.image
         self.raw: bytes = found.original or found.image
         self.age_ns: int = found.age_ns
+        self.pieces = tuple(Piece(one.offset, one.data, one.mask) for one in found.pieces)
         self.ended = False
         self.changes: tuple[Change, ...] = table.apply(found.values) if found.HasField("values") else ()
         self.marked = found.HasField("invalid") or found.HasField("injected")
@@ -139,7 +150,7 @@ class Tables:
         """
         for one in found.tables:
             news = Table(one)
-            self.known = {number: old for number, old in self.known.items() if old.source != news.source}
+            self.known = {number: old for number, old in self.known.items() if not _same(old, news)}
             self.known[news.number] = news
         for update in found.updates:
             table = self.known.get(update.table)
@@ -155,8 +166,15 @@ class Tables:
     def ended(self, found: Any) -> Iterator[Update]:
         """What a message says of sources that are not there any more."""
         for end in found.ended:
-            for table in [table for table in self.known.values() if table.source == end.source]:
-                yield end_of(table, end.reason)
+            direction = "in" if end.direction == wire.DIRECTION_IN else "out"
+            for table in list(self.known.values()):
+                if (table.source, table.direction) == (end.source, direction):
+                    yield end_of(table, end.reason)
+
+
+def _same(old: Table, news: Table) -> bool:
+    """Whether a table takes another's place."""
+    return (old.source, old.direction) == (news.source, news.direction)
 
 
 class Snapshot:
@@ -175,7 +193,7 @@ class Snapshot:
         if update is None and len(self.updates) == 1:
             (update,) = self.updates.values()
         if update is None:
-            raise PathError(f"{path}: not among what was read")
+            raise unknown(path, list(self), f"what was read of {', '.join(self.updates) or 'no source'}")
         return update
 
     def __getitem__(self, path: str) -> Any:

@@ -96,27 +96,27 @@ class Timed:
         """The instance's clock as it is now: wall time, or virtual time with its last step."""
         return self._segment.clock.read()
 
-    def step(self, dt_ms: float | None = None) -> Step:
-        """Move time by ``dt_ms`` (default: the step size), and wait until all sources on the clock have done so.
+    def step(self, dt_s: float | None = None) -> Step:
+        """Move time by ``dt_s`` (default: the step size), and wait until all sources on the clock have done so.
 
         From the first call on, of this or :meth:`pause` or :meth:`play`, only steps move time; this program owns it
         until it detaches. The attachment must be ``writable``. TimeError: another program owns time, or the step
         failed: who did not answer or failed, and why; ValueRangeError: not within 1 us and 1 h.
         """
-        return self._time.step(_ns(dt_ms))
+        return self._time.step(_ns(dt_s))
 
-    def play(self, rate: float = 1.0, dt_ms: float | None = None) -> None:
+    def play(self, rate: float = 1.0, dt_s: float | None = None) -> None:
         """Step from now on ``rate`` times as fast as real time, until :meth:`pause`. TimeError, ValueRangeError."""
-        self._time.play(rate, _ns(dt_ms))
+        self._time.play(rate, _ns(dt_s))
 
     def pause(self) -> None:
         """Have time stand. TimeError: another program owns it, or a step failed while it was played."""
         self._time.pause()
 
 
-def _ns(dt_ms: float | None) -> int | None:
+def _ns(dt_s: float | None) -> int | None:
     """The length of a step; ValueRangeError."""
-    if dt_ms is None:
+    if dt_s is None:
         return None
-    check_step(dt_ms * 1e6)  # before it is made a whole number: infinity is none
-    return round(dt_ms * 1e6)
+    check_step(dt_s * 1e9)  # before it is made a whole number: infinity is none
+    return round(dt_s * 1e9)

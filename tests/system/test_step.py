@@ -179,7 +179,7 @@ def test_a_program_steps_and_plays(line: Cell) -> None:
     with shmio.attach(line.instance, writable=True) as cell:
         begun = cell.clock
         assert not begun.playing
-        made = cell.step(dt_ms=20)
+        made = cell.step(dt_s=0.02)
         assert (made.number, made.time_ns) == (begun.step + 1, begun.time_ns + 20_000_000)
         cell.play(50)
         with pytest.raises(TimeError, match="pause it"):

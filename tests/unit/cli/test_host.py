@@ -7,8 +7,9 @@ import json
 import re
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 
 import pytest
@@ -112,6 +113,104 @@ def test_set_and_inject(segment: Segment, capsys: pytest.CaptureFixture[str]) ->
         assert remote("inject", "--lift", number)[0] == 0
         assert remote("get", "cell/step")[1] == "cell/step  8\n"
         assert remote("inject", "--lift-all") == (0, "", "")
+
+    both(segment, capsys, test)
+
+
+CAMPAIGN = """
+[[injection]]
+name = "drift"
+target = "cell/axis/position"
+operation = "offset"
+value = 2.5
+when = "cell/running"
+times = 1
+
+[[injection]]
+name = "noise"
+target = "cell/step"
+operation = "noise"
+amplitude = 3
+start_s = 1e6
+"""
+
+
+@pytest.fixture
+def unstopped(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody presses Ctrl-C: verbs run in a thread here, which hears of no signals."""
+    monkeypatch.setattr("shmio.cli.campaign.told_to_stop", lambda: nullcontext(threading.Event()))
+
+
+def lines(out: str) -> list[tuple[str, ...]]:
+    """Without what differs from run to run."""
+    return [tuple(re.sub(r"^.*?(?=\w+: )", "", line).split()) for line in out.splitlines()]
+
+
+@pytest.mark.usefixtures("unstopped")
+def test_a_file_of_declared_ones(segment: Segment, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    file = tmp_path / "campaign.toml"
+    file.write_text(CAMPAIGN)
+    words = ("inject", "--seed", "7", "--file", str(file))
+
+    def test(remote: Output, local: Output, device: Plant) -> None:
+        device.run()
+        there, here = remote(*words, "--for", "0.01"), local(*words, "--for", "0.01")
+        assert there[::2] == here[::2] == (0, "")
+        assert lines(there[1]) == lines(here[1])
+        assert [line[0] for line in lines(there[1])][-2:] == ["injected:", "injected:"]
+        assert local("inject") == (0, "", "")
+        assert remote(*words, "--keep", "--json")[0] == 0
+        assert remote("inject") == local("inject")
+        assert remote("inject", "--json") == local("inject", "--json")
+        told = [json.loads(line) for line in remote(*words, "--json", "--for", "0.01")[1].splitlines()]
+        assert [(one.get("what"), one.get("text")) for one in told[-2:]] == [
+            ("injected", "drift"),
+            ("injected", "noise"),
+        ]
+        assert remote("inject", "--lift-all")[0] == 0
+        assert local("inject") == (0, "", "")
+
+    both(segment, capsys, test)
+
+
+@pytest.mark.usefixtures("unstopped")
+def test_it_ends_when_all_of_it_is_over(segment: Segment, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    file = tmp_path / "campaign.toml"
+    file.write_text(CAMPAIGN.partition('\n[[injection]]\nname = "noise"')[0])
+
+    def test(remote: Output, __: Output, device: Plant) -> None:
+        device.run()
+        flips = iter(range(1 << 30))
+
+        def flip() -> None:
+            while not over.wait(0.01):
+                device.memory[8] = 8 * (next(flips) % 2)
+
+        over = threading.Event()
+        flipping = threading.Thread(target=flip)
+        flipping.start()
+        try:
+            status, out, _ = remote("inject", "--json", "--seed", "1", "--file", str(file))
+        finally:
+            over.set()
+            flipping.join()
+        assert status == 0
+        told = [json.loads(line) for line in out.splitlines()]
+        assert [one["what"] for one in told if "what" in one] == ["injected", "activated", "deactivated", "lifted"]
+
+    both(segment, capsys, test)
+
+
+@pytest.mark.usefixtures("unstopped")
+def test_a_file_with_a_fault_lays_nothing(segment: Segment, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    file = tmp_path / "campaign.toml"
+    file.write_text(CAMPAIGN.replace("cell/step", "cell/stop"))
+
+    def test(remote: Output, local: Output, _: Plant) -> None:
+        words = ("inject", "--seed", "7", "--file", str(file))
+        assert remote(*words) == local(*words)
+        assert "injection[1].target: cell/stop: no such register" in remote(*words)[2]
+        assert remote("inject") == (0, "", "")
 
     both(segment, capsys, test)
 

@@ -42,6 +42,8 @@ def test_values_by_path(segment: Segment) -> None:
         assert found.of("cell/step").age_ns > 0
         with pytest.raises(PathError):
             _ = found["cell/nothing"]
+        with pytest.raises(PathError, match=r"^cell/axis/positon: not among .* cell that .*; near: cell/axis/position"):
+            _ = found["cell/axis/positon"]
         with pytest.raises(PathError):
             _ = found["x/nothing"]
 

@@ -65,7 +65,7 @@ def until_step(cell: Attachment, number: int) -> None:
 
 
 def test_it_plays_until_it_is_paused_and_then_time_stands(cell: Attachment) -> None:
-    cell.play(rate=100, dt_ms=10)
+    cell.play(rate=100, dt_s=0.01)
     until_step(cell, 5)
     assert (cell.clock.playing, cell.clock.rate) == (True, 100)
     with pytest.raises(TimeError, match="pause it"):
@@ -82,7 +82,7 @@ def test_it_keeps_the_pace(cell: Attachment) -> None:
     """Never faster than asked for; how much slower depends on the machine."""
     begun_ns = cell.block().clock.read().time_ns
     watch = threading.Event()
-    cell.play(rate=1, dt_ms=3_600_000)
+    cell.play(rate=1, dt_s=3600)
     watch.wait(0.05)
     cell.pause()
     assert cell.clock.time_ns - begun_ns == 3_600_000 * MS, "the second step is an hour away"
@@ -90,7 +90,7 @@ def test_it_keeps_the_pace(cell: Attachment) -> None:
 
 def test_a_step_that_fails_ends_the_play_and_is_told_by_pause(cell: Attachment, source: dict[int, str]) -> None:
     source[3] = "on fire"
-    cell.play(rate=1000, dt_ms=10)
+    cell.play(rate=1000, dt_s=0.01)
     until_step(cell, 3)
     with pytest.raises(TimeError, match="step 3: sim: on fire"):
         cell.pause()
@@ -114,9 +114,9 @@ def test_what_cannot_be_a_rate_or_a_step_is_refused(cell: Attachment) -> None:
         cell.play(0)
     for wrong in (0, -1, 1e300, float("inf"), float("nan")):
         with pytest.raises(ValueRangeError, match="1 us to 1 h"):
-            cell.step(dt_ms=wrong)
+            cell.step(dt_s=wrong)
         with pytest.raises(ValueRangeError, match="1 us to 1 h"):
-            cell.play(1, dt_ms=wrong)
+            cell.play(1, dt_s=wrong)
     assert not cell.clock.playing
 
 
