@@ -32,7 +32,7 @@ from shmio.segment.cursor import Cursor, Entry
 from shmio.segment.frame import Frame, Quality
 from shmio.segment.guest import take_guest
 from shmio.segment.segment import Segment, running_instances
-from shmio.segment.shadow import Shadow, lift_all
+from shmio.segment.shadow import Diversion, Shadow, lift_all, written
 from shmio.segment.standing import Standing
 from shmio.segment.timekeeper import Timed
 from shmio.segment.view import Reading, View, reading
@@ -87,7 +87,7 @@ class Attachment(Timed):
         if topic.source not in blocks:
             raise PathError(f"{path}: nothing is served under {topic.source} in this version")
         if topic.direction == "in":
-            raise PathError(f"{path}: what goes into a source cannot be read yet; leave out /in")
+            raise PathError(f"{path}: what goes into a source is not read but followed: written(); leave out /in")
         block = blocks[topic.source]
         return block, look_up(block.layout, topic)
 
@@ -207,6 +207,18 @@ class Attachment(Timed):
             [topic.path or "**" for topic in topics], direction=direction, priority=priority, keep=keep, name=name
         )
         return Shadow(commander, number, direction, events, partial(self._next, block), keep=keep)
+
+    def written(self, *paths: str, timeout_s: float | None = None) -> Iterator[Diversion]:
+        """What is written to registers, structures or patterns of one source from now on, by whomever, in order.
+
+        Each command when its end is known; it ends after ``timeout_s`` without one. PathError; NotRunningError.
+        """
+        block, topics = self._of_one_source("call", paths)
+        for path, topic in zip(paths, topics, strict=True):
+            if topic.direction == "out":
+                raise PathError(f"{path}: what comes out of a source is not written; leave out /out")
+        patterns = [topic.path or "**" for topic in topics]
+        return written(block, patterns, block.events.cursor(), partial(self._next, block), timeout_s)
 
     def declare(self, declarations: Sequence[Declaration], *, keep: bool = False) -> list[Laid]:
         """Lay injections that their sources run by themselves, all or none; see docs/reference/injections.md.

@@ -1,4 +1,4 @@
-"""What goes to injections: their events put together again, command by command."""
+"""What goes to injections, or is accepted: its events put together again, command by command."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from shmio.segment.events import Event, EventKind
 
 
 class Diverted(NamedTuple):
-    """What one command wrote that went to one injection: in its parts, in the order of the events."""
+    """What one command wrote that went to one injection, or on to the device: in its parts, in the events' order."""
 
     injection: int
     event: Event
@@ -27,19 +27,20 @@ _NOBODY: Final = (0, 0, 0)
 
 
 class Gatherer:
-    """Gathers the events about what was diverted; give it all events of a block, in order.
+    """Gathers the events about what was diverted, or of another kind with data; give it all of a block's, in order.
 
-    A command is whole when it says something else, for that it does at once, or when another one is diverted.
+    A command is whole when it says something else, or when another one is diverted. What is diverted says so at once.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, kind: EventKind = EventKind.DIVERTED) -> None:
+        self._kind = kind
         self._command: _Key = _NOBODY
         self._parts: dict[int, list[Event]] = {}
 
     def follow(self, event: Event) -> list[Diverted]:
         """What is whole by this event."""
         command = event.incarnation, event.writer, event.command
-        if event.kind != EventKind.DIVERTED:
+        if event.kind != self._kind:
             return self._whole() if command == self._command or event.kind == EventKind.STARTED else []
         whole = [] if command == self._command else self._whole()
         self._command = command

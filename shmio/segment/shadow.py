@@ -8,9 +8,11 @@ from dataclasses import dataclass
 from types import TracebackType
 from typing import Self
 
-from shmio.errors import CommandError
+from shmio.errors import CommandError, PathError
 from shmio.layout.codec import Value
 from shmio.layout.topic import parse_topic
+from shmio.layout.write import cover, merge
+from shmio.segment.block import Block
 from shmio.segment.commander import Commander, Outcome, Ticket
 from shmio.segment.commands import Direction
 from shmio.segment.cursor import Cursor
@@ -23,11 +25,11 @@ Next = Callable[[Cursor[Event], float | None], Event | None]
 
 @dataclass(frozen=True, slots=True)
 class Diversion:
-    """What one command wrote that went to an injection.
+    """What one command wrote toward a source, or of it what went to an injection.
 
     ``values``: by path in the block; of an array that was written in part, its elements. ``writer``, ``command``: whose
     it was, as in events. ``clock_ns``: when, on the instance's clock; ``utc_ns``: in UTC. ``missed``: events lost
-    between the one before and this one, which may have been of this shadow.
+    between the one before and this one, which may have been about more of the same.
     """
 
     values: Mapping[str, Value]
@@ -111,6 +113,41 @@ class Shadow:
     ) -> None:
         if not self._keep:
             self.lift()
+
+
+def written(
+    block: Block, patterns: Iterable[str], events: Cursor[Event], next_event: Next, timeout_s: float | None
+) -> Iterator[Diversion]:
+    """What a source accepts for what the patterns name, command by command, in order; each when it has its end.
+
+    It ends after ``timeout_s`` without any. PathError: they name nothing; NotRunningError.
+    """
+    chosen = list(patterns)
+    bits = cover(block.layout, chosen)
+    if not any(bits):
+        raise PathError(f"{block.source}: {', '.join(chosen)} names no register")
+    return _written(block, bits, events, next_event, timeout_s)
+
+
+def _written(
+    block: Block, bits: bytes, events: Cursor[Event], next_event: Next, timeout_s: float | None
+) -> Iterator[Diversion]:
+    layout, gatherer = block.layout, Gatherer(EventKind.ACCEPTED)
+    last, missed = block.latest(), 0
+    image = bytearray(layout.size if last is None else last.image)
+    until_s = _deadline(timeout_s)
+    while (event := next_event(events, _rest(until_s))) is not None:
+        for accepted in gatherer.follow(event):
+            mask = bytearray(layout.size)
+            apply(mask, (write._replace(data=b"\xff" * len(write.data)) for write in accepted.writes))
+            apply(image, accepted.writes)
+            mask = bytearray(a & b for a, b in zip(mask, bits, strict=True))
+            if any(mask):
+                found = values(layout, bytes(image), merge(image, mask, [(0, layout.size)]))
+                told = accepted.event
+                yield Diversion(found, told.writer, told.command, told.clock_ns, told.utc_ns, events.missed - missed)
+                missed = events.missed
+                until_s = _deadline(timeout_s)
 
 
 def lift_all(injections: Iterable[tuple[Commander, int]]) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 import shmio
 from shmio.connectors.injections import Owner
-from shmio.errors import CommandError
+from shmio.errors import CommandError, PathError
 from shmio.layout.codec import Value
 from shmio.segment import EventKind, Segment
 from shmio.segment.attach import Attachment
@@ -140,3 +140,24 @@ def test_what_cannot_be_lifted_is_named(rig: Rig, local: Attachment) -> None:
     with pytest.raises(CommandError, match="1 of 1 injections still stand: cell: there is no injection 5"):
         local.lift_all()
     rig.block.standing.write(encode([]))
+
+
+def test_a_program_follows_what_is_written_toward_a_source(rig: Rig, local: Attachment) -> None:
+    stream = local.written("cell/speed", "cell/lamps/2/in", timeout_s=20)
+    rig.client.write({"speed": 20, "axis/1": 1})
+    rig.client.write({"axis/1": 2})
+    rig.other.write({"lamps": [True] * 10})
+    with local.inject("cell/speed/in") as shadow:
+        rig.client.write({"speed": 30})  # it does not get that far
+        shadow.set({"cell/speed": 31})
+    rig.client.write({"speed": 20})
+    found = [next(stream) for _ in range(4)]
+    assert [one.values for one in found] == [{"speed": 20}, {"lamps/2": True}, {"speed": 31}, {"speed": 20}]
+    assert [one.writer for one in found] == [4, 5, GUEST, 4]
+    assert list(local.written("cell", timeout_s=0.01)) == []
+
+
+def test_what_cannot_be_followed(rig: Rig, local: Attachment) -> None:
+    for wrong in ("cell/nothing", "cell/speed/out", "nobody/x"):
+        with pytest.raises(PathError):
+            local.written(wrong)
