@@ -13,6 +13,7 @@ import grpc
 from shmio.config import Grpc
 from shmio.config.model import ROLES, Client
 from shmio.config.tokens import Secret, digest, read_tokens
+from shmio.endpoints.grpc.connections import peer_of
 from shmio.endpoints.grpc.roles import NEEDS
 from shmio.errors import ShmioError
 
@@ -148,6 +149,22 @@ class Door:
             grpc.StatusCode.PERMISSION_DENIED,
             f"{call} needs the role {needed}; {who} has {_listed(roles)}: {where} would have to name it",
         )
+
+
+def holder_of(
+    peer: str, metadata: Iterable[tuple[str, str | bytes]], shown: Mapping[str, Iterable[bytes]] | None
+) -> object:
+    """Who holds what a name of its own choice stands for: who shows a token or a certificate, by that; else its host.
+
+    Equal for two connections of one client: which of its ports it came by says nothing.
+    """
+    credentials = Credentials.of(metadata, shown)
+    if credentials.token or credentials.names:
+        return credentials
+    address = peer_of(peer)
+    if peer.startswith("unix:") or (address is not None and address[0].is_loopback):
+        return "this host"
+    return peer if address is None else address[0]
 
 
 def client_of(peer: str, token: str | None) -> str:

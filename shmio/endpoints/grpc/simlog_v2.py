@@ -9,6 +9,7 @@ from typing import Any, Final
 import grpc
 from google.protobuf.empty_pb2 import Empty
 
+from shmio.endpoints.grpc.access import holder_of
 from shmio.endpoints.grpc.marks import Marks
 from shmio.endpoints.grpc.outbox import Outboxes
 from shmio.endpoints.grpc.publish import Publisher, Request
@@ -91,12 +92,13 @@ class SimlogV2:
     async def create_subscriber(self, request: wire.Subscriber, context: Context) -> AsyncIterator[bytes]:
         """Stream the values of all topics that are subscribed for this uuid, in the order of the frames.
 
-        INVALID_ARGUMENT: no uuid; RESOURCE_EXHAUSTED: too many subscribers, or this one does not read what is written
-        to ``/in``, or what a step has changed; ABORTED: another one came with its uuid.
+        INVALID_ARGUMENT: no uuid; ALREADY_EXISTS: it is another client's; RESOURCE_EXHAUSTED: too many subscribers, or
+        this one does not read what is written to ``/in``, or what a step has changed; ABORTED: it came with its uuid
+        again.
         """
         with self._outboxes.opened() as outbox:
             try:
-                subscriber = self._subscribers.enter(request.uuid, request.name, outbox)
+                subscriber = self._subscribers.enter(request.uuid, request.name, outbox, _holder(context))
                 outbox.on_failure = subscriber.close  # what it holds goes at once
             except ShmioError as error:
                 await refuse(context, error)
@@ -117,7 +119,7 @@ class SimlogV2:
         such topic, or subscriber; INVALID_ARGUMENT: a structure too large for a message; RESOURCE_EXHAUSTED: too many.
         """
         try:
-            await self._subscribers.subscribe(request.subscriberUUID, request.path)
+            await self._subscribers.subscribe(request.subscriberUUID, request.path, _holder(context))
         except ShmioError as error:
             await refuse(context, error)
         return Empty()
@@ -215,6 +217,11 @@ class SimlogV2:
         if message is None:
             message = nothing(time_stamp(frame.clock_ns) if frame else b"")
         return message.under(path_field(path))
+
+
+def _holder(context: Context) -> object:
+    """Whose stream a call is about."""
+    return holder_of(context.peer(), context.invocation_metadata() or (), context.auth_context())
 
 
 def _shadowed(path: str, shadow: Shadow) -> bytes:

@@ -16,7 +16,7 @@ from shmio.endpoints.grpc.shadows import Shadow, Shadows, Way
 from shmio.endpoints.grpc.shape import shape
 from shmio.endpoints.grpc.topics import Mark, Topics
 from shmio.endpoints.grpc.values import Encoded, encoder, marked, path_field, subject
-from shmio.errors import EndpointError, PathError, ShmioError, ValueRangeError
+from shmio.errors import ConflictError, EndpointError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import Topic, shorten
 from shmio.logs import fields
 
@@ -45,9 +45,13 @@ class _Subscription:
 class Subscriber:
     """One CreateSubscriber call."""
 
-    def __init__(self, topics: Topics, shadows: Shadows, marks: Marks, name: str, outbox: Outbox) -> None:
+    def __init__(
+        self, topics: Topics, shadows: Shadows, marks: Marks, name: str, outbox: Outbox, holder: object
+    ) -> None:
+        """``holder``: whose it is."""
         self.name = name
         self.outbox = outbox
+        self.holder = holder
         self.replaced = False
         """Whether another one of its uuid has taken its place."""
         self._topics = topics
@@ -139,17 +143,20 @@ class Subscribers:
         self._open: dict[str, Subscriber] = {}
         self._arrived = asyncio.Event()
 
-    def enter(self, uuid: str, name: str, outbox: Outbox) -> Subscriber:
-        """A stream opens. One that has the uuid already ends: it may be what a broken connection has left.
+    def enter(self, uuid: str, name: str, outbox: Outbox, holder: object) -> Subscriber:
+        """A stream opens. One of its holder's that has the uuid ends: it may be what a broken connection has left.
 
-        ValueRangeError: no uuid, or too long; EndpointError: too many.
+        ValueRangeError: no uuid, or too long; ConflictError: another holder has it; EndpointError: too many.
         """
         if not uuid:
             raise ValueRangeError("uuid: it is needed, to say in Subscribe whose stream the topic is for")
         if max(len(uuid), len(name)) > MAX_NAME:
             raise ValueRangeError(f"name and uuid have at most {MAX_NAME} characters")
-        before = self._open.pop(uuid, None)
+        before = self._open.get(uuid)
+        if before is not None and before.holder != holder:
+            raise ConflictError(f"uuid {shorten(uuid)!r} is another client's: take one that is drawn by chance")
         if before is not None:
+            del self._open[uuid]
             before.replaced = True
             before.close()
             before.outbox.clear()
@@ -157,7 +164,7 @@ class Subscribers:
             log.info("subscriber %s came again; its stream before ends", shorten(name), extra=fields(uuid=uuid))
         elif len(self._open) >= MAX_SUBSCRIBERS:
             raise EndpointError(f"there are {MAX_SUBSCRIBERS} subscribers already; one stream serves many topics")
-        subscriber = self._open[uuid] = Subscriber(self._topics, self._shadows, self._marks, name, outbox)
+        subscriber = self._open[uuid] = Subscriber(self._topics, self._shadows, self._marks, name, outbox, holder)
         self._arrived.set()
         self._arrived = asyncio.Event()
         return subscriber
@@ -168,8 +175,8 @@ class Subscribers:
         if self._open.get(uuid) is subscriber:
             del self._open[uuid]
 
-    async def subscribe(self, uuid: str, path: str) -> None:
-        """Add a topic to a subscriber's stream, which may still be about to open.
+    async def subscribe(self, uuid: str, path: str, holder: object) -> None:
+        """Add a topic to a subscriber's stream, which may still be about to open, and is its holder's alone.
 
         PathError: no such topic, or subscriber; ValueRangeError: too much for a message; EndpointError: too many.
         """
@@ -178,7 +185,7 @@ class Subscribers:
                 while uuid not in self._open:
                     await self._arrived.wait()
         subscriber = self._open.get(uuid)
-        if subscriber is None:
+        if subscriber is None or subscriber.holder != holder:
             raise PathError(
                 f"subscriberUUID {shorten(uuid)!r}: no such subscriber; keep the stream of CreateSubscriber open"
             )

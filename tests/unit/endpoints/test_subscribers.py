@@ -10,6 +10,7 @@ import pytest
 
 import shmio
 from shmio.endpoints.grpc import outbox, subscribers
+from shmio.endpoints.grpc.access import holder_of
 from shmio.layout.model import Layout
 from shmio.segment import Attributes, BlockSpec, Quality, Segment
 from shmio.wire import simlog_v2_pb2 as v2
@@ -404,3 +405,45 @@ def test_a_reload_moves_topics_and_one_that_is_gone_comes_back_with_its_source(s
         await served.until(lambda: left(served))
 
     serve(segment, test)
+
+
+def test_a_uuid_is_its_clients_alone(segment: Segment) -> None:
+    """Who knows it can neither end the stream nor have topics added to it; who shows the same token is the same."""
+    first, other = (("authorization", "Bearer one"),), (("authorization", "Bearer other"),)
+    subscriber, topic = v2.Subscriber(name="a", uuid="a"), v2.SubscriptionRequest(path="cell/step", subscriberUUID="a")
+
+    async def test(served: Endpoint) -> None:
+        served.publish(image(step=1))
+        stream = served.v2.CreateSubscriber(subscriber, metadata=first, timeout=TIMEOUT_S)
+        await stream.initial_metadata()
+        rude = served.v2.CreateSubscriber(subscriber, metadata=other, timeout=TIMEOUT_S)
+        status, text = await refusal(rude.read())
+        assert (status, "is another client's" in text) == (Status.ALREADY_EXISTS, True)
+        for metadata in (other, ()):
+            status, text = await refusal(served.v2.Subscribe(topic, metadata=metadata, timeout=TIMEOUT_S))
+            assert (status, "no such subscriber" in text) == (Status.NOT_FOUND, True)
+        await served.v2.Subscribe(topic, metadata=first, timeout=TIMEOUT_S)
+        assert await message(stream) == ("cell/step", 1)
+        again = served.v2.CreateSubscriber(subscriber, metadata=first, timeout=TIMEOUT_S)
+        await again.initial_metadata()
+        assert (await end(stream))[0] is Status.ABORTED
+        again.cancel()
+
+    serve(segment, test)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("ipv4:10.0.0.1:5000", "ipv4:10.0.0.1:5001", True),
+        ("ipv4:10.0.0.1:5000", "ipv6:%5B::ffff:10.0.0.1%5D:5001", True),
+        ("ipv4:10.0.0.1:5000", "ipv4:10.0.0.2:5000", False),
+        ("ipv4:127.0.0.1:5000", "ipv6:%5B::1%5D:5001", True),
+        ("unix:", "ipv4:127.0.0.1:5000", True),
+        ("unix:", "ipv4:10.0.0.1:5000", False),
+    ],
+)
+def test_without_a_token_a_client_is_known_by_its_host(one: str, other: str, same: bool) -> None:
+    assert (holder_of(one, (), None) == holder_of(other, (), None)) is same
+    assert holder_of(one, (("authorization", "Bearer x"),), None) != holder_of(one, (), None)
+    assert holder_of(one, (), {"x509_common_name": [b"a"]}) == holder_of(other, (), {"x509_common_name": [b"a"]})
