@@ -28,12 +28,17 @@ HEALTH, REFLECTION = "/grpc.health.v1.Health/", "/grpc.reflection.v1alpha.Server
 
 
 class Call(NamedTuple):
-    """``many``: it takes a stream of messages. ``stays``: it is open until its client ends it, after its message."""
+    """``many``: it takes a stream of messages. ``stays``: it is open until its client ends it, after its message.
+
+    ``first``: it needs one, which is not as the others. ``ends``: how, if all is well with it.
+    """
 
     method: str
     request: bytes
     many: bool = False
     stays: bool = False
+    first: bool = False
+    ends: grpc.StatusCode = grpc.StatusCode.OK
 
 
 def _put(path: str) -> bytes:
@@ -45,6 +50,15 @@ def _inject(target: str) -> v1.InjectRequest:
     shadow = v1.TopicDescriptor(path=f"{target}/shadow")
     return v1.InjectRequest(injected=shadow, target=v1.TopicDescriptor(path=target))
 
+
+def _lay(path: str) -> bytes:
+    return ours.InjectRequest(lay=ours.Lay(patterns=[path], name="rude")).SerializeToString()
+
+
+NOISE = ours.Declaration(
+    name="rude", targets=["cell/bits"], flip=ours.Flip(bits=[0]), when="cell/step mod 2 == 1"
+)  # over what no other call injects
+SPEED = ours.Assignment(path="cell/axis/speed", value=ours.Value(number=5))
 
 CALLS = (
     Call(V1 + "GetTopic", v1.TopicDescriptor(path="cell/inputs").SerializeToString()),
@@ -65,6 +79,7 @@ CALLS = (
     Call(
         V2 + "Subscribe", v2.SubscriptionRequest(path="CELL://inputs/out", subscriberUUID="polite").SerializeToString()
     ),
+    Call(V2 + "Subscribe", v2.SubscriptionRequest(path="SIMLOG://step", subscriberUUID="polite").SerializeToString()),
     Call(V2 + "Read", v2.ReadRequest(path=["CELL://inputs", "cell/axis"]).SerializeToString()),
     Call(V2 + "Write", _put("CELL://axis/speed/in")),
     Call(V2 + "Inject", v2.InjectRequest(targetPath="CELL://name/in", shadowPathPrefix="rude").SerializeToString()),
@@ -79,6 +94,18 @@ CALLS = (
     Call(OURS + "GetStatus", b""),
     Call(OURS + "Read", ours.ReadRequest(patterns=["cell/axis/*"]).SerializeToString()),
     Call(OURS + "Subscribe", ours.SubscribeRequest(patterns=["cell/inputs"]).SerializeToString(), stays=True),
+    Call(OURS + "Subscribe", ours.SubscribeRequest(patterns=["cell/inputs/in"]).SerializeToString(), stays=True),
+    Call(OURS + "Write", ours.WriteRequest(values=[SPEED]).SerializeToString()),
+    Call(OURS + "Inject", _lay("cell/bits"), many=True, stays=True, first=True),
+    Call(OURS + "Inject", _lay("cell/bits/in"), many=True, stays=True, first=True),
+    Call(OURS + "Declare", ours.DeclareRequest(declarations=[NOISE]).SerializeToString(), stays=True),
+    Call(OURS + "ListInjections", b""),
+    Call(OURS + "Lift", ours.LiftRequest(source="cell", number=7).SerializeToString(), ends=grpc.StatusCode.NOT_FOUND),
+    Call(OURS + "LiftAll", ours.LiftAllRequest(sources=["cell"]).SerializeToString()),
+    Call(OURS + "Step", ours.StepRequest(dt_ns=50_000_000).SerializeToString()),
+    Call(OURS + "SetStepSize", ours.SetStepSizeRequest(dt_ns=50_000_000).SerializeToString()),
+    Call(OURS + "Pause", b""),
+    Call(OURS + "WatchClock", b"", stays=True),
     Call(HEALTH + "Check", health_pb2.HealthCheckRequest(service="source.cell").SerializeToString()),
     Call(HEALTH + "Watch", health_pb2.HealthCheckRequest(service="source.cell").SerializeToString(), stays=True),
     Call(
@@ -123,6 +150,7 @@ class Polite:
             topics = {subject.path for subject in feed._channels} - {"inputs"}
             return (len(served.server.calls), served.service.counters[0], topics) == (2, 2, {"step"}) and not (
                 feed.inlet.echo.busy
+                or feed.inlet.followers.busy
                 or feed.inlet._pending
                 or served.service.waiting_bytes
                 or any(not (connected and one.name.startswith("SIMLOG")) for one in feed.block.standing.read())

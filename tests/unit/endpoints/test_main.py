@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import grpc
 import pytest
@@ -120,26 +120,45 @@ def test_a_stop_with_open_streams_leaves_no_traceback(
     assert [record.message for record in caplog.records if record.levelno >= logging.ERROR] == []
 
 
+class Turn(asyncio.Lock):
+    """A lock that tells when somebody has to wait for it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.waited_for = asyncio.Event()
+
+    async def acquire(self) -> Literal[True]:
+        if self.locked():
+            self.waited_for.set()
+        return await super().acquire()
+
+
 def test_of_two_reloads_the_later_one_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Though the first takes longer to read: a token that is gone must not come back."""
-    overtaken = threading.Event()
+    """Though the first is still being read when the second comes: a token that is gone must not come back."""
+    begun, going_on = threading.Event(), threading.Event()
     numbers = itertools.count()
     taken: list[int] = []
 
     def load(_: Path) -> SimpleNamespace:
         number = next(numbers)
-        if number:
-            overtaken.set()
-        else:
-            overtaken.wait(0.5)
+        if not number:
+            begun.set()
+            assert going_on.wait(TIMEOUT_S)
         return SimpleNamespace(grpc=SimpleNamespace(number=number, token=[], guarded=True))
 
     async def test() -> None:
         worker: Any = SimpleNamespace(log=logging.getLogger("test"))
         doors: Any = SimpleNamespace(take=lambda grpc: taken.append(grpc.number))
         server: Any = SimpleNamespace(calls=SimpleNamespace(review=lambda: 0))
-        turn = asyncio.Lock()
-        await asyncio.gather(*(_take_anew(worker, Path("x"), doors, server, turn) for _ in range(2)))
+        turn = Turn()
+        first = asyncio.create_task(_take_anew(worker, Path("x"), doors, server, turn))
+        assert await asyncio.to_thread(begun.wait, TIMEOUT_S)
+        second = asyncio.create_task(_take_anew(worker, Path("x"), doors, server, turn))
+        waits = asyncio.create_task(turn.waited_for.wait())
+        await asyncio.wait((second, waits), return_when=asyncio.FIRST_COMPLETED)  # it is over, if it need not wait
+        going_on.set()
+        await asyncio.gather(first, second)
+        waits.cancel()
 
     monkeypatch.setattr("shmio.endpoints.grpc.__main__.load", load)
     asyncio.run(test())

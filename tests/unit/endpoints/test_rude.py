@@ -9,15 +9,33 @@ import grpc
 import pytest
 
 from shmio.endpoints.grpc.load import BOUND_BYTES
+from shmio.endpoints.grpc.native import waiting
+from shmio.endpoints.grpc.native.service import MAX_STREAMS
 from shmio.endpoints.grpc.server import MAX_REQUEST_BYTES
 from shmio.segment import Segment
+from shmio.wire import shmio_v1_pb2 as ours
 from shmio.wire import simlog_v1_pb2 as v1
 from shmio.wire import simlog_v2_pb2 as v2
 from tests.unit.endpoints import http2
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, message, value
-from tests.unit.endpoints.rude import CALLS, HEALTH, V1, V2, Call, Polite, begin, beside_a_polite_one, connect, status
+from tests.unit.endpoints.rude import (
+    CALLS,
+    HEALTH,
+    NOISE,
+    OURS,
+    V1,
+    V2,
+    Call,
+    Polite,
+    begin,
+    beside_a_polite_one,
+    connect,
+    status,
+)
 
 Status = grpc.StatusCode
+NARROW = http2.frame(http2.SETTINGS, 0, 0, b"\0\4\0\0\1\0")
+"""So much of a stream that is not read is on its way: 256 bytes."""
 
 
 async def until_calls(served: Endpoint, count: int) -> None:
@@ -96,7 +114,8 @@ def test_half_closed_calls_end_by_themselves_or_go_on(segment: Segment) -> None:
             for call in CALLS:
                 empty = begin(channel, call)
                 await empty.done_writing()
-                assert await status(empty) is (Status.OK if call.many else Status.INVALID_ARGUMENT), call.method
+                good = call.many and not call.first
+                assert await status(empty) is (Status.OK if good else Status.INVALID_ARGUMENT), call.method
                 whole = begin(channel, call)
                 await whole.write(call.request)
                 await whole.done_writing()
@@ -104,7 +123,7 @@ def test_half_closed_calls_end_by_themselves_or_go_on(segment: Segment) -> None:
                     await until_calls(served, 3)
                     whole.cancel()
                 else:
-                    assert await status(whole) is Status.OK, call.method
+                    assert await status(whole) is call.ends, call.method
                 await polite.alone(connected=True)
 
     beside_a_polite_one(segment, test)
@@ -254,6 +273,105 @@ def test_fifty_that_come_and_go_are_not_noticed(segment: Segment) -> None:
     beside_a_polite_one(segment, test)
 
 
+@pytest.mark.parametrize("direction", ["", "/in"])
+def test_streams_of_ours_beyond_the_most_are_refused_and_leave_room_again(segment: Segment, direction: str) -> None:
+    request = ours.SubscribeRequest(patterns=[f"cell/long{direction}"]).SerializeToString()
+
+    async def test(served: Endpoint, polite: Polite) -> None:
+        async with connect(served) as channel:
+            subscribe: Any = channel.unary_stream(OURS + "Subscribe")
+            streams = [subscribe(request, timeout=TIMEOUT_S) for _ in range(MAX_STREAMS + 40)]
+            await until_streams(served, 2 + MAX_STREAMS)
+            refused = [stream for stream in streams if await first(stream) is grpc.aio.EOF]
+            assert len(refused) == 40
+            assert {await stream.code() for stream in refused} == {Status.RESOURCE_EXHAUSTED}
+            await polite.goes_on()
+        await until_streams(served, 2)
+        async with connect(served) as channel:
+            subscribe = channel.unary_stream(OURS + "Subscribe")
+            assert await first(subscribe(request, timeout=TIMEOUT_S)) is not grpc.aio.EOF
+
+    beside_a_polite_one(segment, test)
+
+
+async def first(stream: Any) -> Any:
+    """The first message; EOF of one that is refused."""
+    try:
+        return await stream.read()
+    except grpc.aio.AioRpcError:
+        return grpc.aio.EOF
+
+
+async def until_streams(served: Endpoint, count: int) -> None:
+    async def reached() -> bool:
+        await asyncio.sleep(0)
+        return served.service.counters[0] == count
+
+    await served.until(reached)
+
+
+def test_a_subscriber_of_ours_that_never_reads_holds_nobody_up(segment: Segment) -> None:
+    """Nor is anything kept for it but its place, and what was written, up to a bound."""
+    both = ours.SubscribeRequest(patterns=["cell/long", "cell/long/in"], mode=ours.MODE_EVERY_FRAME)
+
+    async def test(served: Endpoint, polite: Polite) -> None:
+        connection = await http2.Connection.open(served.port)
+        await connection.send(NARROW)
+        await connection.send(http2.call(OURS + "Subscribe", both.SerializeToString()))
+        await until_streams(served, 3)
+        long = ours.Assignment(path="cell/long", value=ours.Value(list=ours.List(values=[ours.Value(integer=1)] * 600)))
+        put = ours.WriteRequest(values=[long]).SerializeToString()
+        async with connect(served) as channel:
+            write: Any = channel.unary_unary(OURS + "Write")
+            for _ in range(2000):
+                await write(put, timeout=TIMEOUT_S)
+                if not served.feeds["cell"].inlet.followers.busy:
+                    break
+        assert not served.feeds["cell"].inlet.followers.busy, "it was given up"
+        await polite.goes_on()
+        await connection.drop(reset=True)
+
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(waiting, "MAX_WAITING", 64)
+        beside_a_polite_one(segment, test)
+
+
+@pytest.mark.parametrize("call", ["Inject", "Declare"])
+def test_who_does_not_read_what_is_told_of_an_injection_loses_it(segment: Segment, call: str) -> None:
+    """Though its stream itself waits for it, and so long as its connection stands."""
+    lay = ours.InjectRequest(lay=ours.Lay(patterns=["cell/inputs/in"]))
+    request: Any = lay if call == "Inject" else ours.DeclareRequest(declarations=[NOISE])
+    put = ours.WriteRequest(values=[ours.Assignment(path="cell/inputs/0", value=ours.Value(integer=1))])
+
+    async def test(served: Endpoint, polite: Polite) -> None:
+        connection = await http2.Connection.open(served.port)
+        await connection.send(NARROW)
+        await connection.send(http2.headers(OURS + call))
+        await connection.send(http2.frame(http2.DATA, 0, 1, http2.message(request.SerializeToString())))
+        standing = segment.blocks["cell"].standing
+
+        async def laid() -> bool:
+            await asyncio.sleep(0)
+            return bool(standing.read())
+
+        await served.until(laid)
+        async with connect(served) as channel:
+            write: Any = channel.unary_unary(OURS + "Write")
+            for _ in range(20_000):
+                if call == "Inject":
+                    await write(put.SerializeToString(), timeout=TIMEOUT_S)
+                else:
+                    await polite.goes_on()  # a step that is odd, then one that is even
+                if not standing.read():
+                    break
+        assert not standing.read()
+        await connection.drop(reset=True)
+
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        monkeypatch.setattr(waiting, "MAX_WAITING", 16)
+        beside_a_polite_one(segment, test)
+
+
 def test_unknown_topics_and_values_that_do_not_parse(segment: Segment) -> None:
     async def test(served: Endpoint, polite: Polite) -> None:
         wrong = "cell/nothing/in"
@@ -283,6 +401,24 @@ def test_unknown_topics_and_values_that_do_not_parse(segment: Segment) -> None:
                 assert await ends(V2 + name, v2.PubRequest(topic=wrong)) is Status.NOT_FOUND
                 assert await ends(V2 + name, v2.PubRequest(topic="cell/step/in")) is Status.INVALID_ARGUMENT
             assert await ends(V2 + "Publish", v2.PubRequest(topic=wrong), v2.PubRequest(topic="cell/step")) is Status.OK
+            number = ours.Value(integer=1)
+            for path, value, code in (
+                (wrong, number, Status.NOT_FOUND),
+                ("cell/step", ours.Value(text="x"), Status.INVALID_ARGUMENT),
+                ("cell/step", ours.Value(), Status.INVALID_ARGUMENT),
+            ):
+                put = ours.WriteRequest(values=[ours.Assignment(path=path, value=value)])
+                assert await ends(OURS + "Write", put) is code
+            assert await ends(OURS + "Subscribe", ours.SubscribeRequest(patterns=[wrong])) is Status.NOT_FOUND
+            lay = ours.InjectRequest(lay=ours.Lay(patterns=["cell/step"]))
+            assert await ends(OURS + "Inject", ours.InjectRequest(lay=ours.Lay(patterns=[wrong]))) is Status.NOT_FOUND
+            bad = ours.Shadow(assignments=[ours.Assignment(path=wrong, value=number)])
+            assert await ends(OURS + "Inject", lay, ours.InjectRequest(shadow=bad)) is Status.NOT_FOUND
+            unknown = ours.Declaration(name="x", targets=[wrong], drop=ours.Drop())
+            declare = ours.DeclareRequest(declarations=[unknown])
+            assert await ends(OURS + "Declare", declare) is Status.INVALID_ARGUMENT
+            assert await ends(OURS + "Lift", ours.LiftRequest(source="nobody", number=1)) is Status.NOT_FOUND
+            assert await ends(OURS + "LiftAll", ours.LiftAllRequest(sources=["nobody"])) is Status.NOT_FOUND
         assert served.service.counters[2:] == (0, len(puts) + 6)
 
     beside_a_polite_one(segment, test)
