@@ -69,6 +69,11 @@ class ShmioStub(object):
                 request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.SimulateRequest.SerializeToString,
                 response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.SimulateResponse.FromString,
                 _registered_method=True)
+        self.Declare = channel.unary_stream(
+                '/shmio.v1.Shmio/Declare',
+                request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.DeclareRequest.SerializeToString,
+                response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.DeclareResponse.FromString,
+                _registered_method=True)
         self.ListInjections = channel.unary_unary(
                 '/shmio.v1.Shmio/ListInjections',
                 request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.ListInjectionsRequest.SerializeToString,
@@ -158,6 +163,13 @@ class ShmioServicer(object):
 
     def Simulate(self, request_iterator, context):
         """Computes a source of the connector "remote" for as long as the stream is open: steps come down, outputs go up.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
+    def Declare(self, request, context):
+        """Lays injections that their sources run by themselves, all or none; then the record of what is done, and when.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')
@@ -256,6 +268,11 @@ def add_ShmioServicer_to_server(servicer, server):
                     servicer.Simulate,
                     request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.SimulateRequest.FromString,
                     response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.SimulateResponse.SerializeToString,
+            ),
+            'Declare': grpc.unary_stream_rpc_method_handler(
+                    servicer.Declare,
+                    request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.DeclareRequest.FromString,
+                    response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.DeclareResponse.SerializeToString,
             ),
             'ListInjections': grpc.unary_unary_rpc_method_handler(
                     servicer.ListInjections,
@@ -487,6 +504,33 @@ class Shmio(object):
             '/shmio.v1.Shmio/Simulate',
             shmio_dot_wire_dot_shmio__v1__pb2.SimulateRequest.SerializeToString,
             shmio_dot_wire_dot_shmio__v1__pb2.SimulateResponse.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Declare(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_stream(
+            request,
+            target,
+            '/shmio.v1.Shmio/Declare',
+            shmio_dot_wire_dot_shmio__v1__pb2.DeclareRequest.SerializeToString,
+            shmio_dot_wire_dot_shmio__v1__pb2.DeclareResponse.FromString,
             options,
             channel_credentials,
             insecure,

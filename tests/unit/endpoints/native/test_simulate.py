@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from shmio.client import Client, Simulation, connect, connect_aio
-from shmio.client.calls import to_wire
 from shmio.client.model import Values
 from shmio.errors import (
     CommandError,
@@ -24,6 +23,7 @@ from shmio.errors import (
     ShmioError,
     ValueRangeError,
 )
+from shmio.messages import value_to_wire
 from shmio.segment import Quality, Segment
 from shmio.wire import shmio_v1_pb2 as wire
 from tests.unit.connectors.test_stepped import Running
@@ -65,7 +65,7 @@ class Raw:
 
 
 def assigned(**given: Any) -> list[wire.Assignment]:
-    return [wire.Assignment(path=path, value=to_wire(value, path)) for path, value in given.items()]
+    return [wire.Assignment(path=path, value=value_to_wire(value, path)) for path, value in given.items()]
 
 
 def stepping(served: Endpoint, count: int = 1) -> asyncio.Task[Any]:
