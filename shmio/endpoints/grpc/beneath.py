@@ -42,7 +42,7 @@ class Beneath:
 
     def image(self, raw: bytes) -> bytes:
         """An image that the source delivered, as the injection finds it."""
-        inner = self._inner  # once: a feed's thread calls this
+        inner = self._inner
         if inner is None:
             return raw
         delivered, bits, values = (np.frombuffer(part, np.uint8) for part in (raw, *inner))

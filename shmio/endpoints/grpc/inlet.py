@@ -60,9 +60,7 @@ class Inlet:
         self._turn = asyncio.Lock()  # who waits for room is served in order
         self._freed: asyncio.Future[None] | None = None
         self._timer: asyncio.TimerHandle | None = None
-        self._ear = Ear(
-            block, bells, heed=self._heed, heeded=self._free, missed=self._missed, retired=self._retired
-        )
+        self._ear = Ear(block, bells, heed=self._heed, heeded=self._free, missed=self._missed, retired=self._retired)
 
     @property
     def alive(self) -> bool:

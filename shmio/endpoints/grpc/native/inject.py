@@ -7,8 +7,8 @@ from collections.abc import AsyncIterator, Mapping, Sequence
 from typing import Final
 
 from shmio.endpoints.grpc import desk
-from shmio.endpoints.grpc.beneath import Beneath
 from shmio.endpoints.grpc.bells import Bells
+from shmio.endpoints.grpc.beneath import Beneath
 from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.followers import Follower
 from shmio.endpoints.grpc.native.columns import pack, pack_slots
