@@ -49,12 +49,9 @@ def test_the_readme_runs_as_shown() -> None:
             lines = []
             for line in cell.stdout:
                 lines.append(line)
-                if "127.0.0.1:8089" in line:
+                if "instance running" in line:
                     break
             assert any("127.0.0.1:8089" in line for line in lines), "".join(lines)
-            # It says where it serves when all processes run; the PLC is read within a few cycles after that.
-            good = shell("shmio-supervisor status --json; shmio watch -n 1 cell/Robot_800/Axs1_Pos")
-            assert good.returncode == 0, good.stderr
             for background, commands in found:
                 if not background:
                     done = shell(commands)
