@@ -15,9 +15,9 @@ import pytest
 import shmio
 from shmio.segment import Cursor, Event, EventKind
 from shmio.segment.attach import Attachment
-from shmio.testing.cell import BIN, CONFIG, PATIENCE_S, Cell, until
+from shmio.testing.cell import BIN, PATIENCE_S, Cell, until
+from tests.system.armed import ARMED
 
-ARMED = CONFIG.replace('connector = "s7"\n', 'connector = "s7"\nwritable = ["Outputs"]\narmed = true\n')
 RECORDER = """
 [recorder]
 directory = "dumps"

@@ -14,27 +14,19 @@ from google.protobuf.struct_pb2 import Value
 
 import shmio
 from shmio.errors import CommandError
-from shmio.testing.cell import BIN, CONFIG, PATIENCE_S, Cell, kill, until
+from shmio.testing.cell import BIN, PATIENCE_S, Cell, kill, until
 from shmio.wire.simlog_v1_pb2 import TopicDescriptor
 from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
 from shmio.wire.simlog_v2_pb2 import PubRequest, SimlogMessage
 from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as SimlogV2Stub
+from tests.system.armed import ARMED, UNARMED
 
-ARMED = CONFIG.replace('connector = "s7"\n', 'connector = "s7"\nwritable = ["Outputs"]\narmed = true\n')
-OTHERS = """
+MEMORY = """
 [[source]]
 name = "panel"
 connector = "memory"
 layout = "panel.toml"
 writable = ["**"]
-
-[[source]]
-name = "unarmed"
-connector = "s7"
-layout = "db201.db"
-writable = ["Outputs"]
-host = "127.0.0.1"
-port = {plc.port}
 """
 PLACE = "cell/Outputs/100"  # of no meaning to the controller's program
 POSITION = "cell/Robot_800/Axs1_Pos"
@@ -43,7 +35,7 @@ POSITION = "cell/Robot_800/Axs1_Pos"
 @pytest.fixture(scope="module")
 def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
     """The A50 cell, armed, and not, and a memory; each test lifts what it lays."""
-    cell = make_shared_cell(config=ARMED + OTHERS)
+    cell = make_shared_cell(config=ARMED + UNARMED + MEMORY)
     (cell.folder / "panel.toml").write_text('[registers]\nspeed = { type = "REAL", initial = 0.5 }\n')
     cell.up()
     until(lambda: all(cell.processes()[name]["quality"] == "good" for name in ("cell", "panel")), "good quality")

@@ -16,27 +16,19 @@ from google.protobuf.struct_pb2 import Value
 
 import shmio
 from shmio.segment.attach import Attachment
-from shmio.testing.cell import CONFIG, PATIENCE_S, Cell, kill, until
+from shmio.testing.cell import PATIENCE_S, Cell, kill, until
 from shmio.wire import simlog_v1_pb2 as v1
 from shmio.wire import simlog_v2_pb2 as v2
 from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
 from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as SimlogV2Stub
+from tests.system.armed import ARMED, UNARMED
 
-ARMED = CONFIG.replace('connector = "s7"\n', 'connector = "s7"\nwritable = ["Outputs"]\narmed = true\n')
-OTHERS = """
+MEMORY = """
 [[source]]
 name = "sim"
 connector = "memory"
 layout = "joints.toml"
 writable = ["**"]
-
-[[source]]
-name = "unarmed"
-connector = "s7"
-layout = "db201.db"
-writable = ["Outputs"]
-host = "127.0.0.1"
-port = {plc.port}
 """
 JOINTS = '[registers]\n"joints/R3200/Link1/R/position" = "LREAL"\n"joints/Kuka.j1/R" = "REAL"\n'
 POSITION = "joints/R3200/Link1/R/position"
@@ -46,7 +38,7 @@ PLACE = "cell/Outputs/100"  # of no meaning to the controller's program
 @pytest.fixture(scope="module")
 def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
     """The A50 cell, armed, and not, and a memory with the joints of old clients; each test lifts what it lays."""
-    cell = make_shared_cell(config=(ARMED + OTHERS).replace("[grpc]\n", '[grpc]\ndefault_source = "sim"\n'))
+    cell = make_shared_cell(config=(ARMED + UNARMED + MEMORY).replace("[grpc]\n", '[grpc]\ndefault_source = "sim"\n'))
     (cell.folder / "joints.toml").write_text(JOINTS)
     cell.up()
     until(lambda: all(cell.processes()[name]["quality"] == "good" for name in ("cell", "sim")), "good quality")

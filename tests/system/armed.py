@@ -1,0 +1,17 @@
+"""The A50 cell for tests that inject toward its controller."""
+
+from __future__ import annotations
+
+from shmio.testing.cell import CONFIG
+
+ARMED = CONFIG.replace('connector = "s7"\n', 'connector = "s7"\nwritable = ["Outputs"]\narmed = true\n')
+UNARMED = """
+[[source]]
+name = "unarmed"
+connector = "s7"
+layout = "db201.db"
+writable = ["Outputs"]
+host = "127.0.0.1"
+port = {plc.port}
+"""
+"""Another source for the same controller."""
