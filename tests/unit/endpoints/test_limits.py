@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from shmio.client import calls
 from shmio.endpoints.grpc import inlet, load, outbox, server, subscribers, values
 from shmio.endpoints.grpc.gate import Limits
 
@@ -41,3 +42,9 @@ SILENT_MS = sum(value for name, value in server.OPTIONS if name.startswith("grpc
 )
 def test_a_limit_is_as_documented(what: str, limit: float) -> None:
     assert {name: int(number) for name, number, _ in ROW.findall(PAGE.read_text())}[what] == limit
+
+
+def test_a_client_of_ours_does_not_ask_too_often_whether_the_endpoint_lives() -> None:
+    """Else gRPC ends the connection of one whose streams rest, after a minute or two."""
+    allowed_ms = dict(server.OPTIONS)["grpc.http2.min_ping_interval_without_data_ms"]
+    assert allowed_ms < dict(calls.OPTIONS)["grpc.keepalive_time_ms"]
