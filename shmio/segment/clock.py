@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import struct
 import time
+from collections.abc import Callable
 from enum import IntEnum
 from typing import Final, NamedTuple
 
@@ -20,6 +21,7 @@ STEP_SIZE_NS: Final = 50_000_000
 """The size of a step unless somebody has set another."""
 
 _SLOTS_AT: Final = 8
+_STEPPED_AT: Final = 12
 _BELL_AT: Final = 0
 _DELIVERED_BELL_AT: Final = 4
 _COPIES_AT: Final = (64, 320)
@@ -102,13 +104,14 @@ class Bell:
 class ClockPage:
     """The section of one segment; several threads may use it, to write it is the owner of time's alone."""
 
-    def __init__(self, memory: memoryview, offset: int, size: int, head: Header) -> None:
-        """``head``: the segment's. ValueError: the section is none of its geometry."""
+    def __init__(self, memory: memoryview, offset: int, size: int, head: Header, owned: Callable[[], bool]) -> None:
+        """``head``: the segment's. ``owned``: whether anybody owns time. ValueError: it is none of this geometry."""
         slots = head.process_capacity
         if size < page_size(slots) or _word(memory, offset + _SLOTS_AT) != slots:
             raise ValueError("the clock page is too short, or has not a place for each process")
         self._memory = memory
         self._offset = offset
+        self._owned = owned
         self._started_ns, self._started_utc_ns = head.started_ns, head.started_utc_ns
         self.bell = Bell(memory, offset + _BELL_AT)
         """Rung at every change of the page."""
@@ -118,13 +121,27 @@ class ClockPage:
     @staticmethod
     def write_new(memory: memoryview, offset: int, slots: int, *, virtual: bool) -> None:
         """The page of a new segment; ``virtual``: time stands at 0 until somebody steps."""
-        struct.pack_into("<I", memory, offset + _SLOTS_AT, slots)
+        struct.pack_into("<II", memory, offset + _SLOTS_AT, slots, virtual)
         _write(memory, offset, ClockState(ClockMode.VIRTUAL if virtual else ClockMode.WALL))
 
+    @property
+    def stepped(self) -> bool:
+        """Whether time was virtual from the start, as the configuration says."""
+        return bool(_word(self._memory, self._offset + _STEPPED_AT))
+
     def read(self) -> ClockState:
-        """The page as it is now. SegmentError: it cannot be read, which no writer of ours brings about."""
-        state = _unpack(self._copy(_STATE.size))
+        """How time stands now. SegmentError: it cannot be read, which no writer of ours brings about.
+
+        Nobody plays it when who did has died.
+        """
+        state = self.told()
+        if state.playing and not self._owned():
+            state = state._replace(playing=False)
         return state if state.virtual else state._replace(time_ns=time.monotonic_ns() - self._started_ns)
+
+    def told(self) -> ClockState:
+        """The page as its writer has left it, dead or alive. SegmentError."""
+        return _unpack(self._copy(_STATE.size))
 
     def _copy(self, size: int) -> bytes:
         """The first bytes of the state. SegmentError."""
@@ -175,8 +192,18 @@ class ClockPage:
         _atomics.store64(self._memory, self._entry(index), step + 1)
         self.delivered_bell.ring()
 
+    def abstain(self, index: int) -> None:
+        """Have no step wait for this process, until it delivers one; the process's alone."""
+        _atomics.store64(self._memory, self._entry(index), 0)
+        self.delivered_bell.ring()
+
     def _entry(self, index: int) -> int:
         return self._offset + _TABLE_AT + index * _ENTRY.size
+
+
+def time_lock(head: Header) -> int:
+    """The byte of the segment that who owns time has locked: the one after those of the process table."""
+    return head.process_capacity + 1
 
 
 def page_size(slots: int) -> int:

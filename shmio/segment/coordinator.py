@@ -14,7 +14,7 @@ from typing import Final
 from shmio.errors import TimeError, ValueRangeError
 from shmio.segment.answers import Wait, answer, silence
 from shmio.segment.block import Block
-from shmio.segment.clock import ClockMode, ClockState
+from shmio.segment.clock import ClockMode, ClockState, time_lock
 from shmio.segment.processes import ProcessSlot
 from shmio.segment.segment import Segment
 
@@ -64,7 +64,7 @@ class Coordinator:
         self._hard_ns = round(hard_s * 1e9)
         self._deliver = deliver
         self._turn = threading.RLock()
-        self._lock_byte = segment.header.process_capacity + 1  # after those of the process table
+        self._lock_byte = time_lock(segment.header)
         self._owns = False
 
     def read(self) -> ClockState:
@@ -251,9 +251,13 @@ class Coordinator:
     def _await_delivery(self, number: int) -> Generator[Wait, None, str]:
         """Wait until the other dispatchers have delivered a step; who has not, or empty."""
         clock, begun_ns, told = self._segment.clock, time.monotonic_ns(), False
+        rung = False
         while True:
             seen = clock.delivered_bell.value()
             waiting = [slot for slot in self._segment.processes if self._owes(slot, number)]
+            if not rung:
+                rung = True
+                self._ring([slot.name for slot in waiting])
             passed_ns = time.monotonic_ns() - begun_ns
             if not waiting:
                 return ""
@@ -282,4 +286,4 @@ class Coordinator:
 def check_step(dt_ns: float) -> None:
     """ValueRangeError: it is no length of a step."""
     if not MIN_STEP_NS <= dt_ns <= MAX_STEP_NS:
-        raise ValueRangeError(f"a step is from 1 us to 1 h, not {dt_ns / 1e6:g} ms")
+        raise ValueRangeError(f"a step is from 0.001 ms to 3600000 ms (1 h), not {dt_ns / 1e6:g} ms")

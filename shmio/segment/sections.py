@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import msgspec
 
@@ -10,7 +11,7 @@ from shmio.errors import FormatError, LayoutError
 from shmio.layout.model import Layout
 from shmio.segment import _atomics, header
 from shmio.segment.block import Attributes, Block
-from shmio.segment.clock import ClockPage
+from shmio.segment.clock import ClockPage, time_lock
 from shmio.segment.commands import CommandQueues
 from shmio.segment.events import EVENT_SIZE
 from shmio.segment.header import Header, SectionEntry, SectionKind
@@ -30,7 +31,7 @@ def read_clock(shared: SharedObject, head: Header, entries: Sequence[SectionEntr
         if entry.kind == SectionKind.CLOCK:
             try:  # on memory of its own: what has been read is still judged by it when the segment is closed
                 own = memoryview(shared.map())
-                return ClockPage(own, entry.offset, entry.size, head)
+                return ClockPage(own, entry.offset, entry.size, head, partial(shared.taken, time_lock(head)))
             except ValueError as error:
                 raise FormatError(f"{shared.name}: {error}") from None
     raise FormatError(

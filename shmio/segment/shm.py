@@ -35,6 +35,7 @@ class SharedObject:
         self.writable = writable
         self.inode = os.fstat(fd).st_ino
         self._fd = fd
+        self._held: set[int] = set()
         self._map: mmap.mmap | None = None
 
     @classmethod
@@ -110,10 +111,12 @@ class SharedObject:
             if error.errno in (errno.EAGAIN, errno.EACCES):
                 return False
             raise
+        self._held.add(byte)
         return True
 
     def unlock(self, byte: int) -> None:
         """Give the lock on one byte back."""
+        self._held.discard(byte)
         fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, struct.pack(_FLOCK, fcntl.F_UNLCK, os.SEEK_SET, byte, 1, 0))
 
     def locked(self, byte: int) -> bool:
@@ -122,6 +125,10 @@ class SharedObject:
         answer = fcntl.fcntl(self._fd, fcntl.F_OFD_GETLK, query)
         kind: int = struct.unpack(_FLOCK, answer)[0]
         return kind != fcntl.F_UNLCK
+
+    def taken(self, byte: int) -> bool:
+        """Whether anybody has the byte, this object or another."""
+        return byte in self._held or self.locked(byte)
 
     def current(self) -> bool:
         """Whether the name still leads to this object (and not to none, or to a successor)."""

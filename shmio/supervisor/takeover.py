@@ -62,8 +62,9 @@ def _fitting(shared: SharedObject, plan: Plan) -> tuple[Segment | None, list[str
         return None, []
     if segment.header.mode != plan.mode:
         return None, [f"{plan.instance} ran in mode {segment.header.mode}, not {plan.mode}: it starts anew"]
-    if plan.stepped and not segment.clock.read().virtual:
-        return None, [f"{plan.instance} ran in real time, but instance.clock is stepped: it starts anew"]
+    if plan.stepped != segment.clock.stepped:
+        began, wanted = ("stepped", "wall") if segment.clock.stepped else ("wall", "stepped")
+        return None, [f"{plan.instance} was started with instance.clock {began}, not {wanted}: it starts anew"]
     status = (shm.DIRECTORY / shared.name).stat()
     if status.st_uid != os.geteuid():
         return None, [f"segment {shared.name} belongs to another user: it starts anew"]

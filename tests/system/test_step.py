@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -253,22 +254,31 @@ def test_a_killed_program_that_played_leaves_time_standing(line: Cell) -> None:
         until(lambda: line.status()["clock"]["step"] > begun + 3, "time runs")
         player.kill()
     stands = line.status()["clock"]
+    assert not stands["playing"], "nobody plays it any more"
     clock = step(line)
     assert clock["step"] in (stands["step"] + 1, stands["step"] + 2), "it may have been killed within a step"
     assert not clock["playing"]
 
 
-def test_a_supervisor_that_takes_over_keeps_the_time_unless_it_is_to_be_stepped_from_the_start(
+def test_a_supervisor_that_takes_over_keeps_the_time_unless_the_configuration_has_another_clock(
     make_line: Callable[[str], Cell],
 ) -> None:
     line = make_line("wall")
     file = line.folder / "supervisor.toml"
-    kill(line.status()["supervisor"]["pid"])
-    file.write_text(file.read_text().replace('clock = "wall"', 'clock = "stepped"'))
-    assert f"{line.instance} ran in real time" in line.supervisor("up", "--detach").stdout
+
+    def up_again(clock: str | None = None) -> str:
+        kill(line.status()["supervisor"]["pid"])
+        if clock:
+            file.write_text(re.sub('clock = ".*"', f'clock = "{clock}"', file.read_text()))
+        return line.supervisor("up", "--detach").stdout
+
+    taken_over = step(line)["step"]
+    assert "took over belt" in up_again(), "its clock is the wall's, though time was taken over"
+    assert step(line)["step"] == taken_over + 1
+    assert f"{line.instance} was started with instance.clock wall, not stepped: it starts anew" in up_again("stepped")
     assert line.status()["clock"]["step"] == 0
     assert step(line, "--count", "3")["step"] == 3
-    kill(line.status()["supervisor"]["pid"])
-    taken = line.supervisor("up", "--detach").stdout
-    assert "took over belt" in taken
+    assert "took over belt" in up_again()
     assert step(line)["step"] == 4
+    assert "with instance.clock stepped, not wall: it starts anew" in up_again("wall")
+    assert line.status()["clock"]["mode"] == "wall"

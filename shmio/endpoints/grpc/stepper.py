@@ -84,7 +84,7 @@ class Stepper:
         """Begin to follow time; go on playing if the process before this one, by its pid, did when it died."""
         self._page = Bell(self._clock.bell, "clock")
         self._page.listeners[self._look] = None
-        state = self._clock.read()
+        state = self._clock.told()
         if state.playing and state.owner == predecessor:  # what another program that died has played stands
             try:
                 await self.play(state.dt_ns or None, state.rate)

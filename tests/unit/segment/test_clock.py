@@ -11,7 +11,7 @@ import pytest
 from shmio.errors import FormatError
 from shmio.layout.model import Layout, Register
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Quality, Segment
-from shmio.segment.clock import ClockMode, ClockState
+from shmio.segment.clock import ClockMode, ClockState, time_lock
 from shmio.segment.header import SectionKind, read_sections, table_state
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("count", "UDINT", (), 0, None, 4, 1),))
@@ -52,9 +52,27 @@ def test_time_stands_at_zero_in_one_that_is_stepped_from_the_start(instance: str
 
 
 def test_who_opens_the_segment_reads_what_was_written(segment: Segment, instance: str) -> None:
+    assert segment.shared.try_lock(time_lock(segment.header))
     segment.clock.write(STATE)
     with Segment.open(instance) as reader:
-        assert reader.clock.read() == STATE
+        assert reader.clock.read() == segment.clock.read() == STATE
+
+
+def test_nobody_plays_time_when_its_owner_is_gone(segment: Segment, instance: str) -> None:
+    with Segment.open(instance, writable=True) as owner:
+        assert owner.shared.try_lock(time_lock(segment.header))
+        owner.clock.write(STATE)
+        assert segment.clock.read() == STATE
+    assert segment.clock.read() == STATE._replace(playing=False)
+    assert segment.clock.told() == STATE, "a successor knows that it was"
+
+
+def test_it_is_told_whether_time_was_stepped_from_the_start(segment: Segment, instance: str) -> None:
+    segment.clock.write(STATE)
+    assert not segment.clock.stepped, "it was taken over"
+    with Segment.create(f"{instance}-stepped", [], [], stepped=True) as other:
+        assert other.clock.stepped
+        other.unlink()
 
 
 def test_the_present_is_before_the_step_that_is_under_way(segment: Segment) -> None:
@@ -75,7 +93,7 @@ def test_a_writer_that_died_half_way_hides_nothing(segment: Segment, copy: int) 
     at = entry.offset + copy
     odd = int.from_bytes(segment.memory[at : at + 8], "little") | 1
     segment.memory[at : at + 8] = odd.to_bytes(8, "little")
-    assert segment.clock.read() == STATE
+    assert segment.clock.told() == STATE
     segment.clock.write(STATE._replace(step=13))
     assert segment.clock.read().step == 13
 
@@ -113,6 +131,8 @@ def test_deliveries_are_told_by_slot(segment: Segment, instance: str) -> None:
         segment.clock.deliver(1, 12)
         assert (reader.clock.delivered(0), reader.clock.delivered(1)) == (None, 12)
         assert reader.clock.delivered_bell.value() != seen
+        segment.clock.abstain(1)
+        assert reader.clock.delivered(1) is None, "no step waits for it"
 
 
 def test_ages_are_taken_against_the_clock_that_a_block_lives_on(segment: Segment) -> None:

@@ -149,9 +149,9 @@ def test_the_step_size_is_remembered_and_checked(instance: str) -> None:
         coordinator.set_step_size(20 * MS)
         assert coordinator.step().dt_ns == 20 * MS
         for wrong in (0, -5, 999, 3_600_000 * MS + 1):
-            with pytest.raises(ValueRangeError, match="1 us to 1 h"):
+            with pytest.raises(ValueRangeError, match=r"0\.001 ms to 3600000 ms"):
                 coordinator.set_step_size(wrong)
-            with pytest.raises(ValueRangeError, match="1 us to 1 h"):
+            with pytest.raises(ValueRangeError, match=r"0\.001 ms to 3600000 ms"):
                 coordinator.step(wrong)
         assert coordinator.read().step == 1
         coordinator.set_step_size(1_000)
@@ -309,7 +309,8 @@ coordinator.step()
             process.kill()
             process.wait()
         state = segment.clock.read()
-        assert (state.step, state.done, state.stepping, state.playing) == (1, 0, True, True)
+        assert (state.step, state.done, state.stepping, state.playing) == (1, 0, True, False)
+        assert segment.clock.told().playing
         coordinator = Coordinator(segment)
         coordinator.take_over()
         state = coordinator.read()

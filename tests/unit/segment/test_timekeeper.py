@@ -113,9 +113,9 @@ def test_what_cannot_be_a_rate_or_a_step_is_refused(cell: Attachment) -> None:
     with pytest.raises(ValueRangeError, match="a rate is above 0"):
         cell.play(0)
     for wrong in (0, -1, 1e300, float("inf"), float("nan")):
-        with pytest.raises(ValueRangeError, match="1 us to 1 h"):
+        with pytest.raises(ValueRangeError, match=r"0\.001 ms to 3600000 ms"):
             cell.step(dt_s=wrong)
-        with pytest.raises(ValueRangeError, match="1 us to 1 h"):
+        with pytest.raises(ValueRangeError, match=r"0\.001 ms to 3600000 ms"):
             cell.play(1, dt_s=wrong)
     assert not cell.clock.playing
 
