@@ -27,6 +27,7 @@ def run(worker: Worker) -> None:
     settings = msgspec.convert({k: v for k, v in worker.config.items() if k != "config_file"}, Settings)
     directory, segment = Path(settings.directory), worker.segment
     worker.running()  # its search for what its predecessor has may take a while
+    segment.clock.abstain(worker.slot.index)  # for which no step waits: the rings have what comes meanwhile
     known = places(directory, segment, BY, worker.slot.beat)
     elsewhere = _elsewhere(worker.before, directory)
     start = Start(known, reason=Reason.ELSEWHERE if elsewhere else Reason.NOT_RUNNING)
@@ -52,9 +53,17 @@ def _elsewhere(before: Report, directory: Path) -> str:
 
 
 def _record(worker: Worker, series: Series) -> None:
-    more, problem, told_s = False, "", 0.0
-    while not worker.stopping.wait(0 if more else series.recorder.pause_s):
+    """Turn after turn; in virtual time a step is over only when there was one for it, so that none of it is missed."""
+    clock, slot = worker.segment.clock, worker.slot.index
+    bell = clock.slot_bell(slot)
+    seen, more, problem, told_s = bell.value(), False, "", 0.0
+    clock.deliver(slot, 0)  # from now on each step waits for it
+    while not worker.stopping.is_set():
+        if not more:
+            seen = bell.wait(seen, round(series.recorder.pause_s * 1e9))
         more = series.recorder.turn()
+        if (done := series.recorder.done) != clock.delivered(slot):
+            clock.deliver(slot, done)
         if time.monotonic() - told_s < BEAT_S:
             continue
         told_s = time.monotonic()

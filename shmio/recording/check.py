@@ -11,7 +11,7 @@ from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
 from shmio.recording.damage import Damage, DamageLog
-from shmio.recording.encoding import FRAME, GAP, Gap
+from shmio.recording.encoding import EVENT, FRAME, Gap
 from shmio.recording.reader import Channel, Reader
 from shmio.recording.records import BROKEN, Record
 from shmio.recording.survey import MAX_BLOCKS, Count, read_index
@@ -130,7 +130,9 @@ class _Check:
             self._problem(f"the chunk at byte {record.at}: its times are not those of its messages")
 
     def _message(self, channel: Channel, data: memoryview) -> None:
-        if channel.encoding != GAP and len(data) >= _NUMBER.size:  # even if the rest of it is not to be decoded
+        if (
+            channel.encoding in (EVENT, FRAME) and len(data) >= _NUMBER.size
+        ):  # even if the rest of it is not to be decoded
             self._numbers.take(channel, *_NUMBER.unpack_from(data))
         item = self._reader.decode(channel, data)
         if isinstance(item, Gap):

@@ -1,4 +1,4 @@
-"""Frames, events and gaps as the messages of a recording (docs/reference/dump-format.md).
+"""Frames, events, gaps and steps as the messages of a recording (docs/reference/dump-format.md).
 
 Decoding trusts nothing: ValueError for bytes that are no such message.
 """
@@ -14,11 +14,14 @@ import msgspec
 from shmio.segment.events import EVENT_DATA_SIZE, Event
 from shmio.segment.frame import Frame, Provenance, Quality
 
-MAX_GAP_BYTES: Final = 4096
+MAX_JSON_BYTES: Final = 4096
 
 FRAME: Final = "shmio.frame.v1"
 EVENT: Final = "shmio.event.v1"
-GAP: Final = "json"
+PLAIN: Final = "json"
+GAP: Final = "gap"
+STEP: Final = "step"
+"""What gaps and steps are called here; in the file both are PLAIN, and their topics tell them apart."""
 
 _FRAME: Final = struct.Struct("<QQqqqQIBBHHHII")
 _EVENT: Final = struct.Struct("<QQQqqqQQIIIIIIHBBHH")
@@ -38,6 +41,10 @@ GAP_SCHEMA: Final = b"""{"type": "object", "properties": {"source": {"type": "st
 "count": {"type": "integer"}, "reason": {"enum": ["overtaken", "not running", "elsewhere", \
 "no room", "unsure"]}, \
 "after_ns": {"type": "integer"}, "before_ns": {"type": "integer"}}}"""
+
+
+STEP_SCHEMA: Final = b"""{"type": "object", "properties": {"step": {"type": "integer"}, \
+"time_ns": {"type": "integer"}, "dt_ns": {"type": "integer"}}}"""
 
 
 class Reason(StrEnum):
@@ -70,6 +77,17 @@ class Gap(msgspec.Struct, frozen=True):
     reason: Reason
     after_ns: int = 0
     before_ns: int = 0
+
+
+class StepMark(msgspec.Struct, frozen=True):
+    """A step of virtual time is done: every frame of it comes before.
+
+    ``time_ns``: the instance's clock after it, which it has moved by ``dt_ns``.
+    """
+
+    step: int
+    time_ns: int
+    dt_ns: int
 
 
 class Place(NamedTuple):
@@ -147,12 +165,27 @@ def encode_gap(gap: Gap) -> bytes:
 
 def decode_gap(data: bytes) -> Gap:
     """The gap of a message; ValueError."""
-    if len(data) > MAX_GAP_BYTES:
+    if len(data) > MAX_JSON_BYTES:
         raise ValueError(f"a gap of {len(data)} bytes")
     gap = msgspec.json.decode(data, type=Gap)
     if gap.what not in ("frames", "events") or not 0 < gap.first <= gap.last or gap.count != gap.last - gap.first + 1:
         raise ValueError("a gap contradicts itself")
     return gap
+
+
+def encode_step(mark: StepMark) -> bytes:
+    """A step's end as JSON."""
+    return msgspec.json.encode(mark)
+
+
+def decode_step(data: bytes) -> StepMark:
+    """The step's end of a message; ValueError."""
+    if len(data) > MAX_JSON_BYTES:
+        raise ValueError(f"a step of {len(data)} bytes")
+    mark = msgspec.json.decode(data, type=StepMark)
+    if min(mark.step, mark.time_ns, mark.dt_ns) < 0:
+        raise ValueError("a step is negative")
+    return mark
 
 
 def encode_place(place: Place) -> str:

@@ -17,9 +17,23 @@ from mcap.records import Metadata
 from shmio.errors import LayoutError, RecordingError
 from shmio.layout.model import Layout
 from shmio.recording.damage import Damage, DamageLog
-from shmio.recording.encoding import EVENT, FRAME, GAP, Gap, Place, decode_event, decode_frame, decode_gap, decode_place
+from shmio.recording.encoding import (
+    EVENT,
+    FRAME,
+    GAP,
+    PLAIN,
+    STEP,
+    Gap,
+    Place,
+    StepMark,
+    decode_event,
+    decode_frame,
+    decode_gap,
+    decode_place,
+    decode_step,
+)
 from shmio.recording.records import BROKEN, Record, Records, stream
-from shmio.recording.writer import ABOUT, GAPS_TOPIC, PLACES
+from shmio.recording.writer import ABOUT, GAPS_TOPIC, PLACES, STEPS_TOPIC
 from shmio.segment import Event, Frame
 
 MAX_LAYOUT_BYTES: Final = 64 << 20
@@ -31,6 +45,7 @@ MAX_CHANNEL_BYTES: Final = 4096
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _ATTACHMENT_HEAD: Final = 4096  # times, name, media type and size of any attachment fit in
 _LAYOUTS: Final = "layouts/"
+_OWN: Final = {GAPS_TOPIC: GAP, STEPS_TOPIC: STEP}
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,12 +66,15 @@ class Channel:
     layout: str = ""
 
 
+Item = Frame | Event | Gap | StepMark
+
+
 class Message(NamedTuple):
-    """One message: a frame, an event or a gap."""
+    """One message: a frame, an event, a gap or the end of a step."""
 
     channel: Channel
     log_ns: int
-    item: Frame | Event | Gap
+    item: Item
 
 
 class AttachmentEntry(NamedTuple):
@@ -185,7 +203,7 @@ class Reader:
                         self.summary_damage = self.summary_damage or f"{error} (byte {record.at}, in the index)"
         return self.channels.get(number)
 
-    def decode(self, channel: Channel, data: memoryview) -> Frame | Event | Gap:
+    def decode(self, channel: Channel, data: memoryview) -> Item:
         """What a message holds; RecordingError."""
         try:
             if channel.encoding == FRAME:
@@ -193,7 +211,9 @@ class Reader:
                 if len(frame.raw) != self.layout(channel).size:
                     raise ValueError("a frame is not of its layout's size")
                 return frame
-            return decode_event(bytes(data)) if channel.encoding == EVENT else decode_gap(bytes(data))
+            if channel.encoding == EVENT:
+                return decode_event(bytes(data))
+            return decode_gap(bytes(data)) if channel.encoding == GAP else decode_step(bytes(data))
         except ValueError as error:
             raise RecordingError(f"{self.file}: {channel.topic}: {error}") from None
 
@@ -262,8 +282,8 @@ class Reader:
                     after,
                     about["layout"],
                 )
-            elif (found.topic, found.message_encoding) == (GAPS_TOPIC, GAP):
-                channel = Channel(found.id, found.message_encoding, found.topic)
+            elif found.message_encoding == PLAIN and found.topic in _OWN:
+                channel = Channel(found.id, _OWN[found.topic], found.topic)
             else:
                 channel = Channel(found.id, "", found.topic)  # another program's
         except (ValueError, KeyError, struct.error, McapError):

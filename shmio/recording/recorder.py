@@ -12,11 +12,12 @@ from typing import Final, NamedTuple
 
 from shmio import __version__
 from shmio.recording.attach import Attachment, Attachments, no_attachments
-from shmio.recording.encoding import Gap, Place, Reason
+from shmio.recording.encoding import Gap, Place, Reason, StepMark
 from shmio.recording.follower import Entry, Follower
 from shmio.recording.output import Output
 from shmio.recording.writer import JSON, Channels, Writer
 from shmio.segment import Frame, Segment
+from shmio.segment.clock import ClockState
 from shmio.segment.events import EVENT_SIZE
 
 TURN_S: Final = 0.1
@@ -110,6 +111,8 @@ class Recorder:
         self._to_confirm: tuple[int, dict[int, Place]] | None = None
         self._writer.places(start.places)
         self._follow(start)
+        self.done = 0
+        """The last step of virtual time of which all is recorded, or lost for want of room."""
         self._lively = False
         self._flushed_s = self._checked_s = time.monotonic()
 
@@ -137,6 +140,7 @@ class Recorder:
 
     def turn(self) -> bool:
         """Take what has been published; whether there is more at once. RecordingError: the file was removed."""
+        state = self._segment.clock.read()  # before looking: what was published for the step that is done is there
         self._segment.refresh()
         if self._segment.blocks is not self._known:
             self._follow(Start())
@@ -156,6 +160,8 @@ class Recorder:
         for followed in [followed for followed in self._followed if self._ended(followed)]:
             self._places[followed.follower.block.section] = followed.follower.place
             self._followed.remove(followed)
+        if state.virtual and state.done > self.done and not more:
+            self._end_step(state, full=full)
         now_s = time.monotonic()
         if now_s - self._flushed_s >= CHUNK_S - TURN_S / 2:
             self._flushed_s = now_s
@@ -165,6 +171,13 @@ class Recorder:
             self._checked_s = now_s
             self.output.check()
         return more
+
+    def _end_step(self, state: ClockState, *, full: bool) -> None:
+        """All of this step, and of those before it, has been taken."""
+        self.done = state.done
+        if state.done == state.step and state.dt_ns and not full:  # or else nobody tells how far that one went
+            mark = StepMark(state.step, state.time_ns, state.dt_ns)
+            self._writer.step(mark, self.log_time(self._segment.clock.monotonic_ns(state.time_ns)))
 
     def _confirm(self) -> None:
         """See what the disk has for certain; what was written by now is the next that it is to have."""

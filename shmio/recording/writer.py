@@ -1,4 +1,4 @@
-"""A recording as MCAP: one channel for the frames and one for the events of each block, one for what was missed."""
+"""A recording as MCAP: channels for the frames and for the events of each block, for gaps and for steps."""
 
 from __future__ import annotations
 
@@ -14,14 +14,17 @@ from shmio.recording.encoding import (
     EVENT_SCHEMA,
     FRAME,
     FRAME_SCHEMA,
-    GAP,
     GAP_SCHEMA,
+    PLAIN,
+    STEP_SCHEMA,
     Gap,
     Place,
+    StepMark,
     encode_event,
     encode_frame,
     encode_gap,
     encode_place,
+    encode_step,
 )
 from shmio.recording.output import Output
 from shmio.segment import Block, Event, Frame
@@ -33,6 +36,7 @@ PLACES: Final = "places"
 """Name of the metadata that tell behind which numbers the recording begins."""
 CHUNK_BYTES: Final = 1 << 20
 GAPS_TOPIC: Final = "gaps"
+STEPS_TOPIC: Final = "steps"
 
 JSON: Final = "application/json"
 TOML: Final = "application/toml"
@@ -57,7 +61,7 @@ class Writer:
         self._mcap.start(PROFILE, f"shmio {__version__}")
         self._mcap.add_metadata(ABOUT, dict(about))
         self._schemas: dict[str, int] = {}
-        self._gaps: int | None = None
+        self._own: dict[str, int] = {}
         self.flush()
 
     def places(self, places: Mapping[int, Place]) -> None:
@@ -103,11 +107,20 @@ class Writer:
 
     def gap(self, gap: Gap, log_ns: int) -> None:
         """Tell what was missed; it comes before what follows it."""
-        if self._gaps is None:
+        self._mcap.add_message(self._channel(GAPS_TOPIC, "shmio.gap.v1", GAP_SCHEMA), log_ns, encode_gap(gap), log_ns)
+
+    def step(self, mark: StepMark, log_ns: int) -> None:
+        """Tell that a step is done; it comes after all its frames."""
+        channel = self._channel(STEPS_TOPIC, "shmio.step.v1", STEP_SCHEMA)
+        self._mcap.add_message(channel, log_ns, encode_step(mark), log_ns, mark.step & 0xFFFFFFFF)
+
+    def _channel(self, topic: str, schema: str, text: bytes) -> int:
+        """A channel of the instance's own, described in the chunk of its first message."""
+        if topic not in self._own:
             self.flush()
-            schema = self._mcap.register_schema("shmio.gap.v1", "jsonschema", GAP_SCHEMA)
-            self._gaps = self._mcap.register_channel(GAPS_TOPIC, GAP, schema)
-        self._mcap.add_message(self._gaps, log_ns, encode_gap(gap), log_ns)
+            number = self._mcap.register_schema(schema, "jsonschema", text)
+            self._own[topic] = self._mcap.register_channel(topic, PLAIN, number)
+        return self._own[topic]
 
     def flush(self) -> None:
         """End the chunk; what was added is on its way to the file."""

@@ -19,7 +19,7 @@ from shmio.layout.text import json_value
 from shmio.layout.topic import parse_topic
 from shmio.logs import printable
 from shmio.recording.damage import Damage
-from shmio.recording.encoding import EVENT, FRAME, GAP, Gap
+from shmio.recording.encoding import EVENT, FRAME, GAP, STEP, Gap, StepMark
 from shmio.recording.reader import Channel, Message, Reader
 from shmio.recording.survey import Survey, survey
 from shmio.segment import Event, EventKind, Frame, Quality
@@ -27,7 +27,7 @@ from shmio.segment.scan import ChangeScan
 
 
 def execute(arguments: argparse.Namespace) -> int:
-    """Print a line for each frame in which a chosen value or the quality changed, and for events and gaps.
+    """Print a line for each frame in which a chosen value or the quality changed, and for events, gaps and steps.
 
     1 if something was damaged: all the rest is printed, and where something is lost is told.
     """
@@ -42,7 +42,7 @@ def execute(arguments: argparse.Namespace) -> int:
         sources = {view.source for view in views.values()} if arguments.patterns else {c.source for c in channels}
         printer: Printer = JsonLines() if arguments.json else Table()
         wanted = {c.number for c in channels if c.number in views or (c.encoding == EVENT and c.source in sources)}
-        wanted |= {c.number for c in channels if c.encoding == GAP}
+        wanted |= {c.number for c in channels if c.encoding == GAP or (c.encoding == STEP and not arguments.patterns)}
         damaged, silent = complaints.damage, True
         for message in reader.messages(lambda channel: channel.number in wanted, from_ns, to_ns, damaged):
             for line in _lines(message, views, sources, printer):
@@ -116,6 +116,9 @@ class Printer(Protocol):
     def gap(self, time_ns: int, gap: Gap) -> str:
         """What was missed."""
 
+    def step(self, time_ns: int, mark: StepMark) -> str:
+        """The end of a step."""
+
 
 def _views(
     reader: Reader, channels: Sequence[Channel], patterns: Sequence[str], complaints: Complaints
@@ -161,6 +164,8 @@ def _lines(message: Message, views: dict[int, View], sources: set[str], printer:
             yield from printer.frame(time_ns, views[channel.number], item)
     elif isinstance(item, Event):
         yield printer.event(time_ns, channel.source, item)
+    elif isinstance(item, StepMark):
+        yield printer.step(time_ns, item)
     elif item.source in sources:
         yield printer.gap(time_ns, item)
 
@@ -214,6 +219,10 @@ class JsonLines:
             time_ns, gap.source, missed=gap.count, what=gap.what, first=gap.first, last=gap.last, why=str(gap.reason)
         )
 
+    def step(self, time_ns: int, mark: StepMark) -> str:
+        """``step`` is its number, ``clock_ns`` the instance's clock after it; it is of no source."""
+        return dumps({"time": iso(time_ns), "step": mark.step, "clock_ns": mark.time_ns, "dt_ns": mark.dt_ns})
+
     def _line(self, time_ns: int, source: str, **fields: Any) -> str:
         return dumps({"time": iso(time_ns), "source": source, **fields})
 
@@ -254,6 +263,10 @@ class Table:
         """How many, which, why."""
         source = printable(gap.source)
         return f"{local(time_ns)}  {source}  {gap.count} {gap.what} missed, {gap.first} to {gap.last}: {gap.reason}"
+
+    def step(self, time_ns: int, mark: StepMark) -> str:
+        """Number, and the time after it."""
+        return f"{local(time_ns)}  step {mark.step} of {mark.dt_ns / 1e6:g} ms is done: {mark.time_ns / 1e9:g} s"
 
     def _row(self, cells: Sequence[str]) -> str:
         return "  ".join(cell.ljust(width) for cell, width in zip(cells, self._widths, strict=True))
