@@ -21,7 +21,8 @@
     ├── RecordingError     a recording cannot be written, or is none that this version can read
     ├── EndpointError      an address cannot be served
     ├── RemoteError        an instance cannot be reached by gRPC, or does not answer as it should
-    │   └── LostError            nothing serves there at present; it may come back
+    │   ├── LostError            nothing serves there at present; it may come back
+    │   └── UnknownClientError   it wants to know who asks
     └── ControlError       the supervisor refused or did not answer
         └── UnreachableError     its socket cannot be connected to
 
@@ -125,6 +126,10 @@ class RemoteError(ShmioError):
 
 class LostError(RemoteError):
     """Nothing serves at this address, or the connection to it was lost; it may come back."""
+
+
+class UnknownClientError(RemoteError):
+    """The endpoint wants a token, and was shown none, or one that it does not know."""
 
 
 class RecordingError(ShmioError):

@@ -21,7 +21,7 @@ from shmio.client import Running as ClientRunning
 from shmio.client import Shadow as ClientShadow
 from shmio.config import Declaration
 from shmio.config.address import UNIX, Address
-from shmio.errors import ConfigError, NotRunningError, PathError, RemoteError, ShmioError
+from shmio.errors import ConfigError, NotRunningError, PathError, RemoteError, ShmioError, UnknownClientError
 from shmio.layout.codec import Value
 from shmio.layout.model import Layout, Register
 from shmio.layout.types import element_type
@@ -34,14 +34,22 @@ from shmio.segment.view import Reading
 
 @contextmanager
 def connected(options: argparse.Namespace) -> Iterator[Remote]:
-    """The instance that the options name. ConfigError: they name none; OSError: a file cannot be read."""
+    """The instance that the options name. ConfigError: they name none; OSError: a file cannot be read.
+
+    UnknownClientError: it wants a token; which option gives one.
+    """
     if options.config is not None or options.instance is not None:
         raise ConfigError("--host names the instance already: leave out -c and --instance")
     if not options.host.startswith(UNIX):
         Address.parse(options.host)
     token = options.token_file.read_text().strip() if options.token_file else None
     with connect(options.host, ca=options.ca, certificate=options.certificate, key=options.key, token=token) as client:
-        yield Remote(client)
+        try:
+            yield Remote(client)
+        except UnknownClientError as error:
+            if options.token_file is not None:
+                raise
+            raise UnknownClientError(f"{error}; here by --token-file FILE, which has the token alone") from None
 
 
 class Remote:

@@ -11,6 +11,8 @@ from shmio.cli.cell import Cell
 from shmio.cli.interrupt import told_to_stop
 from shmio.cli.run import at_least, dumps
 from shmio.cli.supervise.status import clock_line
+from shmio.errors import ValueRangeError
+from shmio.segment.coordinator import MAX_RATE, MAX_STEP_NS, MIN_STEP_NS, check_step
 from shmio.segment.status import clock_status
 
 HELP = "Step the instance's time: from the first step on nothing else moves it."
@@ -19,12 +21,12 @@ LOOK_S = 0.2
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the verb's own arguments."""
-    parser.add_argument("--dt-ms", type=_above_zero, metavar="N", help="by how much (default: the step size, 50)")
+    parser.add_argument("--dt-ms", type=_dt_ms, metavar="N", help="by how much (default: the step size, 50)")
     parser.add_argument("--count", type=at_least(1), default=1, metavar="N", help="so many steps (default: 1)")
     how = parser.add_mutually_exclusive_group()
     how.add_argument(
         "--play",
-        type=_above_zero,
+        type=_rate,
         nargs="?",
         const=1.0,
         metavar="RATE",
@@ -56,11 +58,25 @@ def _play(cell: Cell, rate: float, dt_s: float | None) -> None:
         cell.pause()
 
 
-def _above_zero(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+def _rate(text: str) -> float:
+    value = _number(text)
+    if not 0 < value <= MAX_RATE:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0, at most {MAX_RATE:g}")
     return value
+
+
+def _dt_ms(text: str) -> float:
+    value = _number(text)
+    try:
+        check_step(value * 1e6)
+    except ValueRangeError:
+        limits = f"from {MIN_STEP_NS / 1e6:g} to {MAX_STEP_NS // 10**6}"
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of ms {limits}") from None
+    return value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

@@ -17,6 +17,7 @@ from shmio.errors import (
     PathError,
     RemoteError,
     ShmioError,
+    UnknownClientError,
     ValueRangeError,
 )
 from shmio.messages import value_to_wire
@@ -77,7 +78,7 @@ class Target:
         code, details = error.code(), error.details() or ""
         if kind := _ERRORS.get(code):
             return kind(details)
-        told = LostError if code is grpc.StatusCode.UNAVAILABLE else RemoteError
+        told = _REMOTE.get(code, RemoteError)
         return told(f"{self.address}: {_MEANING.get(code, code.name)}{f': {details}' if details else ''}")
 
     def fail(self, error: Any) -> NoReturn:
@@ -85,6 +86,10 @@ class Target:
         raise self.error(error) from None
 
 
+_REMOTE: Final[Mapping[grpc.StatusCode, type[RemoteError]]] = {
+    grpc.StatusCode.UNAVAILABLE: LostError,
+    grpc.StatusCode.UNAUTHENTICATED: UnknownClientError,
+}
 _MEANING: Final = {
     grpc.StatusCode.UNAVAILABLE: "no instance serves there, or it has ended",
     grpc.StatusCode.DEADLINE_EXCEEDED: "it did not answer in time",
@@ -116,7 +121,7 @@ def ns(dt_s: float | None) -> int:
     if dt_s is None:
         return 0
     if not 0 < dt_s <= 3600:
-        raise ValueRangeError(f"a step is from 1 us to 1 h, not {dt_s} s")
+        raise ValueRangeError(f"a step is from 0.001 ms to 3600000 ms (1 h), not {dt_s * 1e3:g} ms")
     return max(1, round(dt_s * 1e9))
 
 

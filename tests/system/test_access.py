@@ -51,6 +51,10 @@ def test_tokens_come_and_go_with_reloads(guarded: Cell) -> None:
     nobody = subscribe(guarded, address)
     assert nobody.returncode == 1
     assert "UNAUTHENTICATED: Subscribe needs the role read" in nobody.stderr
+    get = ("get", "--host", address, "cell/Inputs")
+    assert guarded.run("shmio", *get).stderr.endswith("; here by --token-file FILE, which has the token alone\n")
+    assert guarded.run("shmio", *get, "--token-file", "dash").returncode == 0
+    assert "--token-file" not in guarded.run("shmio", *get, "--token-file", "other").stderr
     assert subscribe(guarded, address, "--token-file", "dash").returncode == 0
     assert "none of [[grpc.token]]" in subscribe(guarded, address, "--token-file", "other").stderr
     pid = guarded.processes()["grpc"]["pid"]

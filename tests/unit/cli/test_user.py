@@ -69,6 +69,25 @@ def test_a_number_of_lines_is_one_or_more(count: str, capsys: pytest.CaptureFixt
     assert "is not a whole number from 1 on" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        *(
+            (("--dt-ms", text), f"'{text}' is not a number of ms from 0.001 to 3600000")
+            for text in ("0", "-5", "4e6", "x")
+        ),
+        *((("--play", text), f"'{text}' is not a number above 0, at most 1000") for text in ("0", "1001", "nan")),
+    ],
+)
+def test_a_step_and_a_rate_have_limits(
+    words: tuple[str, str], problem: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(["step", *words])
+    assert stop.value.code == 2
+    assert problem in capsys.readouterr().err
+
+
 def test_watch_ends_with_ctrl_c(running: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def news(*_: object) -> None:
         raise KeyboardInterrupt
