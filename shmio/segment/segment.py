@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Collection, Sequence
 from contextlib import suppress
@@ -30,6 +31,8 @@ class Segment:
         self.memory = memoryview(shared.map())
         self.header = Header.read(self.memory, shared.name)
         self.processes = ProcessTable(shared, self.memory, self.header)
+        self._turn = threading.RLock()
+        """Held over a change of ``blocks``, which threads may look for at the same time."""
         self.clock = read_clock(shared, self.header, self._sections())
         self._known: dict[int, Block] = {}  # by the section of its layout
         self.blocks = self._find_blocks()
@@ -108,8 +111,10 @@ class Segment:
 
         As of :meth:`refresh`. FormatError.
         """
-        entries = enumerate(self._entries)
-        return [self._found(index) for index, entry in entries if entry.kind == SectionKind.LAYOUT and entry.retired]
+        with self._turn:
+            entries = enumerate(self._entries)
+            layouts = [index for index, entry in entries if entry.kind == SectionKind.LAYOUT and entry.retired]
+            return [self._found(index) for index in layouts]
 
     def _sections(self) -> list[SectionEntry]:
         """The section table of one generation."""
@@ -134,13 +139,14 @@ class Segment:
     def refresh(self) -> bool:
         """Look again what blocks there are, if a reload has changed that. Blocks that go on stay the same objects.
 
-        The process table is read anew too. FormatError.
+        The process table is read anew too. Several threads may: one waits for what another has begun. FormatError.
         """
-        if not self.outdated:
-            return False
-        self.blocks = self._find_blocks()
-        self.processes = ProcessTable(self.shared, self.memory, self.header)
-        return True
+        with self._turn:
+            if not self.outdated:
+                return False
+            self.blocks = self._find_blocks()
+            self.processes = ProcessTable(self.shared, self.memory, self.header)
+            return True
 
     def reserve(self, add: Sequence[BlockSpec]) -> int:
         """Make room for what :meth:`change` is to add, so that it cannot fail; the offset at which it is.

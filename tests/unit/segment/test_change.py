@@ -5,13 +5,14 @@ from __future__ import annotations
 import struct
 import threading
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 
 import shmio
 from shmio.errors import NotRunningError, PathError, SegmentError
 from shmio.layout.model import Layout, Register
-from shmio.segment import BlockSpec, ProcessSpec, Quality, Segment, _atomics, build, header, shm
+from shmio.segment import Block, BlockSpec, ProcessSpec, Quality, Segment, _atomics, build, header, sections, shm
 from shmio.segment.view import View
 
 OLD = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))
@@ -296,3 +297,32 @@ def test_who_waits_is_woken_by_the_new_block(segment: Segment) -> None:
     assert views
     assert views[0] is not None
     assert views[0]["count"] == 4
+
+
+def test_a_thread_that_looks_while_another_reads_a_reload_waits_for_it(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with Segment.open(segment.instance) as reader:
+        segment.change(add=[spec("robot")])
+        reads, go_on, seen = threading.Event(), threading.Event(), list[set[str]]()
+        read_block = sections.read_block
+
+        def slow(*arguments: Any) -> Block:
+            reads.set()
+            go_on.wait()
+            return read_block(*arguments)
+
+        def look() -> None:
+            reader.refresh()
+            seen.append(set(reader.blocks))
+
+        monkeypatch.setattr("shmio.segment.segment.read_block", slow)
+        first, second = (threading.Thread(target=look) for _ in range(2))
+        first.start()
+        reads.wait()
+        second.start()
+        second.join(0.2)  # one that did not wait would be through by then
+        go_on.set()
+        first.join()
+        second.join()
+        assert seen == [{"cell", "press", "robot"}] * 2
