@@ -9,25 +9,48 @@ import shutil
 import signal
 import sys
 import tempfile
+import threading
 from pathlib import Path
 
 from tests.faults import report
-from tests.faults.suite import Suite
+from tests.faults.stepping import Stepping
+from tests.faults.suite import Record, Suite
+
+STEPPED = 0.2
+"""The share of a run that is for the instance that is stepped."""
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="fault-suite", description="Break a whole instance under load, and watch.")
-    parser.add_argument("--for", dest="for_s", type=float, default=60.0, metavar="SECONDS", help="default: 60")
+    parser.add_argument(
+        "--for", dest="for_s", type=float, default=60.0, metavar="SECONDS",
+        help="default: 60; a fifth of it is for the instance that is stepped",
+    )  # fmt: skip
     parser.add_argument("--seed", type=int, help="which faults come when; default: a new one")
     parser.add_argument("--report", type=Path, metavar="FILE", help="default: printed at the end")
     arguments = parser.parse_args()
     seed = secrets.randbits(32) if arguments.seed is None else arguments.seed
     folder = Path(tempfile.mkdtemp(prefix="shmio-faults-"))
     print(f"fault suite: seed {seed}, {arguments.for_s:g} s, in {folder}", flush=True)
-    suite = Suite(folder, f"faults-{os.getpid()}", seed, lambda line: print(line, flush=True))
+    record, instance = Record(seed), f"faults-{os.getpid()}"
+
+    def say(line: str) -> None:
+        print(line, flush=True)
+
+    suite = Suite(folder, instance, record, say)
+    stepping = Stepping(folder / "stepped", f"{instance}-stepped", record, say)
+    told = threading.Event()
+
+    def stop() -> None:
+        told.set()
+        suite.stop()
+        stepping.stop()
+
     for sign in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(sign, lambda *_: suite.stop())
-    record = suite.run(arguments.for_s)
+        signal.signal(sign, lambda *_: stop())
+    suite.run(arguments.for_s * (1 - STEPPED))
+    if not (record.violated or told.is_set()):
+        stepping.run(arguments.for_s * STEPPED)
     text = report.write(record)
     if arguments.report:
         arguments.report.write_text(text)

@@ -20,6 +20,8 @@ from typing import Any, Final
 from tests.faults.checks import Counts, Source
 from tests.faults.truth import Truth
 
+NOTES: Final = ("landed", "guarded", "given")
+"""The truths of a source beside that of what its PLC's program did; see :class:`Source`."""
 TELL_S: Final = 0.1
 PULSE_S: Final = 0.05
 SLACK_NS: Final = 1_000_000_000
@@ -44,7 +46,7 @@ class Description:
     rings_ns: Mapping[str, int]
     """For how long each source's ring holds a frame."""
     sources: tuple[Mapping[str, Any], ...]
-    """The fields of :class:`Source`, with paths of files for ``truth`` and ``landed``."""
+    """The fields of :class:`Source`, with paths of files for ``truth`` and the :data:`NOTES`."""
 
     def to_json(self) -> str:
         """As an argument of a command line."""
@@ -53,7 +55,7 @@ class Description:
 
 def open_source(fields: Mapping[str, Any]) -> Source:
     """A source whose truth is mapped."""
-    files = {name: Truth(Path(fields[name])) if fields[name] else None for name in ("truth", "landed")}
+    files = {name: Truth(Path(fields[name])) if fields[name] else None for name in ("truth", *NOTES)}
     return Source(**{**fields, **files})
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from shmio.segment import Frame, Quality
-from tests.faults.plc import OTHERS
+from tests.faults.plc import OTHERS, SHOWN_AT, WORD
 from tests.faults.truth import Truth, Words, generations, places
 
 Complain = Callable[[str], None]
@@ -35,7 +35,11 @@ class Source:
     one_pdu: bool
     truth: Truth | None = None
     landed: Truth | None = None
-    """What was written into the last two words, where there is a truth; they are none of the program's then."""
+    """What was written into the first two of the last words, where there is a truth; they are none of the program's."""
+    guarded: Truth | None = None
+    """What came into the word that injections stand before."""
+    given: Truth | None = None
+    """What injections were about to give, of the word that shows that and of the one they stand before."""
 
     @property
     def oldest_ns(self) -> int:
@@ -64,6 +68,7 @@ class FrameCheck:
     counts: Counts = field(default_factory=Counts)
     _last: Frame | None = None
     _words: Words | None = None
+    _shown: int = 0
     _started_ns: int = 0
 
     def __post_init__(self) -> None:
@@ -121,7 +126,9 @@ class FrameCheck:
         if len(frame.image) != self.source.size:
             self._say(frame, f"has {len(frame.image)} bytes")
             return
-        if frame.quality is not Quality.GOOD and not any(frame.image):
+        if self.source.given is not None:
+            self._injected(frame, self.source.given)
+        if frame.quality is not Quality.GOOD and not any(frame.raw):
             return  # never had one
         if frame.quality is not Quality.GOOD and repeats and self._last is not None and frame.raw != self._last.raw:
             self._say(frame, "is bad, but its bytes are not those of the frame before")
@@ -146,6 +153,23 @@ class FrameCheck:
             if since_ns > frame.publish_ns:
                 self._say(frame, f"holds generation {found[-1]} of later, {since_ns}")
             self.counts.since_ns = max(self.counts.since_ns, since_ns)
+
+    def _injected(self, frame: Frame, given: Truth) -> None:
+        """One word is injected over: the PLC has 0 there, and consumers see that or what had been given by then."""
+        at = self._own + SHOWN_AT
+        raw, shown = (int.from_bytes(image[at : at + WORD], "big") for image in (frame.raw, frame.image))
+        if raw:
+            self._say(frame, f"tells {raw}, which was injected, as what the PLC has")
+        if frame.image[:at] != frame.raw[:at] or frame.image[at + WORD :] != frame.raw[at + WORD :]:
+            self._say(frame, "an injection over one word has changed others")
+        if not shown:
+            return
+        since_ns = given.since_ns(shown)
+        if since_ns is None or since_ns > frame.publish_ns:
+            self._say(frame, f"shows {shown}, which nobody had injected by then")
+        elif shown < self._shown:
+            self._say(frame, f"shows {shown}, injected before {self._shown}")
+        self._shown = shown
 
     def age(self, frame: Frame, now_ns: int) -> None:
         """What is good now was in the PLC not long ago."""

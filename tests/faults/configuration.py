@@ -26,6 +26,8 @@ _DB = """DATA_BLOCK DB{number}
       {name} : Array[1..{words}] of LWord;
       command : LWord;
       remote : LWord;
+      shown : LWord;
+      guarded : LWord;
    END_STRUCT;
 BEGIN
 END_DATA_BLOCK
@@ -41,7 +43,8 @@ dbNumber = {number}
 timeout = 400
 period_ms = {period_ms}
 stale_ms = {stale_ms}
-writable = ["command", "remote"]
+writable = ["command", "remote", "guarded"]
+armed = true
 """
 _OTHERS = """
 [[emulator]]

@@ -13,7 +13,7 @@ from shmio.testing.cell import kill, until
 from tests.faults.configuration import Configuration
 from tests.faults.deface import deface
 from tests.faults.midwrite import MidWrite
-from tests.faults.rig import Device, Rig
+from tests.faults.rig import Device, Instance, Rig
 from tests.faults.schedule import SUPERVISOR, Fault
 
 GONE_S: Final = 20.0
@@ -28,35 +28,29 @@ GARBAGE: Final = (
 )
 
 
-class Inflictor:
-    """Knows the rig, and how to break each part of it."""
+Kinds = dict[str, Callable[[Fault], None]]
 
-    def __init__(self, rig: Rig, mid_write: MidWrite) -> None:
-        self._rig = rig
-        self._mid_write = mid_write
 
-    def inflict(self, fault: Fault) -> None:
-        """Do it, at once."""
-        kinds: dict[str, Callable[[Fault], None]] = {
+class ProcessInflictor:
+    """Knows how to break the processes of an instance."""
+
+    def __init__(self, instance: Instance) -> None:
+        self._of = instance
+        self.kinds: Kinds = {
             "kill": lambda f: kill(self._pid(f.target)),
             "pause": self._pause,
             "hang": self._hang,
-            "restart": lambda f: self._rig.ask("restart", f.target),
-            "torn": self._torn,
-            "relayout": lambda f: self._rig.reload(lambda configuration: configuration.relayout(f.target)),
-            "reload": lambda _: self._rig.reload(Configuration.toggle_extra),
+            "restart": lambda f: instance.ask("restart", f.target),
             "supervisor_kill": self._supervisor_kill,
             "supervisor_pause": self._pause,
-            "clock": lambda f: self._rig.set_clock(f.number % 3 and round((f.number / 2**31 - 1) * 30 * DAY_NS)),
-            "midwrite": lambda f: self._mid_write.strike(f.number),
         }
-        if fault.kind in kinds:
-            kinds[fault.kind](fault)
-        else:
-            self._device(fault, self._rig.devices[fault.target.rpartition(" ")[2]])
+
+    def inflict(self, fault: Fault) -> None:
+        """Do it, at once."""
+        self.kinds[fault.kind](fault)
 
     def _pid(self, name: str) -> int:
-        status = self._rig.status()
+        status = self._of.status()
         if name == SUPERVISOR:
             assert status.supervisor is not None
             return status.supervisor.pid
@@ -73,7 +67,36 @@ class Inflictor:
     def _hang(self, fault: Fault) -> None:
         pid = self._pid(fault.target)
         kill(pid, signal.SIGSTOP)
-        until(lambda: self._rig.processes()[fault.target].pid != pid, f"{fault.target} replaced", GONE_S)
+        until(lambda: self._of.processes()[fault.target].pid != pid, f"{fault.target} replaced", GONE_S)
+
+    def _supervisor_kill(self, fault: Fault) -> None:
+        kill(self._pid(SUPERVISOR))
+        until(lambda: self._of.status().supervisor is None, "the supervisor is gone")
+        time.sleep(fault.for_s)
+        self._of.up()
+
+
+class Inflictor(ProcessInflictor):
+    """Knows the rig, and how to break each part of it."""
+
+    def __init__(self, rig: Rig, mid_write: MidWrite) -> None:
+        super().__init__(rig)
+        self._rig = rig
+        self._mid_write = mid_write
+        self.kinds |= {
+            "torn": self._torn,
+            "relayout": lambda f: self._rig.reload(lambda configuration: configuration.relayout(f.target)),
+            "reload": lambda _: self._rig.reload(Configuration.toggle_extra),
+            "clock": lambda f: self._rig.set_clock(f.number % 3 and round((f.number / 2**31 - 1) * 30 * DAY_NS)),
+            "midwrite": lambda f: self._mid_write.strike(f.number),
+        }
+
+    def inflict(self, fault: Fault) -> None:
+        """Do it, at once."""
+        if fault.kind in self.kinds:
+            super().inflict(fault)
+        else:
+            self._device(fault, self._rig.devices[fault.target.rpartition(" ")[2]])
 
     def _torn(self, fault: Fault) -> None:
         """The writer dies in the middle of a slot, for certain."""
@@ -83,12 +106,6 @@ class Inflictor:
         with Segment.open(self._rig.instance, writable=True) as segment:
             deface(segment.memory, fault.target, fault.number)
         kill(pid)
-
-    def _supervisor_kill(self, fault: Fault) -> None:
-        kill(self._pid(SUPERVISOR))
-        until(lambda: self._rig.status().supervisor is None, "the supervisor is gone")
-        time.sleep(fault.for_s)
-        self._rig.up()
 
     def _device(self, fault: Fault, device: Device) -> None:
         chance = random.Random(fault.number)

@@ -12,9 +12,9 @@ from typing import Final, Self
 from tests.faults.checker import Description
 from tests.faults.checks import Counts
 
-MODULES: Final = ("local", "remote", "churn", "writing", "recorded")
-LATE: Final = ("slow", "recorded")
-"""How the counts begin of those who see values long after they were published."""
+MODULES: Final = ("local", "remote", "churn", "writing", "injecting", "recorded")
+LATE: Final = ("slow", "recorded", "injected")
+"""How the counts begin of those who see values long after they were published, or one source after the other."""
 END_S: Final = 20.0
 
 

@@ -1,8 +1,9 @@
 """An emulated S7 PLC, as a process, whose block changes all the time and that keeps the truth about it.
 
-``python -m tests.faults.plc TRUTH LANDED PORT SIZE PERIOD_MS``. The program leaves the last two words of the block to
-others; what they write there is noted in LANDED, another file of truth, before they are answered. It prints a line
-when it listens, and ends with its standard input.
+``python -m tests.faults.plc TRUTH LANDED GUARDED PORT SIZE PERIOD_MS``. The program leaves the last four words of the
+block to others. What is written to the first two of them is noted in LANDED, what is written to the last one in
+GUARDED, further files of truth, before it is answered. It prints a line when it listens, and ends with its standard
+input.
 """
 
 from __future__ import annotations
@@ -18,28 +19,31 @@ from tests.faults.truth import Truth, image, places
 
 NUMBER = 7
 WORD = 8
-OTHERS = 2 * WORD
-"""What the program leaves to others, at the block's end: a word for local writers, one for those by gRPC."""
+OTHERS = 4 * WORD
+"""What the program leaves to others, at the block's end: a word for local writers, one for those by gRPC, one that
+nobody writes and injections show something else for, and one that injections stand before."""
+SHOWN_AT = 2 * WORD
+"""Where among them the one is that injections show something else for."""
 
 
 class Noting:
     """The server's lock, which is held over each job: notes what a job has written before it lets go."""
 
-    def __init__(self, block: bytearray, landed: Truth) -> None:
+    def __init__(self, block: bytearray, landed: Truth, guarded: Truth) -> None:
         self._lock = threading.Lock()
         self._block = block
-        self._landed = landed
-        self._last = [bytes(WORD)] * 2
+        self._notes = (landed, landed, None, guarded)
+        self._last = [bytes(WORD)] * len(self._notes)
 
     def __enter__(self) -> None:
         self._lock.acquire()
 
     def __exit__(self, *_: object) -> None:
         tail = bytes(self._block[-OTHERS:])
-        words = [tail[:WORD], tail[WORD:]]
-        for word, last in zip(words, self._last, strict=True):
-            if word != last:
-                self._landed.land(int.from_bytes(word, "big"), time.monotonic_ns())
+        words = [tail[at : at + WORD] for at in range(0, OTHERS, WORD)]
+        for note, word, last in zip(self._notes, words, self._last, strict=True):
+            if note is not None and word != last:
+                note.land(int.from_bytes(word, "big"), time.monotonic_ns())
         self._last = words
         self._lock.release()
 
@@ -62,10 +66,11 @@ def play(server: S7Server, block: bytearray, truth: Truth, period_s: float, stop
 
 
 def main() -> None:
-    file, landed, port, size, period_ms = sys.argv[1:]
+    file, landed, guarded, port, size, period_ms = sys.argv[1:]
     block = bytearray(int(size))
     server = S7Server(Address("127.0.0.1", int(port)))
-    server.lock = server._memory.lock = Noting(block, Truth(Path(landed)))  # type: ignore[assignment]
+    noting = Noting(block, Truth(Path(landed)), Truth(Path(guarded)))
+    server.lock = server._memory.lock = noting  # type: ignore[assignment]
     server.add_block(NUMBER, block)
     stopping = threading.Event()
     program = threading.Thread(target=play, args=(server, block, Truth(Path(file)), float(period_ms) / 1000, stopping))

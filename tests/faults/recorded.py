@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from shmio.recording.encoding import FRAME, Gap
+from shmio.recording.encoding import FRAME, Gap, StepMark
 from shmio.recording.reader import Channel, Reader
 from shmio.recording.survey import survey
 from shmio.segment import Event, Frame
@@ -110,6 +110,8 @@ def check(file: Path, away_ns: int, checks: Mapping[str, BlockCheck]) -> None:
                 for block in checks.values():
                     block.begin(reader.about["epoch"], int(reader.about["started_ns"]), away_ns)
             item, channel = message.item, message.channel
+            if isinstance(item, StepMark):
+                continue
             if isinstance(item, Gap):
                 channel = next(c for c in reader.channels.values() if c.encoding == FRAME and c.block == item.block)
             if channel.source in checks:

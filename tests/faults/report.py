@@ -34,7 +34,7 @@ counted for the kind that ended last.
 
 | kind | times | recovery, s: median | max |
 |---|---|---|---|""".splitlines()
-    for kind in WEIGHTS:
+    for kind in [*WEIGHTS, *sorted(record.faults.keys() - WEIGHTS.keys())]:
         if record.faults[kind]:
             took = record.recoveries[kind]
             figures = f"{statistics.median(took):.2f} | {max(took):.2f}" if took else "- | -"
@@ -44,6 +44,9 @@ counted for the kind that ended last.
         lines.append(f"| {name} | {counts.frames:,} | {counts.missed:,} | {counts.good:,} | {counts.values:,} |")
     lines += ["", "## Processes", "", "| process | most private MB | most descriptors |", "|---|---|---|"]
     lines += [f"| {name} | {peak[0]:.0f} | {peak[1]} |" for name, peak in sorted(record.peaks.items())]
+    if record.steps:
+        lines += ["", "## Steps", "", "Of the instance that is stepped.", "", "| | |", "|---|---|"]
+        lines += [f"| {what} | {count:,} |" for what, count in sorted(record.steps.items())]
     if record.violations:
         lines += ["", "## Violations"]
     for violation in record.violations:

@@ -20,7 +20,7 @@ from shmio.segment import Segment
 from shmio.segment.status import InstanceStatus, read_status
 from shmio.testing.ports import reserved_port
 from shmio.testing.proxy import FaultProxy
-from tests.faults.checker import Description
+from tests.faults.checker import NOTES, Description
 from tests.faults.checks import Process, Source
 from tests.faults.configuration import EXTRA, PERIODS_MS, SIZES, STALE_MS, Configuration
 from tests.faults.truth import Truth
@@ -41,9 +41,10 @@ class Device:
         self._file = folder / f"{name}.truth"
         self.truth = Truth(self._file, create=True)
         self.proxy = FaultProxy(address)
-        self._landed = folder / f"{name}.landed.truth"
-        Truth(self._landed, create=True).close()
-        self._command = [str(self._file), str(self._landed), str(address.port), str(SIZES[name]), "2"]
+        notes = [folder / f"{name}.{part}.truth" for part in NOTES]
+        for note in notes:
+            Truth(note, create=True).close()
+        self._command = [str(self._file), *map(str, notes[:2]), str(address.port), str(SIZES[name]), "2"]
         self._environment = environment
         self.start()
 
@@ -73,10 +74,10 @@ class Device:
         self.truth.close()
 
 
-class Rig:
-    """Everything that is not a checker. Use as a context manager; the instance is running inside."""
+class Instance:
+    """An instance as its user has it. ``file``: its configuration."""
 
-    def __init__(self, folder: Path, instance: str) -> None:
+    def __init__(self, folder: Path, instance: str, file: Path) -> None:
         self.folder = folder
         self.instance = instance
         self.environment = dict(os.environ) | {
@@ -84,7 +85,62 @@ class Rig:
             "PYTHONFAULTHANDLER": "1",
             "PYTHONPATH": f"{Path(shmio.__file__).parents[1]}{os.pathsep}{ROOT}",
         }
+        self._file = file
+        self._preload: dict[str, str] = {}
+
+    def supervisor(self, verb: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """Run ``shmio-supervisor`` on the instance."""
+        return subprocess.run(
+            [sys.executable, "-P", "-m", "shmio.cli.supervisor", verb, "-c", str(self._file), *arguments],
+            env=self.environment | self._preload | {"XDG_RUNTIME_DIR": str(self.folder)},
+            cwd=self.folder,
+            capture_output=True,
+            text=True,
+            timeout=COMMAND_S,
+            check=False,
+        )
+
+    def up(self) -> None:
+        """Start the instance, or take up what a dead supervisor has left; returns when it runs."""
+        done = self.supervisor("up", "--detach")
+        if done.returncode:
+            raise RuntimeError(f"up failed: {done.stderr}")
+
+    def ask(self, verb: str, *arguments: str) -> None:
+        """Have the instance do something; again, when it is just being changed, as the supervisor says then."""
+        until_s = time.monotonic() + COMMAND_S
+        while (done := self.supervisor(verb, *arguments)).returncode:
+            if "ask again" not in done.stderr or time.monotonic() > until_s:
+                raise RuntimeError(f"{verb} {' '.join(arguments)} failed: {done.stderr}")
+
+    def down(self) -> None:
+        """Stop the instance."""
+        done = self.supervisor("down")
+        if done.returncode:
+            raise RuntimeError(f"down failed: {done.stderr}")
+
+    def clear(self) -> None:
+        """Stop it, if it is there."""
+        if self.status().running:
+            self.supervisor("down")
+
+    def status(self) -> InstanceStatus:
+        """The instance as ``status`` tells it."""
+        return read_status(self.instance)
+
+    def processes(self) -> dict[str, Process]:
+        """The processes that the supervisor started, as ``status`` tells it, but for the source that comes and goes."""
+        processes = [p for p in self.status().processes if p.kind != "guest" and p.name != EXTRA]
+        return {p.name: Process(p.pid, p.restarts) for p in processes}
+
+
+class Rig(Instance):
+    """Everything that is not a checker. Use as a context manager; the instance is running inside."""
+
+    def __init__(self, folder: Path, instance: str) -> None:
+        super().__init__(folder, instance, folder / "supervisor.toml")
         self._clock = folder / "clock"
+        self._preload = {"LD_PRELOAD": str(folder / "clock.so"), "SHMIO_FAULTS_CLOCK": str(self._clock)}
         self.set_clock(0)
         compile_c(HERE / "clock.c", folder / "clock.so", "-shared", "-fPIC", "-ldl")
         compile_c(ROOT / "examples/reader.c", folder / "reader")
@@ -95,7 +151,7 @@ class Rig:
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             self._build(stack)
-            stack.callback(self._clear)
+            stack.callback(self.clear)
             self.up()
             self._stack = stack.pop_all()
         return self
@@ -119,7 +175,7 @@ class Rig:
         for name, size in SIZES.items():
             period_ns, stale_ns, tolerance_ns = (ms * 10**6 for ms in (PERIODS_MS[name], STALE_MS[name], TOLERANCE_MS))
             source = Source(name, size, period_ns, stale_ns, tolerance_ns, one_pdu=size < 900)
-            files = {"truth": f"{name}.truth", "landed": f"{name}.landed.truth"}
+            files = {"truth": f"{name}.truth"} | {part: f"{name}.{part}.truth" for part in NOTES}
             known = name in self.devices
             paths = {field: str(self.folder / file) if known else None for field, file in files.items()}
             sources.append(asdict(source) | paths)
@@ -128,47 +184,11 @@ class Rig:
         reader, recordings = str(self.folder / "reader"), str(self.folder / "dumps")
         return Description(self.instance, str(self.grpc), seed, reader, recordings, rings, tuple(sources))
 
-    def supervisor(self, verb: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """Run ``shmio-supervisor`` on the instance, on a host whose clock can be set."""
-        preload = {"LD_PRELOAD": str(self.folder / "clock.so"), "SHMIO_FAULTS_CLOCK": str(self._clock)}
-        return subprocess.run(
-            [sys.executable, "-P", "-m", "shmio.cli.supervisor", verb, "-c", str(self.configuration.file), *arguments],
-            env=self.environment | preload | {"XDG_RUNTIME_DIR": str(self.folder)},
-            cwd=self.folder,
-            capture_output=True,
-            text=True,
-            timeout=COMMAND_S,
-            check=False,
-        )
-
-    def up(self) -> None:
-        """Start the instance, or take up what a dead supervisor has left; returns when it runs."""
-        done = self.supervisor("up", "--detach")
-        if done.returncode:
-            raise RuntimeError(f"up failed: {done.stderr}")
-
-    def ask(self, verb: str, *arguments: str) -> None:
-        """Have the instance do something; again, when it is just being changed, as the supervisor says then."""
-        until_s = time.monotonic() + COMMAND_S
-        while (done := self.supervisor(verb, *arguments)).returncode:
-            if "ask again" not in done.stderr or time.monotonic() > until_s:
-                raise RuntimeError(f"{verb} {' '.join(arguments)} failed: {done.stderr}")
-
     def reload(self, change: Callable[[Configuration], None]) -> None:
         """Change the configuration and have the instance take it."""
         with self._turn:
             change(self.configuration)
             self.ask("reload")
-
-    def down(self) -> None:
-        """Stop the instance."""
-        done = self.supervisor("down")
-        if done.returncode:
-            raise RuntimeError(f"down failed: {done.stderr}")
-
-    def _clear(self) -> None:
-        if self.status().running:
-            self.supervisor("down")
 
     def set_clock(self, offset_ns: int) -> None:
         """Set the clock of the instance's host, relative to the true one."""
@@ -176,15 +196,6 @@ class Rig:
             self._clock.write_bytes(bytes(8))
         with self._clock.open("r+b") as clock:
             clock.write(struct.pack("=q", offset_ns))
-
-    def status(self) -> InstanceStatus:
-        """The instance as ``status`` tells it."""
-        return read_status(self.instance)
-
-    def processes(self) -> dict[str, Process]:
-        """The processes that the supervisor started, as ``status`` tells it, but for the source that comes and goes."""
-        processes = [p for p in self.status().processes if p.kind != "guest" and p.name != EXTRA]
-        return {p.name: Process(p.pid, p.restarts) for p in processes}
 
 
 def compile_c(source: Path, program: Path, *arguments: str) -> None:

@@ -18,7 +18,7 @@ from tests.faults.inflict import Inflictor
 from tests.faults.midwrite import MidWrite
 from tests.faults.panel import Panel
 from tests.faults.resources import Resources
-from tests.faults.rig import Rig, marked
+from tests.faults.rig import Instance, Rig, marked
 from tests.faults.schedule import RENEWING, RESTARTING, Fault, Round, rounds
 
 RECOVERY_S: Final = 30.0
@@ -52,15 +52,17 @@ class Record:
     mid_frames: int = 0
     peaks: dict[str, tuple[float, int]] = field(default_factory=dict)
     """Most MB of memory and most descriptors of each process."""
+    steps: Counter[str] = field(default_factory=Counter)
+    """Of the instance that is stepped: what became of the steps."""
     violations: list[str] = field(default_factory=list)
     violated: int = 0
 
 
-class Suite:
+class Run:
     """One run on one instance. ``say`` gets a line for each round, and each violation with its evidence."""
 
-    def __init__(self, folder: Path, instance: str, seed: int, say: Say) -> None:
-        self.record = Record(seed)
+    def __init__(self, folder: Path, instance: str, record: Record, say: Say) -> None:
+        self.record = record
         self._folder = folder
         self._instance = instance
         self._say = say
@@ -83,6 +85,41 @@ class Suite:
     def stop(self) -> None:
         """End the run after the present round."""
         self._stopping.set()
+
+    def check_processes(self, rig: Instance) -> None:
+        """No process of the instance but those it shows."""
+        deadline_s = time.monotonic() + END_S
+        ours = ("shmio.connectors", "shmio.emulators", "shmio.endpoints", "shmio.recording", "shmio.cli.supervisor up")
+        while True:
+            status = rig.status()
+            known = {p.pid for p in status.processes} | {status.supervisor.pid if status.supervisor else None}
+            strays = {
+                pid: line
+                for pid, line in marked(rig.instance).items()
+                if pid not in known and any(module in line for module in ours)
+            }
+            if not strays:
+                return
+            if time.monotonic() > deadline_s:
+                self.complain(f"processes that belong to nobody: {strays}")
+                return
+            time.sleep(LOOK_S)
+
+    def check_leftovers(self) -> None:
+        """Nothing is left: no segment, no process, no socket in the file system, no file but configuration and logs."""
+        if left := [name for name in instances() if name.startswith(self._instance)]:
+            self.complain(f"segments left behind: {left}")
+        if processes := marked(self._instance):
+            self.complain(f"processes left behind: {processes}")
+        known = {".toml", ".db", ".truth", ".mem", ".so", ".log", ".1", ".2", ".3", ".py", ".pyc"}
+        files = [file for file in self._folder.rglob("*") if not file.is_dir() and file.suffix not in known]
+        names = {str(file.relative_to(self._folder)) for file in files} - {"clock", "reader", "logs/.instance"}
+        if names:
+            self.complain(f"files left behind: {sorted(names)}")
+
+
+class Suite(Run):
+    """A run on an instance in real time, with PLCs and all kinds of readers."""
 
     def run(self, for_s: float, faults: Iterable[Round] | None = None) -> Record:
         """Run for so long, or through the rounds given; the record. What is left behind is a violation too."""
@@ -107,8 +144,8 @@ class Suite:
             self.record.peaks = resources.peaks
             rig.down()
         self.record.counts = panel.counts
-        self._check_leftovers()
-        self.record.duration_s = time.monotonic() - begun_s
+        self.check_leftovers()
+        self.record.duration_s += time.monotonic() - begun_s
         return self.record
 
     def _round(self, rig: Rig, panel: Panel, turn: Round) -> None:
@@ -141,7 +178,7 @@ class Suite:
         elif replaced:
             self.complain("the instance has another segment, but its supervisor was not hit")
         check_restarts(before, rig.processes(), hit, renewed, replaced=replaced, complain=self.complain)
-        self._check_processes(rig)
+        self.check_processes(rig)
         panel.check()
         self._stopping.wait(turn.rest_s)
 
@@ -181,34 +218,3 @@ class Suite:
     def _epoch(self, rig: Rig) -> str:
         """What tells one segment of an instance from the next."""
         return str((Path("/dev/shm") / f"shmio-{rig.instance}").stat().st_ino)
-
-    def _check_processes(self, rig: Rig) -> None:
-        """No process of the instance but those it shows."""
-        status = rig.status()
-        known = {p.pid for p in status.processes} | {status.supervisor.pid if status.supervisor else None}
-        ours = ("shmio.connectors", "shmio.emulators", "shmio.endpoints", "shmio.recording", "shmio.cli.supervisor up")
-        deadline_s = time.monotonic() + END_S
-        while True:
-            strays = {
-                pid: line
-                for pid, line in marked(rig.instance).items()
-                if pid not in known and any(module in line for module in ours)
-            }
-            if not strays:
-                return
-            if time.monotonic() > deadline_s:
-                self.complain(f"processes that belong to nobody: {strays}")
-                return
-            time.sleep(LOOK_S)
-
-    def _check_leftovers(self) -> None:
-        """Nothing is left: no segment, no process, no socket in the file system, no file but configuration and logs."""
-        if left := [name for name in instances() if name.startswith(self._instance)]:
-            self.complain(f"segments left behind: {left}")
-        if processes := marked(self._instance):
-            self.complain(f"processes left behind: {processes}")
-        known = {".toml", ".db", ".truth", ".mem", ".so", ".log", ".1", ".2", ".3"}
-        files = [file for file in self._folder.rglob("*") if not file.is_dir() and file.suffix not in known]
-        names = {str(file.relative_to(self._folder)) for file in files} - {"clock", "reader", "logs/.instance"}
-        if names:
-            self.complain(f"files left behind: {sorted(names)}")

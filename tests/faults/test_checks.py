@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,13 @@ import pytest
 from shmio.segment import Frame, Provenance, Quality
 from tests.faults import report
 from tests.faults.checks import Complain, FrameCheck, Process, Source, ValueCheck, check_restarts
-from tests.faults.plc import OTHERS
+from tests.faults.plc import OTHERS, SHOWN_AT, WORD
 from tests.faults.resources import Resources
 from tests.faults.suite import Record
 from tests.faults.truth import ENTRIES, Truth, generations, image, places
 
 MS = 1_000_000
-SIZE = 40
+SIZE = 56
 PERIOD_NS, STALE_NS, TOLERANCE_NS = 20 * MS, 500 * MS, 50 * MS
 STARTED_NS = 1_000 * MS
 FIRST = 50
@@ -51,7 +52,9 @@ def check(source: Source, found: list[str]) -> FrameCheck:
 
 
 def block(generation: int) -> bytes:
-    return image(generation, places(SIZE - OTHERS)) + b"\xff" * OTHERS  # the last words are not the program's
+    """The last words are not the program's; one of them stays 0, whatever is injected over it."""
+    others = b"\xff" * SHOWN_AT + bytes(WORD) + b"\xff" * WORD
+    return image(generation, places(SIZE - OTHERS)) + others
 
 
 def frame(number: int, generation: int = FIRST, **changes: Any) -> Frame:
@@ -134,6 +137,31 @@ def test_a_frame_that_stays_turns_bad_in_time(check: FrameCheck, found: list[str
     for late_ns in range(0, STALE_NS * 2, 10 * MS):
         check.age(one, one.publish_ns + late_ns)
     assert found == []
+
+
+def injected(number: int, shown: int, **changes: Any) -> Frame:
+    """A good frame over which ``shown`` is injected."""
+    one = good(number, **changes)
+    at = SIZE - OTHERS + SHOWN_AT
+    return one._replace(effective=one.raw[:at] + shown.to_bytes(WORD, "big") + one.raw[at + WORD :])
+
+
+def test_what_is_injected_was_given_and_leaves_the_rest_alone(source: Source, tmp_path: Path, found: list[str]) -> None:
+    given = Truth(tmp_path / "given", create=True)
+    given.land(6, good(1).publish_ns)
+    given.land(7, good(2).publish_ns)
+    check = FrameCheck(replace(source, given=given), found.append)
+    check.begin(STARTED_NS)
+    feed(check, (good(1), 0), (injected(2, 6), 0), (injected(3, 7), 0), (good(4), 0), (injected(5, 0), 0))
+    assert found == []
+    other = injected(10, 7)
+    effective = other.image[:8] + b"?" + other.image[9:]
+    raw = good(11, raw=injected(11, 6).image, effective=None)
+    feed(check, (injected(6, 6), 0), (injected(7, 8), 0), (injected(8, 6, publish_ns=good(1).publish_ns - 1), 0))
+    feed(check, (injected(9, 7), 0), (other._replace(effective=effective), 0), (raw, 0))
+    expected = ("shows 6, injected before 7", "shows 8, which nobody", "has changed others", "tells 6, which was")
+    assert [any(part in line for line in found) for part in expected] == [True] * 4
+    given.close()
 
 
 def test_good_beyond_its_age_is_found(check: FrameCheck, found: list[str]) -> None:
@@ -245,7 +273,7 @@ def test_the_truth_forgets_in_order(truth: Truth) -> None:
     assert truth.since_ns(FIRST) == STARTED_NS + FIRST * 10 * MS
     truth.record(FIRST + ENTRIES, 7)
     assert truth.since_ns(FIRST) is None
-    assert list(generations(block(FIRST)[:-OTHERS], places(SIZE - OTHERS))) == [FIRST] * (SIZE // 8 - 2)
+    assert list(generations(block(FIRST)[:-OTHERS], places(SIZE - OTHERS))) == [FIRST] * ((SIZE - OTHERS) // 8)
 
 
 def test_a_violation_is_in_the_report() -> None:

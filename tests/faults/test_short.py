@@ -11,6 +11,7 @@ import pytest
 
 from tests.faults import report, suite
 from tests.faults.schedule import DEVICE_FAULTS, SOURCES, SUPERVISOR, WEIGHTS, Fault, Round, rounds
+from tests.faults.stepping import STEPPER, WORKERS, Stepping
 from tests.faults.suite import Record, Suite
 
 pytestmark = pytest.mark.timeout(400)
@@ -27,7 +28,7 @@ def one(*targets: tuple[str, str]) -> Round:
 
 
 def run(folder: Path, instance: str, faults: Iterable[Round]) -> Record:
-    record = Suite(folder, instance, seed=SEED, say=print).run(0.0, faults)
+    record = Suite(folder, instance, Record(SEED), say=print).run(0.0, faults)
     print(report.write(record))
     return record
 
@@ -46,6 +47,19 @@ def test_each_kind_of_fault(tmp_path: Path, instance: str) -> None:
     assert all(counts.values > 0 for counts in record.counts.values()), record.counts
     assert record.counts["slow fast"].missed > 0
     assert record.adopted + record.replaced == record.mid_kills == 1
+
+
+def test_steps_are_whole_or_fail_by_name(tmp_path: Path, instance: str) -> None:
+    record = Record(SEED)
+    kinds = [("kill", worker) for worker in WORKERS] + [("pause", "lead"), ("pause", "recorder"), ("restart", "panel")]
+    kinds += [("stepper_kill", STEPPER), ("stepper_kill", STEPPER), ("supervisor_kill", SUPERVISOR)]
+    faults = [Fault(kind, target, 0.0, SHORT_S, NUMBER) for kind, target in kinds]
+    Stepping(tmp_path / "stepped", instance, record, print).run(0.0, faults)
+    print(report.write(record))
+    assert record.violations == []
+    assert record.rounds == len(faults)
+    assert record.steps["done"] > 0
+    assert record.steps["recorded marks"] > 0
 
 
 def test_a_piece_of_a_schedule_and_then_a_broken_promise(

@@ -1,0 +1,84 @@
+"""The invariants of injections: what goes past one toward the PLC, and how long one stands without its client."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from shmio.segment import EventKind
+from tests.faults.checks import Complain, Counts, Source
+from tests.faults.write_checks import SURELY_NOT
+
+LIFTED_NS: Final = 1_000_000_000
+"""So long an injection may stand that nobody keeps, when its client is gone and who has to lift it is awake."""
+
+
+@dataclass
+class GuardCheck:
+    """Holds the word that injections stand before to what was written and what they gave.
+
+    A value that is written is even and is written once; an injection gives the next higher one in its place.
+    """
+
+    source: Source
+    complain: Complain
+    counts: Counts = field(default_factory=Counts)
+    _known: dict[int, EventKind] = field(default_factory=dict)
+
+    def written(self, value: int, kind: EventKind, text: str, *, stood: bool, free: bool) -> None:
+        """What the writer of ``value`` was told. ``stood``: one injection stood all the while; ``free``: none could."""
+        self._known[value] = kind
+        self.counts.values += 1
+        if kind is EventKind.WRITTEN and stood:
+            self._say(f"{value} was written past the injection that stood before it")
+        elif kind is EventKind.TAKEN and free:
+            self._say(f"{value} was taken, but there was no injection")
+        elif kind not in SURELY_NOT | {EventKind.WRITTEN, EventKind.TAKEN, EventKind.UNKNOWN}:
+            self._say(f"{value} ended as {kind.name} ({text})")
+        self.counts.good += kind is EventKind.TAKEN
+
+    def look(self, value: int) -> None:
+        """See what has come of it, and of what was given in its place; values before it are forgotten."""
+        assert self.source.guarded is not None
+        assert self.source.given is not None
+        kind, landed_ns = self._known[value], self.source.guarded.since_ns(value)
+        if landed_ns is not None and kind in SURELY_NOT | {EventKind.TAKEN}:
+            self._say(f"{value} was {kind.name}, but the PLC got it")
+        if landed_ns is None and kind is EventKind.WRITTEN:
+            self._say(f"{value} was WRITTEN, but the PLC never got it")
+        answer_ns, given_ns = self.source.guarded.since_ns(value + 1), self.source.given.since_ns(value + 1)
+        if answer_ns is not None and (given_ns is None or given_ns > answer_ns):
+            self._say(f"the PLC got {value + 1}, which no injection had given by then")
+        for old in [key for key in self._known if key < value]:
+            del self._known[old]
+
+    def _say(self, problem: str) -> None:
+        self.complain(f"{self.source.name}: {problem}")
+
+
+@dataclass
+class LifeCheck:
+    """Holds one injection, whose client has ended, to how long it is to stand."""
+
+    name: str
+    keep: bool
+    ended_ns: int
+    complain: Complain
+    _told: bool = False
+
+    def look(self, now_ns: int, *, stands: bool, awake_since_ns: int, slack_ns: int, renewed: bool = False) -> None:
+        """It stands, or not. ``awake_since_ns``: since when all who have to lift it run; ``renewed``: the block is new.
+
+        A reload that makes the block anew, and the instance's own end, take what is kept with them.
+        """
+        if self._told or renewed:
+            return
+        for_ns = now_ns - max(self.ended_ns, awake_since_ns)
+        if self.keep and not stands:
+            self._tell("was to be kept, but is gone")
+        elif not self.keep and stands and for_ns > LIFTED_NS + slack_ns:
+            self._tell(f"still stands {for_ns / 1e9:.1f} s after its client's end")
+
+    def _tell(self, problem: str) -> None:
+        self._told = True
+        self.complain(f"the injection {self.name} {problem}")

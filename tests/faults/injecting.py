@@ -1,0 +1,254 @@
+"""Clients that inject into each PLC's signals, one after another, and die: what they leave, and what goes past them."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass
+from itertools import count, cycle, product
+from typing import Final
+
+from shmio.errors import CommandError, PathError, QualityError
+from shmio.segment import EventKind
+from shmio.segment.attach import Attachment
+from shmio.segment.standing import Standing
+from tests.faults.checker import Checker
+from tests.faults.checks import Counts, Source
+from tests.faults.inject_checks import GuardCheck, LifeCheck
+from tests.faults.injector import WAYS, Order
+from tests.faults.local import attached
+from tests.faults.plc import OTHERS, SHOWN_AT, WORD
+
+PAUSE_S: Final = 0.05
+BEGIN_S: Final = 20.0
+"""A client that has not laid its injection by then is given up."""
+EFFECT_NS: Final = 90 * 10**9
+"""Some injection has an effect within this time, whatever happens."""
+KEPT_NS: Final = 1_500_000_000
+"""So long one that is kept is watched."""
+QUIET_NS: Final = 600_000_000
+"""Who has given no heartbeat for this long, three of them, has not run all the time."""
+SHOWN_NS: Final = 200_000_000
+NUMBERS: Final = 1000
+"""Values that are set aside for one client."""
+REMEMBERED: Final = 100
+
+
+class Client:
+    """One of them, a process of its own."""
+
+    def __init__(self, order: Order) -> None:
+        self.order = order
+        self.stands = threading.Event()
+        pipe = subprocess.PIPE
+        command = [sys.executable, "-P", "-m", "tests.faults.injector", order.to_json()]
+        self._popen = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self._popen.stdout is not None
+        for line in self._popen.stdout:
+            if line == "stands\n":
+                self.stands.set()
+
+    @property
+    def over(self) -> bool:
+        """Whether it has ended."""
+        return self._popen.poll() is not None
+
+    def end(self, *, kill: bool) -> int:
+        """Kill it, or have it lift what it laid; when it ended."""
+        assert self._popen.stdin is not None
+        if kill:
+            self._popen.kill()
+        self._popen.stdin.close()
+        try:
+            self._popen.wait(BEGIN_S)
+        except subprocess.TimeoutExpired:  # it waits for an endpoint that is frozen
+            self._popen.kill()
+            self._popen.wait()
+        ended_ns = time.monotonic_ns()
+        self._reader.join()
+        assert self._popen.stdout is not None
+        self._popen.stdout.close()
+        return ended_ns
+
+
+class Awake:
+    """Since when processes have run without a pause, by their heartbeats."""
+
+    def __init__(self, attachment: Attachment) -> None:
+        self._attachment = attachment
+        self._since_ns: dict[str, tuple[int, int]] = {}
+
+    def look(self) -> None:
+        """Take note; several times a second."""
+        now_ns = time.monotonic_ns()
+        for slot in self._attachment._segment.processes:
+            pid, since_ns = self._since_ns.get(slot.name, (0, now_ns))
+            if slot.report.pid != pid or now_ns - slot.heartbeat_ns > QUIET_NS or not slot.alive():
+                since_ns = now_ns
+            self._since_ns[slot.name] = slot.report.pid, since_ns
+
+    def since_ns(self, *names: str) -> int:
+        """Since when all of these have."""
+        return max(self._since_ns.get(name, (0, time.monotonic_ns()))[1] for name in names)
+
+
+@dataclass
+class Target:
+    """A source, and what is known of writes to it."""
+
+    source: Source
+    guard: GuardCheck
+    past: deque[int]
+
+
+class Injecting:
+    """Has one client after another inject."""
+
+    def __init__(self, checker: Checker) -> None:
+        self._checker = checker
+        self._chance = random.Random(checker.description.seed)
+        self._numbers = count(2, 2)
+        self._effect_ns = time.monotonic_ns()
+        self._shown: dict[str, Counts] = {}
+        targets = []
+        self._given = {fields["name"]: fields["given"] for fields in checker.description.sources}
+        for source in checker.sources:
+            if source.given is not None:
+                guard = GuardCheck(source, checker.complain, checker.counts(f"injected {source.name} in"))
+                targets.append(Target(source, guard, deque(maxlen=REMEMBERED)))
+                self._shown[source.name] = checker.counts(f"injected {source.name} out")
+        self._turns = cycle(product(("out", "in"), targets))
+
+    def work(self, attachment: Attachment) -> None:
+        """Go on as long as this instance is there."""
+        self._attachment, self._awake = attachment, Awake(attachment)
+        while self._goes_on:
+            try:
+                self._turn()
+            except (CommandError, PathError, QualityError):  # the source is just being restarted, or made anew
+                self._checker.stopping.wait(PAUSE_S)
+            if time.monotonic_ns() - self._effect_ns > EFFECT_NS + self._checker.slack_ns:
+                self._effect_ns = time.monotonic_ns()
+                self._checker.complain(f"no injection has had an effect for {EFFECT_NS / 1e9:g} s")
+
+    @property
+    def _goes_on(self) -> bool:
+        return self._attachment.current and not self._checker.stopping.is_set()
+
+    def _turn(self) -> None:
+        """One client, from its start until nothing of it is left."""
+        chance = self._chance
+        direction, target = next(self._turns)
+        self._lift_rest(target)
+        way = chance.choice(WAYS)
+        first = next(self._numbers)
+        self._numbers = count(first + NUMBERS, 2)
+        source, description = target.source.name, self._checker.description
+        keep = way != "v1" and chance.random() < 0.3
+        order = Order(
+            description.instance, description.grpc, way, source, direction, keep, f"n{first}", first,
+            self._given[source],
+        )  # fmt: skip
+        section = self._attachment.block(source).section
+        client = Client(order)
+        try:
+            until_s = time.monotonic() + BEGIN_S
+            while self._goes_on and not (client.stands.is_set() or client.over or time.monotonic() > until_s):
+                self._tick(target, order)
+            stood, until_s = client.stands.is_set(), time.monotonic() + chance.uniform(0.2, 2.0)
+            while self._goes_on and stood and not client.over and time.monotonic() < until_s:
+                self._tick(target, order)
+        finally:
+            ended_ns = client.end(kill=keep or chance.random() < 0.7)
+        if stood:
+            self._after(target, order, ended_ns, section)
+
+    def _after(self, target: Target, order: Order, ended_ns: int, section: int) -> None:
+        """See it go, or stay and be lifted; then consumers see the PLC again."""
+        life = LifeCheck(
+            f"{order.name} of {order.word}/{order.direction}", order.keep, ended_ns, self._checker.complain
+        )
+        names = [order.source] if order.way == "local" else [order.source, "grpc"]
+        stands = True
+        while stands and self._goes_on:
+            self._awake.look()
+            block = self._attachment.block(order.source)
+            now_ns = time.monotonic_ns()
+            stands = bool(self._standing(order.source))
+            renewed = block.section != section or block.retired or not self._attachment.current
+            life.look(
+                now_ns, stands=stands, awake_since_ns=self._awake.since_ns(*names), slack_ns=self._checker.slack_ns,
+                renewed=renewed,
+            )  # fmt: skip
+            if renewed or (order.keep and now_ns > ended_ns + KEPT_NS):
+                break
+            self._tick(target, order)
+        self._lift_rest(target)
+        gone_ns = time.monotonic_ns()
+        while self._goes_on and time.monotonic_ns() < gone_ns + 2 * SHOWN_NS:
+            frame = self._attachment.frame(order.source).frame
+            if frame.publish_ns > gone_ns + SHOWN_NS and (shown := _shown(frame.image)):
+                self._checker.complain(f"{order.source}: shows {shown} of {order.name}, which was lifted")
+                return
+            self._tick(target)
+
+    def _lift_rest(self, target: Target) -> None:
+        """Nothing stands afterwards; CommandError."""
+        for one in self._standing(target.source.name):
+            self._attachment.lift(target.source.name, one.id)
+
+    def _standing(self, source: str) -> list[Standing]:
+        return [one for one in self._attachment.injections()[source] if not one.lifted]
+
+    def _tick(self, target: Target, order: Order | None = None) -> None:
+        """Write before the injection, and look at what is shown, as its neighbours do."""
+        self._checker.stopping.wait(PAUSE_S)
+        self._awake.look()
+        self._write(target, free=order is None)
+        view = self._attachment.frame(target.source.name)
+        if order is not None and (shown := _shown(view.frame.image)) >= order.first:
+            counts = self._shown[target.source.name]
+            counts.values += 1
+            counts.good += shown < order.first + NUMBERS
+            counts.since_ns = self._effect_ns = time.monotonic_ns()
+
+    def _write(self, target: Target, *, free: bool) -> None:
+        name, value = target.source.name, next(self._numbers)
+        before = {one.id for one in self._standing(name) if one.direction == "in"}
+        kind, text = EventKind.REJECTED, ""
+        try:
+            (outcome,) = self._attachment.write({f"{name}/guarded": value}, 0.5)
+            kind, text = outcome.kind, outcome.text
+        except CommandError as error:
+            text = str(error)
+        after = {one.id for one in self._standing(name) if one.direction == "in"}
+        target.guard.written(value, kind, text, stood=bool(before & after), free=free and not before | after)
+        if kind is EventKind.TAKEN:
+            target.guard.counts.since_ns = self._effect_ns = time.monotonic_ns()
+        target.past.append(value)
+        target.guard.look(target.past[0])
+
+
+def _shown(image: bytes) -> int:
+    """What the word that is injected over shows."""
+    at = len(image) - OTHERS + SHOWN_AT
+    return int.from_bytes(image[at : at + WORD], "big")
+
+
+def main() -> None:
+    checker = Checker()
+    injecting = Injecting(checker)
+    checker.work(lambda: attached(checker, injecting.work, writable=True))
+    checker.run()
+
+
+if __name__ == "__main__":
+    main()

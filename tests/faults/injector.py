@@ -1,0 +1,182 @@
+"""One client that injects, to be killed: ``python -m tests.faults.injector ORDER``; ``injecting`` starts it.
+
+It lays an injection over one word, prints a line when it stands, and gives values until its standard input ends; then
+it lifts it. It ends by itself when it is told that its injection is gone, or cannot reach the instance any more.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import shmio
+from shmio.errors import ShmioError
+from shmio.segment import EventKind
+from shmio.segment.commander import Outcome
+from tests.faults.truth import Truth
+
+PAUSE_S = 0.05
+CALL_S = 20.0
+WAYS = ("local", "v1", "shmio")
+"""Attached, by SimlogAPI v1, which keeps nothing, and by shmio.v1."""
+
+
+@dataclass(frozen=True)
+class Order:
+    """What the client is to do. ``first``: the first of the values to give over ``/out``, each one above the last."""
+
+    instance: str
+    grpc: str
+    way: str
+    source: str
+    direction: str
+    keep: bool
+    name: str
+    first: int
+    given: str
+    """The file of truth for what it is about to give."""
+
+    @property
+    def word(self) -> str:
+        """The word that it injects over."""
+        return f"{self.source}/{'shown' if self.direction == 'out' else 'guarded'}"
+
+    def to_json(self) -> str:
+        """As an argument of a command line."""
+        return json.dumps(asdict(self))
+
+
+class Client:
+    """What all ways share: the values, noted before they are given."""
+
+    def __init__(self, order: Order) -> None:
+        self.order = order
+        self.stopping = threading.Event()
+        self._given = Truth(Path(order.given))
+        self.when_told(self.stopping.set, sys.stdin.read)
+
+    def when_told(self, act: Callable[[], object], told: Callable[[], object] | None = None) -> None:
+        """Do something as soon as it is told to end."""
+
+        def wait() -> None:
+            (told or self.stopping.wait)()
+            act()
+
+        threading.Thread(target=wait, daemon=True).start()
+
+    def stands(self) -> None:
+        """Tell that the injection stands."""
+        print("stands", flush=True)
+
+    def numbers(self) -> Iterator[int]:
+        """Values to give, with time between, until told to stop."""
+        number = self.order.first
+        while not self.stopping.wait(PAUSE_S):
+            yield self.note(number)
+            number += 1
+
+    def note(self, number: int) -> int:
+        """Put down that this value may be seen from now on."""
+        self._given.land(number, time.monotonic_ns())
+        return number
+
+
+def local(client: Client) -> None:
+    """A program that is attached. Over ``/in`` each value goes on as the next higher one."""
+    order = client.order
+    with (
+        shmio.attach(order.instance, writable=True) as cell,
+        cell.inject(f"{order.word}/{order.direction}", keep=order.keep, name=order.name) as shadow,
+    ):
+        client.stands()
+        if order.direction == "out":
+            for number in client.numbers():
+                if gone(shadow.set({order.word: number})):
+                    return
+            return
+        while not client.stopping.is_set():
+            for diversion in shadow.diverted(timeout_s=PAUSE_S):
+                for value in diversion.values.values():
+                    assert isinstance(value, int)
+                    shadow.set({order.word: client.note(value + 1)})
+            if not any(one.id == shadow.number for one in cell.injections()[order.source]):
+                return
+
+
+def gone(outcomes: list[Outcome]) -> bool:
+    """Whether the injection was lifted under its client."""
+    return any(outcome.kind is EventKind.REJECTED and "no injection" in outcome.text for outcome in outcomes)
+
+
+def v1(client: Client) -> None:
+    """A client of SimlogAPI v1: a stream of the originals, and values that are published to the shadow."""
+    import grpc
+
+    from shmio.wire.simlog_v1_pb2 import InjectRequest, PubRequest, ROSMessage, TopicDescriptor
+    from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
+
+    order = client.order
+    target, shadow = (TopicDescriptor(path=f"{order.word}/{part}") for part in (order.direction, order.name))
+    with grpc.insecure_channel(order.grpc) as channel:
+        stub = SimlogAPIStub(channel)  # type: ignore[no-untyped-call]
+
+        def publish(number: int) -> None:
+            data = ROSMessage(type="int", value=str(client.note(number)))
+            stub.Publish(iter([PubRequest(topic=shadow, data=data)]), timeout=CALL_S)
+
+        originals = stub.Inject(InjectRequest(injected=shadow, target=target))
+        try:
+            originals.initial_metadata()
+            client.stands()
+            if order.direction == "out":
+                for number in client.numbers():
+                    publish(number)
+                    if not originals.is_active():
+                        return
+                return
+            client.when_told(originals.cancel)
+            for original in originals:
+                publish(int(original.value) + 1)
+        except grpc.RpcError:
+            return  # its server has gone, or it was told to end
+        finally:
+            originals.cancel()
+
+
+def own(client: Client) -> None:
+    """A client of shmio.v1."""
+    from shmio.client import Client as Remote
+    from shmio.client import Target
+
+    order = client.order
+    path = f"{order.word}/{order.direction}"
+    with (
+        Remote(Target(order.grpc)) as remote,
+        remote.inject(path, keep=order.keep, name=order.name, originals=order.direction == "in") as shadow,
+    ):
+        client.stands()
+        if order.direction == "out":
+            for number in client.numbers():
+                shadow.set({order.word: number})
+            return
+        client.when_told(shadow.close)
+        for update in shadow:
+            shadow.send({order.word: client.note(int(update[order.word]) + 1)})
+
+
+def main() -> None:
+    client = Client(Order(**json.loads(sys.argv[1])))
+    ways: dict[str, Callable[[Client], None]] = {"local": local, "v1": v1, "shmio": own}
+    try:
+        ways[client.order.way](client)
+    except ShmioError as error:
+        print(f"ended: {error}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

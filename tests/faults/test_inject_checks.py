@@ -1,0 +1,109 @@
+"""The checks of injections: a true history passes, each kind of false one is found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shmio.segment import EventKind
+from tests.faults.checks import Source
+from tests.faults.inject_checks import LIFTED_NS, GuardCheck, LifeCheck
+from tests.faults.truth import Truth
+
+S = 1_000_000_000
+
+
+@pytest.fixture
+def found() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Iterator[Source]:
+    guarded, given = (Truth(tmp_path / name, create=True) for name in ("guarded", "given"))
+    yield Source("cell", 64, 1, 1, 1, True, guarded=guarded, given=given)
+    guarded.close()
+    given.close()
+
+
+def check(source: Source, found: list[str]) -> GuardCheck:
+    return GuardCheck(source, found.append)
+
+
+def land(source: Source, value: int, now_ns: int) -> None:
+    assert source.guarded is not None
+    source.guarded.land(value, now_ns)
+
+
+def give(source: Source, value: int, now_ns: int) -> None:
+    assert source.given is not None
+    source.given.land(value, now_ns)
+
+
+def test_what_an_injection_takes_is_held_to_what_the_plc_got(source: Source, found: list[str]) -> None:
+    guard = check(source, found)
+    land(source, 2, 10)
+    give(source, 5, 20)
+    land(source, 5, 20)
+    land(source, 8, 30)
+    guard.written(2, EventKind.WRITTEN, "", stood=False, free=True)
+    guard.written(4, EventKind.TAKEN, "", stood=True, free=False)
+    guard.written(6, EventKind.TAKEN, "", stood=False, free=False)  # nothing was given in its place
+    guard.written(8, EventKind.UNKNOWN, "no answer", stood=True, free=False)
+    guard.written(10, EventKind.REJECTED, "not now", stood=False, free=True)
+    for value in (2, 4, 6, 8, 10):
+        guard.look(value)
+    assert found == []
+    assert (guard.counts.values, guard.counts.good) == (5, 2)
+
+
+@pytest.mark.parametrize(
+    ("kind", "stood", "free", "landed", "answered", "problem"),
+    [
+        (EventKind.WRITTEN, True, False, True, False, "past the injection that stood"),
+        (EventKind.TAKEN, False, True, False, False, "there was no injection"),
+        (EventKind.ACCEPTED, False, False, False, False, "ended as ACCEPTED"),
+        (EventKind.TAKEN, True, False, True, False, "was TAKEN, but the PLC got it"),
+        (EventKind.WRITTEN, False, True, False, False, "the PLC never got it"),
+        (EventKind.TAKEN, True, False, False, True, "the PLC got 3, which no injection had given"),
+    ],
+)  # fmt: skip
+def test_what_goes_past_one_is_found(
+    source: Source, found: list[str], kind: EventKind, stood: bool, free: bool, landed: bool, answered: bool,
+    problem: str,
+) -> None:  # fmt: skip
+    guard = check(source, found)
+    if landed:
+        land(source, 2, 10)
+    if answered:
+        give(source, 3, 21)
+        land(source, 3, 20)
+    guard.written(2, kind, "", stood=stood, free=free)
+    guard.look(2)
+    assert len(found) == 1
+    assert problem in found[0]
+
+
+def test_one_that_nobody_keeps_goes_within_a_second(found: list[str]) -> None:
+    life = LifeCheck("n1", keep=False, ended_ns=10 * S, complain=found.append)
+    life.look(11 * S, stands=True, awake_since_ns=0, slack_ns=0)
+    life.look(14 * S, stands=True, awake_since_ns=13 * S, slack_ns=0)  # who lifts it was stopped
+    life.look(16 * S, stands=True, awake_since_ns=13 * S, slack_ns=2 * S)
+    life.look(20 * S, stands=True, awake_since_ns=0, slack_ns=0, renewed=True)
+    life.look(30 * S, stands=False, awake_since_ns=0, slack_ns=0)
+    assert found == []
+    late_ns = 10 * S + LIFTED_NS + 1
+    life.look(late_ns, stands=True, awake_since_ns=0, slack_ns=0)
+    life.look(late_ns + 1, stands=True, awake_since_ns=0, slack_ns=0)
+    assert found == ["the injection n1 still stands 1.0 s after its client's end"]
+
+
+def test_one_that_is_kept_stays(found: list[str]) -> None:
+    life = LifeCheck("n1", keep=True, ended_ns=10 * S, complain=found.append)
+    life.look(20 * S, stands=True, awake_since_ns=0, slack_ns=0)
+    life.look(20 * S, stands=False, awake_since_ns=0, slack_ns=0, renewed=True)
+    assert found == []
+    life.look(20 * S, stands=False, awake_since_ns=0, slack_ns=0)
+    assert found == ["the injection n1 was to be kept, but is gone"]
