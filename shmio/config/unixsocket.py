@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import secrets
 import socket
 import stat
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from shmio.errors import EndpointError
 
@@ -59,18 +62,38 @@ def listened_on(path: str) -> bool:
 
 
 class SocketFile:
-    """A socket that this process has made, to be removed when it no longer listens."""
+    """A socket that this process makes, to be removed when it no longer listens."""
 
     def __init__(self, path: str, gid: int | None) -> None:
-        """Let its user open it, or a group's users as well. EndpointError."""
+        """Its user may open it, or a group's users as well."""
         self._path = path
+        self._gid = gid
+        self._inode = 0
+
+    @contextmanager
+    def binding(self) -> Iterator[str]:
+        """Where to bind it; afterwards it is at its path. EndpointError: it cannot be, or something is there by now.
+
+        That is in a folder which nobody else can enter: nobody opens the socket before it has its mode, whatever the
+        process's umask is, which all threads share.
+        """
+        path, name = Path(self._path), secrets.token_hex(8)
         try:
-            if gid is not None:
-                os.chown(path, -1, gid)
-            Path(path).chmod(0o600 if gid is None else 0o660)
-            self._inode = os.lstat(path).st_ino
+            with TemporaryDirectory(prefix=".shmio-", dir=path.parent) as folder:
+                # By its descriptor, for a socket's path must be short.
+                inside = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
+                try:
+                    yield f"/proc/self/fd/{inside}/{name}"
+                    made = Path(folder) / name
+                    if self._gid is not None:
+                        os.chown(made, -1, self._gid)
+                    made.chmod(0o600 if self._gid is None else 0o660)
+                    os.link(made, path)  # not renamed: that would take the place of what is there by now
+                    self._inode = os.lstat(path).st_ino
+                finally:
+                    os.close(inside)
         except OSError as error:
-            raise EndpointError(f"unix:{path}: {error.strerror}") from None
+            raise EndpointError(f"unix:{self._path}: {error.strerror}") from None
 
     def remove(self) -> None:
         """Remove it, unless somebody else has one of that name by now."""

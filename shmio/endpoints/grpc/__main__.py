@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import grp
+import logging
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -15,6 +16,7 @@ from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.doors import Doors
 from shmio.endpoints.grpc.feeds import Feeds
 from shmio.endpoints.grpc.hold import Hold
+from shmio.endpoints.grpc.ration import Ration
 from shmio.endpoints.grpc.server import Server
 from shmio.endpoints.grpc.services import Services
 from shmio.errors import SegmentError, ShmioError
@@ -26,7 +28,12 @@ CALLS_S: Final = 1.0
 
 def run(worker: Worker) -> None:
     """Serve until told to stop."""
-    asyncio.run(_serve(worker))
+    log, ration = logging.getLogger("shmio.grpc"), Ration()
+    log.addFilter(ration)
+    try:
+        asyncio.run(_serve(worker))
+    finally:
+        log.removeFilter(ration)
 
 
 async def _serve(worker: Worker) -> None:

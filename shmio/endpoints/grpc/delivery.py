@@ -14,8 +14,9 @@ from shmio.errors import SegmentError
 from shmio.segment.clock import ClockState
 from shmio.segment.coordinator import Step
 
-PATIENCE_S: Final = 4.0
-"""So long clients have for the values of a step, and again for its marker; less than a step's own time-out together."""
+PATIENCE_S: Final = 3.0
+"""So long clients have for the values of a step, those of shmio.v1 after the others, and again for its marker; all
+together less than a step's own time-out."""
 
 log = logging.getLogger("shmio.grpc")
 

@@ -23,12 +23,13 @@ Decode = Callable[[bytes], Any]
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Of calls that are open at once, on all addresses together.
+    """Of calls, and connections, that are open at once, on all addresses together.
 
     When fewer than ``reserve`` are free, only a client with fewer than ``share`` gets another: one that opens thousands
     leaves room for the others.
     """
 
+    connections: int = 2048
     calls: int = 4096
     reserve: int = 1024
     share: int = 64

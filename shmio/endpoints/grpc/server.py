@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import logging
-import os
+import socket
 from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, Final
@@ -16,7 +17,8 @@ from grpc_reflection.v1alpha import reflection
 
 from shmio.config import Address, Tls, UnixAddress
 from shmio.config.tls import read_tls
-from shmio.config.unixsocket import SocketFile, clear
+from shmio.config.unixsocket import SocketFile, clear, listened_on
+from shmio.endpoints.grpc.descriptors import room
 from shmio.endpoints.grpc.doors import Listener
 from shmio.endpoints.grpc.gate import Calls, Gate
 from shmio.endpoints.grpc.health import Health
@@ -26,6 +28,9 @@ from shmio.errors import EndpointError
 MAX_REQUEST_BYTES = 1 << 20
 LOOK_S: Final = 0.2
 """Time between two looks whether gRPC still serves."""
+CLOSES_S: Final = 0.02
+"""Time between two looks whether a listener has closed."""
+FREE_S: Final = 10.0
 
 log = logging.getLogger("shmio.grpc")
 
@@ -51,6 +56,8 @@ class Server:
         self._files: dict[str, SocketFile] = {}
         self._keepers: list[asyncio.Task[None]] = []
         self._retiring: set[asyncio.Task[None]] = set()
+        self._connections = 1
+        """How many each address may have."""
         logging.getLogger("grpc._cython.cygrpc").addFilter(_is_news)
 
     @property
@@ -65,6 +72,11 @@ class Server:
         EndpointError names the address in the way.
         """
         credentials = _credentials(tls) if tls else None
+        wanted = self.calls.limits.connections
+        connections = room(wanted)
+        if connections < wanted:
+            log.warning("at most %d connections, not %d: the hard limit of open files is too low", connections, wanted)
+        self._connections = max(1, connections // len(listeners))
         ports = []
         for listener in listeners:
             server = self._server(Gate(listener.door, self.calls))
@@ -108,11 +120,23 @@ class Server:
                 task = asyncio.create_task(self._retire(server))
                 self._retiring.add(task)
                 task.add_done_callback(self._retiring.discard)
-                await asyncio.sleep(LOOK_S)  # it has to have closed: gRPC does not survive to find the port taken
+                await self._free(listener.address)
                 server = self._server(Gate(listener.door, self.calls))
                 self._servers[server] = None
                 self._bind(server, listener, credentials, gid)
                 await server.start()
+
+    async def _free(self, address: Address | UnixAddress) -> None:
+        """Wait until the one before has closed: gRPC does not survive to find the address taken (segmentation fault).
+
+        EndpointError: it is still taken after ``FREE_S``.
+        """
+        loop = asyncio.get_running_loop()
+        until_s = loop.time() + FREE_S
+        while taken(address):
+            if loop.time() > until_s:
+                raise EndpointError(f"grpc: cannot listen on {address} anew: it is still taken after {FREE_S:g} s")
+            await asyncio.sleep(CLOSES_S)
 
     async def _retire(self, server: grpc.aio.Server) -> None:
         """Let the calls of one that listens no more end by themselves. Not to be cancelled: gRPC would take it ill."""
@@ -134,18 +158,14 @@ class Server:
                 else:
                     port = server.add_insecure_port(str(address))
             else:
-                before = os.umask(0o177)
-                try:
-                    port = server.add_insecure_port(f"unix:{quote(address.path)}")
-                finally:
-                    os.umask(before)
+                self._files[address.path] = file = SocketFile(address.path, gid)
+                with file.binding() as place:
+                    port = server.add_insecure_port(f"unix:{quote(place)}")
         except RuntimeError:
             raise EndpointError(
                 f"grpc: cannot listen on {address}: another program has it (ss -ltnp shows which), or this host has no "
                 "such address"
             ) from None
-        if isinstance(address, UnixAddress):
-            self._files[address.path] = SocketFile(address.path, gid)
         return port
 
     def _server(self, gate: Gate) -> grpc.aio.Server:
@@ -156,6 +176,7 @@ class Server:
         options: list[tuple[str, Any]] = [
             *OPTIONS,
             ("grpc.max_concurrent_streams", most),
+            ("grpc.max_allowed_incoming_connections", self._connections),
             (pending, 4 * most),
             (f"{pending}_hard_limit", 8 * most),
         ]
@@ -165,6 +186,20 @@ class Server:
         names = [*self._services.names, health.SERVICE_NAME, reflection.SERVICE_NAME]
         reflection.enable_server_reflection(names, server)
         return server
+
+
+def taken(address: Address | UnixAddress) -> bool:
+    """Whether somebody listens there, so that nobody else can."""
+    if isinstance(address, UnixAddress):
+        return listened_on(address.path)
+    family = socket.AF_INET6 if ":" in address.host else socket.AF_INET
+    with socket.socket(family) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((address.host, address.port))
+            return False
+        except OSError as error:
+            return error.errno == errno.EADDRINUSE
 
 
 def _credentials(tls: Tls) -> grpc.ServerCredentials:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import AsyncIterator, Collection
+from contextlib import ExitStack
 from functools import partial
 from typing import Any, Final
 
@@ -126,7 +127,9 @@ class SimlogV1:
                 while True:
                     feed = self._topics.feed(topic.source)
                     encode = encoder(found, feed.block.layout)
-                    leave = lane.join(feed, Subject("v1", found.path, found.registers, encode))
+                    joined = ExitStack()
+                    joined.callback(lane.join(feed, Subject("v1", found.path, found.registers, encode)))
+                    outbox.on_failure = joined.close  # at once, though a client that does not read holds up the end
                     try:
                         if not told:
                             await context.send_initial_metadata(())  # who waits for it misses nothing from then on
@@ -134,7 +137,7 @@ class SimlogV1:
                         while (message := await outbox.pop()) is not None:
                             yield message
                     finally:
-                        leave()
+                        joined.close()
                     if outbox.failure:
                         await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, outbox.failure)
                     found = await self._find_again(topic, context)
@@ -143,14 +146,12 @@ class SimlogV1:
 
     async def _follow(self, mark: Mark, context: Context) -> AsyncIterator[bytes]:
         """Stream a topic of time."""
-        with self._outboxes.opened() as outbox:
-            leave = self._stepper.marks.listen(mark, _marked, StateLane(outbox))
-            try:
-                await context.send_initial_metadata(())
-                while (message := await outbox.pop()) is not None:
-                    yield message
-            finally:
-                leave()
+        with self._outboxes.opened() as outbox, ExitStack() as listening:
+            listening.callback(self._stepper.marks.listen(mark, _marked, StateLane(outbox)))
+            outbox.on_failure = listening.close
+            await context.send_initial_metadata(())
+            while (message := await outbox.pop()) is not None:
+                yield message
             await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, outbox.failure)
 
     def move(self, sources: Collection[str]) -> None:

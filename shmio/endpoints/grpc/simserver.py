@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Awaitable
+from functools import partial
 from typing import Any, Final
 
 import grpc
@@ -80,12 +81,13 @@ class SimServer:
         with self._outboxes.opened() as outbox:
             lane = StateLane(outbox)
             self._lanes[lane] = None
+            outbox.on_failure = partial(self._lanes.pop, lane, None)
             try:
                 await context.send_initial_metadata(())  # who waits for it misses nothing from then on
                 while (message := await outbox.pop()) is not None:
                     yield message
             finally:
-                del self._lanes[lane]
+                self._lanes.pop(lane, None)
             await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, outbox.failure)
 
     async def _answer(self, call: Awaitable[Status], context: Context) -> wire.SimStatus:

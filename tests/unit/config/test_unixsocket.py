@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from shmio.config.address import MAX_PATH_BYTES
 from shmio.config.unixsocket import SocketFile, clear, obstacle
 from shmio.errors import EndpointError
 
@@ -66,20 +67,56 @@ def test_what_is_no_socket_is_left(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("gid", "mode"), [(None, 0o600), (os.getegid(), 0o660)])
 def test_its_user_may_open_it_and_maybe_a_group(tmp_path: Path, gid: int | None, mode: int) -> None:
     path = tmp_path / "s"
-    with bound(path):
+    before = os.umask(0)  # as open as it gets
+    try:
         file = SocketFile(str(path), gid)
+        with file.binding() as place, bound(Path(place)) as listener:
+            assert not path.exists()
+            (folder,) = tmp_path.iterdir()
+            assert stat.S_IMODE(folder.stat().st_mode) == 0o700, "nobody else comes to it before it has its mode"
+            listener.listen(1)
         assert stat.S_IMODE(path.stat().st_mode) == mode
         assert path.stat().st_gid == os.getegid()
-        file.remove()
-        assert not path.exists()
-        file.remove()
+        assert os.umask(0) == 0, "which all threads share"
+    finally:
+        os.umask(before)
+    assert list(tmp_path.iterdir()) == [path]
+    file.remove()
+    assert not path.exists()
+    file.remove()
+
+
+def test_its_path_may_be_as_long_as_a_socket_s(tmp_path: Path) -> None:
+    path = tmp_path / ("s" * (MAX_PATH_BYTES - len(str(tmp_path)) - 1))
+    file = SocketFile(str(path), None)
+    with file.binding() as place:
+        bound(Path(place)).close()
+    assert path.is_socket()
+
+
+def test_what_has_come_there_meanwhile_stays(tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    file = SocketFile(str(path), None)
+    other = bound(tmp_path / "other")
+
+    def bind_late() -> None:
+        with file.binding() as place:
+            bound(Path(place)).close()
+            (tmp_path / "other").rename(path)
+
+    with other, pytest.raises(EndpointError, match=f"unix:{path}: File exists"):
+        bind_late()
+    assert path.is_socket()
+    file.remove()
+    assert path.is_socket()
 
 
 def test_another_ones_socket_of_that_name_stays(tmp_path: Path) -> None:
     path = tmp_path / "s"
+    file = SocketFile(str(path), None)
+    with file.binding() as place:
+        bound(Path(place)).close()
+    path.rename(tmp_path / "old")  # so that its inode is not given to the next
     with bound(path):
-        file = SocketFile(str(path), None)
-        path.rename(tmp_path / "old")  # so that its inode is not given to the next
-        with bound(path):
-            file.remove()
-            assert path.is_socket()
+        file.remove()
+        assert path.is_socket()

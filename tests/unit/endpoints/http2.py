@@ -54,10 +54,10 @@ class Connection:
         self._writer = writer
 
     @classmethod
-    async def open(cls, port: int) -> Self:
-        """Connected, and known by the server to speak HTTP/2."""
+    async def open(cls, port: int, *, deaf: bool = False) -> Self:
+        """Connected, and known by the server to speak HTTP/2. ``deaf``: its windows stay closed: it takes no data."""
         connection = cls(*await asyncio.open_connection("127.0.0.1", port))
-        await connection.send(PREFACE + frame(SETTINGS, 0, 0, b""))
+        await connection.send(PREFACE + frame(SETTINGS, 0, 0, b"\0\4\0\0\0\0" if deaf else b""))
         async with asyncio.timeout(TIMEOUT_S):
             head = await connection.reader.readexactly(9)
             assert head[3] == SETTINGS

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from contextlib import suppress
 from typing import Any
 
 import grpc
@@ -48,6 +49,43 @@ class Another:
         for stream in self.streams:
             stream.cancel()
         await self._channel.close()
+
+
+def test_connections_beyond_the_limit_are_closed_and_the_others_go_on(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        served.publish(image())
+        polite = Another(served)
+        await polite.open(1)
+        assert await value(polite.streams[0])
+        idle = [await http2.Connection.open(served.port) for _ in range(2)]
+        for _ in range(3):
+            reader, writer = await asyncio.open_connection("127.0.0.1", served.port)
+            with suppress(ConnectionResetError):
+                async with asyncio.timeout(TIMEOUT_S):
+                    assert await reader.read() == b"", "it is not even greeted"
+            writer.close()
+            with suppress(ConnectionResetError):
+                await writer.wait_closed()
+        await polite.open(1)
+        assert await value(polite.streams[1]), "who is there goes on"
+        await idle[0].drop(reset=True)
+
+        async def room() -> bool:
+            reader, writer = await asyncio.open_connection("127.0.0.1", served.port)
+            writer.write(http2.PREFACE + http2.frame(http2.SETTINGS, 0, 0, b""))
+            try:
+                async with asyncio.timeout(TIMEOUT_S):
+                    return bool(await reader.read(1))
+            except ConnectionResetError:
+                return False
+            finally:
+                writer.transport.abort()
+
+        await served.until(room)
+        await idle[1].drop(reset=True)
+        await polite.close()
+
+    serve(segment, test, Limits(connections=3))
 
 
 async def until_calls(served: Endpoint, count: int) -> None:

@@ -22,6 +22,7 @@ SILENT_MS = sum(value for name, value in server.OPTIONS if name.startswith("grpc
     ("what", "limit"),
     [
         ("a message from a client", server.MAX_REQUEST_BYTES // MIB),
+        ("connections open at once, on all addresses", LIMITS.connections),
         ("calls open at once, on all addresses", LIMITS.calls),
         (f"of these, left to clients with fewer than {LIMITS.share}", LIMITS.reserve),
         ("time for a call's one message to come", LIMITS.message_s),

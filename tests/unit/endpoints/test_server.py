@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import socket
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,8 @@ from urllib.parse import quote
 import grpc
 import pytest
 
-from shmio.config import UnixAddress
+from shmio.config import Address, UnixAddress
+from shmio.endpoints.grpc import server as module
 from shmio.endpoints.grpc.access import Door, Keys
 from shmio.endpoints.grpc.doors import Listener
 from shmio.endpoints.grpc.server import Server
@@ -113,3 +115,48 @@ def test_headers_that_are_no_text_leave_nothing_in_the_log(segment: Segment, cap
 
     serve(segment, test)
     assert not [record for record in caplog.records if record.exc_info]
+
+
+def test_it_listens_anew_only_when_the_one_before_has_closed(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """However late a busy machine lets it close: gRPC ends in a segmentation fault when it finds the port taken."""
+    looks: list[bool] = []
+    taken = module.taken
+
+    def busy(address: Address | UnixAddress) -> bool:
+        looks.append(len(looks) < 5 or taken(address))
+        return looks[-1]
+
+    monkeypatch.setattr(module, "taken", busy)
+
+    async def test(served: Endpoint) -> None:
+        connection = await http2.Connection.open(served.port)
+        await connection.send(NO_TEXT)
+        await served.until(told(caplog, 1))
+        await connection.drop(reset=True)
+        async with fresh(f"127.0.0.1:{served.port}") as channel:
+            assert await known(channel)
+        assert looks[:5] == [True] * 5
+        assert looks[-1] is False
+        assert served.server.alive
+
+    serve(segment, test)
+    caplog.clear()
+
+
+def test_an_address_is_taken_as_long_as_somebody_listens_there(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        address = Address(*listener.getsockname())
+        assert module.taken(address)
+        with socket.create_connection(listener.getsockname()):
+            accepted, _ = listener.accept()
+    with accepted:
+        assert not module.taken(address), "a connection that is left from it does not count"
+    file = UnixAddress(str(tmp_path / "s"))
+    assert not module.taken(file)
+    with socket.socket(socket.AF_UNIX) as local:
+        local.bind(file.path)
+        local.listen()
+        assert module.taken(file)
+    assert not module.taken(file)

@@ -11,8 +11,10 @@ import pytest
 from google.protobuf.empty_pb2 import Empty
 
 from shmio.endpoints.grpc import delivery
+from shmio.endpoints.grpc.native import service
 from shmio.segment import Segment
 from shmio.segment.coordinator import Coordinator
+from shmio.wire import shmio_v1_pb2 as ours
 from shmio.wire import simlog_v1_pb2 as v1
 from shmio.wire import simlog_v2_pb2 as v2
 from shmio.wire import simserver_pb2 as sim
@@ -83,7 +85,7 @@ def test_a_step_is_50_ms_unless_it_was_set_and_all_of_its_nanoseconds_are_told(i
         for wrong in (0, -1, 3_600_001):
             request = v1.StepSizeRequest(step=wrong)
             status, text = await refusal(served.stub.setStepSize(request, timeout=TIMEOUT_S))
-            assert (status, "a step is from 1 us to 1 h" in text) == (Status.INVALID_ARGUMENT, True)
+            assert (status, "a step is from 0.001 ms to 3600000 ms" in text) == (Status.INVALID_ARGUMENT, True)
 
     simulate(instance, test)
 
@@ -333,6 +335,46 @@ def test_one_that_does_not_read_ends_and_the_others_go_on(instance: str, monkeyp
     simulate(instance, test)
 
 
+DEAF = {
+    "v1": ("/simulation.server.SimlogAPI/Subscribe", v1.TopicDescriptor(path="sim/row").SerializeToString()),
+    "shmio": ("/shmio.v1.Shmio/Subscribe", ours.SubscribeRequest(patterns=["sim/row"]).SerializeToString()),
+}
+
+
+@pytest.mark.parametrize("wire", DEAF)
+def test_one_that_takes_nothing_costs_one_step_and_holds_nothing_any_more(
+    instance: str, monkeypatch: pytest.MonkeyPatch, wire: str
+) -> None:
+    def patience(for_s: float) -> None:
+        for module in (delivery, service):
+            monkeypatch.setattr(module, "PATIENCE_S", for_s)
+
+    async def test(served: Endpoint, models: Models) -> None:
+        patience(0.5)
+        connection = await http2.Connection.open(served.port, deaf=True)
+        await connection.send(http2.call(*DEAF[wire]))
+        reader = await served.subscriber("reader", "sim/count")
+
+        def given_up() -> bool:
+            streams = served.service._native._open
+            return any(outbox.failure for outbox in served.service._outboxes._open) or any(one.late for one in streams)
+
+        number = 0
+        while not given_up():
+            assert await step(served) == 0
+            number += 1
+        patience(3600)
+        for _ in range(3):
+            assert await step(served) == 0
+        got = await messages(reader, number + 4)
+        assert got == [("sim/count", float(n)) for n in range(number + 4)]
+        assert {subject.path for subject in served.feeds["sim"]._channels} == {"count"}
+        assert not any(one._followers for one in served.service._native._open)
+        await connection.drop(reset=True)
+
+    simulate(instance, test)
+
+
 def test_a_step_goes_to_its_end_without_its_client(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         stream = await served.subscriber("one", "SIMLOG://step")
@@ -483,7 +525,7 @@ def test_wrong_steps_are_refused(instance: str) -> None:
             served.time.start(sim.StartRequest(deltaTime=3_600_001), timeout=TIMEOUT_S),
         ):
             status, text = await refusal(call)
-            assert (status, "a step is from 1 us to 1 h" in text) == (Status.INVALID_ARGUMENT, True)
+            assert (status, "a step is from 0.001 ms to 3600000 ms" in text) == (Status.INVALID_ARGUMENT, True)
         assert not served.segment.clock.read().playing
 
     simulate(instance, test)

@@ -137,7 +137,7 @@ class NativeService:
         if marks:
             _, late = await asyncio.wait(marks, timeout=PATIENCE_S)
             for mark in late:
-                marks[mark].late = True
+                marks[mark].give_up()
 
     def move(self, sources: Collection[str]) -> None:
         """Have the streams of these sources go over to the blocks that there are by now."""

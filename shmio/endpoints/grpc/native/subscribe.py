@@ -55,7 +55,7 @@ class Subscription:
         check(request)
         self.updates = 0
         self.late = False
-        """Whether a step has waited too long for it."""
+        """Whether a step has waited too long for it; see :meth:`give_up`."""
         self._hold = hold
         self._marks: deque[tuple[Step, asyncio.Future[None]]] = deque()
         self._selections = selections
@@ -83,6 +83,12 @@ class Subscription:
             _set(self._marks.popleft()[1])
         for place in self._wanted:
             self._leave(place)
+
+    def give_up(self) -> None:
+        """Nothing waits for it any more, and it ends as soon as its client reads again; what it holds goes at once."""
+        self.late = True
+        self.close()
+        self._news.set()
 
     def move(self, sources: Collection[str]) -> None:
         """A reload has changed these sources."""

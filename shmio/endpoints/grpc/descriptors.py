@@ -1,0 +1,23 @@
+"""How many connections the process has descriptors for: they must not run out, for then nothing works any more."""
+
+from __future__ import annotations
+
+import resource
+from typing import Final
+
+OWN: Final = 256
+"""What the process needs beside connections, and far more."""
+EACH: Final = 2
+"""Descriptors set aside for a connection: an address that had to listen anew may have those of before as well."""
+
+
+def room(wanted: int) -> int:
+    """So many connections, or as many as the limit of open files allows, which is raised as far as it may be."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    needed = OWN + EACH * wanted
+    if soft != resource.RLIM_INFINITY and soft < needed:
+        soft = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    if soft == resource.RLIM_INFINITY:
+        return wanted
+    return max(1, min(wanted, (soft - OWN) // EACH))
