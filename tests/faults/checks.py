@@ -104,6 +104,8 @@ class FrameCheck:
         if frame.incarnation < last.incarnation:
             self._say(frame, f"incarnation {last.incarnation} was here before")
         again = frame.cycle == last.cycle and frame.quality is last.quality is Quality.GOOD
+        if again and self.source.given is not None:
+            again = frame.raw != last.raw  # what is injected is shown at once, over the image that there is
         if frame.cycle < last.cycle or again:
             self._say(frame, f"cycle {last.cycle} was here before, in frame {last.number}")
         if frame.publish_ns < last.publish_ns:
