@@ -148,6 +148,8 @@ def child_environment() -> dict[str, str]:
     the standard library).
     """
     environment = dict(os.environ, PYTHONFAULTHANDLER="1")
+    # gRPC prints a line for each bad handshake, which any client may send, into a log that would not even rotate then.
+    environment.setdefault("GRPC_VERBOSITY", "NONE")
     for name in NOTIFY_VARIABLES:  # a child must not speak to the service manager in the supervisor's name
         environment.pop(name, None)
     root = Path(shmio.__file__).parents[1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import grp
 import os
+import socket
 import stat
 import subprocess
 import sys
@@ -85,6 +86,35 @@ def test_tokens_come_and_go_with_reloads(guarded: Cell) -> None:
     assert "took tokens and roles anew" in told
     assert DASH not in told
     assert OTHER not in told
+
+
+def test_bad_handshakes_leave_nothing_in_the_log(make_cell: Callable[..., Cell], tmp_path: Path) -> None:
+    """gRPC itself would print a line for each."""
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    words = [
+        "openssl",
+        "req",
+        "-x509",
+        "-newkey",
+        "rsa:2048",
+        "-nodes",
+        "-days",
+        "2",
+        "-subj",
+        "/CN=localhost",
+        "-keyout",
+    ]
+    subprocess.run([*words, key, "-out", certificate], check=True, capture_output=True)
+    key.chmod(0o600)
+    cell = make_cell(config=CONFIG + '[grpc.tls]\ncertificate = "certificate.pem"\nkey = "key.pem"\n')
+    cell.up()
+    log = cell.folder / "logs/grpc.log"
+    before = log.read_text()
+    for _ in range(20):
+        with socket.create_connection((cell.grpc.host, cell.grpc.port)) as rude:
+            rude.sendall(b"GET / HTTP/1.1\r\n\r\n")
+            rude.recv(1)
+    assert log.read_text() == before
 
 
 def test_a_unix_socket_is_cleared_after_a_death_and_removed_at_the_end(guarded: Cell) -> None:
