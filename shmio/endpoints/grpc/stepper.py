@@ -83,7 +83,7 @@ class Stepper:
     async def start(self, predecessor: int = 0) -> None:
         """Begin to follow time; go on playing if the process before this one, by its pid, did when it died."""
         self._page = Bell(self._clock.bell, "clock")
-        self._page.listeners[self._look] = None
+        self._page.listeners[self.look] = None
         state = self._clock.told()
         if state.playing and state.owner == predecessor:  # what another program that died has played stands
             try:
@@ -195,11 +195,11 @@ class Stepper:
                 if not self._owns:
                     self._coordinator.take_over()
                     self._own(True)
-                    self._look()
+                    self.look()
                 yield
             finally:
                 self._moving = None
-                self._look()
+                self.look()
                 self._set_rest()
 
     def _own(self, owns: bool) -> None:
@@ -271,8 +271,8 @@ class Stepper:
         if await self._delivery.deliver(step, mark):
             self._coordinator.delivered(self._slot, step.number)
 
-    def _look(self) -> None:
-        """Heed what the page says by now."""
+    def look(self) -> None:
+        """Heed what the page says by now; also called now and then, for the death of who plays rings no bell."""
         state = self._clock.read()
         if state.virtual and not self.hold.on:
             self._delivery.begin(before(state))

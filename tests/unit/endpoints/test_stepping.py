@@ -472,6 +472,20 @@ def test_an_endpoint_goes_on_playing_what_its_predecessor_did_and_nobody_elses(i
             model.stop()
 
 
+def test_the_death_of_a_program_that_plays_is_told(instance: str) -> None:
+    async def test(served: Endpoint, models: Models) -> None:
+        statuses = served.time.subscribe(Empty(), timeout=TIMEOUT_S)
+        await statuses.initial_metadata()
+        with Segment.open(instance, writable=True) as dying:  # without giving time up
+            Coordinator(dying).set_playing(True)
+            assert (await asyncio.wait_for(statuses.read(), TIMEOUT_S)).playing
+        served.service.stepper.look()
+        assert not (await asyncio.wait_for(statuses.read(), TIMEOUT_S)).playing
+        assert await step(served) == 0, "it is anybody's again"
+
+    simulate(instance, test)
+
+
 def test_steps_of_several_clients_are_made_one_after_another(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         stream = await served.subscriber("one", "sim/count", "SIMLOG://step")
