@@ -117,10 +117,17 @@ class RecordedSteps:
 
     complain: Complain
 
-    def check(self, done: set[int], marks: set[int], cycles: Mapping[str, set[int]], missed: Mapping[str, int]) -> None:
-        """``done``: steps that were; ``marks``: those that it tells of; ``cycles``: of the frames in it, by source.
+    def check(
+        self,
+        done: set[int],
+        failed: set[int],
+        marks: set[int],
+        cycles: Mapping[str, set[int]],
+        missed: Mapping[str, int],
+    ) -> None:
+        """``done``: steps that were told to be, ``failed``: not to be. ``marks``: those that it tells of.
 
-        ``missed``: frames that its gaps tell of.
+        ``cycles``: of the frames in it, by source. ``missed``: frames that its gaps tell of.
         """
         for name in PARTICIPANTS:
             lost = done - cycles.get(name, set())
@@ -130,5 +137,5 @@ class RecordedSteps:
                     f"{len(lost)} frames of {name} are not recorded, of steps {some}, ..., and its gaps tell of "
                     f"{missed.get(name, 0)}"
                 )
-        if wrong := {mark for mark in marks if mark not in done and mark + 1 in done and mark - 1 in done}:
+        if wrong := marks & failed:
             self.complain(f"the recording tells that steps {sorted(wrong)[:5]} are done, which have failed")

@@ -69,13 +69,19 @@ class Stepper:
         except ShmioError as error:
             if not cell.current:
                 return
-            self._check.failed(before, str(error), dt_ms * 10**6, cell.clock)
-            say(failed=str(error))
+            after = cell.clock
+            self._check.failed(before, str(error), dt_ms * 10**6, after)
+            say(failed=str(error), epoch=_epoch(cell), undone=0 if after.done == after.step else after.step)
             return
         after = cell.clock
         answers = {name: answer for name in PARTICIPANTS if (answer := _answer(cell.block(name), number))}
         self._check.done(before, number, dt_ms * 10**6, after, answers)
-        say(step=number, begun_ns=begun_ns, epoch=f"{cell._segment.header.epoch:016x}")
+        say(step=number, begun_ns=begun_ns, epoch=_epoch(cell))
+
+
+def _epoch(cell: Attachment) -> str:
+    """What tells one run of an instance from the next, as recordings have it."""
+    return f"{cell._segment.header.epoch:016x}"
 
 
 def _answer(block: Block, number: int) -> Answer | None:
