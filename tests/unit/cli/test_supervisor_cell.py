@@ -133,42 +133,29 @@ def test_a_day_in_the_life_of_the_cell(cell: Cell) -> None:
     assert json.loads(cell.run("status", "--json", status=1).stdout)["state"] == "stopped"
 
 
-def test_down_clears_what_a_killed_supervisor_left(cell: Cell) -> None:
-    cell.run("up", "--detach", status=0)
-    status = cell.status()
-    os.kill(status["supervisor"]["pid"], signal.SIGKILL)
+def kill_supervisor(cell: Cell) -> None:
+    os.kill(cell.status()["supervisor"]["pid"], signal.SIGKILL)
     until(lambda: cell.look().supervisor is None, "the supervisor's death")
+
+
+def test_what_a_killed_supervisor_left_is_taken_over_or_cleared(cell: Cell) -> None:
+    cell.run("up", "--detach", status=0)
+    processes = cell.status()["processes"]
+    kill_supervisor(cell)
     assert "supervisor of instance" in cell.run("restart", "cell", status=1).stderr
-    lines = cell.run("down", status=0).stdout
-    for process in status["processes"]:
-        assert f"stopped {process['name']}, pid {process['pid']}, which had lost its supervisor\n" in lines
-    assert cell.instance not in instances()
-    assert not list((cell.folder / "run" / "shmio").iterdir())
-
-
-def test_up_tells_what_it_takes_over_of_a_killed_supervisor(cell: Cell) -> None:
-    cell.run("up", "--detach", status=0)
-    status = cell.status()
-    os.kill(status["supervisor"]["pid"], signal.SIGKILL)
-    until(lambda: cell.look().supervisor is None, "the supervisor's death")
     ours = "shmio-supervisor up takes them over, shmio-supervisor down stops them"
     assert ours in cell.run("status", status=0).stdout
     named = f"shmio-supervisor up -c FILE takes them over, shmio-supervisor down --instance {cell.instance} stops them"
     assert named in cell.run("status", "--instance", cell.instance, status=0).stdout
     lines = cell.run("up", "--detach", status=0).stdout
-    for process in status["processes"]:
+    for process in processes:
         assert f"took over {process['name']}, pid {process['pid']}, which had lost its supervisor\n" in lines
-    cell.run("down", status=0)
-
-
-def test_the_logs_of_another_instance_are_left_alone(cell: Cell) -> None:
-    cell.run("up", "--detach", status=0)
-    other = cell.folder / "other.toml"
-    text = (cell.folder / "supervisor.toml").read_text().replace(f'"{cell.instance}"', '"other"')
-    other.write_text(text.replace('listen = "127.0.0.1:', 'listen = "127.0.0.1:0" #'))
-    refused = cell.run("up", "-c", "other.toml", status=1).stderr
-    assert refused.startswith(f"instance.log_dir: instance {cell.instance!r} writes its logs to ")
-    cell.run("down", status=0)
+    kill_supervisor(cell)
+    lines = cell.run("down", status=0).stdout
+    for process in processes:
+        assert f"stopped {process['name']}, pid {process['pid']}, which had lost its supervisor\n" in lines
+    assert cell.instance not in instances()
+    assert not list((cell.folder / "run" / "shmio").iterdir())
 
 
 def test_a_block_without_a_number_is_played_and_read(cell: Cell) -> None:
@@ -258,11 +245,15 @@ def test_a_left_over_segment_without_processes_hides_no_taken_port(cell: Cell) -
     assert error.startswith(f"grpc: cannot listen on 127.0.0.1:{port}: another program listens there; ")
 
 
-def test_a_port_that_another_instance_has_is_said_to_be_its(cell: Cell) -> None:
+def test_what_another_instance_has_is_said_to_be_its(cell: Cell) -> None:
     serve_on(cell, f"127.0.0.1:{free_port()}")
     cell.run("up", "--detach", status=0)
-    text = (cell.folder / "supervisor.toml").read_text()
-    text = text.replace(f'"{cell.instance}"', f'"{cell.instance}-2"\nlog_dir = "logs-2"')
+    text = (cell.folder / "supervisor.toml").read_text().replace(f'"{cell.instance}"', f'"{cell.instance}-2"')
+    elsewhere = text.replace('listen = "127.0.0.1:', 'listen = "127.0.0.1:0" #')
+    (cell.folder / "second.toml").write_text(elsewhere.replace("listen = [", 'listen = ["127.0.0.1:0"] #'))
+    refused = cell.run("up", "-c", "second.toml", status=1).stderr
+    assert refused.startswith(f"instance.log_dir: instance {cell.instance!r} writes its logs to ")
+    text = text.replace(f'"{cell.instance}-2"', f'"{cell.instance}-2"\nlog_dir = "logs-2"')
     for name, listen in (("plc", r'listen = "127.0.0.1:(\d+)"'), ("grpc", r'listen = \["127.0.0.1:(\d+)"\]')):
         port = re.search(listen, text)
         assert port is not None
