@@ -78,8 +78,8 @@ class Orders:
         """Lay an injection as long as the stream is open, or for good; originals down, other values up.
 
         NOT_FOUND: no such register; INVALID_ARGUMENT: no injection, or values that are none of it; FAILED_PRECONDITION:
-        the source refuses it, and says why; RESOURCE_EXHAUSTED: too many streams, or what is written is not read;
-        ABORTED: somebody else has lifted it.
+        the source refuses it, and says why; RESOURCE_EXHAUSTED: too many streams; ABORTED: somebody else has lifted
+        it, or what is written is not read.
         """
         opening: asyncio.Task[bytes] | None = None
         taking: asyncio.Task[None] | None = None
