@@ -17,7 +17,7 @@ from shmio.segment.scan import ChangeScan
 
 log = logging.getLogger("shmio.grpc")
 
-CATCH_UP_FRAMES = 32
+CATCH_UP_FRAMES = 48
 """A feed that is further behind than this goes on with the newest frame: what it skips is conflated, not lost.
 
 So does one that nobody listens to.

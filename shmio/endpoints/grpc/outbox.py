@@ -10,14 +10,14 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, Final
 
-from shmio.endpoints.grpc.feed import CATCH_UP_FRAMES, Feed
+from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.load import Load, Total
 from shmio.endpoints.grpc.pace import LATE_S, Pace
 from shmio.endpoints.grpc.subject import Subject
 from shmio.segment.events import EVENT_SLOTS
 
-TOPIC_BOUND: Final = 2 * CATCH_UP_FRAMES
-"""Values of one topic that may wait; a feed that catches up delivers half as many at once."""
+TOPIC_BOUND: Final = 64
+"""Values of one topic that may wait: more than a feed that catches up delivers."""
 STATE_BOUND: Final = 4096
 """When so many values of all topics of a stream wait, it is given only the newest of each."""
 EVENT_BOUND: Final = 2 * EVENT_SLOTS

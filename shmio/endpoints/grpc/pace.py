@@ -6,6 +6,8 @@ from typing import Final
 
 WINDOW_S: Final = 0.25
 """So often it is looked at."""
+BEHIND_S: Final = 2.0
+"""So long a client is far behind; then it is tried again, for what it loses meanwhile does not say how fast it is."""
 PART: Final = 3
 """A client that has lost more than one in so many values is far behind."""
 LATE_S: Final = 0.002
@@ -25,9 +27,9 @@ class Pace:
     def offer(self, now_s: float) -> None:
         """There is a value for it."""
         if now_s >= self._until_s:
-            self.behind = PART * self._lost > self._offered
+            self.behind = not self.behind and PART * self._lost > self._offered
             self._offered = self._lost = 0
-            self._until_s = now_s + WINDOW_S
+            self._until_s = now_s + (BEHIND_S if self.behind else WINDOW_S)
         self._offered += 1
 
     def lose(self, count: int) -> None:
