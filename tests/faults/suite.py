@@ -111,8 +111,9 @@ class Run:
             self.complain(f"segments left behind: {left}")
         if processes := marked(self._instance):
             self.complain(f"processes left behind: {processes}")
-        known = {".toml", ".db", ".truth", ".mem", ".so", ".log", ".1", ".2", ".3", ".py", ".pyc"}
-        files = [file for file in self._folder.rglob("*") if not file.is_dir() and file.suffix not in known]
+        known = {".toml", ".db", ".truth", ".mem", ".so", ".log", ".1", ".2", ".3", ".py"}
+        found = [file for file in self._folder.rglob("*") if not file.is_dir() and file.parent.name != "__pycache__"]
+        files = [file for file in found if file.suffix not in known]
         names = {str(file.relative_to(self._folder)) for file in files} - {"clock", "reader", "logs/.instance"}
         if names:
             self.complain(f"files left behind: {sorted(names)}")
