@@ -11,6 +11,7 @@ import msgspec
 
 from shmio.config import Declaration
 from shmio.config.campaign import parse_campaign
+from shmio.config.declaration import MAX_DECLARATIONS
 from shmio.endpoints.grpc import desk
 from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.feed import Feed
@@ -45,6 +46,10 @@ class Campaign:
 
     def __init__(self, feeds: Mapping[str, Feed], request: wire.DeclareRequest, turn: asyncio.Lock) -> None:
         """``turn``: calls are looked at one after another. ConfigError, ValueRangeError: what is declared cannot be."""
+        if len(request.declarations) > MAX_DECLARATIONS:  # before looking at any: nobody is served meanwhile
+            raise ValueRangeError(
+                f"{len(request.declarations)} injections are declared, {MAX_DECLARATIONS} are the most"
+            )
         tables = [declaration_from_wire(one, f"injection[{index}]") for index, one in enumerate(request.declarations)]
         if not tables:
             raise ValueRangeError("no injection is declared")

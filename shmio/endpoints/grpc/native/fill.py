@@ -32,11 +32,16 @@ class Fill:
             slots = part.slots or range(self._selection.columns.sizes[column])
             if len(slots) != len(part.values):
                 raise ValueRangeError(f"{name}: {len(part.values)} values for {len(slots)} slots")
+            most = self._selection.columns.sizes[column]
+            if len(slots) > max(1, most):  # else one message could hold up everybody
+                raise ValueRangeError(f"{name}: {len(slots)} values, the table has {most}: give each once")
             for slot, value in zip(slots, part.values, strict=True):
                 self._put(*self._at(column, slot), value, image)
 
     def assigned(self, assignments: Any, image: bytearray) -> None:
         """Values by paths, with or without the source. PathError: no such register in the table; ValueRangeError."""
+        if len(assignments) > (most := self._selection.elements):
+            raise ValueRangeError(f"assignments: {len(assignments)} values, the table has {most}: give each once")
         order = self._selection.block.layout.byte_order
         for assignment in assignments:
             register = self._paths.get(assignment.path)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.native.columns import Array
 from shmio.endpoints.grpc.native.selection import MAX_PATTERNS, Place
+from shmio.endpoints.grpc.native.values import MAX_VALUES
 from shmio.endpoints.grpc.topics import Topics
 from shmio.errors import PathError, ValueRangeError
 from shmio.layout.topic import Topic, shorten
@@ -104,11 +105,13 @@ class Ranges:
                 yield field(_PIECES, wire.Piece(offset=start, data=data, mask=mask).SerializeToString())
 
 
-def raw_writes(pieces: Iterable[wire.Piece], bits: bytes) -> list[Write]:
+def raw_writes(pieces: Collection[wire.Piece], bits: bytes) -> list[Write]:
     """What raw bytes that a client gives write; ``bits``: what its injection is over.
 
-    ValueRangeError: it is not over all of them.
+    ValueRangeError: it is not over all of them, or they are too many.
     """
+    if len(pieces) > MAX_VALUES:
+        raise ValueRangeError(f"{len(pieces)} pieces, {MAX_VALUES} are the most: join neighbours, or give less at once")
     cover = np.frombuffer(bits, np.uint8)
     image, given = np.zeros(len(bits), np.uint8), np.zeros(len(bits), np.uint8)
     spans = []

@@ -38,6 +38,10 @@ def outcome(kind: EventKind, reason: str) -> wire.Outcome:
 
 def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, object]]:
     """The source, and values by their paths in it. PathError, ValueRangeError; CommandError: ``/out``."""
+    if len(assignments) > MAX_VALUES:  # before looking at any: it takes its time, in which nobody is served
+        raise ValueRangeError(
+            f"{len(assignments)} values, {MAX_VALUES} are the most: write whole arrays, or less at once"
+        )
     values: dict[str, object] = {}
     sources: dict[str, None] = {}
     for assignment in assignments:
@@ -51,8 +55,6 @@ def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, object]]:
         sources[topic.source] = None
     if not values:
         raise ValueRangeError("no value is given")
-    if len(values) > MAX_VALUES:
-        raise ValueRangeError(f"{len(values)} values, {MAX_VALUES} are the most: write whole arrays, or less at once")
     if len(sources) > 1:
         raise ValueRangeError(f"one call is for one source, these values are for {', '.join(sorted(sources))}")
     return next(iter(sources)), values

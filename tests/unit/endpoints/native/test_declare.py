@@ -193,6 +193,15 @@ def test_messages_that_make_no_sense(segment: Segment) -> None:
     with_plant(segment, test)
 
 
+def test_too_many_are_refused_before_any_is_looked_at(segment: Segment) -> None:
+    async def test(served: Endpoint, _: Plant) -> None:
+        call = stub(served).Declare(wire.DeclareRequest(declarations=[wire.Declaration()] * 257), timeout=TIMEOUT_S)
+        code, text = await refusal(call.read())
+        assert (code, text) == (Status.INVALID_ARGUMENT, "257 injections are declared, 256 are the most")
+
+    with_plant(segment, test)
+
+
 def test_with_asyncio(segment: Segment) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
         async with connect_aio(f"127.0.0.1:{served.port}") as cell:

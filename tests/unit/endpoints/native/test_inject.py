@@ -360,6 +360,21 @@ def test_what_is_no_range(segment: Segment) -> None:
     with_client(segment, test)
 
 
+def test_too_many_pieces_are_refused_before_any_is_looked_at(segment: Segment) -> None:
+    async def test(served: Endpoint, _: Plant) -> None:
+        call = stub(served).Inject(timeout=TIMEOUT_S)
+        lay = wire.Lay(source="cell", ranges=[wire.Range(offset=26, size=600)], quiet=True)
+        await call.write(wire.InjectRequest(lay=lay))
+        shadow = wire.Shadow(sequence=1, pieces=[wire.Piece(offset=26, data=b"x")] * 4097)
+        await call.write(wire.InjectRequest(shadow=shadow))
+        while not (answers := (await asyncio.wait_for(call.read(), TIMEOUT_S)).answers):
+            pass
+        assert answers[0].outcome.reason.startswith("4097 pieces, 4096 are the most")
+        call.cancel()
+
+    with_plant(segment, test)
+
+
 def test_what_a_declared_one_makes_is_not_an_original(segment: Segment) -> None:
     """And does not hide the source's own value either."""
 

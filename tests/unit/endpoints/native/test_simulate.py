@@ -182,6 +182,11 @@ def test_one_that_joins_again_goes_on_from_what_was_shown(instance: str) -> None
         ({"assignments": assigned(**{"lamps/in": [True] * 10})}, "lamps/in: it is none of the outputs"),
         ({"values": wire.Values(doubles=wire.Doubles(slots=[7], values=[1.0]))}, "doubles: the table has no slot 7"),
         ({"values": wire.Values(doubles=wire.Doubles(values=[1.0, 2.0]))}, "doubles: 2 values for 1 slots"),
+        (
+            {"values": wire.Values(doubles=wire.Doubles(slots=[0, 0], values=[1, 2]))},
+            "doubles: 2 values, the table has 1",
+        ),
+        ({"assignments": assigned(**{"axis/count": 1}) * 22}, "assignments: 22 values, the table has 21"),
         ({"values": wire.Values(floats=wire.Floats(slots=[0], values=[1.0]))}, "floats: the table has no slot 0"),
     ],
 )
