@@ -147,9 +147,10 @@ class Stepper:
         if self._player is None:
             self._coordinator.close()
         self._driver.stop()
-        if self._page is not None:
-            self._page.stop()
-            self._page.join()
+        page, self._page = self._page, None  # what was broken off may still give up time, and have it ring again
+        if page is not None:
+            page.stop()
+            page.join()
 
     # ---- moving time ---------------------------------------------------------------------------------------------
 

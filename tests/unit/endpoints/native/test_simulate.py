@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import threading
 from collections.abc import Callable
@@ -14,6 +15,7 @@ import pytest
 
 from shmio.client import Client, Simulation, connect, connect_aio
 from shmio.client.model import Values
+from shmio.endpoints.grpc import stepper
 from shmio.errors import (
     CommandError,
     ConflictError,
@@ -329,6 +331,30 @@ def test_a_reload_ends_it_and_it_may_join_the_new_one(instance: str) -> None:
 
     with remote_segment(instance) as segment:
         asyncio.run(run(segment))
+
+
+def test_an_endpoint_that_ends_within_a_step_gives_time_up_once(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stepper, "REST_S", 0.02)
+
+    async def test(served: Endpoint, drive: Running) -> None:
+        wrong: list[dict[str, Any]] = []
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(lambda _, context: wrong.append(context))
+        model = Raw(served)
+        await model.join()
+        step = asyncio.create_task(served.service.stepper.step(20_000_000))
+        await model.work()
+        await served.service.stepper.stop()
+        with pytest.raises(asyncio.CancelledError):
+            await step
+        rested = asyncio.Event()
+        loop.call_later(5 * stepper.REST_S, rested.set)  # longer than whoever moved time rests
+        await rested.wait()
+        gc.collect()
+        assert wrong == []
+        model.call.cancel()
+
+    serve_remote(instance, test)
 
 
 # ---- the clients -----------------------------------------------------------------------------------------------------
