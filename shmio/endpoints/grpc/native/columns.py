@@ -165,6 +165,23 @@ class Columns:
             arrays[column][part.slots] = data[part.bytes].view(part.kind)[:, 0]
         return arrays
 
+    def encode(self, column: Column, slots: Array, values: Array, image: bytearray) -> Array:
+        """Put values at slots, which there are, into an image; which ``slots`` are no plain numbers, or do not fit."""
+        data, left = np.frombuffer(image, np.uint8), np.full(len(slots), column is not Column.BOOL)
+        if column is Column.BOOL:
+            slots, last = np.unique(slots[::-1], return_index=True)
+            where, shifts = (part[slots] for part in self._bits)
+            np.bitwise_and.at(data, where, ~(np.uint8(1) << shifts))
+            np.bitwise_or.at(data, where, values[::-1][last].astype(np.uint8) << shifts)
+        for part in (part for other, part in self._numbers if other is column):
+            mine = (slots >= part.slots.start) & (slots < part.slots.stop)
+            if part.kind.kind != "f":
+                mine &= (values >= np.iinfo(part.kind).min) & (values <= np.iinfo(part.kind).max)
+            numbers = values[mine].astype(part.kind)[:, None]
+            data[part.bytes[slots[mine] - part.slots.start]] = numbers.view(np.uint8)
+            left &= ~mine
+        return np.flatnonzero(left)
+
     def decode(self, image: bytes) -> Decoded:
         """All elements of an image of the block."""
         arrays = self.decode_numbers(image)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from shmio.endpoints.grpc.native.columns import Column
+import numpy as np
+
+from shmio.endpoints.grpc.native.columns import KINDS, Column
 from shmio.endpoints.grpc.native.values import FIELDS, index_of, plain
 from shmio.endpoints.grpc.native.views import Selection
 from shmio.errors import PathError, ValueRangeError
@@ -29,14 +31,20 @@ class Fill:
             if not values.HasField(name):
                 continue
             part = getattr(values, name)
-            slots = part.slots or range(self._selection.columns.sizes[column])
+            columns = self._selection.columns
+            most = columns.sizes[column]
+            slots = np.fromiter(part.slots or range(most), np.int64)
             if len(slots) != len(part.values):
                 raise ValueRangeError(f"{name}: {len(part.values)} values for {len(slots)} slots")
-            most = self._selection.columns.sizes[column]
             if len(slots) > max(1, most):  # else one message could hold up everybody
                 raise ValueRangeError(f"{name}: {len(slots)} values, the table has {most}: give each once")
-            for slot, value in zip(slots, part.values, strict=True):
-                self._put(*self._at(column, slot), value, image)
+            if len(wrong := np.flatnonzero(slots >= most)):
+                raise ValueRangeError(f"{name}: the table has no slot {slots[wrong[0]]}")
+            left = np.arange(len(slots))
+            if column in KINDS:
+                left = columns.encode(column, slots, np.fromiter(part.values, KINDS[column]), image)
+            for at in left.tolist():
+                self._put(*self._at(column, int(slots[at])), part.values[at], image)
 
     def assigned(self, assignments: Any, image: bytearray) -> None:
         """Values by paths, with or without the source. PathError: no such register in the table; ValueRangeError."""

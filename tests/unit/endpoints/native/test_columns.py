@@ -95,6 +95,41 @@ def test_what_goes_by_wire_is_what_the_codec_says(
     assert list(now.invalid) == invalid
 
 
+@given(paths=chosen, little=st.booleans(), one=seeds, other=seeds, part=seeds)
+def test_what_a_client_gives_is_what_the_codec_makes_of_it(
+    paths: list[str], little: bool, one: int, other: int, part: int
+) -> None:
+    registers, layout = [BY_PATH[path] for path in paths], LITTLE if little else LAYOUT
+    columns = Columns(registers, layout.byte_order)
+    image, given = random_image(one), columns.decode_numbers(random_image(other))
+    found, wanted = bytearray(image), bytearray(image)
+    random = np.random.default_rng(part)
+    for column, values in given.items():
+        slots = np.concatenate([random.permutation(len(values))[: part % 9], random.integers(0, len(values), 2)])
+        left = set(columns.encode(column, slots, values[slots], found).tolist())
+        for at, slot in enumerate(slots.tolist()):
+            place = columns.place(column, slot)
+            assert place is not None
+            register = registers[place]
+            if at in left:
+                assert register.element.base in ("S5TIME", "TIME_OF_DAY", "LTOD")
+                continue
+            if register.dims:
+                flat = np.unravel_index(slot - columns.places[place][1], register.shape)
+                index = tuple(int(i) + low for i, (low, _) in zip(flat, register.dims, strict=True))
+                register = layout.element(register, index)
+            codec(register, layout.byte_order).encode_into(values[slot].item(), wanted)
+    assert found == wanted
+
+
+def test_numbers_that_do_not_fit_are_left() -> None:
+    register = Register("count", "INT", (), 0, None, 2, 1)
+    columns, image = Columns([register], "big"), bytearray(2)
+    slots = np.zeros(3, np.int64)
+    assert columns.encode(Column.INT32, slots, np.array([1 << 15, -2, -(1 << 15) - 1]), image).tolist() == [0, 2]
+    assert image == b"\xff\xfe"
+
+
 def holds_none(value: Value) -> bool:
     return any(map(holds_none, value)) if isinstance(value, list) else value is None
 
