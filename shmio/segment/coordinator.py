@@ -23,6 +23,7 @@ MAX_STEP_NS: Final = 3_600_000_000_000
 TURN_NS: Final = 100_000_000
 """Who waits for an owner of time looks by itself, too: the bell of one that dies is silent."""
 MAX_RATE: Final = 1000.0
+_NOBODY: Final = "no source lives on the instance's clock: steps move none; those with a device go on in real time"
 DISPATCHERS: Final = frozenset({"grpc", "mqtt", "recorder"})
 """Kinds of processes that a step may wait for until they have delivered it."""
 
@@ -153,7 +154,7 @@ class Coordinator:
             self._ring([block.source for block in participants])
             problem = yield from self._await_frames(step.number, participants, asked)
         finally:
-            note = f"step {step.number} failed: {problem}" if problem else ""
+            note = f"step {step.number} failed: {problem}" if problem else "" if participants else _NOBODY
             done = before.done if problem else step.number
             self._write(asked._replace(done=done, stepping=False, note=note))
         if not problem:
@@ -193,7 +194,7 @@ class Coordinator:
             state = self.read()
             if rest_ns <= 0 or state.playing:
                 name = self._segment.instance
-                how = ", which plays it" if state.playing else ""
+                how = ", which plays it; stop that first" if state.playing else "; it is free when that ends"
                 raise TimeError(f"the time of instance {name!r} is moved by {self._owner(state.owner)}{how}")
             bell.wait(seen, min(rest_ns, TURN_NS))
 

@@ -49,7 +49,10 @@ class SupervisorStatus(msgspec.Struct):
 
 
 class ClockStatus(msgspec.Struct):
-    """The instance's clock. ``mode``: wall or virtual. ``note``: whom a step waits for, or why the last one failed."""
+    """The instance's clock. ``mode``: wall or virtual.
+
+    ``note``: whom a step waits for, why the last one failed, or that it moved nothing.
+    """
 
     mode: str
     time_s: float

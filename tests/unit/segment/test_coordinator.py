@@ -90,6 +90,14 @@ def test_a_step_is_over_when_all_have_done_it(instance: str) -> None:
         assert [(step.number, state.done) for step, state in delivered] == [(1, 1), (2, 2)], "delivered once done"
 
 
+def test_a_step_that_moves_nothing_says_so(instance: str) -> None:
+    with built(instance, spec("plc", stepped=False)) as segment:
+        coordinator = Coordinator(segment)
+        assert coordinator.step() == Step(1, coordinator.read().time_ns, 50 * MS)
+        assert coordinator.read().note.startswith("no source lives on the instance's clock: steps move none; ")
+        assert coordinator.read().note.endswith("go on in real time"), "it was not cut off"
+
+
 def test_frames_are_stamped_with_the_time_after_their_step(instance: str) -> None:
     with built(instance, spec("a")) as segment, Participant(instance, "a"):
         Coordinator(segment).step(hour := 3_600_000 * MS)
@@ -245,11 +253,15 @@ def test_one_program_at_a_time_moves_time(instance: str) -> None:
         first, second = Coordinator(segment), Coordinator(other)
         first.set_playing(True, 2.0)
         for call in (second.take_over, second.step, lambda: second.set_step_size(10 * MS)):
-            with pytest.raises(TimeError, match=rf"moved by another program \(pid {os.getpid()}\), which plays it"):
+            with pytest.raises(
+                TimeError, match=rf"moved by another program \(pid {os.getpid()}\), which plays it; stop that first$"
+            ):
                 call()
         assert (first.read().playing, first.read().rate) == (True, 2.0)
         first.set_playing(False)
-        with pytest.raises(TimeError, match=rf"moved by another program \(pid {os.getpid()}\)$"):
+        with pytest.raises(
+            TimeError, match=rf"moved by another program \(pid {os.getpid()}\); it is free when that ends$"
+        ):
             second.take_over(HARD_S)
         first.close()
         assert (second.read().playing, second.read().owner) == (False, 0)
