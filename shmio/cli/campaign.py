@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import secrets
+import sys
 import threading
 import time
 from typing import Final
@@ -37,6 +38,10 @@ def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
         if any(declaration.seed is None for declaration in read):
             told = dumps({"seed": seed}) if options.json else f"seed {seed}: --seed {seed} does the same again"
             print(told, flush=True)
+        clock = cell.clock
+        if clock.virtual and not clock.playing and any(one.start_s or one.end_s for one in declarations):
+            stands = f"time stands at {clock.present_ns / 1e9:.3f} s"
+            print(f"{stands}: start_s and end_s wait for shmio step to move it", file=sys.stderr, flush=True)
         _follow(campaign, over, options)
     return 0
 

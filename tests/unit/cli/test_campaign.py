@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from argparse import Namespace
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import cast
 
 import pytest
 
+from shmio.cli.campaign import run_campaign
+from shmio.cli.cell import Cell, Happened
 from shmio.cli.user import main
+from shmio.config import Declaration
 from shmio.layout.model import Layout, Register
 from shmio.segment import BlockSpec, ProcessSpec, Segment
+from shmio.segment.clock import ClockMode, ClockState
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("a", "INT", (), 0, None, 2, 1), Register("b", "INT", (), 2, None, 2, 1)))
 GOOD = '[[injection]]\nname = "x"\ntarget = "cell/a"\noperation = "noise"\namplitude = 1\n'
@@ -46,6 +53,34 @@ def test_a_file_with_a_fault_lays_nothing(
     assert error in told
     assert told.count("\n") == 1
     assert segment.blocks["cell"].standing.read() == ()
+
+
+class Still:
+    """An instance whose time stands, and in which everything is over at once."""
+
+    clock = ClockState(ClockMode.VIRTUAL, time_ns=3_000_000_000)
+    stands = False
+
+    def news(self) -> list[Happened]:
+        return []
+
+    @contextmanager
+    def declare(self, _declarations: Sequence[Declaration], *, keep: bool) -> Iterator[Still]:
+        yield self
+
+
+@pytest.mark.parametrize("clock", [Still.clock, Still.clock._replace(playing=True), ClockState()])
+@pytest.mark.parametrize("from_now", [True, False])
+def test_where_time_stands_a_campaign_by_time_says_who_moves_it(
+    tmp_path: Path, clock: ClockState, from_now: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (file := tmp_path / "c.toml").write_text(GOOD)
+    cell = Still()
+    cell.clock = clock
+    options = Namespace(seed=1, file=file, from_now=from_now, keep=False, for_s=None, json=False)
+    assert run_campaign(cast("Cell", cell), options) == 0
+    stands = "time stands at 3.000 s: start_s and end_s wait for shmio step to move it\n"
+    assert capsys.readouterr().err == (stands if clock is Still.clock and from_now else "")
 
 
 def test_a_file_and_values_do_not_go_together(segment: Segment, capsys: pytest.CaptureFixture[str]) -> None:
