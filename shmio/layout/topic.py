@@ -28,6 +28,7 @@ _SOURCES_SHOWN = 4
 _SCHEME = re.compile(r"([^/:]+)://")
 _INDEX = re.compile(r"0|-?[1-9][0-9]{0,9}")
 _ESCAPE = re.compile(r"%([0-9A-Fa-f]{2})?")
+_PART = re.compile(r"(.+)\.%[XBWD][0-9]{1,3}")
 _RESERVED = re.compile(r"[/%+#]")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
@@ -59,10 +60,15 @@ def encode_segment(name: str) -> str:
 def decode_segment(segment: str) -> str:
     """Return the member's name of one path segment.
 
-    Raises PathError: a ``%`` without two hexadecimal digits, or bytes that are not UTF-8.
+    Raises PathError: a ``%`` without two hexadecimal digits, bytes that are not UTF-8, or a part of a register.
     """
     if "%" not in segment:
         return segment
+    if part := _PART.fullmatch(segment):  # none is a name: not one of them decodes
+        raise PathError(
+            f"{shorten(segment)}: a bit or another part of a register is only for what is declared, as by "
+            f"shmio inject --file; name the register, {shorten(part[1])}"
+        )
     data = bytearray()
     position = 0
     for match in _ESCAPE.finditer(segment):

@@ -77,6 +77,14 @@ def test_malformed(text: str) -> None:
         parse_topic(text, SOURCES, "cell")
 
 
+@pytest.mark.parametrize("part", ["%X0", "%B1", "%W0", "%D0", "%X31"])
+def test_a_part_of_a_register_is_no_register(part: str) -> None:
+    with pytest.raises(
+        PathError, match=rf"^8\.{part}: a bit or another part .* shmio inject --file; name the register, 8$"
+    ):
+        parse_topic(f"cell/a/8.{part}", SOURCES, "cell")
+
+
 def test_without_default_the_source_must_be_named() -> None:
     assert parse_topic("cell/a", SOURCES, None) == Topic("cell", "a", None)
     with pytest.raises(
