@@ -149,5 +149,5 @@ def _running(running: dict[str, Any] | None) -> str:
     """How a declared one is."""
     if running is None:
         return ""
-    times = f", the {running['runs']}. time, since cycle {running['cycle']}" if running["state"] == "active" else ""
+    times = f" since cycle {running['cycle']}, run {running['runs']}" if running["state"] == "active" else ""
     return f", {running['declaration']['operation']}, seed {running['seed']}: {running['state']}{times}"

@@ -22,7 +22,7 @@ _TYPES = {
     "float": "a number",
     "str": "text",
     "bool": "true or false",
-    "array": "a list",
+    "array": "a list in [ ]",
     "object": "a table",
 }
 

@@ -142,7 +142,9 @@ def _lines(found: dict[str, Any]) -> list[str]:
     lines = [
         f"{found['file']}: {size}, {ended}",
         f"  instance {found['instance']}, mode {found['mode']}, started {found['started']}; {by}",
-        f"  {found['from']} to {found['to']}, {found['duration_s']:.1f} s{rate}",
+        f"  {found['from']} to {found['to']}, {found['duration_s']:.1f} s{rate}"
+        if found["from"]
+        else "  no frames in it",
     ]
     if found["doubtful"]:
         where = f"behind byte {found['doubtful_from']} of {found['doubtful']}"

@@ -96,6 +96,13 @@ def test_info_tells_what_is_in_a_file(file: str, segment: Segment, said: Output)
     assert any(f"{gap['count']} frames, 1 to {gap['last']}: overtaken" in line for line in out)
 
 
+def test_what_recorded_nothing_says_so(segment: Segment, tmp_path: Path, said: Output) -> None:
+    work = recorder(segment, tmp_path)
+    work.close()
+    assert main(["info", str(work.output.path)]) == 0
+    assert "  no frames in it" in said()[0]
+
+
 def test_info_folds_equal_lines(segment: Segment, tmp_path: Path, said: Output) -> None:
     """As of a source that reloads have given one block after the other."""
     work = recorder(segment, tmp_path / "dumps")

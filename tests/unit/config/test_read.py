@@ -125,7 +125,11 @@ def test_tls_files_are_relative_to_the_config(folder: Path) -> None:
         ("[[source]]", "[source]", r"source: write \[\[source\]\]"),
         ("[[emulator]]", "[emulator]", r"emulator: write \[\[emulator\]\]"),
         ('layout = "db201.db"', "layout = []", r'source\[0\]\.layout: must not be empty \(source "cell"\)$'),
-        ('layout = "db201.db"', "layout = 5", r"source\[0\]\.layout: expected text or a list, got a whole number"),
+        (
+            'layout = "db201.db"',
+            "layout = 5",
+            r"source\[0\]\.layout: expected text or a list in \[ \], got a whole number",
+        ),
         ("armed = false", "armed = 1", r"source\[0\]\.armed: expected true or false, got a whole number"),
         ("armed = false", "stale_ms = 30", r"source\[0\]\.stale_ms: 30 is less than two periods of 20 ms"),
         ('name = "cell"', 'name = "Model"', r"source\[0\]\.name: 'Model' is reserved"),
