@@ -57,6 +57,7 @@ class Subscription:
         self.late = False
         """Whether a step has waited too long for it; see :meth:`give_up`."""
         self._hold = hold
+        self._opened = False
         self._marks: deque[tuple[Step, asyncio.Future[None]]] = deque()
         self._selections = selections
         self._bells = bells
@@ -75,6 +76,7 @@ class Subscription:
     async def open(self) -> bytes:
         """Join all blocks; the tables. PathError, ValueRangeError, EndpointError."""
         views = await self._selections.select(self._wanted, frames=self._request.format == wire.FORMAT_FRAMES)
+        self._opened = True
         return b"".join(map(self._join, self._wanted, views))
 
     def close(self) -> None:
@@ -96,9 +98,12 @@ class Subscription:
         self._news.set()
 
     def mark(self, step: Step) -> asyncio.Future[None]:
-        """Say that a step is over, when all that has changed in it is sent; what is done then, or when this ends."""
+        """Say that a step is over, when all that has changed in it is sent; what is done then, or when this ends.
+
+        Before the tables are there, which takes seconds for a large layout, it is done at once.
+        """
         sent = asyncio.get_running_loop().create_future()
-        if self.late:
+        if self.late or not self._opened:
             sent.set_result(None)
         else:
             self._marks.append((step, sent))

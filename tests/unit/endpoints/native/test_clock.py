@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from typing import Any
 
 import grpc
 import pytest
 
 from shmio.client import connect_aio
+from shmio.endpoints.grpc.native import selection
 from shmio.errors import CommandError, ValueRangeError
 from shmio.wire import shmio_v1_pb2 as wire
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, refusal
@@ -103,6 +105,31 @@ def test_a_step_that_fails_says_why(instance: str) -> None:
         async with connect_aio(f"127.0.0.1:{served.port}") as cell:
             with pytest.raises(CommandError, match="division by zero"):
                 await cell.step()
+
+    simulate(instance, test)
+
+
+def test_a_stream_that_takes_long_to_open_holds_up_no_step(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun, go_on = threading.Event(), threading.Event()
+    select = selection._select
+
+    def slow(*given: Any, **options: Any) -> Any:
+        begun.set()
+        assert go_on.wait(TIMEOUT_S)
+        return select(*given, **options)
+
+    monkeypatch.setattr(selection, "_select", slow)
+
+    async def test(served: Endpoint, _: Models) -> None:
+        opening = subscribe(served, "sim/count")
+        first = asyncio.create_task(opening.values())
+        assert await asyncio.to_thread(begun.wait, TIMEOUT_S)
+        await step(served)
+        assert not go_on.is_set()
+        go_on.set()
+        assert await first == {"count": 1}
+        await step(served)
+        assert await opening.values() == {"count": 2}
 
     simulate(instance, test)
 
