@@ -22,6 +22,8 @@ from shmio.wire import shmio_v1_pb2 as wire
 
 BATCH_BYTES: Final = 1 << 18
 """What has come of all blocks goes out in one message up to this size."""
+BATCH_UPDATES: Final = 256
+"""And up to so many of frames, however small, which takes milliseconds: then others have their turn."""
 MAX_RATE_HZ: Final = 1e6
 
 TABLES, UPDATES, ENDED, STEP = (
@@ -152,7 +154,8 @@ class Subscription:
         waiting = deque(follower for follower in self._followers.values() if self._open(follower))
         waiting.rotate(self._turn)
         self._turn += 1  # else one with long updates would hide the others
-        while waiting and size < BATCH_BYTES:
+        most = len(parts) + BATCH_UPDATES
+        while waiting and size < BATCH_BYTES and len(parts) < most:
             update = waiting[0].next(now_s)
             if update is None:
                 waiting.popleft()

@@ -11,6 +11,7 @@ import pytest
 
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.native import service
+from shmio.endpoints.grpc.native.subscribe import BATCH_UPDATES
 from shmio.layout.model import Layout, Register
 from shmio.segment import Attributes, BlockSpec, Quality, Segment
 from shmio.wire import shmio_v1_pb2 as wire
@@ -93,6 +94,26 @@ def test_age_is_said_too(soon_stale: Segment, mode: Any) -> None:
         assert (update.frame, update.quality) == (2, wire.QUALITY_GOOD)
 
     serve(soon_stale, test)
+
+
+def test_a_stream_that_is_behind_catches_up_in_turns(segment: Segment) -> None:
+    """However small its updates are: others have their turn in between."""
+
+    async def test(served: Endpoint) -> None:
+        served.publish(image(step=0))
+        stream = subscribe(served, "cell/step", mode=EVERY)
+        await stream.values()
+        most = BATCH_UPDATES + BATCH_UPDATES // 2
+        for step in range(1, most + 1):
+            served.publish(image(step=step))
+        counts = []
+        while sum(counts) < most:
+            message = await asyncio.wait_for(stream.call.read(), TIMEOUT_S)
+            counts.append(len(message.updates))
+            assert not any(update.missed for update in message.updates)
+        assert max(counts) <= BATCH_UPDATES
+
+    serve(segment, test)
 
 
 def test_every_frame_comes_in_order(segment: Segment) -> None:
