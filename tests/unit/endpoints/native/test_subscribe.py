@@ -106,7 +106,7 @@ def test_a_stream_that_is_behind_catches_up_in_turns(segment: Segment) -> None:
         most = BATCH_UPDATES + BATCH_UPDATES // 2
         for step in range(1, most + 1):
             served.publish(image(step=step))
-        counts = []
+        counts: list[int] = []
         while sum(counts) < most:
             message = await asyncio.wait_for(stream.call.read(), TIMEOUT_S)
             counts.append(len(message.updates))
