@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import AsyncIterator, Mapping
 from contextlib import suppress
+from functools import partial
 from typing import Any, Final
 
 import grpc
@@ -68,6 +69,7 @@ class Simulations:
             self._ring(simulation.block)
             taking = asyncio.get_running_loop().create_task(simulation.take(requests))
             taking.add_done_callback(simulation.taken)
+            taking.add_done_callback(partial(self._release, simulation))  # however long nobody reads that it is over
             yield first
             async for message in simulation.messages():
                 yield message
@@ -77,9 +79,7 @@ class Simulations:
             if taking is not None:
                 taking.cancel()
             if simulation is not None:
-                del self._open[simulation.block.section]
-                simulation.leave()
-                self._ring(simulation.block)
+                self._release(simulation)
         if simulation.failure is not None:
             await refuse(context, simulation.failure)
 
@@ -108,6 +108,13 @@ class Simulations:
                 f"those that one can join: {can}"
             )
         return block
+
+    def _release(self, simulation: Simulation, _: object = None) -> None:
+        """Have its source free for another one, if it is not yet."""
+        if self._open.get(simulation.block.section) is simulation:
+            del self._open[simulation.block.section]
+            simulation.leave()
+            self._ring(simulation.block)
 
     def _ring(self, block: Block) -> None:
         """Have the source look who is connected."""

@@ -29,6 +29,7 @@ from shmio.messages import value_to_wire
 from shmio.segment import Quality, Segment
 from shmio.wire import shmio_v1_pb2 as wire
 from tests.unit.connectors.test_stepped import Running
+from tests.unit.endpoints import http2
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, endpoint, refusal
 from tests.unit.endpoints.native.harness import stub, values
 from tests.unit.endpoints.native.remote import remote_segment, serve_remote, shown, source, spec
@@ -291,6 +292,21 @@ def test_an_answer_to_another_step_ends_the_stream(instance: str) -> None:
         assert (code, text) == (Status.INVALID_ARGUMENT, "an answer to step 9, and step 1 is to be done")
         _, text = await refusal(task)
         assert "model 'raw' was gone before it had answered" in text
+
+    serve_remote(instance, test)
+
+
+def test_who_ends_without_reading_leaves_the_source_to_others(instance: str) -> None:
+    async def test(served: Endpoint, drive: Running) -> None:
+        deaf = await http2.Connection.open(served.port, deaf=True)
+        await deaf.send(http2.headers("/shmio.v1.Shmio/Simulate"))
+        joining = http2.message(Request(join=wire.Join(source="drive")).SerializeToString())
+        await deaf.send(http2.frame(http2.DATA, 0, 1, joining))
+        await shown(drive, Quality.GOOD)
+        await deaf.send(http2.frame(http2.DATA, http2.END_STREAM, 1, b""))
+        await asyncio.wait_for(shown(drive, Quality.BAD), TIMEOUT_S)
+        await Raw(served).join()
+        await deaf.drop(reset=True)
 
     serve_remote(instance, test)
 
