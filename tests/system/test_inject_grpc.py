@@ -15,6 +15,7 @@ import pytest
 from google.protobuf.struct_pb2 import Value
 
 import shmio
+from shmio.segment import Frame
 from shmio.segment.attach import Attachment
 from shmio.testing.cell import PATIENCE_S, Cell, kill, until
 from shmio.wire import simlog_v1_pb2 as v1
@@ -164,13 +165,19 @@ def test_a_killed_client_and_a_killed_endpoint_leave_no_shadow(cell: Cell, local
             assert standing(local) == 0
 
 
+def newest(local: Attachment) -> Frame:
+    frame = local.block("cell").latest()
+    assert frame is not None
+    return frame
+
+
 def test_the_sources_own_process_goes_on_with_the_injections_of_clients(cell: Cell, local: Attachment) -> None:
     with client(cell) as (stub, _):
         originals = inject(stub, f"{PLACE}/in", "s")
-        pid = cell.processes()["cell"]["pid"]
-        kill(pid)
-        until(lambda: cell.processes()["cell"]["pid"] not in (pid, None), "another process")
-        until(lambda: local.read(PLACE).quality.name == "GOOD", "good again")
+        before = newest(local)
+        kill(cell.processes()["cell"]["pid"])
+        until(lambda: newest(local).incarnation > before.incarnation, "frames of another process")
+        until(lambda: newest(local).quality.name == "GOOD", "good again")
         publish(stub, PLACE, "5")
         assert next(originals).value == "5"
         publish(stub, "s", "6")
