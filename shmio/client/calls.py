@@ -76,6 +76,8 @@ class Target:
     def error(self, error: Any) -> ShmioError:
         """What the end of a call means."""
         code, details = error.code(), error.details() or ""
+        if "message larger than max" in details:  # gRPC's own words
+            details = f"too much for one message: give or ask for fewer values at once ({details})"
         if kind := _ERRORS.get(code):
             return kind(details)
         told = _REMOTE.get(code, RemoteError)

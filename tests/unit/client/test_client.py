@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from shmio.client import Client, Column, Quality, connect, connect_aio
-from shmio.errors import PathError, QualityError, RemoteError, ValueRangeError
+from shmio.errors import EndpointError, PathError, QualityError, RemoteError, ValueRangeError
 from shmio.segment import Quality as FrameQuality
 from shmio.segment import Segment
 from tests.unit.endpoints.conftest import segment as segment  # noqa: PLC0414  the fixture
@@ -125,6 +125,14 @@ def test_errors_are_those_of_a_local_program(segment: Segment) -> None:
             next(stream)
         with pytest.raises(PathError, match="no source 'x'"):
             cell.layouts("x")
+
+    with_client(segment, test)
+
+
+def test_more_than_a_message_holds_is_told_with_what_to_do(segment: Segment) -> None:
+    def test(_: Endpoint, cell: Client) -> None:
+        with pytest.raises(EndpointError, match=r"^too much for one message: give or ask for fewer values at once \("):
+            cell.write({"cell/name": "x" * (2 << 20)})
 
     with_client(segment, test)
 
