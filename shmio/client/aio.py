@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from typing import Any, Self
 
 import grpc
 
 from shmio.client import calls, injections, shadow
+from shmio.client.aio_calls import receive
 from shmio.client.aio_campaign import Campaign
 from shmio.client.aio_model import Simulation, Step, serve
 from shmio.client.aio_shadow import Shadow
@@ -212,17 +212,7 @@ class Subscription(AsyncIterator[Update]):
         while True:
             for update in self._waiting:
                 return update
-            try:
-                message = await self._call.read()
-            except grpc.RpcError as error:
-                self._target.fail(error)
-            except asyncio.CancelledError:
-                if (task := asyncio.current_task()) is not None and task.cancelling():
-                    raise
-                raise StopAsyncIteration from None  # it was the call that was cancelled: by close
-            if message is grpc.aio.EOF:
-                raise StopAsyncIteration
-            self._waiting = self._tables.all_of(message)
+            self._waiting = self._tables.all_of(await receive(self._call, self._target.fail))
 
     def close(self) -> None:
         """End it."""

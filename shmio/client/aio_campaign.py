@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator
 from contextlib import suppress
 from typing import Any, Protocol, Self
 
-import grpc
-
 from shmio.client import injections
+from shmio.client.aio_calls import receive
 from shmio.client.calls import Target
 from shmio.client.injections import Happening
 from shmio.errors import CommandError, PathError
@@ -38,17 +36,7 @@ class Campaign(AsyncIterator[Happening]):
     async def __anext__(self) -> Happening:
         """As that of :class:`shmio.client.Campaign`."""
         while not self._happened:
-            try:
-                message = await self._call.read()
-            except grpc.RpcError as error:
-                self._client.target.fail(error)
-            except asyncio.CancelledError:
-                if (task := asyncio.current_task()) is not None and task.cancelling():
-                    raise
-                raise StopAsyncIteration from None  # it was the call that was cancelled: by close
-            if message is grpc.aio.EOF:
-                raise StopAsyncIteration
-            self._happened = injections.happenings(message)
+            self._happened = injections.happenings(await receive(self._call, self._client.target.fail))
         happened = self._happened.pop(0)
         if happened.what == "lifted":
             self._left.pop((happened.source, happened.number), None)

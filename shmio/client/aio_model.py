@@ -6,11 +6,12 @@ import asyncio
 import inspect
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import suppress
-from typing import Any, Self
+from typing import Any, NoReturn, Self
 
 import grpc
 
 from shmio.client import model
+from shmio.client.aio_calls import receive
 from shmio.client.calls import Target
 from shmio.client.model import Member, Part, Work
 from shmio.errors import ConflictError, RemoteError
@@ -46,19 +47,7 @@ class Simulation(Member, AsyncIterator[Work]):
 
     async def __anext__(self) -> Work:
         """As that of :class:`shmio.client.sync_model.Simulation`."""
-        try:
-            found = await self._call.read()
-        except grpc.RpcError as error:
-            if self._closed:
-                raise StopAsyncIteration from None
-            self._target.fail(error)
-        except asyncio.CancelledError:
-            if (task := asyncio.current_task()) is not None and task.cancelling():
-                raise
-            raise StopAsyncIteration from None  # it was the call that was cancelled: by close
-        if found is grpc.aio.EOF:
-            raise StopAsyncIteration
-        self._work = self._part.take(found)
+        self._work = self._part.take(await receive(self._call, self._fail))
         return self._work
 
     async def done(self, outputs: Mapping[str, object]) -> None:
@@ -79,6 +68,11 @@ class Simulation(Member, AsyncIterator[Work]):
         except Exception as error:  # noqa: BLE001  whatever it is, the step has failed with it
             answer = rejoining.failed(self._part, work, error)
         await self._answer(answer)
+
+    def _fail(self, error: Any) -> NoReturn:
+        if self._closed:
+            raise StopAsyncIteration
+        self._target.fail(error)
 
     async def _answer(self, data: bytes) -> None:
         self._work = None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -10,7 +10,7 @@ import numpy.typing as npt
 from shmio.errors import LayoutError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout, Register
-from shmio.layout.write import Write, apply, bits_of
+from shmio.layout.write import Write, apply, covering
 
 
 class Images:
@@ -25,8 +25,8 @@ class Images:
         initial, _ = initial_frame(layout)
         self.commanded, self.shown = bytearray(initial), initial
         self._outputs = tuple(outputs)
-        self._computed = _bits(outputs, layout.size)
-        self._given = ~_array(_bits((*outputs, *inouts), layout.size))
+        self._computed = covering(outputs, layout.size)
+        self._given = ~_array(covering((*outputs, *inouts), layout.size))
 
     def write(self, writes: Sequence[Write]) -> list[str]:
         """Command these bytes and bits; of each "" or why it is refused: the model computes it."""
@@ -52,15 +52,6 @@ class Images:
             return f"the model computes {hit[0]}: it is an output, which nobody writes"
         apply(write, self.commanded)
         return ""
-
-
-def _bits(registers: Iterable[Register], size: int) -> bytes:
-    """An image of so many bytes in which the bits of all these registers are set."""
-    mask = bytearray(size)
-    for register in registers:
-        for at, bits in enumerate(bits_of(register), register.offset):
-            mask[at] |= bits
-    return bytes(mask)
 
 
 def _array(data: bytes | bytearray) -> npt.NDArray[np.uint8]:

@@ -9,7 +9,7 @@ from typing import Any, Final, Unpack
 
 from shmio.config import Declaration
 from shmio.endpoints.grpc.followers import Follower
-from shmio.endpoints.grpc.inlet import Inlet
+from shmio.endpoints.grpc.inlet import RETIRED, Inlet
 from shmio.endpoints.grpc.pending import Done, End
 from shmio.errors import CommandError
 from shmio.layout.write import Write
@@ -114,4 +114,4 @@ def stands(inlet: Inlet, injection: int) -> bool:
 
 def _check(inlet: Inlet) -> None:
     if inlet.block.retired:
-        raise CommandError("the source was changed or removed by a reload")
+        raise CommandError(RETIRED)

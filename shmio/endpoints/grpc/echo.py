@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sized
+from collections.abc import Callable, Sized
 from typing import Final, NamedTuple, Protocol
 
 from shmio.endpoints.grpc.subject import Subject
-from shmio.layout.model import Register
-from shmio.layout.write import Write, apply, bits_of
+from shmio.endpoints.grpc.underway import Underway
+from shmio.layout.write import covering
 from shmio.segment import Block, Event, EventKind
 
 
@@ -29,7 +29,7 @@ class InChannel:
         self.listeners: dict[Listener, None] = {}  # in the order in which they came
         self.start = min(register.offset for register in subject.registers)
         self.stop = max(register.offset + register.size for register in subject.registers)
-        self.bits = _bits(subject.registers, self.stop)
+        self.bits = int.from_bytes(covering(subject.registers, self.stop), "big")
 
 
 Message = tuple[InChannel, Sized]
@@ -60,11 +60,9 @@ class Echo:
         self._stamp = stamp
         self._channels: dict[Subject, InChannel] = {}
         self._table: tuple[InChannel, ...] = ()
-        self._frame = -1  # the image is this frame, and what was accepted since
-        self._image = bytearray(block.layout.size)
+        self._underway = Underway(block)
         self._command = _NOBODY  # the one accepted last; it is not known at first, nor after a gap
-        self._whole = False  # whether the image and the mask have all of it so far
-        self._mask = bytearray(block.layout.size)  # what the command has written
+        self._whole = False  # whether all of it so far has been put
         self._partly: dict[InChannel, Event] = {}  # channels it has written a part of
 
     def listen(self, subject: Subject, listener: Listener) -> None:
@@ -96,7 +94,8 @@ class Echo:
 
     def skip(self) -> None:
         """Events were missed: what is known of the command they may have belonged to is worth nothing."""
-        self._command, self._whole, self._frame = _NOBODY, False, -1
+        self._command, self._whole = _NOBODY, False
+        self._underway.forget()
         self._partly.clear()
 
     def follow(self, event: Event) -> list[Message]:
@@ -112,12 +111,13 @@ class Echo:
             self._whole = bool(table) and (self._command != _NOBODY or self._begins(event))
             self._command = command
             if self._whole:
-                self._begin(event.frame)
+                self._underway.begin(event.frame)
         if not table:
-            self._whole, self._frame = False, -1
+            self._whole = False
+            self._underway.forget()
         if not self._whole:
             return messages
-        self._apply(event)
+        self._underway.put(event)
         for channel in table:
             if channel.start < event.offset + len(event.data) and event.offset < channel.stop:
                 self._touch(channel, event, messages)
@@ -133,25 +133,13 @@ class Echo:
                 return _command(before) != _command(event)
         return True
 
-    def _begin(self, number: int) -> None:
-        """A command begins, behind this frame; frames that come between its parts must not undo the first ones."""
-        if number != self._frame:
-            frame = self._block.read(number) or self._block.latest()
-            self._frame = number
-            self._image = bytearray(len(self._image)) if frame is None else bytearray(frame.image)
-        self._mask = bytearray(len(self._image))
-
-    def _apply(self, event: Event) -> None:
-        apply(Write(event.offset, event.mask, event.data), self._image)
-        apply(Write(event.offset, event.mask, b"\xff" * len(event.data)), self._mask)
-
     def _touch(self, channel: InChannel, event: Event, messages: list[Message]) -> None:
         """Show a channel when the last of its bits is written; what remains in part is shown by :meth:`_rest`."""
         bits = int.from_bytes(event.mask.to_bytes(1, "big") if event.mask else b"\xff" * len(event.data), "big")
         shift = 8 * (channel.stop - event.offset - len(event.data))
         if not (bits << shift if shift >= 0 else bits >> -shift) & channel.bits:
             return  # other bits of its bytes
-        if channel.bits & ~int.from_bytes(self._mask[channel.start : channel.stop], "big"):
+        if channel.bits & ~int.from_bytes(self._underway.mask[channel.start : channel.stop], "big"):
             self._partly[channel] = event
             return
         self._partly.pop(channel, None)
@@ -166,18 +154,10 @@ class Echo:
         return messages
 
     def _show(self, channel: InChannel, event: Event, messages: list[Message]) -> None:
-        message = channel.encode(_Written(*self._stamp(event), bytes(self._image)))
+        message = channel.encode(_Written(*self._stamp(event), bytes(self._underway.image)))
         if message is not None:
             messages.append((channel, message))
 
 
 def _command(event: Event) -> tuple[int, int, int]:
     return event.incarnation, event.writer, event.command
-
-
-def _bits(registers: Iterable[Register], stop: int) -> int:
-    """The bits of all these registers, as those of one number whose last byte is the one before ``stop``."""
-    bits = 0
-    for register in registers:
-        bits |= int.from_bytes(bits_of(register), "big") << 8 * (stop - register.offset - register.size)
-    return bits

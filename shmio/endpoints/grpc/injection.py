@@ -12,6 +12,7 @@ from shmio.endpoints.grpc.beneath import Beneath
 from shmio.endpoints.grpc.echo import Listener
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.followers import Follower
+from shmio.endpoints.grpc.inlet import RETIRED
 from shmio.endpoints.grpc.outbox import EventLane, Finish, Outbox, StateLane
 from shmio.endpoints.grpc.pending import Done, End, worst
 from shmio.endpoints.grpc.shape import Shape
@@ -101,7 +102,7 @@ class Injection(Follower):
         direction = Direction.IN if self.inward else Direction.OUT
         try:
             if self.feed.block.retired:
-                raise CommandError("the source was changed or removed by a reload")
+                raise CommandError(RETIRED)
             answer = desk.Answer()
             bits = covering(self.shape.registers, self.feed.block.layout.size)
             self._beneath.number = self.feed.inlet.lay(bits, self, answer.done, direction=direction, name=name)

@@ -27,7 +27,7 @@ from shmio.segment.commands import Laid
 MAX_OPEN: Final = 512
 """Events that may be outstanding: a quarter of the ring, so that none is overwritten before it is read."""
 
-_RETIRED: Final = "the source was changed or removed by a reload"
+RETIRED: Final = "the source was changed or removed by a reload"
 
 
 class Inlet:
@@ -164,7 +164,7 @@ class Inlet:
                 self._freed = self._loop.create_future()
                 await self._freed
             if self.block.retired:
-                raise CommandError(_RETIRED)
+                raise CommandError(RETIRED)
             if self._silent and self._pending:  # one at a time asks whether it is back
                 raise CommandError(
                     f"source {self.block.source} does not answer; shmio-supervisor status says how it fares"
@@ -254,8 +254,8 @@ class Inlet:
 
     def _retired(self) -> None:
         for number in list(self._pending):
-            self._end(number, _RETIRED)
-        self.followers.end(_RETIRED)
+            self._end(number, RETIRED)
+        self.followers.end(RETIRED)
         self._free()
 
     def _end(self, number: int, missing: str = "") -> None:

@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 
 from shmio.endpoints.grpc.connections import Peer, connected, peer_of
 from shmio.endpoints.grpc.injection import Injection
+from shmio.endpoints.grpc.inlet import RETIRED
 from shmio.endpoints.grpc.shape import Shape
 from shmio.endpoints.grpc.topics import Mark, Topics
 from shmio.errors import ConflictError, EndpointError, ValueRangeError
@@ -125,7 +126,7 @@ class Shadows:
         """These sources have other blocks by now: what lay over the ones before is gone."""
         for injection in list(self._holders):
             if injection.target.source in sources:
-                injection.end("the source was changed or removed by a reload")
+                injection.end(RETIRED)
 
     def _joined(self, target: Topic, ways: Mapping[str, Way]) -> Injection | None:
         """The injection that has these topics; ConflictError: they are another one's."""

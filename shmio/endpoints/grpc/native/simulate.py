@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 import time
 from collections.abc import AsyncIterator, Mapping
-from contextlib import suppress
 from functools import partial
-from typing import Any, Final
+from typing import Any
 
 import grpc
 import numpy as np
 
+from shmio.endpoints.grpc.bells import Bell
 from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.native.clock import clock
@@ -28,9 +27,6 @@ from shmio.logs import printable
 from shmio.segment import Block, Segment
 from shmio.segment.link import MAX_NAME_BYTES, Ask, Link, ends_of
 from shmio.wire import shmio_v1_pb2 as wire
-
-TURN_NS: Final = 200_000_000
-"""How often who waits for a source to ask looks whether it still is to."""
 
 _JOINED, _WORK = (wire.SimulateResponse.DESCRIPTOR.fields_by_name[name].number for name in ("joined", "work"))
 _INPUTS, _OUTPUTS, _PRESENT = (
@@ -143,7 +139,7 @@ class Simulation:
         self._joined = False
         self._over = False
         self._news = asyncio.Event()
-        self._loop = asyncio.get_running_loop()
+        self._bell: Bell | None = None  # rings when the source has asked for a step
         self._handed = 0
         self._asked: Ask | None = None  # what the model has in hand
         self._given: Decoded | None = None
@@ -167,7 +163,8 @@ class Simulation:
             name, who = (before.name, f"pid {before.pid}") if before else ("another", "which is leaving")
             raise ConflictError(_taken(self.block, name, who))
         self._joined = True
-        threading.Thread(target=self._wait, name=f"asked-{self.block.source}", daemon=True).start()
+        self._bell = Bell(link.asked, f"asked-{self.block.source}")
+        self._bell.listeners[self._news.set] = None
         frame = self.block.latest()
         image = frame.raw if frame is not None and frame.source_ns else bytes(initial_frame(self.block.layout)[0])
         joined = wire.Joined(
@@ -185,22 +182,14 @@ class Simulation:
         self._over = True
         if self._joined:
             self._link.leave()
-            self._link.asked.wake()  # for our own thread
+        if self._bell is not None:
+            self._bell.stop()
 
     def end(self, failure: ShmioError | None = None) -> None:
         """Have the stream end."""
         self.failure = self.failure or failure
         self._over = True
         self._news.set()
-
-    def _wait(self) -> None:
-        """Tell the event loop whenever the source has asked for a step; in a thread."""
-        asked = self._link.asked
-        with suppress(RuntimeError):  # the event loop is closed
-            while not self._over:
-                seen = asked.doorbell()  # before it is told, so that nothing is lost
-                self._loop.call_soon_threadsafe(self._news.set)
-                asked.wait(seen, TURN_NS)
 
     # ---- down: what is to be done ------------------------------------------------------------------------------
 

@@ -11,8 +11,9 @@ from shmio.endpoints.grpc.encoding import field
 from shmio.endpoints.grpc.inlet import Inlet
 from shmio.endpoints.grpc.native.columns import Columns, pack_slots
 from shmio.endpoints.grpc.native.waiting import Waiting
+from shmio.endpoints.grpc.underway import Underway, ones
 from shmio.layout.model import Register
-from shmio.layout.write import Write, covering
+from shmio.layout.write import covering
 from shmio.segment import Block, Event
 from shmio.segment.diverted import apply
 from shmio.segment.events import EVENT_DATA_SIZE
@@ -44,9 +45,7 @@ class Writes:
         self._block = block
         self._columns = columns
         self._cover = np.frombuffer(covering(registers, block.layout.size), np.uint8)
-        self._frame = -1  # the image is this frame, and what was accepted since
-        self._image = bytearray(block.layout.size)
-        self._mask = bytearray(block.layout.size)  # what the command has written
+        self._underway = Underway(block)
         self._command = _NOBODY
         self._event = 0
         self._update = b""
@@ -65,31 +64,21 @@ class Writes:
         command = event.incarnation, event.writer, event.command
         if command != self._command:
             self._command = command
-            self._begin(event.frame)
-        part = bytearray(len(self._mask))
-        ones = Write(event.offset, event.mask, b"\xff" * len(event.data))
-        apply(part, (ones,))
-        apply(self._mask, (ones,))
-        apply(self._image, (Write(event.offset, event.mask, event.data),))
+            self._underway.begin(event.frame)
+        self._underway.put(event)
+        image, mask = self._underway.image, self._underway.mask
+        part = bytearray(len(mask))
+        apply(part, (ones(event),))
         if not (np.frombuffer(part, np.uint8) & self._cover).any():
             return b""
         slots = self._columns.touched(bytes(part))
         if len(event.data) == EVENT_DATA_SIZE:
-            left = self._columns.touched(bytes(bits ^ 0xFF for bits in self._mask))
+            left = self._columns.touched(bytes(bits ^ 0xFF for bits in mask))
             whole = {column: np.setdiff1d(found, left[column]) for column, found in slots.items() if column in left}
             slots = {column: found for column, found in (slots | whole).items() if len(found)}
         if not slots:
             return b""
-        return head_of(self._number, event) + field(
-            _VALUES, pack_slots(self._columns.decode(bytes(self._image)), slots)
-        )
-
-    def _begin(self, number: int) -> None:
-        if number != self._frame:
-            frame = self._block.read(number) or self._block.latest()
-            self._frame = number
-            self._image = bytearray(len(self._image)) if frame is None else bytearray(frame.image)
-        self._mask = bytearray(len(self._image))
+        return head_of(self._number, event) + field(_VALUES, pack_slots(self._columns.decode(bytes(image)), slots))
 
 
 class Inward:
