@@ -168,7 +168,7 @@ def _complaint(path: str, outcome: Outcome) -> str:
     if outcome.kind == EventKind.REJECTED:
         return f"{path}: not written, the source took nothing: {outcome.text}; see shmio-supervisor status"
     if outcome.kind == EventKind.REFUSED:
-        return f"{path}: refused by the device: {outcome.text}"
+        return f"{path}: the source refused it: {outcome.text}"
     if outcome.kind == EventKind.EXPIRED:
         return f"{path}: not written: {outcome.text}; try again, or with a longer --timeout"
     return f"{path}: {outcome.text}; look with shmio get {shlex.quote(path)} before writing it again"

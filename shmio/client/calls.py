@@ -80,6 +80,7 @@ class Target:
             details = f"too much for one message: give or ask for fewer values at once ({details})"
         if kind := _ERRORS.get(code):
             return kind(details)
+        details = next((plain for words, plain in _PLAIN.items() if words in details), details)
         told = _REMOTE.get(code, RemoteError)
         return told(f"{self.address}: {_MEANING.get(code, code.name)}{f': {details}' if details else ''}")
 
@@ -92,6 +93,12 @@ _REMOTE: Final[Mapping[grpc.StatusCode, type[RemoteError]]] = {
     grpc.StatusCode.UNAVAILABLE: LostError,
     grpc.StatusCode.UNAUTHENTICATED: UnknownClientError,
 }
+_PLAIN: Final = {
+    "Connection refused": "nothing listens on that port",
+    "No such file or directory": "there is no such socket",
+    "Domain name not found": "there is no host of that name",
+}
+"""What gRPC says at length."""
 _MEANING: Final = {
     grpc.StatusCode.UNAVAILABLE: "no instance serves there, or it has ended",
     grpc.StatusCode.DEADLINE_EXCEEDED: "it did not answer in time",

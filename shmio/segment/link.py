@@ -27,6 +27,7 @@ _SIZE: Final = struct.Struct("<Q")
 _JOINED_AT: Final = 64
 _JOINED: Final = struct.Struct("<IIQ104s")
 _RINGS_AT: Final = 192
+_COMPUTED: Final = 1  # flag: a model has done a step
 
 
 class Ends(NamedTuple):
@@ -143,6 +144,11 @@ class Link:
         pid, _, number, name = _JOINED.unpack(data)
         return Joined(number, pid, text(name))
 
+    def computed(self) -> bool:
+        """Whether a model has done a step, this one or one before."""
+        data = _atomics.cell_read(self._memory, self._offset + _JOINED_AT, _JOINED.size)
+        return data is not None and _JOINED.unpack(data)[1] == _COMPUTED
+
     # ---- the source's part ---------------------------------------------------------------------------------------
 
     def ask(self, ask: Ask, publish_ns: int) -> int:
@@ -167,10 +173,13 @@ class Link:
         """Take the link; False: another process has it."""
         if not self._shared.try_lock(self._lock_byte):
             return False
-        joined = _JOINED.pack(os.getpid(), 0, self._read().number + 1, cut(name, MAX_NAME_BYTES))
-        _atomics.cell_write(self._memory, self._offset + _JOINED_AT, joined)
+        self._tell(Joined(self._read().number + 1, os.getpid(), name), _COMPUTED if self.computed() else 0)
         self.answered.begin()
         return True
+
+    def _tell(self, joined: Joined, flags: int) -> None:
+        data = _JOINED.pack(joined.pid, flags, joined.number, cut(joined.name, MAX_NAME_BYTES))
+        _atomics.cell_write(self._memory, self._offset + _JOINED_AT, data)
 
     def leave(self) -> None:
         """Give it back, and have a source look that waits for an answer."""
@@ -187,6 +196,8 @@ class Link:
 
     def answer(self, ask: Ask, now_ns: int, image: bytes | bytearray, failure: str | None = None) -> None:
         """Answer an ask; ``failure``: why it failed. ``now_ns``: CLOCK_MONOTONIC."""
+        if failure is None and not self.computed():
+            self._tell(self._read(), _COMPUTED)
         self.answered.publish(
             image, None, ask.step, now_ns, ask.time_ns, 0, Quality.GOOD if failure is None else Quality.BAD,
             Provenance.SIMULATED, ask.number, 0, cut(failure or "", _atomics.REASON_SIZE),

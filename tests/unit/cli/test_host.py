@@ -217,7 +217,9 @@ def test_a_file_with_a_fault_lays_nothing(segment: Segment, capsys: pytest.Captu
 
 def test_what_is_wrong_with_the_host(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main(["get", "--host", "127.0.0.1:1", "cell"]) == 1
-    assert capsys.readouterr().err.startswith("127.0.0.1:1: no instance serves there, or it has ended")
+    assert capsys.readouterr().err == (
+        "127.0.0.1:1: no instance serves there, or it has ended: nothing listens on that port\n"
+    )
     assert main(["get", "--host", "nonsense", "cell"]) == 1
     assert capsys.readouterr().err == "'nonsense' is not an address; expected host:port, such as 127.0.0.1:8089\n"
     assert main(["get", "--host", "127.0.0.1:1", "--instance", "x", "cell"]) == 1

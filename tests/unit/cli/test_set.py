@@ -197,7 +197,7 @@ def test_json_is_an_object_by_path(device: Device, capsys: pytest.CaptureFixture
         "cell/count": {"outcome": "refused", "reason": "locked"},
         "cell/run": {"outcome": "written", "reason": ""},
     }
-    assert err == "cell/count: refused by the device: locked\n"
+    assert err == "cell/count: the source refused it: locked\n"
 
 
 @pytest.mark.parametrize(
@@ -252,7 +252,7 @@ def test_a_reason_that_is_not_that_of_the_error_stands_beside_its_value(
     assert main(["set", "cell/count", "1", "cell/speed", "2", "cell/run", "true"]) == 1
     out, err = capsys.readouterr()
     assert out.splitlines() == ["cell/count  refused", "cell/speed  refused: worn out", "cell/run    written"]
-    assert err == "cell/count: refused by the device: locked (and 1 more)\n"
+    assert err == "cell/count: the source refused it: locked (and 1 more)\n"
 
 
 def test_what_nobody_knows_is_said_with_what_to_do(device: Device, capsys: pytest.CaptureFixture[str]) -> None:

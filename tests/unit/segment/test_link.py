@@ -108,6 +108,23 @@ def test_one_model_at_a_time_and_each_is_told_from_the_one_before(segment: Segme
         assert source.model() == Joined(2, os.getpid(), "ä" * 51)
 
 
+def test_a_model_has_computed_once_a_step_of_it_was_done_even_by_one_that_has_left(segment: Segment) -> None:
+    source = link_of(segment)
+    source.asked.begin()
+    with Segment.open(segment.instance, writable=True) as other:
+        model = link_of(other)
+        assert model.join("belt")
+        found = ask(5)._replace(number=source.ask(ask(5), 123))
+        model.answer(found, 456, b"\1" * 12, "it has failed")
+        assert not source.computed()
+        model.answer(found, 456, b"\1" * 12)
+        assert source.computed()
+        assert source.model() == Joined(1, os.getpid(), "belt"), "nothing else has changed"
+        model.leave()
+        assert model.join("belt")
+        assert source.computed()
+
+
 def test_a_killed_process_has_left(segment: Segment) -> None:
     command = [sys.executable, "-c", HOLD, segment.instance]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as holder:

@@ -168,7 +168,7 @@ class Simulation:
         frame = self.block.latest()
         image = frame.raw if frame is not None and frame.source_ns else bytes(initial_frame(self.block.layout)[0])
         joined = wire.Joined(
-            computed=link.answered.head() > 0, clock=clock(self._segment.clock.read()), period_ns=self.block.period_ns
+            computed=link.computed(), clock=clock(self._segment.clock.read()), period_ns=self.block.period_ns
         )
         parts = (
             field(_INPUTS, self._inputs.table)
