@@ -9,8 +9,8 @@ import msgspec
 
 from shmio import worker
 from shmio.config import Recorder as Settings
+from shmio.dump.encoding import Reason
 from shmio.recording.attach import ConfigFiles
-from shmio.recording.encoding import Reason
 from shmio.recording.predecessor import places
 from shmio.recording.recorder import Recorder, Start
 from shmio.recording.series import Series

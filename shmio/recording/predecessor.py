@@ -13,11 +13,11 @@ from typing import Final
 
 from mcap.opcode import Opcode
 
+from shmio.dump.encoding import EVENT, FRAME, Place
+from shmio.dump.reader import Reader
+from shmio.dump.survey import survey
 from shmio.errors import RecordingError
-from shmio.recording.encoding import EVENT, FRAME, Place
 from shmio.recording.output import SUFFIX
-from shmio.recording.reader import Reader
-from shmio.recording.survey import survey
 from shmio.segment import Block, Segment
 
 MAX_FILES: Final = 256

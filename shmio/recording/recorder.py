@@ -11,8 +11,8 @@ from itertools import chain
 from typing import Final, NamedTuple
 
 from shmio import __version__
+from shmio.dump.encoding import Gap, Place, Reason, StepMark
 from shmio.recording.attach import Attachment, Attachments, no_attachments
-from shmio.recording.encoding import Gap, Place, Reason, StepMark
 from shmio.recording.follower import Entry, Follower
 from shmio.recording.output import Output
 from shmio.recording.writer import JSON, Channels, Writer

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Final
 
 from shmio.config import Recorder as Settings
+from shmio.dump.encoding import Reason
 from shmio.errors import RecordingError
 from shmio.recording.attach import Attachments
-from shmio.recording.encoding import Reason
 from shmio.recording.output import Output, create
 from shmio.recording.recorder import Recorder, Start
 from shmio.segment import Segment

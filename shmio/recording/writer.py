@@ -9,14 +9,19 @@ from typing import IO, Final, cast
 import mcap.writer
 
 from shmio import __version__
-from shmio.recording.encoding import (
+from shmio.dump.encoding import (
+    ABOUT,
     EVENT,
     EVENT_SCHEMA,
     FRAME,
     FRAME_SCHEMA,
     GAP_SCHEMA,
+    GAPS_TOPIC,
+    PLACES,
     PLAIN,
+    PROFILE,
     STEP_SCHEMA,
+    STEPS_TOPIC,
     Gap,
     Place,
     StepMark,
@@ -29,14 +34,7 @@ from shmio.recording.encoding import (
 from shmio.recording.output import Output
 from shmio.segment import Block, Event, Frame
 
-PROFILE: Final = "shmio"
-ABOUT: Final = "shmio"
-"""Name of the metadata that tell about the instance."""
-PLACES: Final = "places"
-"""Name of the metadata that tell behind which numbers the recording begins."""
 CHUNK_BYTES: Final = 1 << 20
-GAPS_TOPIC: Final = "gaps"
-STEPS_TOPIC: Final = "steps"
 
 JSON: Final = "application/json"
 TOML: Final = "application/toml"

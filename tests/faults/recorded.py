@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from shmio.recording.encoding import FRAME, Gap, StepMark
-from shmio.recording.reader import Channel, Reader
-from shmio.recording.survey import survey
+from shmio.dump.channels import Channel
+from shmio.dump.encoding import FRAME, Gap, StepMark
+from shmio.dump.reader import Reader
+from shmio.dump.survey import survey
 from shmio.segment import Event, Frame
 from tests.faults.checker import Checker
 from tests.faults.checks import Complain, Counts, FrameCheck, Source

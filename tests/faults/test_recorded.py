@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from shmio.dump.encoding import Gap, Reason
 from shmio.layout.model import Layout, Register
-from shmio.recording.encoding import Gap, Reason
 from shmio.recording.output import Output, create
 from shmio.recording.recorder import Recorder
 from shmio.segment import BlockSpec, Event, EventKind, Frame, Quality, Record, Segment

@@ -11,6 +11,11 @@ from typing import Any, Protocol
 from shmio.cli.dumping.moments import MAX_NS, iso, local, lost, parse_time
 from shmio.cli.readings import shown
 from shmio.cli.run import dumps
+from shmio.dump.channels import Channel
+from shmio.dump.damage import Damage
+from shmio.dump.encoding import EVENT, FRAME, GAP, STEP, Gap, StepMark
+from shmio.dump.reader import Message, Reader
+from shmio.dump.survey import Survey, survey
 from shmio.errors import PathError, RecordingError
 from shmio.layout.codec import codec
 from shmio.layout.glob import named
@@ -18,10 +23,6 @@ from shmio.layout.model import Layout, Register
 from shmio.layout.text import json_value
 from shmio.layout.topic import parse_topic
 from shmio.logs import printable
-from shmio.recording.damage import Damage
-from shmio.recording.encoding import EVENT, FRAME, GAP, STEP, Gap, StepMark
-from shmio.recording.reader import Channel, Message, Reader
-from shmio.recording.survey import Survey, survey
 from shmio.segment import Event, EventKind, Frame, Quality
 from shmio.segment.scan import ChangeScan
 

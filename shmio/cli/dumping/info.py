@@ -12,12 +12,12 @@ import msgspec
 
 from shmio.cli.dumping.moments import iso, local, lost
 from shmio.cli.run import dumps
+from shmio.dump.check import check
+from shmio.dump.encoding import EVENT, FRAME
+from shmio.dump.reader import Reader
+from shmio.dump.survey import Survey, Track, survey
 from shmio.errors import RecordingError
 from shmio.logs import printable
-from shmio.recording.check import check
-from shmio.recording.encoding import EVENT, FRAME
-from shmio.recording.reader import Reader
-from shmio.recording.survey import Survey, Track, survey
 
 
 def execute(arguments: argparse.Namespace) -> int:

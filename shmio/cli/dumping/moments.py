@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
+from shmio.dump.damage import Damage
 from shmio.errors import RecordingError
-from shmio.recording.damage import Damage
 
 MAX_NS = (1 << 63) - 1
 

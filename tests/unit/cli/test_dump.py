@@ -15,7 +15,7 @@ import pytest
 from mcap.opcode import Opcode
 
 from shmio.cli.dump import main
-from shmio.recording.reader import Reader
+from shmio.dump.reader import Reader
 from shmio.recording.recorder import Start
 from shmio.segment import EventKind, Quality, Record, Segment
 from shmio.testing.cell import until

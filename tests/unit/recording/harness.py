@@ -8,12 +8,12 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from shmio.dump.encoding import Gap
+from shmio.dump.reader import Message, Reader
+from shmio.dump.survey import survey
 from shmio.layout.model import Layout, Register
-from shmio.recording.encoding import Gap
 from shmio.recording.output import Output, create
-from shmio.recording.reader import Message, Reader
 from shmio.recording.recorder import Recorder
-from shmio.recording.survey import survey
 from shmio.segment import BlockSpec, BlockWriter, Event, Frame, Segment
 
 LAYOUT = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))

@@ -9,10 +9,10 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 
-from shmio.recording.encoding import Place
+from shmio.dump.encoding import Place
+from shmio.dump.reader import Reader
+from shmio.dump.records import MAGIC, Record
 from shmio.recording.predecessor import places
-from shmio.recording.reader import Reader
-from shmio.recording.records import MAGIC, Record
 from shmio.segment import Segment
 from tests.unit.recording.harness import publish, recorder
 

@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 
 from shmio.cli.dump import main
+from shmio.dump.check import check
+from shmio.dump.encoding import Reason
+from shmio.dump.reader import Reader
+from shmio.dump.records import MAGIC
 from shmio.errors import RecordingError
-from shmio.recording.check import check
-from shmio.recording.encoding import Reason
-from shmio.recording.reader import Reader
-from shmio.recording.records import MAGIC
 from shmio.segment import Activity, BlockSpec, Event, Frame, Segment
 from shmio.testing.cell import kill, until
 from tests.unit.recording.harness import OTHER, RING, Process, gaps, numbers, publish, read, spec

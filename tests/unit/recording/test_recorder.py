@@ -11,12 +11,12 @@ from types import SimpleNamespace
 import mcap.reader
 import pytest
 
+from shmio.dump.encoding import Reason, decode_event, decode_frame
+from shmio.dump.reader import Reader
 from shmio.errors import RecordingError
 from shmio.recording import recorder as module
 from shmio.recording.attach import Attachment
-from shmio.recording.encoding import Reason, decode_event, decode_frame
 from shmio.recording.output import Output, create
-from shmio.recording.reader import Reader
 from shmio.recording.recorder import Recorder, Start
 from shmio.segment import Event, EventKind, Frame, Provenance, Quality, Record, Segment
 from tests.unit.recording.harness import OTHER, RING, gaps, numbers, publish, read, recorder, spec

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from shmio.cli.dump import main
-from shmio.recording.check import check
-from shmio.recording.encoding import Reason, StepMark, decode_step, encode_step
-from shmio.recording.reader import Reader
+from shmio.dump.check import check
+from shmio.dump.encoding import Reason, StepMark, decode_step, encode_step
+from shmio.dump.reader import Reader
 from shmio.recording.recorder import Recorder
 from shmio.segment import Attributes, BlockSpec, Frame, ProcessSpec, Segment
 from shmio.segment.coordinator import Coordinator

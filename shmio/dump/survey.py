@@ -8,10 +8,11 @@ from typing import Final, NamedTuple
 
 from mcap.opcode import Opcode
 
+from shmio.dump.channels import Channel
+from shmio.dump.encoding import GAP, Gap
+from shmio.dump.reader import Reader
+from shmio.dump.records import BROKEN, MAX_RECORD_BYTES, Record
 from shmio.errors import RecordingError
-from shmio.recording.encoding import GAP, Gap
-from shmio.recording.reader import Channel, Reader
-from shmio.recording.records import BROKEN, MAX_RECORD_BYTES, Record
 
 MAX_GAPS: Final = 1000
 """Gaps that are kept one by one; all are counted."""

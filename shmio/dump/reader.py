@@ -5,24 +5,21 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Channel as ChannelRecord
 from mcap.records import Metadata
 
-from shmio.errors import LayoutError, RecordingError
-from shmio.layout.model import Layout
-from shmio.recording.damage import Damage, DamageLog
-from shmio.recording.encoding import (
+from shmio.dump.channels import MAX_CHANNEL_BYTES, MAX_CHANNELS, Channel, describe
+from shmio.dump.damage import Damage, DamageLog
+from shmio.dump.encoding import (
+    ABOUT,
     EVENT,
     FRAME,
     GAP,
-    PLAIN,
-    STEP,
+    PLACES,
     Gap,
     Place,
     StepMark,
@@ -32,38 +29,18 @@ from shmio.recording.encoding import (
     decode_place,
     decode_step,
 )
-from shmio.recording.records import BROKEN, Record, Records, stream
-from shmio.recording.writer import ABOUT, GAPS_TOPIC, PLACES, STEPS_TOPIC
+from shmio.dump.records import BROKEN, Record, Records, stream
+from shmio.errors import LayoutError, RecordingError
+from shmio.layout.model import Layout
 from shmio.segment import Event, Frame
 
 MAX_LAYOUT_BYTES: Final = 64 << 20
 """All layouts of one file together."""
 MAX_ATTACHMENTS: Final = 10_000
-MAX_CHANNELS: Final = 10_000
-MAX_CHANNEL_BYTES: Final = 4096
 
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _ATTACHMENT_HEAD: Final = 4096  # times, name, media type and size of any attachment fit in
 _LAYOUTS: Final = "layouts/"
-_OWN: Final = {GAPS_TOPIC: GAP, STEPS_TOPIC: STEP}
-
-
-@dataclass(frozen=True, slots=True)
-class Channel:
-    """Where the messages of one kind of one block are. ``layout``: the hash of its layout, in hexadecimal digits.
-
-    ``encoding`` is empty for messages that are not a recorder's.
-    """
-
-    number: int
-    encoding: str
-    topic: str
-    source: str = ""
-    block: int = 0
-    section: int = 0
-    after: int = 0
-    """Number behind which the recording of this kind began."""
-    layout: str = ""
 
 
 Item = Frame | Event | Gap | StepMark
@@ -268,27 +245,10 @@ class Reader:
                 f"{self.file}: it describes more channels, or one at more length, than a recorder does"
             )
         try:
-            found = ChannelRecord.read(stream(content))
-            about = found.metadata
-            if found.message_encoding in (FRAME, EVENT):
-                block, section, after = (int(about[name]) for name in ("block", "section", "after"))
-                channel = Channel(
-                    found.id,
-                    found.message_encoding,
-                    found.topic,
-                    about["source"],
-                    block,
-                    section,
-                    after,
-                    about["layout"],
-                )
-            elif found.message_encoding == PLAIN and found.topic in _OWN:
-                channel = Channel(found.id, _OWN[found.topic], found.topic)
-            else:
-                channel = Channel(found.id, "", found.topic)  # another program's
+            channel = describe(content)
         except (ValueError, KeyError, struct.error, McapError):
             raise RecordingError(f"{self.file}: the description of a channel is damaged") from None
-        self.channels[found.id] = channel
+        self.channels[channel.number] = channel
 
     def require_ours(self) -> None:
         """RecordingError if nothing in what was read is of a recorder of shmio."""

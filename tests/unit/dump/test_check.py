@@ -10,12 +10,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.opcode import Opcode
 
+from shmio.dump.check import Findings, check
+from shmio.dump.damage import Damage
+from shmio.dump.reader import Message, Reader
+from shmio.dump.records import MAGIC, Record
 from shmio.errors import RecordingError
 from shmio.recording import follower
-from shmio.recording.check import Findings, check
-from shmio.recording.damage import Damage
-from shmio.recording.reader import Message, Reader
-from shmio.recording.records import MAGIC, Record
 from shmio.segment import Frame, Segment
 from tests.unit.recording.harness import publish, recorder
 

@@ -22,8 +22,8 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 
+from shmio.dump.framing import CHUNK, FOOTER, MAX_CHUNK_BYTES, U32, framed, unpack
 from shmio.errors import RecordingError
-from shmio.recording.framing import CHUNK, FOOTER, MAX_CHUNK_BYTES, U32, framed, unpack
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 MAX_RECORD_BYTES: Final = 1 << 20

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from shmio.recording.records import Record
+from shmio.dump.records import Record
 
 
 class Damage(NamedTuple):

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.recording.encoding import (
+from shmio.dump.encoding import (
     Gap,
     Reason,
     decode_event,

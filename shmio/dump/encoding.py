@@ -16,6 +16,14 @@ from shmio.segment.frame import Frame, Provenance, Quality
 
 MAX_JSON_BYTES: Final = 4096
 
+PROFILE: Final = "shmio"
+ABOUT: Final = "shmio"
+"""Name of the metadata that tell about the instance."""
+PLACES: Final = "places"
+"""Name of the metadata that tell behind which numbers the recording begins."""
+GAPS_TOPIC: Final = "gaps"
+STEPS_TOPIC: Final = "steps"
+
 FRAME: Final = "shmio.frame.v1"
 EVENT: Final = "shmio.event.v1"
 PLAIN: Final = "json"

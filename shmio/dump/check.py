@@ -9,12 +9,13 @@ from typing import Final
 
 from mcap.opcode import Opcode
 
+from shmio.dump.channels import Channel
+from shmio.dump.damage import Damage, DamageLog
+from shmio.dump.encoding import EVENT, FRAME, Gap
+from shmio.dump.reader import Reader
+from shmio.dump.records import BROKEN, Record
+from shmio.dump.survey import MAX_BLOCKS, Count, read_index
 from shmio.errors import RecordingError
-from shmio.recording.damage import Damage, DamageLog
-from shmio.recording.encoding import EVENT, FRAME, Gap
-from shmio.recording.reader import Channel, Reader
-from shmio.recording.records import BROKEN, Record
-from shmio.recording.survey import MAX_BLOCKS, Count, read_index
 
 MAX_TOLD: Final = 1000
 """Damaged places, and contradictions, that are kept one by one; all are counted."""

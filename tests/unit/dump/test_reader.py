@@ -14,11 +14,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 
+from shmio.dump.framing import MAX_CHUNK_BYTES
+from shmio.dump.reader import Message, Reader
+from shmio.dump.records import MAGIC
+from shmio.dump.survey import survey
 from shmio.errors import RecordingError
-from shmio.recording.framing import MAX_CHUNK_BYTES
-from shmio.recording.reader import Message, Reader
-from shmio.recording.records import MAGIC
-from shmio.recording.survey import survey
 
 CHUNK = 6  # opcode
 

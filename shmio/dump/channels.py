@@ -1,0 +1,47 @@
+"""What a recording says of its channels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from mcap.records import Channel as ChannelRecord
+
+from shmio.dump.encoding import EVENT, FRAME, GAP, GAPS_TOPIC, PLAIN, STEP, STEPS_TOPIC
+from shmio.dump.records import stream
+
+MAX_CHANNELS: Final = 10_000
+MAX_CHANNEL_BYTES: Final = 4096
+
+_OWN: Final = {GAPS_TOPIC: GAP, STEPS_TOPIC: STEP}
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """Where the messages of one kind of one block are. ``layout``: the hash of its layout, in hexadecimal digits.
+
+    ``encoding`` is empty for messages that are not a recorder's.
+    """
+
+    number: int
+    encoding: str
+    topic: str
+    source: str = ""
+    block: int = 0
+    section: int = 0
+    after: int = 0
+    """Number behind which the recording of this kind began."""
+    layout: str = ""
+
+
+def describe(content: memoryview) -> Channel:
+    """The channel that a record describes; ValueError, KeyError, struct.error, McapError."""
+    found = ChannelRecord.read(stream(content))
+    about = found.metadata
+    if found.message_encoding in (FRAME, EVENT):
+        block, section, after = (int(about[name]) for name in ("block", "section", "after"))
+        source, layout = about["source"], about["layout"]
+        return Channel(found.id, found.message_encoding, found.topic, source, block, section, after, layout)
+    if found.message_encoding == PLAIN and found.topic in _OWN:
+        return Channel(found.id, _OWN[found.topic], found.topic)
+    return Channel(found.id, "", found.topic)  # another program's
