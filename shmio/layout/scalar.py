@@ -27,7 +27,7 @@ from __future__ import annotations
 import struct
 import sys
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 from shmio.errors import ValueRangeError
 from shmio.layout import calendar
@@ -65,14 +65,15 @@ class _Number:
         self._struct = struct.Struct(order + code)
         self._limit = limit
         self._convert: Callable[[object, str], float] = to_float if code in "fd" else to_int
+        self._native = frozenset({int, float} if code in "fd" else {int})  # types that are packed as they are
 
     def decode(self, data: Buffer, offset: int) -> float | None:
         value: float = self._struct.unpack_from(data, offset)[0]
         return value if self._limit is None or value <= self._limit else None
 
-    def encode(self, value: object) -> bytes:
+    def encode(self, value: Any) -> bytes:
         try:
-            number = self._convert(value, self._name)
+            number = value if type(value) in self._native else self._convert(value, self._name)
             if self._limit is None or number <= self._limit:
                 return self._struct.pack(number)
         except (struct.error, OverflowError):

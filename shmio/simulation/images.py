@@ -27,6 +27,7 @@ class Images:
         self._outputs = tuple(outputs)
         self._computed = covering(outputs, layout.size)
         self._given = ~_array(covering((*outputs, *inouts), layout.size))
+        self._all_computed = not self._given.any()
 
     def write(self, writes: Sequence[Write]) -> list[str]:
         """Command these bytes and bits; of each "" or why it is refused: the model computes it."""
@@ -40,6 +41,8 @@ class Images:
 
     def with_given(self, image: bytes | bytearray) -> bytes:
         """An image with what is commanded of all that the model does not compute."""
+        if self._all_computed:
+            return bytes(image)
         return (_array(self.commanded) & self._given | _array(image) & ~self._given).tobytes()
 
     def _write(self, write: Write) -> str:

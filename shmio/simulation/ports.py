@@ -11,6 +11,7 @@ from shmio.errors import ValueRangeError
 from shmio.layout.checks import brief
 from shmio.layout.codec import codec
 from shmio.layout.model import ByteOrder, Register
+from shmio.simulation.bulk import Bulk
 
 _PYTHON: Final = frozenset({bool, int, float, str, list, tuple})
 _NUMPY: Final = (np.ndarray, np.generic)
@@ -30,7 +31,7 @@ class Port(Protocol):
 def port_of(path: str, registers: Mapping[str, Register], byte_order: ByteOrder, image: bytearray) -> Port:
     """The port of a declaration's registers, by their paths in it: a structure, or one register under ``""``."""
     ports = {member: RegisterPort(register, byte_order, image) for member, register in registers.items()}
-    return ports.get("") or StructurePort(path, ports)
+    return ports.get("") or StructurePort(path, ports, Bulk.of(registers, byte_order), image)
 
 
 class RegisterPort:
@@ -65,16 +66,23 @@ class RegisterPort:
 class StructurePort:
     """A structure's registers."""
 
-    def __init__(self, path: str, ports: Mapping[str, RegisterPort]) -> None:
+    def __init__(self, path: str, ports: Mapping[str, RegisterPort], bulk: Bulk | None, image: bytearray) -> None:
+        """``bulk``: all of them at once, if that can be."""
         self._path = path
         self._ports = ports
+        self._bulk = bulk
+        self._image = image
 
     def read(self) -> dict[str, Any]:
         """All members, by path."""
+        if self._bulk is not None:
+            return self._bulk.read(self._image)
         return {path: port.read() for path, port in self._ports.items()}
 
     def write(self, value: object) -> None:
         """Change the members that are named."""
+        if isinstance(value, Mapping) and self._bulk is not None and self._bulk.write(value, self._image):
+            return
         if not isinstance(value, Mapping) or value.keys() - self._ports.keys():
             some = ", ".join(self._ports)
             raise ValueRangeError(f"{self._path}: expected a dict with some of {some}, found {brief(value)}")

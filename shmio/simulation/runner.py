@@ -106,7 +106,8 @@ class ModelRunner:
 
         ModelError: the model's code failed, and the image is still the one before.
         """
-        self.begin()
+        if not self._started:
+            self.begin()
         before = self.image
         self._images.shown[:] = self._images.with_given(before)
         self._run(self._model.step, time_ns / 1e9, dt_ns / 1e9, instead=before)
