@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from shmio.endpoints.grpc.native.columns import KINDS, Column
-from shmio.endpoints.grpc.native.values import FIELDS, index_of, plain
+from shmio.endpoints.grpc.native.values import FIELDS, MAX_VALUES, index_of, plain
 from shmio.endpoints.grpc.native.views import Selection
 from shmio.errors import PathError, ValueRangeError
 from shmio.layout.codec import RegisterCodec, codec
@@ -50,6 +50,10 @@ class Fill:
         """Values by paths, with or without the source. PathError: no such register in the table; ValueRangeError."""
         if len(assignments) > (most := self._selection.elements):
             raise ValueRangeError(f"assignments: {len(assignments)} values, the table has {most}: give each once")
+        if len(assignments) > MAX_VALUES:  # each is put in by itself, and nobody is served meanwhile
+            raise ValueRangeError(
+                f"assignments: {len(assignments)} values, {MAX_VALUES} are the most by path: give them by slots"
+            )
         order = self._selection.block.layout.byte_order
         for assignment in assignments:
             register = self._paths.get(assignment.path)
