@@ -162,6 +162,10 @@ class Recorder(Section):
     directory: Text = "dumps"
     fsync_s: Annotated[float, Meta(ge=0, le=3600)] = 0.0
     buffer_mb: Annotated[float, Meta(gt=0, le=65536)] = 16.0
+    rotate_min: Annotated[float, Meta(ge=0, le=100_000)] = 60.0
+    rotate_mb: Annotated[float, Meta(ge=0, le=1e9)] = 1000.0
+    keep_days: Annotated[float, Meta(ge=0, le=100_000)] = 0.0
+    keep_mb: Annotated[float, Meta(ge=0, le=1e9)] = 0.0
 
     @property
     def buffer_bytes(self) -> int:

@@ -12,8 +12,8 @@ from shmio.config import Recorder as Settings
 from shmio.dump.encoding import Reason
 from shmio.recording.attach import ConfigFiles
 from shmio.recording.predecessor import places
-from shmio.recording.recorder import Recorder, Start
 from shmio.recording.series import Series
+from shmio.recording.tap import Start, Tap
 from shmio.segment import Report
 from shmio.worker import BEAT_S, Worker
 
@@ -31,16 +31,14 @@ def run(worker: Worker) -> None:
     known = places(directory, segment, BY, worker.slot.beat)
     elsewhere = _elsewhere(worker.before, directory)
     start = Start(known, reason=Reason.ELSEWHERE if elsewhere else Reason.NOT_RUNNING)
-    series = Series(segment, settings, BY, start, ConfigFiles(Path(worker.config["config_file"])))
+    series = Series(Tap(segment, start), settings, BY, ConfigFiles(Path(worker.config["config_file"])))
     goes_on = ", going on where its predecessor ended" if known else ""
     worker.log.info("recording to %s%s%s", series.recorder.output.path, goes_on, elsewhere)
     _record(worker, series)
-    recorder = series.recorder
-    if not recorder.close():
-        output = recorder.output
-        worker.log.error("%s%s", output.problem or output.path, "" if output.doubt else "; it was not closed")
-    _report(worker, recorder, "")
-    counters = recorder.counters
+    for unclosed in series.close():
+        worker.log.error("%s", unclosed)
+    _report(worker, series, "")
+    counters = series.counters
     worker.log.info("%d frames, %d events, %d missed", counters.frames, counters.events, counters.missed)
 
 
@@ -60,27 +58,26 @@ def _record(worker: Worker, series: Series) -> None:
     clock.deliver(slot, 0)  # from now on each step waits for it
     while not worker.stopping.is_set():
         if not more:
-            seen = bell.wait(seen, round(series.recorder.pause_s * 1e9))
-        more = series.recorder.turn()
-        if (done := series.recorder.done) != clock.delivered(slot):
+            seen = bell.wait(seen, round(series.pause_s * 1e9))
+        more = series.turn()
+        if (done := series.done) != clock.delivered(slot):
             clock.deliver(slot, done)
         if time.monotonic() - told_s < BEAT_S:
             continue
         told_s = time.monotonic()
-        renewed = series.renew()
-        recorder = series.recorder
-        before, problem = "" if renewed else problem, recorder.problem
+        renewed = series.tend()
+        before, problem = "" if renewed else problem, series.problem
         if problem and not before:
             worker.log.error("%s", problem)
         elif before and not problem:
-            worker.log.info("%s is being written again", recorder.output.path)
-        _report(worker, recorder, problem)
+            worker.log.info("%s is being written again", series.recorder.output.path)
+        _report(worker, series, problem)
 
 
-def _report(worker: Worker, recorder: Recorder, problem: str) -> None:
-    counters = recorder.counters
-    numbers = (counters.frames, counters.events, counters.missed, recorder.output.written)
-    worker.report(numbers, note=problem or f"{NOTE}{recorder.output.path.name}")
+def _report(worker: Worker, series: Series, problem: str) -> None:
+    counters, output = series.counters, series.recorder.output
+    numbers = (counters.frames, counters.events, counters.missed, output.written)
+    worker.report(numbers, note=problem or f"{NOTE}{output.path.name}")
 
 
 if __name__ == "__main__":

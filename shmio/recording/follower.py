@@ -5,18 +5,25 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Generic, NamedTuple, TypeVar
 
-from shmio.dump.encoding import Gap, Place, Reason
+from shmio.dump.encoding import Gap, Place, Reason, StepMark
 from shmio.segment import Block, Cursor, Event, Frame
 
 Item = TypeVar("Item", bound=Frame | Event)
 
 
 class Entry(NamedTuple):
-    """Something to be recorded, with the time it has there."""
+    """Something of a block that is to be recorded, with the time it has there."""
 
     log_ns: int
     follower: Follower
     item: Frame | Event | Gap
+
+
+class Aside(NamedTuple):
+    """Something of the instance that is to be recorded, with the time it has there."""
+
+    log_ns: int
+    item: StepMark
 
 
 class _Side(Generic[Item]):
@@ -39,14 +46,24 @@ class _Side(Generic[Item]):
 class Follower:
     """Follows one block. ``done`` when a reload has ended the block and all of it was taken."""
 
-    def __init__(self, block: Block, number: int, place: Place, reason: Reason, log_time: Callable[[int], int]) -> None:
+    def __init__(
+        self,
+        block: Block,
+        number: int,
+        place: Place,
+        reason: Reason,
+        log_time: Callable[[int], int],
+        *,
+        over: bool = False,
+    ) -> None:
         """``number``: of the block in the recording. ``reason``: why something may be missing at the beginning.
 
-        ``log_time`` turns CLOCK_MONOTONIC into the time in the recording.
+        ``log_time`` turns CLOCK_MONOTONIC into the time in the recording. ``over``: a reload had ended it before.
         """
         self.block = block
         self.number = number
         self.begin = place
+        self.over = over
         self.done = False
         self._log_time = log_time
         self._log_ns = place.log_ns

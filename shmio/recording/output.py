@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import threading
 import time
@@ -15,6 +16,8 @@ from shmio.errors import RecordingError
 
 RETRY_S: Final = 0.5
 """How often a disk that refuses is tried again."""
+WAIT_S: Final = 0.02
+"""How often it is looked whether the file before is whole."""
 SLOW_S: Final = 2.0
 """A write that takes longer is told."""
 SUFFIX: Final = ".mem"
@@ -42,11 +45,19 @@ class Output:
     """Takes bytes from one thread and writes them in another.
 
     What was written between two calls of :meth:`flush` is a piece; the file holds whole pieces only, also while the
-    disk is full: a piece that does not fit is taken back and tried again.
+    disk is full: a piece that does not fit is taken back and tried again. The file is locked (flock) for as long, so
+    that nobody takes it for what a recorder that died has left.
     """
 
-    def __init__(self, path: Path, fd: int, *, limit_bytes: int, fsync_s: float = 0.0) -> None:
-        """``limit_bytes``: from where on :attr:`full`. ``fsync_s``: how often to fsync; 0: at the end."""
+    def __init__(
+        self, path: Path, fd: int, *, limit_bytes: int, fsync_s: float = 0.0, after: Output | None = None
+    ) -> None:
+        """``limit_bytes``: from where on :attr:`full`. ``fsync_s``: how often to fsync; 0: at the end.
+
+        ``after``: the file before, which must be whole before anything of this one is written.
+        """
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         self.path = path
         self.error = ""
         """Why the disk does not take what waits; empty while it does."""
@@ -65,6 +76,10 @@ class Output:
         self._full = False
         self._pieces: deque[bytes] = deque()
         self._news = threading.Condition()
+        self._after = after
+        self.whole = False
+        """Whether no more is to come, and all is in the file."""
+        self._ending = False
         self._closing = False
         self._busy_since_s: float | None = None
         self._synced_s = time.monotonic()
@@ -115,11 +130,23 @@ class Output:
         if os.fstat(self._fd).st_nlink == 0:
             raise RecordingError(f"{self.path} was removed while it was being written")
 
+    def end(self) -> None:
+        """No more will be given: what waits is written, however long the disk takes for it."""
+        self.flush()
+        with self._news:
+            self._ending = True
+            self._news.notify()
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing waits any more, and none will: :meth:`close` will not wait either."""
+        return not self._thread.is_alive()
+
     def close(self, patience_s: float) -> bool:
         """Write what waits, as far as the disk takes it in this time; whether all of it is there, for certain."""
         self.flush()
         with self._news:
-            self._closing = True
+            self._ending = self._closing = True
             self._news.notify()
         self._thread.join(patience_s)
         if self._thread.is_alive():
@@ -132,9 +159,11 @@ class Output:
     # ---- the disk's thread -------------------------------------------------------------------------------------------
 
     def _run(self) -> None:
+        if not self._is_next():
+            return
         while True:
             with self._news:
-                while not self._pieces and not self._closing:
+                while not self._pieces and not self._ending:
                     self._news.wait()
                 if not self._pieces:
                     break
@@ -147,7 +176,18 @@ class Output:
                     self._sync()
             elif not self._wait():
                 break
+        self.whole = not self._pieces
         self._sync()
+
+    def _is_next(self) -> bool:
+        """Wait for the file before to be written; False if that, or the time for it, has come to an end without."""
+        after, self._after = self._after, None
+        while after is not None and not after.whole:
+            if self._closing or after.ended:
+                self.error = f"{after.path} before it was not written to its end"
+                return after.whole
+            after._thread.join(WAIT_S)
+        return True
 
     def _put(self, piece: bytes) -> bool:
         """Write a piece as a whole, or leave nothing of it."""

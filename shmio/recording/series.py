@@ -1,4 +1,4 @@
-"""Recordings of one recorder, one after the other."""
+"""Recordings of one recorder, one file after the other."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from shmio.dump.encoding import Reason
 from shmio.errors import RecordingError
 from shmio.recording.attach import Attachments
 from shmio.recording.output import Output, create
-from shmio.recording.recorder import Recorder, Start
-from shmio.segment import Segment
+from shmio.recording.recorder import CLOSE_S, Counters, Recorder
+from shmio.recording.tap import Start, Tap
 
 FIRST_WAIT_S: Final = 1.0
 MAX_WAIT_S: Final = 600.0
@@ -23,45 +23,124 @@ log = logging.getLogger("shmio.recorder")
 
 
 class Series:
-    """Takes a new file when an fsync of the present one has failed: of that nobody can say any more what the disk has.
+    """Takes a new file when the present one is large or old enough, from the entry on with which that ends.
 
-    The new file begins where the disk had the old one for certain: what the rings still hold of it is recorded again,
-    the rest is a gap there.
+    Also when an fsync of a file has failed: of that nobody can say any more what the disk has. Then the new file begins
+    where the disk had the old one for certain: what the rings still hold of it is recorded again, the rest is a gap
+    there.
     """
 
-    def __init__(self, segment: Segment, settings: Settings, by: str, start: Start, attachments: Attachments) -> None:
-        """``start``: where the recorder before ended. RecordingError: no file can be made."""
-        self._segment = segment
+    def __init__(self, tap: Tap, settings: Settings, by: str, attachments: Attachments) -> None:
+        """RecordingError: no file can be made."""
+        self._tap = tap
         self._settings = settings
         self._by = by
         self._attachments = attachments
         self._wait_s = FIRST_WAIT_S
         self._again_s = 0.0
-        self.recorder = self._begin(start)
+        self._ending: list[Recorder] = []
+        """Files that are complete but for what the disk has not taken yet."""
+        self.counters = Counters()
+        self.recorder = self._begin(self._tap, None, {})
 
-    def _begin(self, start: Start) -> Recorder:
+    def _begin(self, tap: Tap, before: Recorder | None, about: dict[str, str]) -> Recorder:
         settings = self._settings
-        path, fd = create(Path(settings.directory), self._segment.instance)
-        output = Output(path, fd, limit_bytes=settings.buffer_bytes, fsync_s=settings.fsync_s)
-        return Recorder(self._segment, output, by=self._by, start=start, attachments=self._attachments)
+        path, fd = create(Path(settings.directory), tap.segment.instance)
+        output = Output(
+            path, fd, limit_bytes=settings.buffer_bytes, fsync_s=settings.fsync_s, after=before and before.output
+        )
+        self._begun_s = time.monotonic()
+        return Recorder(
+            tap, output, by=self._by, places=before and before.places, about=about, counters=self.counters,
+            attachments=self._attachments,
+        )  # fmt: skip
 
-    def renew(self) -> bool:
-        """Begin a new file if that is called for; whether it was."""
+    def turn(self) -> bool:
+        """Record what has been published; whether there is more at once. RecordingError: the file was removed."""
+        entries, more = self._tap.take()
+        self.recorder.put(entries)
+        return more
+
+    @property
+    def pause_s(self) -> float:
+        """How long to wait between two turns."""
+        return self._tap.pause_s
+
+    @property
+    def done(self) -> int:
+        """The last step of virtual time of which all is recorded, or lost for want of room."""
+        return self._tap.done
+
+    @property
+    def problem(self) -> str:
+        """What is wrong at present, in words; empty: nothing."""
+        return next(filter(None, (recorder.problem for recorder in (*self._ending, self.recorder))), "")
+
+    def tend(self) -> bool:
+        """Begin a new file if that is called for; whether a doubtful one was given up."""
+        for old in [old for old in self._ending if old.output.ended and not old.output.doubt]:
+            old.output.close(0)
+            self._ending.remove(old)
+        doubtful = next((old for old in (*self._ending, self.recorder) if old.output.doubt), None)
+        if doubtful is not None:
+            return self._renew(doubtful)
+        if self.recorder.output.synced:
+            self._wait_s = FIRST_WAIT_S
+        if self._due and time.monotonic() >= self._again_s:
+            self._rotate()
+        return False
+
+    @property
+    def _due(self) -> bool:
+        """Whether the present file is to end: never while the disk has trouble, which a new file would not help."""
+        settings, recorder = self._settings, self.recorder
+        old = bool(settings.rotate_min) and time.monotonic() - self._begun_s >= settings.rotate_min * 60
+        large = bool(settings.rotate_mb) and recorder.output.tell() >= settings.rotate_mb * 1e6
+        return (old or large) and not (self._ending or recorder.problem or recorder.losing)
+
+    def _rotate(self) -> None:
         old = self.recorder
-        if not old.output.doubt:
-            if old.output.synced:
-                self._wait_s = FIRST_WAIT_S
-            return False
+        old.settle()
+        try:
+            self.recorder = self._begin(self._tap, old, {})
+        except RecordingError as error:
+            log.error("%s; going on in %s", error, old.output.path)
+            self._again_s = time.monotonic() + MAX_WAIT_S
+            return
+        old.end()
+        self._ending.append(old)
+        log.info("recording to %s, going on where %s ends", self.recorder.output.path, old.output.path.name)
+
+    def _renew(self, doubtful: Recorder) -> bool:
         if time.monotonic() < self._again_s:
             return False
         self._again_s = time.monotonic() + self._wait_s
         self._wait_s = min(2 * self._wait_s, MAX_WAIT_S)
-        about = {"doubtful": old.output.path.name, "doubtful_from": str(old.output.synced)}
+        output = doubtful.output
+        about = {"doubtful": output.path.name, "doubtful_from": str(output.synced)}
+        tap = self._tap.again(Start(doubtful.confirmed, True, Reason.UNSURE))
         try:
-            self.recorder = self._begin(Start(old.confirmed, True, Reason.UNSURE, about, old.counters))
+            recorder = self._begin(tap, None, about)
         except RecordingError as error:
-            log.error("%s; %s", old.output.problem, error)
+            log.error("%s; %s", output.problem, error)
             return False
-        log.error("%s; going on in %s", old.output.problem, self.recorder.output.path)
-        old.close()
+        log.error("%s; going on in %s", output.problem, recorder.output.path)
+        if self.recorder is not doubtful:
+            self._ending.remove(doubtful)
+            output.close(0)
+        self.recorder.close()
+        self._tap, self.recorder = tap, recorder
         return True
+
+    def close(self, patience_s: float = CLOSE_S) -> list[str]:
+        """Take what is there, write it, close all files; what is wrong with those that are not whole."""
+        until_s = time.monotonic() + patience_s
+        files = [*self._ending, self.recorder]
+        for old in self._ending:
+            old.output.close(max(0.0, until_s - time.monotonic()))
+        self.recorder.close(max(0.1, until_s - time.monotonic()))
+        return [_unclosed(recorder.output) for recorder in files if not recorder.output.whole or recorder.problem]
+
+
+def _unclosed(output: Output) -> str:
+    return f"{output.problem or output.path}{'' if output.doubt else '; it was not closed'}"

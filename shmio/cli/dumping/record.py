@@ -16,7 +16,8 @@ from shmio.errors import ControlError, PathError, RecordingError
 from shmio.logs import printable
 from shmio.recording.attach import Attachments, ConfigFiles, no_attachments
 from shmio.recording.output import Output, create
-from shmio.recording.recorder import Recorder, Start
+from shmio.recording.recorder import Recorder
+from shmio.recording.tap import Start, Tap
 from shmio.segment import Segment
 from shmio.supervisor import control
 
@@ -37,11 +38,9 @@ def execute(arguments: argparse.Namespace) -> int:
                 raise PathError(f"no source {source!r}; there are: {', '.join(segment.blocks)}")
         path, fd = create(arguments.directory, segment.instance)
         recorder = Recorder(
-            segment,
+            Tap(segment, Start(first=False), sources),
             Output(path, fd, limit_bytes=BUFFER_BYTES),
             by=BY,
-            start=Start(first=False),
-            sources=sources,
             attachments=_attachments(segment),
         )
         _say(f"recording {', '.join(sources or segment.blocks)} of {segment.instance} to {path}; Ctrl-C ends it")
@@ -63,7 +62,7 @@ def _record(segment: Segment, recorder: Recorder, stopping: threading.Event, dur
     until_s = None if duration_s is None else time.monotonic() + duration_s
     look_s, more, problem = 0.0, False, ""
     while True:
-        rest_s = recorder.pause_s if until_s is None else min(recorder.pause_s, until_s - time.monotonic())
+        rest_s = recorder.tap.pause_s if until_s is None else min(recorder.tap.pause_s, until_s - time.monotonic())
         if rest_s <= 0 or stopping.wait(0 if more else rest_s):
             return True
         more = recorder.turn()

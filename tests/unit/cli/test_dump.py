@@ -16,7 +16,7 @@ from mcap.opcode import Opcode
 
 from shmio.cli.dump import main
 from shmio.dump.reader import Reader
-from shmio.recording.recorder import Start
+from shmio.recording.tap import Start
 from shmio.segment import EventKind, Quality, Record, Segment
 from shmio.testing.cell import until
 from tests.unit.recording.harness import OTHER, RING, numbers, publish, recorder, spec

@@ -14,6 +14,7 @@ from shmio.dump.survey import survey
 from shmio.layout.model import Layout, Register
 from shmio.recording.output import Output, create
 from shmio.recording.recorder import Recorder
+from shmio.recording.tap import Start, Tap
 from shmio.segment import BlockSpec, BlockWriter, Event, Frame, Segment
 
 LAYOUT = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))
@@ -35,10 +36,12 @@ def publish(writer: BlockWriter, count: int, first: int = 0) -> None:
         writer.publish((cycle & 0x7FFF).to_bytes(size, "big"), cycle=cycle)
 
 
-def recorder(segment: Segment, folder: Path, **options: Any) -> Recorder:
+def recorder(
+    segment: Segment, folder: Path, start: Start = Start(), sources: list[str] | None = None, **options: Any
+) -> Recorder:
     """A recorder in this process."""
     path, fd = create(folder, segment.instance)
-    return Recorder(segment, Output(path, fd, limit_bytes=1 << 24), by="test", **options)
+    return Recorder(Tap(segment, start, sources), Output(path, fd, limit_bytes=1 << 24), by="test", **options)
 
 
 def read(file: Path) -> list[Message]:

@@ -17,7 +17,8 @@ from shmio.errors import RecordingError
 from shmio.recording import recorder as module
 from shmio.recording.attach import Attachment
 from shmio.recording.output import Output, create
-from shmio.recording.recorder import Recorder, Start
+from shmio.recording.recorder import Recorder
+from shmio.recording.tap import Start, Tap
 from shmio.segment import Event, EventKind, Frame, Provenance, Quality, Record, Segment
 from tests.unit.recording.harness import OTHER, RING, gaps, numbers, publish, read, recorder, spec
 
@@ -179,7 +180,7 @@ def test_a_chunk_is_in_the_file_within_the_second(
     publish(segment.writer("cell"), 1)
     begun_s, given = clock.s, recording.output.tell()
     while recording.output.tell() == given:
-        clock.s += recording.pause_s
+        clock.s += recording.tap.pause_s
         recording.turn()
     assert clock.s - begun_s < 1.0
     recording.close()
@@ -223,7 +224,7 @@ def test_what_a_full_disk_costs_is_a_gap_and_it_goes_on(
 ) -> None:
     path, fd = create(tmp_path, segment.instance)
     output = Output(path, fd, limit_bytes=2000)
-    recording = Recorder(segment, output, by="test")
+    recording = Recorder(Tap(segment), output, by="test")
     monkeypatch.setattr(module, "CHUNK_S", 0.0)  # a chunk each turn
     writer = segment.writer("cell")
 

@@ -89,7 +89,7 @@ def test_a_step_is_told_behind_all_its_frames(segment: Segment, tmp_path: Path) 
     for _ in range(3):
         coordinator.step(MS)
         recording.turn()
-    assert recording.done == 3
+    assert recording.tap.done == 3
     assert recording.close()
     items = [message.item for message in read(recording.output.path)]
     kinds = [

@@ -1,0 +1,127 @@
+"""What the blocks of an instance publish and what else happens in it, in order: what recordings are made of."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Mapping
+from typing import Final, NamedTuple
+
+from shmio.dump.encoding import Place, Reason, StepMark
+from shmio.recording.follower import Aside, Entry, Follower
+from shmio.segment import Block, Segment
+from shmio.segment.clock import ClockState
+from shmio.segment.events import EVENT_SIZE
+
+TURN_S: Final = 0.1
+LIVELY: Final = 256
+"""Entries of one block in one turn from which on the next turn comes sooner: many commands turn an event ring fast."""
+BATCH_BYTES: Final = 2 << 20
+"""About as much of one block in one turn; what is left comes in the next, at once."""
+
+
+class Start(NamedTuple):
+    """Where to begin: behind these places, by section; blocks without one at their first frame, or at the present."""
+
+    places: Mapping[int, Place] = {}
+    first: bool = True
+    reason: Reason = Reason.NOT_RUNNING
+    """Why something may be missing at the beginning."""
+
+
+class Tap:
+    """Takes from the blocks of a segment what they publish, each entry once. Use from one thread.
+
+    Blocks that a reload adds or puts in the place of others are followed too. Files may follow each other on one tap:
+    nothing is lost between them.
+    """
+
+    def __init__(self, segment: Segment, start: Start = Start(), sources: Collection[str] | None = None) -> None:
+        """``sources``: only these."""
+        self.segment = segment
+        self.start = start
+        self.followers: list[Follower] = []
+        """Of the blocks that are there, or whose end has not been taken yet."""
+        self.done = 0
+        """The last step of virtual time of which all has been taken."""
+        self._sources = sources
+        self._seen: set[int] = set()
+        """Sections whose blocks are followed, were, or need not be."""
+        self._blocks = 0
+        self._lively = False
+        self._follow(start)
+
+    def again(self, start: Start) -> Tap:
+        """Another tap of the same, from elsewhere on."""
+        tap = Tap(self.segment, start, self._sources)
+        tap.done = self.done
+        return tap
+
+    def log_time(self, monotonic_ns: int) -> int:
+        """Time in a recording, UTC by the instance's start: it goes on evenly whatever is done to the wall clock."""
+        head = self.segment.header
+        return max(0, head.started_utc_ns + monotonic_ns - head.started_ns)
+
+    def now(self) -> int:
+        """The time in a recording now."""
+        return self.log_time(time.monotonic_ns())
+
+    def take(self) -> tuple[list[Entry | Aside], bool]:
+        """What has been published, in order; whether there is more at once."""
+        state = self.segment.clock.read()  # before looking: what was published for the step that is done is there
+        self.segment.refresh()
+        if self.segment.blocks is not self._known:
+            self._follow(Start())
+        entries: list[Entry | Aside] = []
+        more, most = False, 0
+        for follower in self.followers:
+            batch = max(16, BATCH_BYTES // (follower.block.layout.size + EVENT_SIZE))
+            taken = list(follower.take(batch))
+            more |= len(taken) >= batch
+            if follower.done:
+                taken += follower.rest()
+            most = max(most, len(taken))
+            entries += taken
+        self._lively = most > LIVELY
+        self.followers = [follower for follower in self.followers if not follower.done]
+        entries.sort(key=lambda entry: entry.log_ns)  # stable: a block's own order stays
+        if state.virtual and state.done > self.done and not more:
+            entries += self._step(state)
+        return entries, more
+
+    def rest(self) -> list[Entry]:
+        """What was missed at the very end, which no later entry has shown: there will be none."""
+        return [entry for follower in self.followers for entry in follower.rest()]
+
+    @property
+    def pause_s(self) -> float:
+        """How long to wait between two turns: far less than any ring holds."""
+        rings = [follower.block.ring for follower in self.followers]
+        return min(
+            [TURN_S / 10 if self._lively else TURN_S, *(ring.slot_count * ring.period_ns / 8e9 for ring in rings)]
+        )
+
+    def _step(self, state: ClockState) -> list[Aside]:
+        """The end of this step, of which all has been taken, and of those before it."""
+        self.done = state.done
+        if state.done != state.step or not state.dt_ns:  # nobody tells how far that one went
+            return []
+        log_ns = self.log_time(self.segment.clock.monotonic_ns(state.time_ns))
+        return [Aside(log_ns, StepMark(state.step, state.time_ns, state.dt_ns))]
+
+    def _follow(self, start: Start) -> None:
+        """Follow what is not followed yet: blocks that a reload has ended, too, unless all they have is recorded."""
+        self._known = self.segment.blocks
+        ended = self.segment.ended
+        for block in (*ended, *self._known.values()):
+            if block.section in self._seen or (self._sources is not None and block.source not in self._sources):
+                continue
+            self._seen.add(block.section)
+            place = start.places.get(block.section)
+            reason = start.reason if place or start.first else Reason.OVERTAKEN
+            if place is None:
+                place = Place() if start.first else Place(block.ring.head(), block.events.head())
+            over = block in ended
+            if over and (place.frame, place.event) == (block.ring.head(), block.events.head()):
+                continue
+            self._blocks += 1
+            self.followers.append(Follower(block, self._blocks, place, reason, self.log_time, over=over))
