@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from shmio import __version__
-from shmio.recording.attach import Attachment, Attachments, no_attachments
 from shmio.dump.encoding import Gap, Place, Reason
+from shmio.recording.attach import Attachment, Attachments, no_attachments
 from shmio.recording.follower import Aside, Entry, Follower
 from shmio.recording.output import Output
 from shmio.recording.tap import TURN_S, Tap
@@ -60,7 +60,7 @@ class _Followed:
         return Place(self.frame, self.event, self.log_ns)
 
     def come_to(self, what: str, number: int, log_ns: int) -> None:
-        """This frame or event was written, or a gap up to it."""
+        """Up to this frame or event it was written, or is in a gap that was."""
         self.log_ns = log_ns
         if what == "frames":
             self.frame = number
@@ -160,7 +160,8 @@ class Recorder:
             self.settle()
             self._to_confirm = self.output.tell(), dict(self.places)
 
-    def _settle(self) -> None:
+    def settle(self) -> None:
+        """Bring :attr:`places` up to date."""
         self.places |= {section: followed.place for section, followed in self._followed.items()}
 
     @property
@@ -172,7 +173,9 @@ class Recorder:
     def problem(self) -> str:
         """What is wrong at present, in words; empty: nothing."""
         problem = self.output.problem
-        lost = sum(lost.last - lost.first + 1 for followed in self._followed.values() for lost in followed.lost.values())
+        lost = sum(
+            lost.last - lost.first + 1 for followed in self._followed.values() for lost in followed.lost.values()
+        )
         return f"{problem}; {lost} frames and events lost so far" if problem and lost else problem
 
     def end(self) -> None:

@@ -47,11 +47,15 @@ class Series:
         settings = self._settings
         path, fd = create(Path(settings.directory), tap.segment.instance)
         output = Output(
-            path, fd, limit_bytes=settings.buffer_bytes, fsync_s=settings.fsync_s, after=before and before.output
+            path,
+            fd,
+            limit_bytes=settings.buffer_bytes,
+            fsync_s=settings.fsync_s,
+            after=before.output if before else None,
         )
         self._begun_s = time.monotonic()
         return Recorder(
-            tap, output, by=self._by, places=before and before.places, about=about, counters=self.counters,
+            tap, output, by=self._by, places=before.places if before else None, about=about, counters=self.counters,
             attachments=self._attachments,
         )  # fmt: skip
 
@@ -136,10 +140,9 @@ class Series:
         """Take what is there, write it, close all files; what is wrong with those that are not whole."""
         until_s = time.monotonic() + patience_s
         files = [*self._ending, self.recorder]
-        for old in self._ending:
-            old.output.close(max(0.0, until_s - time.monotonic()))
-        self.recorder.close(max(0.1, until_s - time.monotonic()))
-        return [_unclosed(recorder.output) for recorder in files if not recorder.output.whole or recorder.problem]
+        closed = [old.output.close(max(0.0, until_s - time.monotonic())) for old in self._ending]
+        closed.append(self.recorder.close(max(0.1, until_s - time.monotonic())))
+        return [_unclosed(recorder.output) for recorder, whole in zip(files, closed, strict=True) if not whole]
 
 
 def _unclosed(output: Output) -> str:

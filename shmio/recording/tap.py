@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 from shmio.dump.encoding import Place, Reason, StepMark
 from shmio.recording.follower import Aside, Entry, Follower
-from shmio.segment import Block, Segment
+from shmio.segment import Segment
 from shmio.segment.clock import ClockState
 from shmio.segment.events import EVENT_SIZE
 
@@ -28,6 +28,9 @@ class Start(NamedTuple):
     """Why something may be missing at the beginning."""
 
 
+FROM_THE_FIRST: Final = Start()
+
+
 class Tap:
     """Takes from the blocks of a segment what they publish, each entry once. Use from one thread.
 
@@ -35,7 +38,7 @@ class Tap:
     nothing is lost between them.
     """
 
-    def __init__(self, segment: Segment, start: Start = Start(), sources: Collection[str] | None = None) -> None:
+    def __init__(self, segment: Segment, start: Start = FROM_THE_FIRST, sources: Collection[str] | None = None) -> None:
         """``sources``: only these."""
         self.segment = segment
         self.start = start
@@ -70,7 +73,7 @@ class Tap:
         state = self.segment.clock.read()  # before looking: what was published for the step that is done is there
         self.segment.refresh()
         if self.segment.blocks is not self._known:
-            self._follow(Start())
+            self._follow(FROM_THE_FIRST)
         entries: list[Entry | Aside] = []
         more, most = False, 0
         for follower in self.followers:

@@ -14,7 +14,7 @@ from shmio.dump.survey import survey
 from shmio.layout.model import Layout, Register
 from shmio.recording.output import Output, create
 from shmio.recording.recorder import Recorder
-from shmio.recording.tap import Start, Tap
+from shmio.recording.tap import FROM_THE_FIRST, Start, Tap
 from shmio.segment import BlockSpec, BlockWriter, Event, Frame, Segment
 
 LAYOUT = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))
@@ -37,7 +37,7 @@ def publish(writer: BlockWriter, count: int, first: int = 0) -> None:
 
 
 def recorder(
-    segment: Segment, folder: Path, start: Start = Start(), sources: list[str] | None = None, **options: Any
+    segment: Segment, folder: Path, start: Start = FROM_THE_FIRST, sources: list[str] | None = None, **options: Any
 ) -> Recorder:
     """A recorder in this process."""
     path, fd = create(folder, segment.instance)
