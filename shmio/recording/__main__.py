@@ -11,6 +11,7 @@ from shmio import worker
 from shmio.config import Recorder as Settings
 from shmio.dump.encoding import Reason
 from shmio.recording.attach import ConfigFiles
+from shmio.recording.keeper import Keeper
 from shmio.recording.predecessor import places
 from shmio.recording.series import Series
 from shmio.recording.tap import Start, Tap
@@ -34,7 +35,10 @@ def run(worker: Worker) -> None:
     series = Series(Tap(segment, start), settings, BY, ConfigFiles(Path(worker.config["config_file"])))
     goes_on = ", going on where its predecessor ended" if known else ""
     worker.log.info("recording to %s%s%s", series.recorder.output.path, goes_on, elsewhere)
+    keeper = Keeper(segment.instance, settings, BY, series.present)
+    keeper.start()
     _record(worker, series)
+    keeper.stop()
     for unclosed in series.close():
         worker.log.error("%s", unclosed)
     _report(worker, series, "")

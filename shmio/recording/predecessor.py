@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 import logging
-import os
-import re
-import stat
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Final
-
-from mcap.opcode import Opcode
 
 from shmio.dump.encoding import EVENT, FRAME, Place
 from shmio.dump.reader import Reader
 from shmio.dump.survey import survey
 from shmio.errors import RecordingError
-from shmio.recording.output import SUFFIX
+from shmio.recording.folder import about_of, own_files
 from shmio.segment import Block, Segment
 
 MAX_FILES: Final = 256
 """How many recordings, the newest by their names first, are looked at."""
-ABOUT_BYTES: Final = 1 << 20
-"""What a recorder says of the instance is its file's second record: far before this byte."""
 
 log = logging.getLogger("shmio.recorder")
 
@@ -50,45 +42,17 @@ def places(directory: Path, segment: Segment, by: str, beat: Callable[[], object
 
 def _of_this_run(directory: Path, segment: Segment, by: str, beat: Callable[[], object]) -> list[Path]:
     """The recordings of this run, the newest first; not by name, for the host's clock may go back."""
-    run = {"instance": segment.instance, "epoch": f"{segment.header.epoch:016x}", "recorder": by}
+    epoch = f"{segment.header.epoch:016x}"
     found: list[tuple[int, Path]] = []
-    name = re.compile(rf"{re.escape(segment.instance)}-\d{{8}}T\d{{6}}Z(_\d+)?{re.escape(SUFFIX)}")  # not of a50-test
-    files = [file for file in directory.glob(f"{segment.instance}-*{SUFFIX}") if name.fullmatch(file.name)]
-    for file in sorted(_own(files), reverse=True)[:MAX_FILES]:
+    for file in sorted(own_files(directory, segment.instance), reverse=True)[:MAX_FILES]:
         beat()
         try:
-            with Reader(file, own=True, beat=beat) as reader:
-                about = _about(reader)
-            if about.items() >= run.items():
+            about = about_of(file, segment.instance, by, beat)
+            if about.get("epoch") == epoch:
                 found.append((int(about["recording_ns"]), file))
         except (OSError, RecordingError, KeyError, ValueError) as error:
             log.warning("%s is passed over: %s", file, error)
     return [file for _, file in sorted(found, reverse=True)]
-
-
-def _own(files: list[Path]) -> list[Path]:
-    """Regular files of this user: what others may have put into the folder says nothing of where a recorder ended."""
-    found: list[Path] = []
-    strange: list[Path] = []
-    for file in files:
-        with suppress(OSError):  # removed just now
-            status = file.lstat()
-            own = stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid()
-            (found if own else strange).append(file)
-    if strange:
-        more = f", and {len(strange) - 1} others," if len(strange) > 1 else ""
-        log.warning("%s%s passed over: no regular file of this user", strange[0], more)
-    return found
-
-
-def _about(reader: Reader) -> dict[str, str]:
-    """What the recorder said of the instance, at the very beginning."""
-    for record in reader.records.walk(to=ABOUT_BYTES):
-        if record.opcode == Opcode.METADATA:
-            reader.note(record)
-        if record.opcode == Opcode.CHUNK or reader.about:
-            break
-    return reader.about
 
 
 def _places(reader: Reader, blocks: dict[int, Block]) -> dict[int, Place]:

@@ -94,6 +94,8 @@ class Recorder:
         """Where the recording had come to, by section, when :meth:`settle` was called last."""
         self.confirmed: Mapping[int, Place] = dict(self.places)
         """Where it had come to when what was written last that is on the disk for certain."""
+        self.empty = True
+        """Whether nothing has happened yet."""
         self._attachments = attachments
         self._writer = Writer(output, {**self._about(by), **(about or {})})
         self._followed: dict[int, _Followed] = {}
@@ -219,6 +221,7 @@ class Recorder:
     # ---- entries -----------------------------------------------------------------------------------------------------
 
     def _write(self, entry: Entry | Aside) -> None:
+        self.empty = False
         if isinstance(entry, Aside):
             self._writer.step(entry.item, entry.log_ns)
             return

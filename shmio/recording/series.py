@@ -94,13 +94,17 @@ class Series:
             self._rotate()
         return False
 
+    def present(self) -> set[Path]:
+        """What is being written; asked from another thread."""
+        return {recorder.output.path for recorder in (*self._ending, self.recorder)}
+
     @property
     def _due(self) -> bool:
         """Whether the present file is to end: never while the disk has trouble, which a new file would not help."""
         settings, recorder = self._settings, self.recorder
         old = bool(settings.rotate_min) and time.monotonic() - self._begun_s >= settings.rotate_min * 60
         large = bool(settings.rotate_mb) and recorder.output.tell() >= settings.rotate_mb * 1e6
-        return (old or large) and not (self._ending or recorder.problem or recorder.losing)
+        return (old or large) and not (recorder.empty or self._ending or recorder.problem or recorder.losing)
 
     def _rotate(self) -> None:
         old = self.recorder
