@@ -92,6 +92,10 @@ def test_log_mode_records_and_serves_nothing(tmp_path: Path) -> None:
         "directory": str(tmp_path / "dumps"),
         "fsync_s": 2,
         "buffer_mb": 16,
+        "rotate_min": 60,
+        "rotate_mb": 1000,
+        "keep_days": 0,
+        "keep_mb": 0,
         "config_file": str(tmp_path / "s.toml"),
     }
 
