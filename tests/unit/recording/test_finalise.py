@@ -97,9 +97,9 @@ def test_it_may_end_anywhere_within_its_last_chunk_and_what_follows_that(
     """Or within an end that somebody has begun to make, who was killed too."""
     monkeypatch.setattr(os, "fsync", lambda _: None)  # of a thousand files
     content = whole.read_bytes()
-    last, _ = records(whole, Opcode.CHUNK)[-1]
+    last, end = records(whole, Opcode.CHUNK)[-1]
     file = tmp_path / "cut.mem"
-    for size in range(last, len(content)):
+    for size in (*range(last, end + 1), *range(end + 2, len(content), 7)):
         file.write_bytes(content[:size])
         before = expected(content, tmp_path, size)
         assert finalise(file)
