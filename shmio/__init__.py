@@ -1,6 +1,6 @@
 """shmio: shared-memory I/O for digital twins of multi-robot cells.
 
-A local program begins with :func:`attach`.
+A local program begins with :func:`attach`, one that looks into recordings with :func:`open_dump`.
 """
 
 from __future__ import annotations
@@ -8,16 +8,21 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from shmio.dump.dump import open_dump
     from shmio.segment.attach import attach
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "attach"]
+__all__ = ["__version__", "attach", "open_dump"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import ``attach`` when it is first asked for: most processes of an instance do without it."""
+    """Import them when they are first asked for: most processes of an instance do without."""
     if name == "attach":
         from shmio.segment.attach import attach  # noqa: PLC0415
 
         return attach
+    if name == "open_dump":
+        from shmio.dump.dump import open_dump  # noqa: PLC0415
+
+        return open_dump
     raise AttributeError(f"module 'shmio' has no attribute {name!r}")

@@ -19,6 +19,7 @@
     ├── ConnectorError     the device did not answer as it should; carries a reason code
     ├── ModelError         a simulation model is declared wrongly, or its code failed; names it, and the line
     ├── RecordingError     a recording cannot be written, or is none that this version can read
+    ├── MissingLibraryError  an optional library is not installed; names the command that does it
     ├── EndpointError      an address cannot be served
     ├── RemoteError        an instance cannot be reached by gRPC, or does not answer as it should
     │   ├── LostError            nothing serves there at present; it may come back
@@ -110,6 +111,10 @@ class ConnectorError(ShmioError):
 
     The base loop drops the connection on any of these. ``str()`` becomes the frame's reason text.
     """
+
+
+class MissingLibraryError(ShmioError, ImportError):
+    """An optional library is not installed; the message names the command that installs it."""
 
 
 class EndpointError(ShmioError):

@@ -32,6 +32,8 @@ class Channel:
     after: int = 0
     """Number behind which the recording of this kind began."""
     layout: str = ""
+    period_ns: int = 0
+    stale_ns: int = 0
 
 
 def describe(content: memoryview) -> Channel:
@@ -40,8 +42,11 @@ def describe(content: memoryview) -> Channel:
     about = found.metadata
     if found.message_encoding in (FRAME, EVENT):
         block, section, after = (int(about[name]) for name in ("block", "section", "after"))
+        period_ns, stale_ns = (int(about[name]) for name in ("period_ns", "stale_ns"))
         source, layout = about["source"], about["layout"]
-        return Channel(found.id, found.message_encoding, found.topic, source, block, section, after, layout)
+        return Channel(
+            found.id, found.message_encoding, found.topic, source, block, section, after, layout, period_ns, stale_ns
+        )
     if found.message_encoding == PLAIN and found.topic in _OWN:
         return Channel(found.id, _OWN[found.topic], found.topic)
     return Channel(found.id, "", found.topic)  # another program's

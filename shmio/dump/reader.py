@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -91,12 +91,14 @@ class Reader:
         from_ns: int = 0,
         to_ns: int = (1 << 64) - 1,
         damaged: Callable[[Damage], object] | None = None,
+        records: Iterable[Record] | None = None,
     ) -> Iterator[Message]:
         """Messages of the wanted channels whose log times are in this range, as the file has them.
 
-        Ends where the file does; then :attr:`Records.closed` and :attr:`Records.damage` say how. What is damaged before
-        that, in this range, ``damaged`` is told of where it is, and the next whole chunk follows; without it
-        RecordingError is raised. Chunks outside of the range are not looked into.
+        ``records``: only of these; None: of the whole file. Ends where the file does; then :attr:`Records.closed` and
+        :attr:`Records.damage` say how. What is damaged before that, in this range, ``damaged`` is told of where it is,
+        and the next whole chunk follows; without it RecordingError is raised. Chunks outside of the range are not
+        looked into.
         """
 
         def tell(damage: Damage) -> None:
@@ -104,7 +106,7 @@ class Reader:
                 damaged(damage)
 
         log = DamageLog(tell)
-        for record in self.records.walk():
+        for record in self.records.walk() if records is None else records:
             try:
                 if record.opcode == Opcode.CHUNK:
                     first_ns, last_ns = self.records.chunk_times(record)

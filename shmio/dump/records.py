@@ -106,7 +106,7 @@ class Records:
         at = len(MAGIC)
         end = self.size if to is None else min(to, self.size)
         while at < end:
-            record = self._record(at)
+            record = self.record(at)
             if record is None:
                 goes_on = self._whole(at + 1, end) or self._footer(at + 1)
                 if not goes_on:
@@ -138,7 +138,7 @@ class Records:
         if not footer:
             return
         at, _, _ = FOOTER.unpack(self.read(footer + _HEAD.size, FOOTER.size))
-        while at >= len(MAGIC) and at < footer and (record := self._record(at)) is not None:
+        while at >= len(MAGIC) and at < footer and (record := self.record(at)) is not None:
             yield record
             at = record.at + record.size
 
@@ -171,8 +171,8 @@ class Records:
             self._worked_bytes = 0
             self._beat()
 
-    def _record(self, at: int) -> Record | None:
-        """The record there; None if what is there makes no sense."""
+    def record(self, at: int) -> Record | None:
+        """The record that begins there; None if what is there makes no sense."""
         head = self._peek(at, _HEAD.size + LOOK_BYTES)
         if len(head) < _HEAD.size:
             return None
@@ -188,7 +188,7 @@ class Records:
         """Where, before ``end``, the next chunk or attachment begins of which all is there, by its CRC; 0: nowhere."""
         for begin in range(at, end, _SEARCH_BYTES):
             for found in _MARK.finditer(self._peek(begin, _SEARCH_BYTES + _MARK_BYTES - 1)):
-                record = self._record(begin + found.start())
+                record = self.record(begin + found.start())
                 if record is not None and record.start < begin + _SEARCH_BYTES:
                     with suppress(RecordingError):
                         self.check_crc(record)
@@ -198,10 +198,15 @@ class Records:
                         return 0
         return 0
 
+    def footer(self) -> Record | None:
+        """The footer of a file that was closed."""
+        start = self._footer(len(MAGIC))
+        return self.record(start) if start else None
+
     def _footer(self, at: int) -> int:
         """Where the footer is that ends the file, if not before here; 0: there is none."""
         start = self.size - len(MAGIC) - FOOTER.size - _HEAD.size
-        record = self._record(start) if start >= at else None
+        record = self.record(start) if start >= at else None
         if record is None or record.opcode != Opcode.FOOTER or record.at + record.size + len(MAGIC) != self.size:
             return 0
         return start
@@ -222,12 +227,16 @@ class Records:
 
     def chunk(self, record: Record) -> Iterator[tuple[int, memoryview]]:
         """(opcode, content) of the records in a chunk. RecordingError: at once if the chunk as a whole is damaged."""
+        return self._split(record, memoryview(self.unpacked(record)))
+
+    def unpacked(self, record: Record) -> bytes:
+        """The bytes in a chunk, whole by their CRC; RecordingError."""
         try:
-            data = memoryview(unpack(self.read(record.at, record.size, MAX_CHUNK_BYTES)))
+            data = unpack(self.read(record.at, record.size, MAX_CHUNK_BYTES))
         except (ValueError, struct.error, zstandard.ZstdError) as error:
             raise RecordingError(f"{self.file}: the chunk at byte {record.at} is damaged: {error}") from None
         self._worked(len(data))
-        return self._split(record, data)
+        return data
 
     def check_crc(self, record: Record) -> None:
         """RecordingError if a chunk's or an attachment's own CRC is wrong."""

@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 from mcap.opcode import Opcode
 
 from shmio.dump.channels import Channel
+from shmio.dump.chunks import Chunks
 from shmio.dump.encoding import GAP, Gap
 from shmio.dump.reader import Reader
 from shmio.dump.records import BROKEN, MAX_RECORD_BYTES, Record
@@ -83,6 +84,19 @@ class Survey:
     gap_count: int = 0
     damage: list[str] = field(default_factory=list)
     """What could not be read."""
+    chunks: Chunks = field(default_factory=Chunks)
+    """All that can be told of, by their indexes or by themselves."""
+
+    def add_gap(self, gap: Gap) -> None:
+        """Something was missed. RecordingError: it is of more blocks than a recorder tells of."""
+        key = (gap.source, gap.block, gap.what)
+        if key not in self.missed and len(self.missed) >= MAX_BLOCKS:
+            raise RecordingError(f"gaps of more than {MAX_BLOCKS} blocks")
+        self.gap_count += 1
+        self.missed[key] = self.missed.get(key, 0) + gap.count
+        self.missed_to[key] = max(self.missed_to.get(key, 0), gap.last)
+        if len(self.gaps) < MAX_GAPS:
+            self.gaps.append(gap)
 
 
 def survey(reader: Reader) -> Survey:
@@ -103,6 +117,8 @@ def survey(reader: Reader) -> Survey:
         if record.opcode == Opcode.CHUNK:
             chunk, counts = record, []
         else:
+            if record.opcode == BROKEN:
+                found.chunks.add_broken(record)
             try:
                 reader.note(record)
             except RecordingError as error:
@@ -131,6 +147,8 @@ def _settle(reader: Reader, found: Survey, chunk: Record, counts: list[Count] | 
     """Count a chunk's messages: by its indexes, unless something in it must be read."""
     if not counts or any(_must_read(reader, count.channel) for count in counts):
         counts = _read(reader, found, chunk)
+    first_ns, last_ns = reader.records.chunk_times(chunk)
+    found.chunks.add(chunk, first_ns, last_ns, [count.channel for count in counts])
     for count in counts:
         channel = reader.channels[count.channel]
         track = found.tracks.get(count.channel)
@@ -161,18 +179,7 @@ def _read(reader: Reader, found: Survey, chunk: Record) -> list[Count]:
             if channel.encoding == GAP:
                 item = reader.decode(channel, data)
                 if isinstance(item, Gap):
-                    _add_gap(found, item)
+                    found.add_gap(item)
     except RecordingError as error:
         _damaged(found, str(error))
     return list(counts.values())
-
-
-def _add_gap(found: Survey, gap: Gap) -> None:
-    key = (gap.source, gap.block, gap.what)
-    if key not in found.missed and len(found.missed) >= MAX_BLOCKS:
-        raise RecordingError(f"gaps of more than {MAX_BLOCKS} blocks")
-    found.gap_count += 1
-    found.missed[key] = found.missed.get(key, 0) + gap.count
-    found.missed_to[key] = max(found.missed_to.get(key, 0), gap.last)
-    if len(found.gaps) < MAX_GAPS:
-        found.gaps.append(gap)

@@ -38,10 +38,10 @@ class ChangeScan:
 
 def entries(registers: Iterable[Register], index: int) -> bytes:
     """The part of a scan that reports a change of any of the registers as ``index``."""
-    return b"".join(_ENTRY.pack(*run, index) for register in registers for run in _runs(register))
+    return b"".join(_ENTRY.pack(*run, index) for register in registers for run in runs(register))
 
 
-def _runs(register: Register) -> Iterator[tuple[int, int, int]]:
+def runs(register: Register) -> Iterator[tuple[int, int, int]]:
     """(offset, size, mask) of the bytes that hold the register's data; mask 0: whole bytes."""
     offset, element = register.offset, register.element
     if register.bit is not None:
