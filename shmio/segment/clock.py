@@ -151,10 +151,11 @@ class ClockPage:
                 return data
         raise SegmentError("the clock page makes no sense: restart the instance: shmio-supervisor down, up")
 
-    def write(self, state: ClockState) -> None:
-        """Write the page and ring its bell; the owner of time alone."""
+    def write(self, state: ClockState, *, ring: bool = True) -> None:
+        """Write the page and ring its bell; the owner of time alone. ``ring`` False: there is nothing to do yet."""
         _write(self._memory, self._offset, state)
-        self.bell.ring()
+        if ring:
+            self.bell.ring()
 
     def now_ns(self) -> int:
         """What ages of frames that live on this clock are taken against, comparable to CLOCK_MONOTONIC.

@@ -150,7 +150,7 @@ class Coordinator:
         asked = before._replace(step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
         problem = "it was broken off"
         try:
-            self._write(asked)
+            self._segment.clock.write(asked, ring=False)  # those who deliver it have time until it is done
             self._ring([block.source for block in participants])
             problem = yield from self._await_frames(step.number, participants, asked)
         finally:

@@ -51,21 +51,35 @@ class Delivery:
         async with self._turn:
             if step.number <= self._hold.moment.number:
                 return False
-            for feed in list(self._feeds.values()):
-                if feed.block.attributes.stepped:
-                    feed.inlet.catch_up()
-            self._hold.moment = Moment(step.number, step.time_ns)
-            for feed in list(self._feeds.values()):
-                try:
-                    feed.step()
-                except SegmentError as error:
-                    log.warning("step %d: %s", step.number, str(error))
+            self._show(step)
             await self._outboxes.taken(PATIENCE_S)
             for other in self.others:
                 await other(step)
             mark()
             await self._outboxes.taken(PATIENCE_S)
             return True
+
+    @property
+    def busy(self) -> bool:
+        """Whether a step is being delivered."""
+        return self._turn.locked()
+
+    def pass_over(self, step: Step, mark: Callable[[], None]) -> None:
+        """Deliver a step for which there is no stream, unless it has been already; while none is :attr:`busy`."""
+        if step.number > self._hold.moment.number:
+            self._show(step)
+            mark()
+
+    def _show(self, step: Step) -> None:
+        for feed in list(self._feeds.values()):
+            if feed.block.attributes.stepped:
+                feed.inlet.catch_up()
+        self._hold.moment = Moment(step.number, step.time_ns)
+        for feed in list(self._feeds.values()):
+            try:
+                feed.step()
+            except SegmentError as error:
+                log.warning("step %d: %s", step.number, str(error))
 
 
 def before(state: ClockState) -> Moment:

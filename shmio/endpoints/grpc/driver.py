@@ -5,11 +5,15 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from contextlib import closing
+from typing import Final
 
 from shmio.endpoints.grpc.bells import Bell, Bells
 from shmio.segment.answers import Wait
 from shmio.segment.clock import ClockPage
 from shmio.segment.coordinator import Coordinator, Step
+
+BRIEF_NS: Final = 500_000
+"""So long the event loop stands still for a source that answers at once: to be told by a thread takes about as long."""
 
 
 class Driver:
@@ -40,6 +44,8 @@ class Driver:
 
     async def _stay(self, wait: Wait) -> None:
         """Until its bell rings, which it does now and then in any case."""
+        if wait.block is not None and wait.block.ring.wait(wait.seen, min(BRIEF_NS, wait.rest_ns)) != wait.seen:
+            return
         rung = asyncio.get_running_loop().create_future()
 
         def ring() -> None:

@@ -290,6 +290,7 @@ class Feed:
     def present(self) -> Frame | Still | None:
         """What would be shown to who listens now; None: nothing good."""
         if self._held:
+            self._hold.look()
             return self._shown
         frame = self.block.latest()
         return None if frame is None or self.block.assess(frame)[0] is Quality.BAD else frame

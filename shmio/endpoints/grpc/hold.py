@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 
@@ -39,4 +40,6 @@ class Hold:
 
     def __init__(self) -> None:
         self.on = False
+        self.look: Callable[[], object] = lambda: None
+        """Take in steps of other programs that nobody has waited for."""
         self.moment = Moment(0, 0)

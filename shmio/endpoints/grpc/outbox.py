@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Any, Final
 
+from shmio.endpoints.grpc.audience import Audience
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.load import Load, Total
 from shmio.endpoints.grpc.pace import LATE_S, Pace
@@ -251,7 +252,9 @@ Lane = StateLane | EventLane
 class Outboxes:
     """Those of all open streams, counted."""
 
-    def __init__(self) -> None:
+    def __init__(self, audience: Audience | None = None) -> None:
+        """``audience``: what they are a part of."""
+        self._audience = Audience() if audience is None else audience
         self._open: set[Outbox] = set()
         self._dropped = 0
         self._total = Total()
@@ -276,7 +279,8 @@ class Outboxes:
         self._open.add(outbox)
         self._total.streams += 1
         try:
-            yield outbox
+            with self._audience.joined():
+                yield outbox
         finally:
             self._open.discard(outbox)
             self._total.streams -= 1

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping
 
 import grpc
 
+from shmio.endpoints.grpc.audience import Audience
 from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.hold import Hold
@@ -38,12 +39,13 @@ class Services:
         ``default_source``: that of paths which name none; default: the only one.
         """
         topics = Topics(feeds, default_source)
-        self._outboxes = Outboxes()
+        audience = Audience()
+        self._outboxes = Outboxes(audience)
         self._shadows = Shadows(topics)
         self._publisher = Publisher(topics, self._shadows)
-        self.stepper = Stepper(segment, slot, hold, bells, feeds, self._outboxes, self._publisher)
+        self.stepper = Stepper(segment, slot, hold, bells, feeds, self._outboxes, self._publisher, audience)
         """The instance's time."""
-        self._native = NativeService(topics, feeds, bells, segment, self.stepper)
+        self._native = NativeService(topics, feeds, bells, segment, self.stepper, audience)
         self._services = (
             self._native,
             SimlogV1(topics, self._publisher, self._outboxes, self._shadows, self.stepper),

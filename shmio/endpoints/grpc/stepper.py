@@ -9,6 +9,7 @@ from contextlib import asynccontextmanager, suppress
 from functools import partial
 from typing import Any, Final, TypeVar
 
+from shmio.endpoints.grpc.audience import Audience
 from shmio.endpoints.grpc.bells import Bell, Bells
 from shmio.endpoints.grpc.delivery import Delivery, before
 from shmio.endpoints.grpc.driver import Driver
@@ -47,8 +48,9 @@ class Stepper:
         feeds: Mapping[str, Feed],
         outboxes: Outboxes,
         publisher: Publisher,
+        audience: Audience,
     ) -> None:
-        """``slot``: this process's in the table."""
+        """``slot``: this process's in the table. ``audience``: while there is none, no step waits for it."""
         self.marks = Marks(hold, self._now, lambda: self._clock.read().step_size_ns / 1e9)
         """Tells steps and time."""
         self._segment = segment
@@ -77,8 +79,13 @@ class Stepper:
         state = self._clock.read()
         if state.virtual:
             self._delivery.begin(Moment(state.done, state.present_ns))
-        self._told = self.status[1:]
-        self._coordinator.delivered(slot, state.done)
+        self._told = self._status(state)[1:]
+        self._delivered = state.done
+        self._audience = audience
+        self._awaited = False  # whether steps wait for this process
+        audience.changed = self._attend
+        hold.look = self.look
+        self._attend()
 
     async def start(self, predecessor: int = 0) -> None:
         """Begin to follow time; go on playing if the process before this one, by its pid, did when it died."""
@@ -107,6 +114,7 @@ class Stepper:
     @property
     def status(self) -> Status:
         """How time stands."""
+        self.look()
         return self._status(self._clock.read())
 
     async def set_step_size(self, dt_ns: int) -> None:
@@ -264,13 +272,25 @@ class Stepper:
     # ---- delivering ------------------------------------------------------------------------------------------------
 
     async def _deliver(self, step: Step) -> None:
-        def mark() -> None:
-            self._alive = True
-            self.marks.tell()
-            self._tell(Status(step.time_ns, step.dt_ns, True, self._clock.read().playing))
+        if await self._delivery.deliver(step, partial(self._mark, step)):
+            self._delivered = step.number
+            if self._awaited:
+                self._coordinator.delivered(self._slot, step.number)
 
-        if await self._delivery.deliver(step, mark):
-            self._coordinator.delivered(self._slot, step.number)
+    def _mark(self, step: Step) -> None:
+        self._alive = True
+        self.marks.tell()
+        self._tell(Status(step.time_ns, step.dt_ns, True, self._clock.read().playing))
+
+    def _attend(self) -> None:
+        """Have steps wait for this process from now on, or no longer."""
+        if self._audience:
+            self.look()  # it is shown what is over by now, and waited for from the next step on
+            self._awaited = True
+            self._coordinator.delivered(self._slot, self._delivered)
+        else:
+            self._awaited = False
+            self._clock.abstain(self._slot.index)
 
     def look(self) -> None:
         """Heed what the page says by now; also called now and then, for the death of who plays rings no bell."""
@@ -278,7 +298,12 @@ class Stepper:
         if state.virtual and not self.hold.on:
             self._delivery.begin(before(state))
         if state.done > self.hold.moment.number and not self._moving:
-            self._spawn(self._deliver(Step(state.done, state.present_ns, state.dt_ns)))
+            step = Step(state.done, state.present_ns, state.dt_ns)
+            if self._awaited or self._delivery.busy:
+                self._spawn(self._deliver(step))
+            else:
+                self._delivered = step.number
+                self._delivery.pass_over(step, partial(self._mark, step))
         elif self._status(state)[1:] != self._told:
             self._tell(self._status(state))
 
@@ -287,7 +312,7 @@ class Stepper:
         return Status(self._now().clock_ns, dt_ns, self._alive, state.playing)
 
     def _tell(self, status: Status) -> None:
-        self._told = self.status[1:]
+        self._told = self._status(self._clock.read())[1:]
         for watcher in self._watchers:
             watcher(status)
 

@@ -47,6 +47,7 @@ class Model:
             self.output, ["goal"], time.monotonic_ns, armed=True, owner_of=lambda writer: Owner(writer, 1)
         )
         self._clock = segment.clock
+        self._bell = segment.clock.slot_bell(segment.processes.find(source).index)
         self._stopping = False
         self._done = self._clock.read().step
         self.publish(self._done)
@@ -65,25 +66,25 @@ class Model:
     def answer(self) -> None:
         """Answer steps again."""
         self.mute = False
-        self._clock.bell.ring()
+        self._bell.ring()
 
     def stop(self) -> None:
         self._stopping = True
         self.desk.stop()
-        self._clock.bell.ring()
+        self._bell.ring()
         for thread in self._threads:
             thread.join(20)
             assert not thread.is_alive()
 
     def _run(self) -> None:
         while not self._stopping:
-            seen = self._clock.bell.value()
+            seen = self._bell.value()
             state = self._clock.read()
             if state.stepping and state.step > self._done and not self.mute:
                 self._done = state.step
                 self._step(state.step)
             else:
-                self._clock.bell.wait(seen, _FAR_NS)
+                self._bell.wait(seen, _FAR_NS)
 
     def _step(self, number: int) -> None:
         before = _NUMBERS.unpack_from(self.image)

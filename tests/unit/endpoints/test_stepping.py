@@ -286,6 +286,32 @@ def test_steps_of_another_program_are_delivered_likewise_and_acknowledged(instan
     simulate(instance, test)
 
 
+def test_a_step_waits_for_the_endpoint_only_while_it_has_streams(instance: str) -> None:
+    async def test(served: Endpoint, models: Models) -> None:
+        slot = served.segment.processes.find("grpc")
+        slot.take()
+
+        async def left() -> bool:
+            return served.segment.clock.delivered(slot.index) is None
+
+        with Segment.open(instance, writable=True) as other:
+            local = Coordinator(other)
+            for _ in range(3):
+                local.step()  # in the event loop's own thread, which takes no notice meanwhile
+            stream = await served.subscriber("one", "sim/count", "SIMLOG://step")
+            assert await messages(stream, 1) == [("sim/count", 3.0)], "it is shown what is over"
+            await asyncio.to_thread(local.step)
+            assert served.segment.clock.delivered(slot.index) == 4
+            assert await messages(stream, 2) == [("sim/count", 4.0), ("SIMLOG://step", 4.0)]
+            stream.cancel()
+            await served.until(left)
+            local.step()
+            assert served.service.stepper.status.clock_ns == 5 * 50_000_000
+            local.close()
+
+    simulate(instance, test)
+
+
 def test_a_first_step_that_is_over_before_the_endpoint_looks_is_delivered_too(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         stream = await served.subscriber("one", "sim/count", "SIMLOG://step")

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import grpc
 
+from shmio.endpoints.grpc.audience import Audience
 from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.delivery import PATIENCE_S
 from shmio.endpoints.grpc.encoding import field, number
@@ -39,14 +40,22 @@ class NativeService:
     name = SERVICE
 
     def __init__(
-        self, topics: Topics, feeds: Mapping[str, Feed], bells: Bells, segment: Segment, stepper: Stepper
+        self,
+        topics: Topics,
+        feeds: Mapping[str, Feed],
+        bells: Bells,
+        segment: Segment,
+        stepper: Stepper,
+        audience: Audience,
     ) -> None:
+        """``audience``: what its streams are a part of."""
         self._feeds = feeds
         self._segment = segment
         self._selections = Selections(topics)
         self._bells = bells
         self._clocks = Clocks(segment, stepper)
         self._hold = stepper.hold
+        self._audience = audience
         stepper.also(self._deliver)
         self._orders = Orders(topics, feeds, self._selections, self._bells)
         self._simulations = Simulations(feeds, segment)
@@ -121,9 +130,10 @@ class NativeService:
             await refuse(context, error)
         self._open.add(subscription)
         try:
-            yield await subscription.open()
-            async for message in subscription.messages():
-                yield message
+            with self._audience.joined():
+                yield await subscription.open()
+                async for message in subscription.messages():
+                    yield message
         except ShmioError as error:
             await refuse(context, error)
         finally:
