@@ -32,6 +32,8 @@ CONTENDERS = {
     "v2, an array of 100 as one topic": "v2-array",
     "v1, 100 topics and model/clock": "v1",
     "shmio.v1, 100 registers in one update": "native",
+    "the same, steps on a stream, one by one": "native-stream",
+    "the same, many steps for one request": "native-many",
     "SimServerAPI.step, no subscriber": "alone",
 }
 

@@ -29,6 +29,8 @@ from shmio.wire.simserver_pb2_grpc import SimServerAPIStub
 
 PATHS = [f"sim/values/r{index:02}" for index in range(COUNT)]
 PATIENCE_S = 30
+MANY = 1_000_000
+"""More than are done."""
 
 
 @contextmanager
@@ -77,6 +79,35 @@ def native(target: str) -> Iterator[Callable[[], None]]:
             while next(updates).cycle < number:
                 pass
 
+        yield step
+
+
+@contextmanager
+def native_stream(target: str) -> Iterator[Callable[[], None]]:
+    """The same; steps without a call for each, each asked for when all of the one before has come."""
+    with connect(target) as client, client.subscribe("sim/values/*") as updates, client.steps() as steps:
+        next(updates)
+
+        def step() -> None:
+            number = steps.step().step
+            while next(updates).cycle < number:
+                pass
+
+        yield step
+
+
+@contextmanager
+def native_many(target: str) -> Iterator[Callable[[], None]]:
+    """The same; as many steps as are done, asked for at once. A step is over when all of it has come, as ever."""
+    with connect(target) as client, client.subscribe("sim/values/*") as updates, client.steps(MANY) as steps:
+        next(updates)
+
+        def step() -> None:
+            number = next(steps).step
+            while seen[0] < number:
+                seen[0] = next(updates).cycle
+
+        seen = [0]
         yield step
 
 
@@ -132,7 +163,10 @@ def version_1(channel: grpc.Channel) -> Iterator[Callable[[], None]]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("target")
-    parser.add_argument("kind", choices=["alone", "native", "v2", "v2-array", "v2-structure", "v1", "bare"])
+    parser.add_argument(
+        "kind",
+        choices=["alone", "native", "native-stream", "native-many", "v2", "v2-array", "v2-structure", "v1", "bare"],
+    )
     arguments = parser.parse_args()
     kinds: dict[str, Callable[[grpc.Channel], Any]] = {
         "alone": alone,
@@ -142,6 +176,8 @@ def main() -> None:
         "v1": version_1,
         "bare": bare,
         "native": lambda _: native(arguments.target),
+        "native-stream": lambda _: native_stream(arguments.target),
+        "native-many": lambda _: native_many(arguments.target),
     }
     with grpc.insecure_channel(arguments.target) as channel:
         tell("ready")

@@ -103,8 +103,8 @@ class Cell(Protocol):
     def clock(self) -> ClockState:
         """How time stands."""
 
-    def step(self, dt_s: float | None) -> None:
-        """Move time by one step."""
+    def step(self, dt_s: float | None, count: int) -> None:
+        """Move time by so many steps."""
 
     def play(self, rate: float, dt_s: float | None) -> None:
         """Have time step by itself."""

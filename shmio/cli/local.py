@@ -129,9 +129,10 @@ class Local:
         """How time stands."""
         return self.attachment.clock
 
-    def step(self, dt_s: float | None) -> None:
-        """Move time by one step."""
-        self.attachment.step(dt_s)
+    def step(self, dt_s: float | None, count: int) -> None:
+        """Move time by so many steps."""
+        for _ in range(count):
+            self.attachment.step(dt_s)
 
     def play(self, rate: float, dt_s: float | None) -> None:
         """Have time step by itself."""

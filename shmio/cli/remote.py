@@ -154,9 +154,11 @@ class Remote:
             mode, now.step, now.time_ns, 0, now.step, now.step_size_ns, now.playing, now.rate, note=now.note
         )
 
-    def step(self, dt_s: float | None) -> None:
-        """Move time by one step."""
-        self._client.step(dt_s)
+    def step(self, dt_s: float | None, count: int) -> None:
+        """Move time by so many steps."""
+        with self._client.steps(count, dt_s) as steps:
+            for _ in steps:
+                pass
 
     def play(self, rate: float, dt_s: float | None) -> None:
         """Have time step by itself."""

@@ -43,8 +43,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
     elif options.pause:
         cell.pause()
     else:
-        for _ in range(options.count):
-            cell.step(dt_s)
+        cell.step(dt_s, options.count)
     clock = clock_status(cell.clock)
     print(dumps(msgspec.to_builtins(clock)) if options.json else clock_line(clock))
     return 0

@@ -17,7 +17,7 @@ from os import PathLike
 from pathlib import Path
 
 from shmio.client import aio
-from shmio.client.calls import Clock, Outcome, Target
+from shmio.client.calls import Clock, Outcome, Stepped, Target
 from shmio.client.injections import Declared, Happening, Injection, Lifted, Running
 from shmio.client.layout import BlockLayout
 from shmio.client.model import Work
@@ -25,6 +25,7 @@ from shmio.client.sync import Client, Subscription
 from shmio.client.sync_campaign import Campaign
 from shmio.client.sync_model import Simulation
 from shmio.client.sync_shadow import Shadow
+from shmio.client.sync_steps import Steps
 from shmio.client.table import Change, Column, Register, Table
 from shmio.client.update import Piece, Provenance, Quality, Snapshot, Update
 
@@ -48,6 +49,8 @@ __all__ = [
     "Shadow",
     "Simulation",
     "Snapshot",
+    "Stepped",
+    "Steps",
     "Subscription",
     "Table",
     "Target",

@@ -12,6 +12,7 @@ from shmio.client.aio_calls import receive
 from shmio.client.aio_campaign import Campaign
 from shmio.client.aio_model import Simulation, Step, serve
 from shmio.client.aio_shadow import Shadow
+from shmio.client.aio_steps import Steps
 from shmio.client.arrays import InjectResponse, ReadResponse, SimulateResponse, SubscribeResponse
 from shmio.client.calls import Clock, Outcome, Target
 from shmio.client.injections import Injection, Lifted
@@ -168,6 +169,10 @@ class Client:
         """
         request = wire.StepRequest(dt_ns=calls.ns(dt_s))
         return Clock.of(await self._call(self._stub.Step, request, calls.STEP_PATIENCE_S))
+
+    def steps(self, count: int = 0, dt_s: float | None = None) -> Steps:
+        """As :meth:`shmio.client.Client.steps`."""
+        return Steps(self._stub.Steps(metadata=self.target.metadata), self.target, count, dt_s)
 
     async def set_step_size(self, dt_s: float) -> Clock:
         """How far a step goes that does not say it; takes time over. CommandError, ValueRangeError."""

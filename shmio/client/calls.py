@@ -195,6 +195,26 @@ class Clock:
         return cls(found.virtual, found.step, found.time_ns, found.step_size_ns, found.playing, found.rate, found.note)
 
 
+@dataclass(frozen=True, slots=True)
+class Stepped:
+    """A step that is done: its number, and the simulation time after it."""
+
+    step: int
+    time_ns: int
+
+    @classmethod
+    def of(cls, found: Any) -> Stepped:
+        """From the wire."""
+        return cls(found.number, found.time_ns)
+
+
+def steps_requests(count: int, dt_s: float | None) -> list[Any]:
+    """For Steps; ValueRangeError."""
+    if not 0 <= count < 1 << 32:
+        raise ValueRangeError(f"{count} steps: from 0 to {(1 << 32) - 1} can be asked for at once")
+    return [wire.StepsRequest(dt_ns=ns(dt_s), count=count)] if count else []
+
+
 def status(found: Any) -> dict[str, Any]:
     """Of an answer, as ``shmio-supervisor status --json`` has it."""
     return {

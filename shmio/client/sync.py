@@ -17,6 +17,7 @@ from shmio.client.model import PATIENCE_S
 from shmio.client.sync_campaign import Campaign
 from shmio.client.sync_model import Simulation, Step, serve
 from shmio.client.sync_shadow import Shadow
+from shmio.client.sync_steps import Steps
 from shmio.client.update import Snapshot, Tables, Update
 from shmio.errors import CommandError
 from shmio.wire import shmio_v1_pb2 as wire
@@ -199,6 +200,10 @@ class Client:
         """
         request = wire.StepRequest(dt_ns=calls.ns(dt_s))
         return Clock.of(self._call(self._stub.Step, request, calls.STEP_PATIENCE_S))
+
+    def steps(self, count: int = 0, dt_s: float | None = None) -> Steps:
+        """Take time over, and move it by so many steps, by one call: see :class:`Steps`. ValueRangeError."""
+        return Steps(self._stub.Steps, self.target, count, dt_s)
 
     def set_step_size(self, dt_s: float) -> Clock:
         """How far a step goes that does not say it; takes time over. CommandError, ValueRangeError."""

@@ -920,6 +920,20 @@ class StepRequest(_message.Message):
     dt_ns: int
     def __init__(self, dt_ns: _Optional[int] = ...) -> None: ...
 
+class StepsRequest(_message.Message):
+    __slots__ = ("dt_ns", "count")
+    DT_NS_FIELD_NUMBER: _ClassVar[int]
+    COUNT_FIELD_NUMBER: _ClassVar[int]
+    dt_ns: int
+    count: int
+    def __init__(self, dt_ns: _Optional[int] = ..., count: _Optional[int] = ...) -> None: ...
+
+class StepsResponse(_message.Message):
+    __slots__ = ("steps",)
+    STEPS_FIELD_NUMBER: _ClassVar[int]
+    steps: _containers.RepeatedCompositeFieldContainer[Step]
+    def __init__(self, steps: _Optional[_Iterable[_Union[Step, _Mapping]]] = ...) -> None: ...
+
 class SetStepSizeRequest(_message.Message):
     __slots__ = ("dt_ns",)
     DT_NS_FIELD_NUMBER: _ClassVar[int]

@@ -94,6 +94,11 @@ class ShmioStub(object):
                 request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.StepRequest.SerializeToString,
                 response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
                 _registered_method=True)
+        self.Steps = channel.stream_stream(
+                '/shmio.v1.Shmio/Steps',
+                request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.StepsRequest.SerializeToString,
+                response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.StepsResponse.FromString,
+                _registered_method=True)
         self.SetStepSize = channel.unary_unary(
                 '/shmio.v1.Shmio/SetStepSize',
                 request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.SetStepSizeRequest.SerializeToString,
@@ -203,6 +208,13 @@ class ShmioServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def Steps(self, request_iterator, context):
+        """The same again and again, without a call for each: so many steps for each request, and an answer for each step.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def SetStepSize(self, request, context):
         """How far a step goes that does not say it; takes time over.
         """
@@ -293,6 +305,11 @@ def add_ShmioServicer_to_server(servicer, server):
                     servicer.Step,
                     request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.StepRequest.FromString,
                     response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.SerializeToString,
+            ),
+            'Steps': grpc.stream_stream_rpc_method_handler(
+                    servicer.Steps,
+                    request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.StepsRequest.FromString,
+                    response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.StepsResponse.SerializeToString,
             ),
             'SetStepSize': grpc.unary_unary_rpc_method_handler(
                     servicer.SetStepSize,
@@ -639,6 +656,33 @@ class Shmio(object):
             '/shmio.v1.Shmio/Step',
             shmio_dot_wire_dot_shmio__v1__pb2.StepRequest.SerializeToString,
             shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Steps(request_iterator,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.stream_stream(
+            request_iterator,
+            target,
+            '/shmio.v1.Shmio/Steps',
+            shmio_dot_wire_dot_shmio__v1__pb2.StepsRequest.SerializeToString,
+            shmio_dot_wire_dot_shmio__v1__pb2.StepsResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -103,6 +103,7 @@ CALLS = (
     Call(OURS + "Lift", ours.LiftRequest(source="cell", number=7).SerializeToString(), ends=grpc.StatusCode.NOT_FOUND),
     Call(OURS + "LiftAll", ours.LiftAllRequest(sources=["cell"]).SerializeToString()),
     Call(OURS + "Step", ours.StepRequest(dt_ns=50_000_000).SerializeToString()),
+    Call(OURS + "Steps", ours.StepsRequest(dt_ns=50_000_000, count=2).SerializeToString(), many=True, stays=True),
     Call(OURS + "SetStepSize", ours.SetStepSizeRequest(dt_ns=50_000_000).SerializeToString()),
     Call(OURS + "Pause", b""),
     Call(OURS + "WatchClock", b"", stays=True),

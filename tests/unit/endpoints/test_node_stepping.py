@@ -55,6 +55,8 @@ def test_a_client_of_node_drives_time_as_clients_do(instance: str) -> None:
         assert (found["started"]["playing"], found["busy"]) == (True, "FAILED_PRECONDITION")
         assert (found["paused"]["playing"], found["paused"]["alive"]) == (False, True)
         assert (found["stopped"]["playing"], found["stopped"]["alive"]) == (False, False)
+        assert found["steps"] == [[0, 0], [1, 20], *([1 + n, 20 + n] for n in range(1, 51))]
+        assert found["stepsEnd"] == "OK"
         assert found["statuses"] == [[50, True, False], [20, True, False], [50, True, False], [2, True, True]]
 
     simulate(instance, test)

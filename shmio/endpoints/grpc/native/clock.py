@@ -1,4 +1,4 @@
-"""The calls of shmio.v1 about time: Step, SetStepSize, Play, Pause, WatchClock."""
+"""The calls of shmio.v1 about time: Step, Steps, SetStepSize, Play, Pause, WatchClock."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import grpc
 
 from shmio.endpoints.grpc.hold import Status
 from shmio.endpoints.grpc.native.refusal import Context, refuse
+from shmio.endpoints.grpc.native.steps import Steps
 from shmio.endpoints.grpc.stepper import Stepper
 from shmio.errors import EndpointError, ShmioError, ValueRangeError
 from shmio.segment import Segment
@@ -35,6 +36,7 @@ class Clocks:
         unary, clock = grpc.unary_unary_rpc_method_handler, wire.Clock.SerializeToString
         return {
             "Step": unary(self.step, wire.StepRequest.FromString, clock),
+            "Steps": grpc.stream_stream_rpc_method_handler(self.steps, wire.StepsRequest.FromString),
             "SetStepSize": unary(self.set_step_size, wire.SetStepSizeRequest.FromString, clock),
             "Play": unary(self.play, wire.PlayRequest.FromString, clock),
             "Pause": unary(self.pause, wire.PauseRequest.FromString, clock),
@@ -53,6 +55,14 @@ class Clocks:
         found = clock(self._segment.clock.read())
         found.step, found.time_ns = step.number, step.time_ns
         return found
+
+    async def steps(self, requests: AsyncIterator[wire.StepsRequest], context: Context) -> AsyncIterator[bytes]:
+        """The same, without a call for each; the first that fails ends it. Errors as of :meth:`step`."""
+        try:
+            async for message in Steps(self._stepper, context.peer()).messages(requests):
+                yield message
+        except ShmioError as error:
+            await refuse(context, error)
 
     async def set_step_size(self, request: wire.SetStepSizeRequest, context: Context) -> wire.Clock:
         """How far a step goes that does not say it; errors as of :meth:`step`."""

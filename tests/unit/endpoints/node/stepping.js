@@ -13,6 +13,7 @@ const credentials = grpc.credentials.createInsecure();
 const old = new (load('simlog_v1.proto').simulation.server.SimlogAPI)(address, credentials);
 const simlog = new (load('simlog_v2.proto').simlog.server.SimlogAPI)(address, credentials);
 const time = new (load('simserver.proto').com.ttsnetwork.simulator3.SimServerAPI)(address, credentials);
+const ours = new (load('shmio_v1.proto').shmio.v1.Shmio)(address, credentials);
 const deadline = () => ({ deadline: Date.now() + 60000 });
 
 const call = (client, name, request) =>
@@ -91,12 +92,34 @@ async function second(result) {
   statuses.cancel();
 }
 
+// shmio.v1: steps without a call for each, each when it is asked for, then many at once.
+async function third(result) {
+  const stream = ours.Steps(deadline());
+  const steps = [];
+  let seen;
+  stream.on('data', (message) => { steps.push(...message.steps); seen(); });
+  const until = async (many) => {
+    while (steps.length < many) await new Promise((resolve) => { seen = resolve; });
+  };
+  for (const dt of [20000000, 0]) {
+    stream.write({ dt_ns: dt });
+    await until(steps.length + 1);
+  }
+  stream.write({ dt_ns: 1000000, count: 50 });
+  await until(52);
+  const over = new Promise((resolve) => stream.on('status', (status) => resolve(grpc.status[status.code])));
+  stream.end();
+  result.stepsEnd = await over;
+  result.steps = steps.map((step) => [step.number - steps[0].number, (step.time_ns - steps[0].time_ns) / 1e6]);
+}
+
 async function main() {
   const result = {};
   await first(result);
   await second(result);
+  await third(result);
   console.log(JSON.stringify(result));
-  for (const client of [old, simlog, time]) client.close();
+  for (const client of [old, simlog, time, ours]) client.close();
 }
 
 main();
