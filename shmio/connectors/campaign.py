@@ -68,7 +68,8 @@ class Campaign:
 
     def seen(self, frame: Frame) -> None:
         """The last frame of the process before this one."""
-        self._chain.injections.now = Now(frame.cycle, self._time_ns(frame.cycle), frame.raw)
+        time_ns = self._time_ns(frame.cycle) if self._own.playhead is None else frame.clock_ns
+        self._chain.injections.now = Now(frame.cycle, time_ns, frame.raw)
 
     def resume(self, standing: Standing, running: Running, seen: Bits) -> None:
         """Go on with one of the process before this one; ``seen``: the image that consumers saw last."""
@@ -195,10 +196,12 @@ class Campaign:
         Of several in one cycle the first is looked at: how many there are depends on how fast their writers were.
         """
         looked = self._chain.injections.now.cycle
-        now = self._chain.injections.now = Now(image.cycle, self._time_ns(image.cycle), image.raw)
+        time_ns = image.at.clock_ns if image.at else self._time_ns(image.cycle)
+        now = self._chain.injections.now = Now(image.cycle, time_ns, image.raw)
         if image.cycle == looked:
             return []
-        step = image.cycle if self._own.attributes.stepped and self._own.clock.read().virtual else None
+        state = self._own.clock.read()
+        step = state.step if self._own.attributes.stepped and state.virtual else None
         readings = Readings(self._own.source, image, self._blocks, step)
         before = {layer.id: layer.active for layer in self._layers}
         changed = [layer for layer in self._layers if layer.advance(now, readings.of(layer.program))]

@@ -81,7 +81,7 @@ class Chain:
         """
         for layer in layers:
             told = Record(EventKind.DIVERTED, layer.name, end.writer, end.command, injection=layer.id)
-            yield from _parts(told, self.injections.beneath(self.output.raw, layer))
+            yield from _parts(told, self.injections.beneath(self.output.base, layer))
 
     def tell(self, growth: int = 0) -> None:
         """Say in the segment what stands, with the output's ``turn`` held.

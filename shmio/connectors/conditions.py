@@ -50,7 +50,7 @@ class Readings:
 def _newest(block: Block, before: int | None) -> bytes | None:
     try:
         frame = block.latest()
-        while frame is not None and before is not None and block.attributes.stepped and frame.cycle >= before:
+        while frame is not None and before is not None and block.came_with(frame, before):
             frame = block.read(frame.number - 1)
     except SegmentError:
         return None

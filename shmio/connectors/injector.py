@@ -105,7 +105,7 @@ class Injector:
             )
             if reason := self._chain.lay(layer):
                 return reason
-            layer.values = self.injections.before(self._output.raw, layer)
+            layer.values = self.injections.before(self._output.base, layer)
             above = [layer, *self.injections.outer(layer)] if layer.direction is Direction.OUT else []
             end = about(EventKind.INJECTED, layer, command.name)
             self._output.show([*self._chain.beneath(above, end), end])

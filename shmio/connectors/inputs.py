@@ -62,7 +62,7 @@ class Inputs:
 def _frame(block: Block, step: int | None) -> tuple[Frame | None, str]:
     """The frame that counts, if it can be trusted, else why not."""
     frame = block.latest()
-    while frame is not None and step is not None and block.attributes.stepped and frame.cycle >= step:
+    while frame is not None and step is not None and block.came_with(frame, step):
         frame = block.read(frame.number - 1)
     if frame is None:
         return None, NO_DATA

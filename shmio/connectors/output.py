@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
 from shmio.connectors.injections import Injections
-from shmio.segment import BlockWriter, Provenance, Quality, Record
+from shmio.segment import BlockWriter, Provenance, Quality, Record, Stamp
 
 EXTRA_FRAMES: Final = 4
 """So many frames a period may come between those of the cycles: rings, which hold 8 s of cycles, must last for all."""
@@ -24,6 +24,15 @@ class Image(NamedTuple):
     provenance: Provenance
     reason: str
     asked_ns: int | None = None
+    shown: bytes | None = None
+    """What consumers saw of it when it was recorded, if that was something else than ``raw``."""
+    at: Stamp | None = None
+    """When it is to be published; default: now."""
+
+    @property
+    def base(self) -> bytes:
+        """What the injections of this instance are laid over."""
+        return self.raw if self.shown is None else self.shown
 
 
 class Output:
@@ -59,6 +68,11 @@ class Output:
         return bytes(self.writer.block.layout.size) if self._last is None else self._last.raw
 
     @property
+    def base(self) -> bytes:
+        """What the injections are laid over: :attr:`raw`, unless a recording has something else."""
+        return self.raw if self._last is None else self._last.base
+
+    @property
     def cycle(self) -> int:
         """The cycle of that image; -1: there is none."""
         return -1 if self._last is None else self._last.cycle
@@ -84,7 +98,12 @@ class Output:
             self._last = image
             if self.advance is not None:
                 self._owed += self.advance(image)
-            self._publish()
+            self._publish(image.at)
+
+    def resume(self, image: Image) -> None:
+        """Go on from an image that was published already."""
+        with self.turn:
+            self._last = image
 
     def show(self, records: Iterable[Record]) -> None:
         """Have consumers see the injections as they are by now, then tell ``records``; with ``turn`` held."""
@@ -99,9 +118,10 @@ class Output:
             if self._changed and self._now_ns() >= self._next_ns:
                 self._publish()
 
-    def _publish(self) -> None:
+    def _publish(self, at: Stamp | None = None) -> None:
         if self._last is not None:
-            raw, cycle, source_ns, quality, provenance, reason, asked_ns = self._last
+            raw, cycle, source_ns, quality, provenance, reason, asked_ns, shown, _ = self._last
+            effective = self.injections.effective(self._last.base)
             self.writer.publish(
                 raw,
                 cycle=cycle,
@@ -109,8 +129,9 @@ class Output:
                 quality=quality,
                 provenance=provenance,
                 reason=reason,
-                effective=self.injections.effective(raw),
+                effective=shown if effective is None else effective,
                 asked_ns=asked_ns,
+                at=at,
             )
         owed, self._owed, self._changed = self._owed, [], False
         for record in owed:

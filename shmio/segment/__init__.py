@@ -4,8 +4,8 @@ The byte format is docs/reference/segment-format.md; a local program starts with
 """
 
 from shmio.layout.write import Write
-from shmio.segment.block import Attributes, Block, BlockWriter
-from shmio.segment.build import BlockSpec, segment_size
+from shmio.segment.block import Attributes, Block, BlockWriter, Stamp
+from shmio.segment.build import BlockSpec, Origin, segment_size
 from shmio.segment.commands import Command, CommandKind, CommandSender, Direction
 from shmio.segment.cursor import Cursor
 from shmio.segment.events import DONE, ENDS, NO_WRITER, Event, EventKind, EventRing, Record
@@ -33,6 +33,7 @@ __all__ = [
     "EventKind",
     "EventRing",
     "Frame",
+    "Origin",
     "Phase",
     "ProcessSlot",
     "ProcessSpec",
@@ -41,6 +42,7 @@ __all__ = [
     "Record",
     "Report",
     "Segment",
+    "Stamp",
     "State",
     "Supervised",
     "Write",

@@ -26,6 +26,9 @@ def answer(block: Block, number: int) -> str | None:
     if block.retired:
         return ""  # a reload has ended it
     try:
+        if block.playhead is not None:
+            play = block.playhead.read()
+            return None if play is None or play.step < number else play.failure
         frame = block.latest()
     except SegmentError as error:
         return str(error)

@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from shmio.errors import SegmentError
 from shmio.segment._atomics import REASON_SIZE, Ring
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from shmio.segment.clock import ClockPage
     from shmio.segment.commands import CommandQueues
     from shmio.segment.link import Link
+    from shmio.segment.playhead import Playhead
     from shmio.segment.standing import DeclaredCell, StandingCell
 
 Bytes = bytes | bytearray | memoryview
@@ -69,11 +70,21 @@ class Attributes:
     """Patterns of what a program elsewhere computes."""
     inouts: tuple[str, ...] = ()
     """Patterns of what it is given, and computes what that shows."""
+    replay: bool = False
+    """Whether it plays a recording."""
 
     @property
     def remote(self) -> bool:
         """Whether a program elsewhere computes registers of it."""
         return bool(self.outputs or self.inouts)
+
+
+class Stamp(NamedTuple):
+    """When something was published, comparable to CLOCK_MONOTONIC, and the instance's clock then; UTC of an event."""
+
+    publish_ns: int
+    clock_ns: int
+    utc_ns: int = 0
 
 
 class Block:
@@ -96,6 +107,7 @@ class Block:
         section: int,
         clock: ClockPage,
         link: Link | None = None,
+        playhead: Playhead | None = None,
     ) -> None:
         self.source = source
         self.section = section
@@ -112,6 +124,8 @@ class Block:
         self.clock = clock
         self.link = link
         """Toward the program elsewhere that computes it; None: it is no such block."""
+        self.playhead = playhead
+        """Of the recording that it plays; None: it plays none."""
         self._retired = retired
 
     @property
@@ -135,12 +149,23 @@ class Block:
         return self.ring.stale_ns
 
     def now_ns(self) -> int:
-        """What the ages of its frames are taken against: the instance's clock or CLOCK_MONOTONIC."""
+        """What the ages of its frames are taken against: the playhead, the instance's clock or CLOCK_MONOTONIC."""
+        if self.playhead is not None:
+            return self.playhead.now_ns()
         return self.clock.now_ns() if self.attributes.stepped else time.monotonic_ns()
 
     def assess(self, frame: Frame) -> tuple[Quality, str]:
         """Quality of a frame of this block as of now, and its reason."""
         return frame.assess(self.stale_ns, self.now_ns())
+
+    def came_with(self, frame: Frame, step: int) -> bool:
+        """Whether a frame came with this step, the present one of virtual time, or a later one.
+
+        Of a block that does not live on the instance's clock none does.
+        """
+        if self.playhead is not None:
+            return frame.publish_ns > self.playhead.now_ns()
+        return self.attributes.stepped and frame.cycle >= step
 
     def latest(self) -> Frame | None:
         """A copy of the newest frame; None before the source has published its first.
@@ -198,22 +223,23 @@ class BlockWriter:
         reason: str = "",
         effective: Bytes | None = None,
         asked_ns: int | None = None,
+        at: Stamp | None = None,
     ) -> int:
         """Publish one frame of ``layout.size`` bytes and wake its readers; returns its number.
 
         ``source_ns`` is UTC, default now; 0: no image yet. ``reason`` says why quality is not
         good; it is cut at 256 bytes. ``asked_ns`` (as :meth:`now_ns`): when the device was asked for the image, which
-        may be as old as that; default now.
+        may be as old as that; default now. ``at``: when, other than now.
         """
         with self._turn:
-            now_ns = self.now_ns()
+            now_ns, clock_ns, _ = at or self._present()
             self._quality = quality
             return self.block.ring.publish(
                 raw,
                 effective,
                 cycle,
                 now_ns,
-                self._clock_ns(now_ns),
+                clock_ns,
                 time.time_ns() if source_ns is None else source_ns,
                 quality,
                 provenance,
@@ -222,20 +248,24 @@ class BlockWriter:
                 cut(reason, REASON_SIZE) if reason else b"",
             )
 
-    def event(self, record: Record, *, quality: Quality | None = None) -> int:
+    def _present(self) -> Stamp:
+        now_ns = self.now_ns()
+        return Stamp(now_ns, self._clock_ns(now_ns))
+
+    def event(self, record: Record, *, quality: Quality | None = None, at: Stamp | None = None) -> int:
         """Publish one event and wake the readers of frames and events; returns its number.
 
-        ``quality``: the new one, for QUALITY; default: that of the last frame.
+        ``quality``: the new one, for QUALITY; default: that of the last frame. ``at``: when, other than now.
         """
         with self._turn:
-            now_ns = self.now_ns()
+            now_ns, clock_ns, utc_ns = at or self._present()
             number = self.block.events.ring.publish(
                 record.pack(),
                 None,
                 self.cycle,
                 now_ns,
-                self._clock_ns(now_ns),
-                time.time_ns(),
+                clock_ns,
+                utc_ns or time.time_ns(),
                 self._quality if quality is None else quality,
                 Provenance.LIVE,
                 self.block.ring.head(),

@@ -14,7 +14,7 @@ import msgspec
 
 from shmio import __version__
 from shmio.layout.model import Layout
-from shmio.segment import _atomics, commands, header, link
+from shmio.segment import _atomics, commands, header, link, playhead
 from shmio.segment.block import Attributes
 from shmio.segment.clock import ClockPage, page_size
 from shmio.segment.events import EVENT_SIZE, EVENT_SLOTS
@@ -31,6 +31,17 @@ SPARE_PROCESSES = 16 + GUESTS
 EVENT_STRIDE = -(-(_atomics.RAW_OFFSET + EVENT_SIZE) // 64) * 64
 
 _RING = struct.Struct("<8Iqq")
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Whose time an instance has that replays a recording.
+
+    ``clock_ns``: what its clock begins with. ``started_utc_ns``: UTC of clock 0.
+    """
+
+    clock_ns: int
+    started_utc_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,6 +99,7 @@ class BlockSpec:
             (SectionKind.STANDING, CELL_SIZE, b""),
             (SectionKind.DECLARED, CELL_SIZE, bytes(8) + self.declared),
             *([(SectionKind.LINK, *link.section(linked, self.slot_bytes))] if self.attributes.remote else []),
+            *([(SectionKind.PLAYHEAD, playhead.SECTION_SIZE, b"")] if self.attributes.replay else []),
         ]
 
 
@@ -139,8 +151,10 @@ def build_segment(
     control: str,
     *,
     stepped: bool,
+    origin: Origin | None = None,
 ) -> None:
     """Make room in a new object and write all of it; the magic last."""
+    now_ns = time.monotonic_ns()
     size = segment_size(blocks, len(processes))
     sections_size, processes_size = _table_sizes(len(blocks), len(processes))
     shared.allocate(size)
@@ -148,8 +162,8 @@ def build_segment(
         head = Header(
             epoch=secrets.randbits(64) | 1,
             size=size,
-            started_utc_ns=time.time_ns(),
-            started_ns=time.monotonic_ns(),
+            started_utc_ns=origin.started_utc_ns if origin else time.time_ns(),
+            started_ns=now_ns - (origin.clock_ns if origin else 0),
             sections_offset=HEADER_SIZE,
             section_capacity=sections_size // SECTION_SIZE,
             processes_offset=HEADER_SIZE + sections_size,
@@ -162,11 +176,13 @@ def build_segment(
         head.write(memory)
         ProcessTable.write(memory, head, processes)
         header.write_supervisor(memory, os.getpid(), State.STARTING)
+        if origin:
+            header.write_supervised_since(memory, now_ns)
         supervisor_beat(memory)
         entries = write_blocks(memory, HEADER_SIZE + sections_size + processes_size, 0, blocks)
         clock_size = _clock_size(len(processes))
         clock_at = size - clock_size
-        ClockPage.write_new(memory, clock_at, head.process_capacity, virtual=stepped)
+        ClockPage.write_new(memory, clock_at, head.process_capacity, virtual=stepped, time_ns=origin.clock_ns if origin else 0)
         own = len(entries)
         entries.append(SectionEntry(SectionKind.CLOCK, False, clock_at, clock_size, own, "clock", bytes(32)))
         header.change_sections(memory, head, entries)

@@ -119,10 +119,10 @@ class ClockPage:
         """Rung by those who deliver steps."""
 
     @staticmethod
-    def write_new(memory: memoryview, offset: int, slots: int, *, virtual: bool) -> None:
-        """The page of a new segment; ``virtual``: time stands at 0 until somebody steps."""
+    def write_new(memory: memoryview, offset: int, slots: int, *, virtual: bool, time_ns: int = 0) -> None:
+        """The page of a new segment; ``virtual``: time stands at ``time_ns`` until somebody steps."""
         struct.pack_into("<II", memory, offset + _SLOTS_AT, slots, virtual)
-        _write(memory, offset, ClockState(ClockMode.VIRTUAL if virtual else ClockMode.WALL))
+        _write(memory, offset, ClockState(ClockMode.VIRTUAL if virtual else ClockMode.WALL, time_ns=time_ns))
 
     @property
     def stepped(self) -> bool:
@@ -167,6 +167,10 @@ class ClockPage:
             return time.monotonic_ns()
         present_ns: int = time_ns - dt_ns if flags & _STEPPING else time_ns
         return self._started_ns + present_ns
+
+    def present_ns(self) -> int:
+        """The instance's clock at present; while a step is under way still what it was before that."""
+        return self.now_ns() - self._started_ns
 
     def monotonic_ns(self, time_ns: int) -> int:
         """A time of the instance's clock as one that is comparable to CLOCK_MONOTONIC."""

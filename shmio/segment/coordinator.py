@@ -210,7 +210,12 @@ class Coordinator:
 
     @staticmethod
     def _cycle(block: Block, now_ns: int) -> int:
-        """The present cycle of a block that has free-run, or a later one if it has published such."""
+        """The present cycle of a block that has free-run, or a later one if it has published such.
+
+        One that plays a recording has the recording's cycles, which are no steps.
+        """
+        if block.playhead is not None:
+            return 0
         frame = block.latest()
         return max(now_ns // block.period_ns, 0 if frame is None else frame.cycle)
 

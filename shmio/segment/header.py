@@ -59,6 +59,7 @@ class SectionKind(IntEnum):
     CLOCK = 7
     DECLARED = 8
     LINK = 9
+    PLAYHEAD = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,6 +196,11 @@ def finish(memory: memoryview) -> None:
 def write_control(memory: memoryview, path: str) -> None:
     """Tell where the control socket is by now."""
     memory[CONTROL_OFFSET : CONTROL_OFFSET + CONTROL_SIZE] = path.encode().ljust(CONTROL_SIZE, b"\0")
+
+
+def write_supervised_since(memory: memoryview, since_ns: int) -> None:
+    """Tell when the supervisor began, which was not at the zero of the instance's clock."""
+    _atomics.store64(memory, SUPERVISED_SINCE_OFFSET, since_ns)
 
 
 def write_supervisor(memory: memoryview, pid: int, state: State) -> None:

@@ -16,11 +16,12 @@ from shmio.segment.commands import CommandQueues
 from shmio.segment.events import EVENT_SIZE
 from shmio.segment.header import Header, SectionEntry, SectionKind
 from shmio.segment.link import Link
+from shmio.segment.playhead import Playhead
 from shmio.segment.shm import SharedObject
 from shmio.segment.standing import declared_cell, standing_cell
 
 FIRST_LINK = 2
-"""The lock of a block's link: so many bytes, and the index of its layout, after those of the process table."""
+"""The lock of a block's link or playhead: so many bytes, and the index of its layout, after those of the process table."""
 
 _ATTRIBUTES = msgspec.json.Decoder(Attributes)  # as in layout/document.py: built before there are threads
 
@@ -70,6 +71,9 @@ def read_block(
         declared = declared_cell(memory, *part(SectionKind.DECLARED))
         lock_byte = head.process_capacity + FIRST_LINK + layout_at
         link = Link(shared, memory, *part(SectionKind.LINK), lock_byte) if attributes.remote else None
+        playhead = (
+            Playhead(shared, memory, *part(SectionKind.PLAYHEAD), lock_byte, clock) if attributes.replay else None
+        )
     except (LayoutError, ValueError, msgspec.MsgspecError) as error:
         raise FormatError(f"{name}: block {described.name}: {error}") from None
     linked_size = layout.size if link is None else link.frame_size
@@ -77,5 +81,5 @@ def read_block(
         raise FormatError(f"{name}: block {described.name}: rings and layout differ in size")
     return Block(
         described.name, layout, frames, events, queues, standing, declared, attributes,
-        lambda: header.retired(memory, head, layout_at), layout_at, clock, link,
+        lambda: header.retired(memory, head, layout_at), layout_at, clock, link, playhead,
     )  # fmt: skip

@@ -10,7 +10,7 @@ from contextlib import suppress
 from shmio.errors import AlreadyRunningError, NotRunningError, SegmentError, UnfinishedError
 from shmio.segment import _atomics, header, shm
 from shmio.segment.block import Block, BlockWriter
-from shmio.segment.build import SECTIONS_PER_BLOCK, BlockSpec, align, build_segment, wake, write_blocks
+from shmio.segment.build import SECTIONS_PER_BLOCK, BlockSpec, Origin, align, build_segment, wake, write_blocks
 from shmio.segment.header import HEADER_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
 from shmio.segment.processes import SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
 from shmio.segment.sections import read_block, read_clock
@@ -48,8 +48,11 @@ class Segment:
         control: str = "",
         group: str | None = None,
         stepped: bool = False,
+        origin: Origin | None = None,
     ) -> Segment:
-        """Build a new segment and hold its supervisor's lock. ``stepped``: time stands at 0 until somebody steps.
+        """Build a new segment and hold its supervisor's lock. ``stepped``: time stands until somebody steps.
+
+        ``origin``: the time of a recording; default: the clock begins at 0, now.
 
         AlreadyRunningError: there is a segment of this name, with or without a living supervisor (see
         :func:`shmio.segment.leftover.clear` for the latter). SegmentError: there is no room.
@@ -65,7 +68,7 @@ class Segment:
             if not shared.try_lock(SUPERVISOR_LOCK) or not shared.current():
                 raise AlreadyRunningError(f"another supervisor is just starting instance {instance}")
             try:
-                build_segment(shared, instance, blocks, processes, mode, control, stepped=stepped)
+                build_segment(shared, instance, blocks, processes, mode, control, stepped=stepped, origin=origin)
                 return cls(shared, instance)
             except BaseException:
                 shm.unlink(name)
@@ -199,7 +202,8 @@ class Segment:
 
     def writer(self, source: str) -> BlockWriter:
         """The writing side of a source's block; for its process alone, which holds the role's lock."""
-        return BlockWriter(self.blocks[source], self.clock_ns)
+        block = self.blocks[source]
+        return BlockWriter(block, self.clock_ns if block.playhead is None else block.playhead.clock_ns)
 
     @property
     def supervisor(self) -> tuple[int, State]:
@@ -231,7 +235,7 @@ class Segment:
 
         Who has opened the segment before keeps the old path.
         """
-        _atomics.store64(self.memory, header.SUPERVISED_SINCE_OFFSET, time.monotonic_ns())
+        header.write_supervised_since(self.memory, time.monotonic_ns())
         header.write_control(self.memory, control)
         self.header = Header.read(self.memory, self.shared.name)
 

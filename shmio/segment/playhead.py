@@ -1,0 +1,275 @@
+"""The playhead of a block that a recording plays: where it is, what moves it, and what others ask of it.
+
+The section is described in docs/reference/segment-format.md. The source's process writes the state; whoever wants it
+moved holds the section's lock, asks, and waits for the answer. A position is a time of the recording: of the clock that
+the recorded instance had, in ns since its start.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+import msgspec
+
+from shmio.errors import CommandError, SegmentError
+from shmio.segment import _atomics
+from shmio.segment.header import cut, text
+from shmio.segment.shm import SharedObject
+
+if TYPE_CHECKING:
+    from shmio.segment.clock import ClockPage
+
+MIN_SPEED: Final = 0.01
+MAX_SPEED: Final = 1000.0
+
+_COPIES_AT: Final = (64, 704)
+_ASK_AT: Final = 1344
+SECTION_SIZE: Final = 2560
+
+_STATE: Final = struct.Struct("<IIqqqqqqqdQQ256s256s")
+_ASK: Final = struct.Struct("<QII1000s")
+_TEXT: Final = 255
+_MAX_ASK: Final = 999
+_MAX_ERROR: Final = 200
+
+_VALID, _PAUSED, _LOOP, _OWN_CLOCK, _OVER = 1, 2, 4, 8, 16
+_LOCK_TURN_S: Final = 0.02
+_LOCK_S: Final = 10.0
+
+
+class Play(NamedTuple):
+    """How a recording plays. Positions and clocks in ns.
+
+    When the instance's clock was ``anchor_ns``, the position was ``position_ns``; it moves at ``speed`` times that
+    clock, up to ``until_ns``. What is played is from ``begin_ns`` to before ``end_ns``; with ``loop`` again and again.
+    ``base_ns``: what a position is counted from in the publish times of frames. ``utc_ns``: UTC of position 0.
+    ``own_clock``: frames have the clock of the recording; else that of the instance when they were due. ``over``:
+    the end was reached. ``step``: the last step of virtual time that was answered, ``failure`` why it failed, or
+    empty. ``asked``: the last request that was answered, with ``answer``.
+    """
+
+    begin_ns: int
+    end_ns: int
+    anchor_ns: int
+    position_ns: int
+    until_ns: int
+    base_ns: int
+    utc_ns: int
+    speed: float = 1.0
+    paused: bool = False
+    loop: bool = False
+    own_clock: bool = False
+    over: bool = False
+    step: int = 0
+    asked: int = 0
+    answer: str = ""
+    failure: str = ""
+
+    @property
+    def playing(self) -> bool:
+        """Whether the position moves with the instance's clock."""
+        return not self.paused
+
+    def reach_ns(self, clock_ns: int) -> int:
+        """The position at a time of the instance's clock, if nothing ended it."""
+        if self.paused or clock_ns <= self.anchor_ns:
+            return self.position_ns
+        passed_ns = clock_ns - self.anchor_ns
+        return self.position_ns + (passed_ns if self.speed == 1 else math.floor(passed_ns * self.speed))
+
+    @property
+    def wraps(self) -> bool:
+        """Whether it begins anew when it has come to the end."""
+        return self.loop and self.until_ns >= self.end_ns
+
+    def at_ns(self, clock_ns: int) -> int:
+        """The position at a time of the instance's clock."""
+        reach_ns = self.reach_ns(clock_ns)
+        if reach_ns >= self.end_ns and self.wraps:
+            return self.begin_ns + (reach_ns - self.begin_ns) % (self.end_ns - self.begin_ns)
+        return min(reach_ns, self.until_ns)
+
+    def due_ns(self, position_ns: int) -> int:
+        """The instance's clock when a position that lies ahead is reached: the first moment at which it has been."""
+        ahead_ns = position_ns - self.position_ns
+        clock_ns = self.anchor_ns + (ahead_ns if self.speed == 1 else math.ceil(ahead_ns / self.speed))
+        while not self.paused and self.reach_ns(clock_ns) < position_ns:  # by a rounding
+            clock_ns += 1
+        return clock_ns
+
+    def settled(self, clock_ns: int) -> Play:
+        """The same, with the rounds that are over by then behind it, and paused where it was to stop."""
+        reach_ns = self.reach_ns(clock_ns)
+        if self.wraps and reach_ns >= self.end_ns:
+            rounds = (reach_ns - self.begin_ns) // (self.end_ns - self.begin_ns)
+            anchor_ns = self.due_ns(self.begin_ns + rounds * (self.end_ns - self.begin_ns))
+            return self._replace(anchor_ns=anchor_ns, position_ns=self.begin_ns)
+        if not self.wraps and self.playing and reach_ns >= self.until_ns:
+            return self.anchored(clock_ns)._replace(paused=True, until_ns=self.end_ns)
+        return self
+
+    def anchored(self, clock_ns: int) -> Play:
+        """The same, told from a time of the instance's clock on."""
+        return self._replace(anchor_ns=clock_ns, position_ns=self.at_ns(clock_ns))
+
+
+class Move(msgspec.Struct, tag="move", forbid_unknown_fields=True, omit_defaults=True):
+    """Ask that it plays otherwise, from ``clock_ns`` of the instance's clock on; what is None stays as it is.
+
+    ``until_ns``: where it is to pause, once; None: at the end.
+    """
+
+    clock_ns: int
+    paused: bool | None = None
+    speed: float | None = None
+    position_ns: int | None = None
+    loop: bool | None = None
+    until_ns: int | None = None
+
+
+class Find(msgspec.Struct, tag="find", forbid_unknown_fields=True, omit_defaults=True):
+    """Ask for the first position behind ``after_ns`` at which a register changes, or an event of a kind happened."""
+
+    after_ns: int
+    path: str = ""
+    event: str = ""
+
+
+class Found(msgspec.Struct, omit_defaults=True):
+    """The answer. ``error``: why it is not done; ``position_ns``: what was to be found; None: it is not there."""
+
+    error: str = ""
+    position_ns: int | None = None
+
+
+Ask = Move | Find
+_ASKS: Final = msgspec.json.Decoder(Ask)
+_FOUND: Final = msgspec.json.Decoder(Found)
+
+
+class Playhead:
+    """The section of one block. Several threads may read it."""
+
+    def __init__(
+        self, shared: SharedObject, memory: memoryview, offset: int, size: int, lock_byte: int, clock: ClockPage
+    ) -> None:
+        """ValueError: the section is too short."""
+        if size < SECTION_SIZE:
+            raise ValueError("the playhead's section is too short")
+        self._shared = shared
+        self._memory = memory
+        self._offset = offset
+        self._lock_byte = lock_byte
+        self._clock = clock
+        self._turn = threading.Lock()
+
+    # ---- for anybody ---------------------------------------------------------------------------------------------
+
+    def read(self) -> Play | None:
+        """How it plays; None: no process of the source has begun yet. SegmentError: it cannot be read."""
+        data = self._copy(_STATE.size)
+        (flags, _, begin, end, anchor, position, until, base, utc, speed, step, asked, answer, failure) = _STATE.unpack(
+            data
+        )
+        if not flags & _VALID or not begin < end or not (math.isfinite(speed) and speed > 0):
+            return None
+        return Play(
+            begin, end, anchor, position, until, base, utc, speed, bool(flags & _PAUSED), bool(flags & _LOOP),
+            bool(flags & _OWN_CLOCK), bool(flags & _OVER), step, asked, text(answer), text(failure),
+        )  # fmt: skip
+
+    def now_ns(self) -> int:
+        """What ages of the block's frames are taken against: the position, as their publish times have it."""
+        play = self.read()
+        return time.monotonic_ns() if play is None else play.base_ns + play.at_ns(self._clock.present_ns())
+
+    def clock_ns(self, publish_ns: int) -> int:
+        """The clock of what is published now at such a time."""
+        play = self.read()
+        return self._clock.present_ns() if play is None or not play.own_clock else publish_ns - play.base_ns
+
+    def _copy(self, size: int) -> bytes:
+        for at in _COPIES_AT * 4:  # one of them is whole, whenever their writer was killed
+            data = _atomics.cell_read(self._memory, self._offset + at, size)
+            if data is not None:
+                return data
+        raise SegmentError("a playhead makes no sense: restart its source: shmio-supervisor restart NAME")
+
+    # ---- the source's part ---------------------------------------------------------------------------------------
+
+    def write(self, play: Play) -> None:
+        """Tell how it plays; the source's process alone."""
+        flags = _VALID | (_PAUSED * play.paused) | (_LOOP * play.loop) | (_OWN_CLOCK * play.own_clock)
+        data = _STATE.pack(
+            flags | (_OVER * play.over), 0, play.begin_ns, play.end_ns, play.anchor_ns, play.position_ns,
+            play.until_ns, play.base_ns, play.utc_ns, play.speed, play.step, play.asked, cut(play.answer, _TEXT),
+            cut(play.failure, _TEXT),
+        )  # fmt: skip
+        for at in _COPIES_AT:
+            _atomics.cell_write(self._memory, self._offset + at, data)
+
+    def asks(self, answered: int) -> tuple[int, Ask | None] | None:
+        """Number and request that waits; None: there is none behind ``answered``. A request that is none is None."""
+        data = _atomics.cell_read(self._memory, self._offset + _ASK_AT, _ASK.size)
+        if data is None:
+            return None
+        number, _, _, document = _ASK.unpack(data)
+        if number == answered:
+            return None
+        try:
+            return number, _ASKS.decode(document.rstrip(b"\0"))
+        except msgspec.MsgspecError:
+            return number, None
+
+    # ---- the part of who asks ------------------------------------------------------------------------------------
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Ask alone. CommandError: another program does not end its requests."""
+        with self._turn:
+            until_s = time.monotonic() + _LOCK_S
+            while not self._shared.try_lock(self._lock_byte):
+                if time.monotonic() > until_s:
+                    raise CommandError("another program is moving this recording: try again when it is done")
+                time.sleep(_LOCK_TURN_S)  # rare, and who holds it rings nothing
+            try:
+                yield
+            finally:
+                self._shared.unlock(self._lock_byte)
+
+    def ask(self, ask: Ask) -> int:
+        """Leave a request, with the lock held; its number. The bell of the source's process is the caller's to ring."""
+        document = msgspec.json.encode(ask)
+        if len(document) > _MAX_ASK:
+            raise CommandError("the request is too long")
+        play = self.read()
+        data = _atomics.cell_read(self._memory, self._offset + _ASK_AT, _ASK.size)
+        before = _ASK.unpack(data)[0] if data else 0
+        number = max(before, play.asked if play else 0) + 1
+        _atomics.cell_write(self._memory, self._offset + _ASK_AT, _ASK.pack(number, os.getpid(), 0, document))
+        return number
+
+    def found(self, number: int) -> Found | None:
+        """The answer to a request; None: there is none yet."""
+        play = self.read()
+        if play is None or play.asked != number:
+            return None
+        try:
+            return _FOUND.decode(play.answer)
+        except msgspec.MsgspecError:
+            return Found(play.answer)
+
+
+def answered(play: Play, number: int, found: Found) -> Play:
+    """With the answer to a request."""
+    found = Found(cut(found.error, _MAX_ERROR).decode(), found.position_ns)
+    return play._replace(asked=number, answer=msgspec.json.encode(found).decode())
+
+
