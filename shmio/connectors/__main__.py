@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from shmio import worker
 from shmio.connectors import registry
@@ -17,22 +17,27 @@ from shmio.connectors.computed import Computed
 from shmio.connectors.injections import Owner
 from shmio.connectors.inputs import Inputs
 from shmio.connectors.loop import SourceLoop, WallClock
+from shmio.connectors.replayed import Replayed
 from shmio.connectors.schedule import Schedule
 from shmio.connectors.stepped import PageClock, SteppedLoop
-from shmio.errors import ConnectorError
+from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.topic import parse_topic
 from shmio.segment import Block, BlockWriter, Segment
 from shmio.worker import BEAT_S, Worker
 
+if TYPE_CHECKING:
+    from shmio.connectors.replay.loop import ReplayLoop
+
 SWITCH_S = 0.0005  # the poll thread is not to wait Python's usual 5 ms for the others
 LAST_WORDS_S = 4.0  # less than a supervisor's patience with a process that is to stop
+REPLAY_TIMEOUT_S = 1.0
 HANG_MARGIN_S = 30.0  # beyond its time-outs: looking up a host name has none of ours
 
 
 class _Part(NamedTuple):
     """A loop, how to stop it, and how long one of its hooks may take."""
 
-    loop: SourceLoop | SteppedLoop
+    loop: SourceLoop | SteppedLoop | ReplayLoop
     stop: Callable[[], None]
     timeout_s: float
 
@@ -76,6 +81,8 @@ def _part(worker: Worker) -> _Part:
     segment, name = worker.segment, worker.config["connector"]
     found = registry.load(name)
     options = registry.convert_options(name, worker.config["options"])
+    if issubclass(found, Replayed):
+        return _replay(worker, options)
     source = found(options, segment.blocks[worker.name].layout)
     writer = segment.writer(worker.name)  # after its source: one that cannot be as configured has begun nothing
     schedule = Schedule(segment.header.started_ns, writer.block.period_ns)
@@ -97,6 +104,28 @@ def _part(worker: Worker) -> _Part:
         source.interrupt()
 
     return _Part(stepped, stop, source.timeout_s)
+
+
+def _replay(worker: Worker, options: Any) -> _Part:
+    """What plays a recording."""
+    from shmio.connectors.replay.loop import ReplayLoop  # noqa: PLC0415  the other sources read no recordings
+    from shmio.connectors.replay.source import Replay  # noqa: PLC0415
+
+    segment = worker.segment
+    source = Replay(options, worker.name)
+    if source.layout.hash != segment.blocks[worker.name].layout.hash:
+        raise ConfigError(f"the recording of source {worker.name} has another layout by now: shmio-supervisor reload")
+    clock = PageClock(segment.clock, worker.slot.index)
+    loop = ReplayLoop(
+        source,
+        segment.writer(worker.name),
+        segment.header.started_ns,
+        clock,
+        worker.config["writable"],
+        owner_of=partial(_owner_of, segment),
+        blocks=partial(_blocks, segment),
+    )
+    return _Part(loop, clock.stop, REPLAY_TIMEOUT_S)
 
 
 def _inputs(source: Computed, writer: BlockWriter, segment: Segment) -> Inputs | None:

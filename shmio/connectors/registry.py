@@ -1,6 +1,6 @@
 """Connectors by name: ours, and those that other packages offer as entry points (group ``shmio.connectors``).
 
-Most reach a device; some are computed here, and live on the instance's clock.
+Most reach a device; some are computed here, or play a recording, and live on the instance's clock.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import msgspec
 from shmio.config.wording import explain
 from shmio.connectors.base import Connector
 from shmio.connectors.computed import Computed
+from shmio.connectors.replayed import Replayed
 from shmio.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ GROUP = "shmio.connectors"
 BUILT_IN = {
     "memory": "shmio.connectors.memory:Memory",
     "remote": "shmio.connectors.remote:Remote",
+    "replay": "shmio.connectors.replay.source:Replay",
     "simulation": "shmio.connectors.simulation:Simulation",
     "s7": "shmio.connectors.s7.connector:S7Connector",
 }
@@ -40,7 +42,7 @@ def _offered() -> EntryPoints:
     return entry_points(group=GROUP)
 
 
-def load(name: str) -> type[Connector] | type[Computed]:
+def load(name: str) -> type[Connector] | type[Computed] | type[Replayed]:
     """Import a connector by name; ConfigError when there is none, or it cannot be imported."""
     if name in BUILT_IN:
         module, _, attribute = BUILT_IN[name].partition(":")
@@ -53,7 +55,7 @@ def load(name: str) -> type[Connector] | type[Computed]:
             found = points[0].load()
         except Exception as error:
             raise ConfigError(f"connector {name!r} ({points[0].value}) cannot be imported: {error}") from error
-    if not (isinstance(found, type) and issubclass(found, Connector | Computed)):
+    if not (isinstance(found, type) and issubclass(found, Connector | Computed | Replayed)):
         raise ConfigError(f"connector {name!r} is not a subclass of shmio.connectors.base.Connector")
     return found
 

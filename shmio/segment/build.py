@@ -154,7 +154,7 @@ def build_segment(
     origin: Origin | None = None,
 ) -> None:
     """Make room in a new object and write all of it; the magic last."""
-    now_ns = time.monotonic_ns()
+    now_ns, begin_ns = time.monotonic_ns(), origin.clock_ns if origin else 0
     size = segment_size(blocks, len(processes))
     sections_size, processes_size = _table_sizes(len(blocks), len(processes))
     shared.allocate(size)
@@ -163,7 +163,7 @@ def build_segment(
             epoch=secrets.randbits(64) | 1,
             size=size,
             started_utc_ns=origin.started_utc_ns if origin else time.time_ns(),
-            started_ns=now_ns - (origin.clock_ns if origin else 0),
+            started_ns=now_ns - begin_ns,
             sections_offset=HEADER_SIZE,
             section_capacity=sections_size // SECTION_SIZE,
             processes_offset=HEADER_SIZE + sections_size,
@@ -182,7 +182,7 @@ def build_segment(
         entries = write_blocks(memory, HEADER_SIZE + sections_size + processes_size, 0, blocks)
         clock_size = _clock_size(len(processes))
         clock_at = size - clock_size
-        ClockPage.write_new(memory, clock_at, head.process_capacity, virtual=stepped, time_ns=origin.clock_ns if origin else 0)
+        ClockPage.write_new(memory, clock_at, head.process_capacity, virtual=stepped, time_ns=begin_ns)
         own = len(entries)
         entries.append(SectionEntry(SectionKind.CLOCK, False, clock_at, clock_size, own, "clock", bytes(32)))
         header.change_sections(memory, head, entries)

@@ -92,7 +92,7 @@ class Play(NamedTuple):
     def at_ns(self, clock_ns: int) -> int:
         """The position at a time of the instance's clock."""
         reach_ns = self.reach_ns(clock_ns)
-        if reach_ns >= self.end_ns and self.wraps:
+        if reach_ns >= self.end_ns and self.wraps and self.playing:
             return self.begin_ns + (reach_ns - self.begin_ns) % (self.end_ns - self.begin_ns)
         return min(reach_ns, self.until_ns)
 
@@ -107,7 +107,7 @@ class Play(NamedTuple):
     def settled(self, clock_ns: int) -> Play:
         """The same, with the rounds that are over by then behind it, and paused where it was to stop."""
         reach_ns = self.reach_ns(clock_ns)
-        if self.wraps and reach_ns >= self.end_ns:
+        if self.wraps and self.playing and reach_ns >= self.end_ns:
             rounds = (reach_ns - self.begin_ns) // (self.end_ns - self.begin_ns)
             anchor_ns = self.due_ns(self.begin_ns + rounds * (self.end_ns - self.begin_ns))
             return self._replace(anchor_ns=anchor_ns, position_ns=self.begin_ns)
@@ -271,5 +271,3 @@ def answered(play: Play, number: int, found: Found) -> Play:
     """With the answer to a request."""
     found = Found(cut(found.error, _MAX_ERROR).decode(), found.position_ns)
     return play._replace(asked=number, answer=msgspec.json.encode(found).decode())
-
-

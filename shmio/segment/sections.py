@@ -21,7 +21,7 @@ from shmio.segment.shm import SharedObject
 from shmio.segment.standing import declared_cell, standing_cell
 
 FIRST_LINK = 2
-"""The lock of a block's link or playhead: so many bytes, and the index of its layout, after those of the process table."""
+"""The lock of a block's link or playhead: so many bytes, and its layout's index, after those of the process table."""
 
 _ATTRIBUTES = msgspec.json.Decoder(Attributes)  # as in layout/document.py: built before there are threads
 

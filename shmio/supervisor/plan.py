@@ -113,13 +113,14 @@ def make_plan(
     declared: Mapping[str, bytes] | None = None,
     warnings: Sequence[str] = (),
     computed: Collection[str] = (),
+    replayed: Collection[str] = (),
     remote: Mapping[str, tuple[Sequence[str], Sequence[str]]] | None = None,
 ) -> Plan:
     """Plan an instance. ``layouts``: of each source, by its name; ``emulated``: all blocks of each emulator.
 
-    ``computed``: the sources that live on the instance's clock. ``remote``: patterns of outputs and in-outs of those
-    that a program elsewhere computes, by the source's name. ``declared``: what the sources' processes get of the
-    declared injections, by the source's name.
+    ``computed``: the sources that live on the instance's clock; ``replayed``: those of them that play a recording.
+    ``remote``: patterns of outputs and in-outs of those that a program elsewhere computes, by the source's name.
+    ``declared``: what the sources' processes get of the declared injections, by the source's name.
     ConfigError: too many processes.
     """
     ring_bytes = round(config.instance.ring_mb * 1e6)
@@ -135,7 +136,9 @@ def make_plan(
                 tuple(source.writable),
                 source.armed,
                 source.name in computed,
-                *map(tuple, (remote or {}).get(source.name, ((), ()))),
+                outputs=tuple((remote or {}).get(source.name, ((), ()))[0]),
+                inouts=tuple((remote or {}).get(source.name, ((), ()))[1]),
+                replay=source.name in replayed,
             ),
             (declared or {}).get(source.name, b""),
         )

@@ -50,7 +50,7 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
     try:
         check_host(config)
         check_listening(config)
-        layouts, computed, remote = check_sources(config, files)
+        layouts, computed, replayed, remote = check_sources(config, files)
         emulated = {emulator.name: _check_emulator(i, emulator, files) for i, emulator in enumerate(config.emulator)}
         declared, described = _check_injections(config, layouts)
         odd = [*_odd(config, layouts), *_not_served(config, layouts, emulated), *_unread(emulated)]
@@ -66,6 +66,7 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
         declared=declared,
         warnings=warnings,
         computed=computed,
+        replayed=replayed,
         remote=remote,
     )
     return Prepared(config, plan, layouts, emulated, described)

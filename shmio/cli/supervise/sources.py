@@ -22,6 +22,8 @@ class Sources(NamedTuple):
     layouts: dict[str, Layout]
     computed: list[str]
     """Those that live on the instance's clock."""
+    replayed: list[str]
+    """Those that play a recording."""
     remote: dict[str, tuple[list[str], list[str]]]
     """Patterns of what a program elsewhere computes, of sources that have such: outputs, in-outs."""
 
@@ -33,17 +35,23 @@ def check_sources(config: Config, files: LayoutFiles) -> Sources:
     """
     from shmio.connectors import registry  # noqa: PLC0415
     from shmio.connectors.computed import Computed  # noqa: PLC0415
+    from shmio.connectors.replayed import Replayed  # noqa: PLC0415
 
     layouts: dict[str, Layout] = {}
     inputs: dict[int, tuple[str, ...]] = {}
     computed = []
+    replayed = []
     remote: dict[str, tuple[list[str], list[str]]] = {}
     for index, source in enumerate(config.source):
         key = f"source[{index}]"
         options = _options(index, source)
         found = registry.load(source.connector)
-        if issubclass(found, Computed):
+        if issubclass(found, Computed | Replayed):
             computed.append(source.name)
+        if issubclass(found, Replayed):
+            replayed.append(source.name)
+            layouts[source.name] = _recorded(key, source, config)
+            continue
         if source.connector == "simulation":
             layouts[source.name], inputs[index] = _model(key, source, config, files)
             continue
@@ -63,7 +71,7 @@ def check_sources(config: Config, files: LayoutFiles) -> Sources:
 
         source = config.source[index]
         check_connections(f"source[{index}]", source.name, source.options.get("connections", {}), paths, layouts)
-    return Sources(layouts, computed, remote)
+    return Sources(layouts, computed, replayed, remote)
 
 
 def _options(index: int, source: Source) -> msgspec.Struct:
@@ -85,6 +93,24 @@ def _options(index: int, source: Source) -> msgspec.Struct:
         raise ConfigError(f"{key}.{error}") from None
     source.options, source.texts = msgspec.to_builtins(options), {}
     return options
+
+
+def _recorded(key: str, source: Source, config: Config) -> Layout:
+    """The layout of a replay: that of the recording, which has its period and its age, too."""
+    from shmio.connectors.replay.source import Replay, files  # noqa: PLC0415
+
+    for name in ("layout", "block", "properties"):
+        if getattr(source, name) is not None:
+            raise ConfigError(f"{key}.{name}: a replay has none: its registers are those of the recording")
+    options = msgspec.convert(source.options, Replay.Options)
+    source.options["file"] = [str(config.path(file)) for file in files(options)]
+    try:
+        replay = Replay(msgspec.convert(source.options, Replay.Options), source.name)
+    except ConfigError as error:
+        raise ConfigError(f"{key}.{error}") from None
+    replay.close()
+    source.period_ms, source.stale_ms = replay.tape.period_ns / 1e6, replay.tape.stale_ns / 1e6
+    return replay.layout
 
 
 def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tuple[Layout, tuple[str, ...]]:

@@ -31,6 +31,7 @@ from shmio.segment import (
     Quality,
     Record,
     Segment,
+    Stamp,
 )
 from shmio.segment.commander import Commander
 from shmio.segment.coordinator import Coordinator
@@ -282,8 +283,8 @@ def test_who_takes_time_over_stops_what_ran_freely_and_its_cycles_go_on(instance
 class SlowToAccept(BlockWriter):
     """Once it has told that a write is accepted it rests, until a step was made without that, or could have been."""
 
-    def event(self, record: Record, *, quality: Quality | None = None) -> int:
-        number = super().event(record, quality=quality)
+    def event(self, record: Record, *, quality: Quality | None = None, at: Stamp | None = None) -> int:
+        number = super().event(record, quality=quality, at=at)
         if record.kind is EventKind.ACCEPTED:
             seen = self.block.ring.doorbell()
             while not self.block.clock.read().stepping:

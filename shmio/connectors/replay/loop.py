@@ -1,0 +1,261 @@
+"""The loop that plays a recording: by the clock in wall time, step by step in virtual time, as the playhead says."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+from shmio.connectors.campaign import Blocks
+from shmio.connectors.desk import CommandDesk
+from shmio.connectors.injector import OwnerOf
+from shmio.connectors.output import Output
+from shmio.connectors.replay.player import OVER, OWN, Player
+from shmio.connectors.replay.search import Search
+from shmio.connectors.replay.source import Replay
+from shmio.connectors.stepped import StepClock
+from shmio.connectors.telling import Counters
+from shmio.errors import PathError, SegmentError
+from shmio.layout.write import Write
+from shmio.segment import BlockWriter, EventKind, Record, Stamp
+from shmio.segment.playhead import MAX_SPEED, MIN_SPEED, Find, Found, Move, Play, answered
+
+PIECE: Final = 64
+"""So many frames and events between two looks at what else there is to do."""
+LATE_NS: Final = 10_000_000_000
+"""What is late is caught up with, up to this much of the instance's clock; what is later is left out."""
+APART_NS: Final = 60_000_000_000
+"""A request may be told of a moment that is so far from now."""
+
+log = logging.getLogger("shmio.source")
+
+
+class ReplayLoop:
+    """Plays one source of a recording. In virtual time a step plays what lies in it, which may be nothing."""
+
+    def __init__(
+        self,
+        source: Replay,
+        writer: BlockWriter,
+        started_ns: int,
+        clock: StepClock,
+        writable: Iterable[str] = (),
+        *,
+        owner_of: OwnerOf = lambda _: None,
+        blocks: Blocks | None = None,
+    ) -> None:
+        """``started_ns``: of the segment. ``blocks``: all of the instance's, other replays among them."""
+        block = writer.block
+        if block.playhead is None:
+            raise SegmentError(f"the block of source {block.source} has no playhead")
+        self._source = source
+        self._writer = writer
+        self._head = block.playhead
+        self._page = block.clock
+        self._started_ns = started_ns
+        self._clock = clock
+        self._blocks = blocks or (lambda: {block.source: block})
+        self._output = Output(writer, clock.now_ns)
+        # Whatever is injected here reaches no plant, so that no arming is needed.
+        self.desk = CommandDesk(
+            self._output, writable, clock.now_ns, armed=True, owner_of=owner_of, blocks=blocks, accepted=clock.nudge
+        )
+        self._player = Player(source.tape, self._output, keep=source.keep)
+        self._search: tuple[int, Search] | None = None
+        self._play = self._first()
+        self.counters = Counters()
+
+    @property
+    def note(self) -> str:
+        """Why quality is not good; empty if it is."""
+        return self._player.note
+
+    def run(self) -> None:
+        """Play until the clock says stop; then tell the readers."""
+        try:
+            self._begin()
+            while not self._turn():
+                pass
+        finally:
+            self.desk.stop()
+            reason = f"{OWN}the source was stopped"
+            self.desk.close(reason)
+            self._player.end(reason, self._stamp_now())
+            self._writer.event(Record(EventKind.STOPPED))
+
+    # ---- the beginning -------------------------------------------------------------------------------------------
+
+    def _first(self) -> Play:
+        """How it is to play: as the process before this one did, else as other sources of this recording do."""
+        span, options = self._source.span, self._source.options
+        replays = [block.playhead for block in self._blocks().values() if block.playhead is not None]
+        with replays[0].held():  # sources that begin at the same time begin together
+            own = self._head.read()
+            alike = [play for play in (head.read() for head in replays) if play and self._is_of(play)]
+            if own is not None and self._is_of(own):
+                return own
+            if alike:
+                play = alike[0]._replace(step=0, asked=0, answer="", failure="")
+            else:
+                now_ns = self._page.read().present_ns
+                recorded = options.clock == "recording"
+                at_ns = span.begin_ns if recorded else now_ns
+                base_ns = self._started_ns + (0 if recorded else now_ns - span.begin_ns)
+                play = Play(
+                    span.begin_ns, span.end_ns, at_ns, span.begin_ns, span.end_ns, base_ns,
+                    self._source.recording.utc_ns, options.speed, options.paused, options.loop, recorded,
+                )  # fmt: skip
+            self._head.write(play)
+            return play
+
+    def _is_of(self, play: Play) -> bool:
+        span = self._source.span
+        return (play.begin_ns, play.end_ns, play.utc_ns) == (*span, self._source.recording.utc_ns)
+
+    def _begin(self) -> None:
+        """Go on from what the process before this one has published, if there was one."""
+        last = self._writer.block.latest()
+        state = self._page.read()
+        if last is None:
+            self._player.begin(self._play.at_ns(self._play.anchor_ns), self._stamp)
+        else:
+            last_ns = last.publish_ns - self._play.base_ns
+            self._player.resume(min(last_ns, self._play.at_ns(state.time_ns)))
+        self.desk.open()
+        self.counters.connects += 1
+
+    # ---- the loop ------------------------------------------------------------------------------------------------
+
+    def _turn(self) -> bool:
+        """Play what is due, do what is asked for, then wait for news; True: told to stop."""
+        state = self._page.read()
+        # In virtual time what is published belongs to the end of the step.
+        at_ns = self._play.base_ns + self._play.at_ns(state.time_ns) if state.virtual else None
+        self._writer.at_ns = at_ns
+        more = self._advance(state.time_ns)
+        if not more and state.stepping and state.step != self._play.step:
+            self._keep(self._play._replace(step=state.step))
+            self._writer.block.ring.wake()
+        if not state.stepping:
+            more |= self._listen(state.time_ns)
+        if self.desk.waiting:
+            self.desk.settle()
+            self.desk.carry_out(self._refuse)
+        self.counters.polls = self._player.published
+        return self._clock.wait_ns(0 if more else self._patience_ns(virtual=state.virtual))
+
+    def _patience_ns(self, *, virtual: bool) -> int | None:
+        """How long nothing is due; None: until somebody rings."""
+        play, next_ns = self._play, self._player.next_ns
+        if virtual or play.paused:
+            return None
+        goal_ns = min(play.until_ns, play.end_ns if next_ns is None else next_ns)
+        return max(0, play.due_ns(goal_ns) - self._page.present_ns())
+
+    def _advance(self, clock_ns: int) -> bool:
+        """Play what is due at a time of the instance's clock, a piece of it; whether there is more."""
+        play = self._play
+        target_ns = min(play.reach_ns(clock_ns), play.until_ns)
+        next_ns = self._player.next_ns
+        late_ns = 0 if next_ns is None or play.paused else clock_ns - play.due_ns(next_ns)
+        if late_ns > LATE_NS and self._writer.at_ns is None:
+            left_out = self._player.skip(target_ns, self._stamp)
+            log.warning("%d frames were left out: this process was held up for %.1f s", left_out, late_ns / 1e9)
+            self.counters.overruns += left_out
+        before = self._player.published
+        if self._player.play(target_ns, self._stamp, PIECE):
+            return True
+        if self._player.published != before:
+            self.desk.release(self._writer.cycle)
+        settled = play.settled(clock_ns)
+        if settled is play:
+            return False
+        if settled.paused:
+            over = settled.position_ns >= settled.end_ns
+            if over:
+                self._player.end(OVER, self._stamp(settled.end_ns, settled.end_ns))
+            self._keep(settled._replace(over=over))
+            return False
+        self._keep(settled)
+        self._player.go(settled.begin_ns)
+        return True
+
+    def _stamp(self, position_ns: int, clock_ns: int) -> Stamp:
+        """When what is at a position is published; ``clock_ns``: of the recording."""
+        play = self._play
+        if play.own_clock:
+            return Stamp(play.base_ns + position_ns, clock_ns)
+        return Stamp(play.base_ns + position_ns, play.due_ns(max(position_ns, play.position_ns)))
+
+    def _stamp_now(self) -> Stamp:
+        at_ns = self._writer.now_ns()
+        return Stamp(at_ns, self._head.clock_ns(at_ns))
+
+    def _keep(self, play: Play) -> None:
+        self._play = play
+        self._head.write(play)
+
+    def _refuse(self, writes: Sequence[Write]) -> list[str]:
+        return [f"source {self._writer.block.source} is a replay: nothing is written"] * len(writes)
+
+    # ---- what others ask for -------------------------------------------------------------------------------------
+
+    def _listen(self, clock_ns: int) -> bool:
+        """Answer a request, or go on with the search for an answer; whether there is more to do."""
+        asked = self._head.asks(self._play.asked)
+        if asked is None:
+            self._search = None
+            return False
+        number, ask = asked
+        if isinstance(ask, Find):
+            return self._find(number, ask)
+        found = self._move(ask, clock_ns) if isinstance(ask, Move) else Found("the request makes no sense")
+        self._answer(number, found)
+        return True
+
+    def _answer(self, number: int, found: Found) -> None:
+        self._search = None
+        self._keep(answered(self._play, number, found))
+        self._writer.block.ring.wake()
+
+    def _find(self, number: int, ask: Find) -> bool:
+        if self._search is None or self._search[0] != number:
+            try:
+                self._search = number, Search(self._source.tape, ask, keep=self._source.keep)
+            except PathError as error:
+                self._answer(number, Found(str(error)))
+                return True
+        found = self._search[1].go_on()
+        if found is not None:
+            self._answer(number, found)
+        return True
+
+    def _move(self, ask: Move, clock_ns: int) -> Found:
+        """Play otherwise from a moment on that is about now."""
+        if ask.speed is not None and not (math.isfinite(ask.speed) and MIN_SPEED <= ask.speed <= MAX_SPEED):
+            return Found(f"a speed is from {MIN_SPEED:g} to {MAX_SPEED:g}, not {ask.speed:g}")
+        if abs(ask.clock_ns - clock_ns) > APART_NS:
+            return Found("the request came too late")
+        play = self._play.anchored(ask.clock_ns)
+        position_ns, paused = ask.position_ns, play.paused if ask.paused is None else ask.paused
+        if position_ns is None and not paused and play.position_ns >= play.end_ns:
+            position_ns = play.begin_ns  # from the end it goes on at the beginning
+        if position_ns is not None and not play.begin_ns <= position_ns <= play.end_ns:
+            length_s = (play.end_ns - play.begin_ns) / 1e9
+            return Found(f"that is not within what is played, which is {length_s:.3f} s long")
+        until_ns = play.end_ns if ask.until_ns is None else min(ask.until_ns, play.end_ns)
+        self._keep(
+            play._replace(
+                paused=paused,
+                speed=play.speed if ask.speed is None else ask.speed,
+                loop=play.loop if ask.loop is None else ask.loop,
+                position_ns=play.position_ns if position_ns is None else position_ns,
+                until_ns=max(until_ns, play.position_ns if position_ns is None else position_ns),
+                over=play.over and position_ns is None,
+            )
+        )
+        if position_ns is not None:
+            self._writer.at_ns = self._play.base_ns + position_ns
+            self._player.show(position_ns, self._stamp)
+        return Found()

@@ -1,0 +1,169 @@
+"""Publishes what a recording holds of one source: each frame and event with its own times."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from typing import Final, cast
+
+from shmio.connectors.output import Image, Output
+from shmio.connectors.replay.tape import Entry, Tape
+from shmio.segment import NO_WRITER, BlockWriter, Event, EventKind, Frame, Provenance, Quality, Record, Stamp
+
+OWN: Final = "replay: "
+"""How what a replay says of itself begins, in reasons and in the texts of events."""
+OVER: Final = f"{OWN}the recording is over"
+NOTHING: Final = f"{OWN}nothing of this source was recorded up to here"
+GOES_ON: Final = f"{OWN}the recording goes on"
+
+_OF_PROCESSES: Final = frozenset({EventKind.STARTED, EventKind.STOPPED})
+_OF_INJECTIONS: Final = frozenset(
+    {
+        EventKind.DIVERTED,
+        EventKind.TAKEN,
+        EventKind.INJECTED,
+        EventKind.LIFTED,
+        EventKind.SHADOWED,
+        EventKind.ACTIVATED,
+        EventKind.DEACTIVATED,
+    }
+)
+
+StampOf = Callable[[int, int], Stamp]
+"""When what has a position and a clock in the recording is published."""
+
+log = logging.getLogger("shmio.source")
+
+
+class Player:
+    """The place in a recording, and what is published there; for one thread."""
+
+    def __init__(self, tape: Tape, output: Output, *, keep: bool) -> None:
+        """``keep``: whether the injections of the recording are seen."""
+        self._tape = tape
+        self._output = output
+        self._writer: BlockWriter = output.writer
+        self._keep = keep
+        self._entries: Iterator[Entry] = iter(())
+        self._next: Entry | None = None
+        self.note = ""
+        """Why quality is not good; empty if it is."""
+        self._bad = False  # as last published
+        self._missing = False  # whether the last frame was of this replay's own making
+        self.published = 0
+
+    @property
+    def next_ns(self) -> int | None:
+        """The position of what comes next; None: there is nothing more."""
+        return None if self._next is None else self._next.position_ns
+
+    def go(self, position_ns: int) -> None:
+        """Have what comes at or behind a position be the next."""
+        self._entries = self._tape.entries(position_ns)
+        self._next = next(self._entries, None)
+
+    def begin(self, position_ns: int, stamp: StampOf) -> None:
+        """Have what comes at or behind a position be the next; what is there before it is seen at once."""
+        entry = self._tape.newest(position_ns - 1)
+        if entry is not None:
+            self._publish(entry, stamp)
+        self.go(position_ns)
+
+    def resume(self, position_ns: int) -> None:
+        """Go on behind a position, up to which the process before this one has published."""
+        self.go(position_ns + 1)
+        entry = self._tape.newest(position_ns)
+        if entry is not None and isinstance(entry.item, Frame):
+            self._output.resume(self._image(entry.item, None))
+            self._bad = entry.item.quality is Quality.BAD
+
+    def show(self, position_ns: int, stamp: StampOf) -> None:
+        """Publish the frame that is the newest at a position, and have what comes behind that be the next."""
+        entry = self._tape.newest(position_ns)
+        if entry is None:
+            self.fail(NOTHING, stamp(position_ns, position_ns))
+        else:
+            self._publish(entry, stamp)
+        self.go(position_ns + 1)
+
+    def play(self, until_ns: int, stamp: StampOf, most: int) -> bool:
+        """Publish what comes up to a position, at most so many; whether there is more."""
+        for _ in range(most):
+            if self._next is None or self._next.position_ns > until_ns:
+                return False
+            self._publish(self._next, stamp)
+            self._next = next(self._entries, None)
+        return self._next is not None and self._next.position_ns <= until_ns
+
+    def skip(self, position_ns: int, stamp: StampOf) -> int:
+        """Go on at a position without what is before, but for the newest frame; how many frames are left out."""
+        count = 0
+        while self._next is not None and self._next.position_ns <= position_ns:
+            count += isinstance(self._next.item, Frame)
+            self._next = next(self._entries, None)
+        entry = self._tape.newest(position_ns)
+        if entry is not None:
+            self._publish(entry, stamp)
+        return max(0, count - 1)
+
+    def end(self, reason: str, stamp: Stamp) -> None:
+        """No more comes: what was good is so no longer."""
+        if not self._bad:
+            self.fail(reason, stamp)
+
+    def fail(self, reason: str, stamp: Stamp) -> None:
+        """Publish the last image as a bad one."""
+        output = self._output
+        image = Image(
+            output.raw, max(0, output.cycle), output.source_ns, Quality.BAD, Provenance.REPLAYED, reason,
+            shown=None if output.base is output.raw else output.base, at=stamp,
+        )  # fmt: skip
+        self._tell(Quality.BAD, reason, stamp)
+        self._missing = True
+        self._show(image)
+
+    # ---- what there is -------------------------------------------------------------------------------------------
+
+    def _publish(self, entry: Entry, stamp: StampOf) -> None:
+        position_ns, item = entry
+        if isinstance(item, Frame):
+            at = stamp(position_ns, item.clock_ns)
+            self._writer.cycle = item.cycle
+            if self._missing:
+                self._missing = False
+                if item.quality is not Quality.BAD:
+                    self._tell(item.quality, GOES_ON, at)
+            self._show(self._image(item, at))
+        elif isinstance(item, Event):
+            self._happen(item, stamp(position_ns, item.clock_ns))
+        else:
+            self.fail(f"{OWN}{item.reason}", stamp(position_ns, position_ns))
+
+    def _image(self, frame: Frame, at: Stamp | None) -> Image:
+        asked_ns = None if at is None else at.publish_ns - 1000 * frame.delay_us
+        return Image(
+            frame.raw, frame.cycle, frame.source_ns, frame.quality, Provenance.REPLAYED, frame.reason, asked_ns,
+            frame.effective if self._keep else None, at,
+        )  # fmt: skip
+
+    def _show(self, image: Image) -> None:
+        self._output.publish(image)
+        self.note = image.reason
+        self._bad = image.quality is Quality.BAD
+        self.published += 1
+
+    def _happen(self, event: Event, at: Stamp) -> None:
+        """Tell a recorded event again: nobody's, so that no client of now takes it for its own."""
+        if event.kind in _OF_PROCESSES or (not self._keep and (event.kind in _OF_INJECTIONS or event.injection)):
+            return
+        record = Record(
+            cast(EventKind, event.kind),  # or a number that this version does not know
+            event.text, NO_WRITER, event.command, event.item, event.items, event.offset, event.mask, event.size,
+            event.data, event.injection,
+        )  # fmt: skip
+        self._writer.cycle = event.cycle
+        self._writer.event(record, quality=event.quality, at=at._replace(utc_ns=event.utc_ns))
+
+    def _tell(self, quality: Quality, reason: str, at: Stamp) -> None:
+        self._writer.event(Record(EventKind.QUALITY, reason), quality=quality, at=at)
+        log.info("quality %s: %s", quality, reason)

@@ -1,0 +1,66 @@
+"""The source of a recording: its keys, and what it takes to play them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Literal
+
+import msgspec
+
+from shmio.connectors.replay.recording import Recording, Span
+from shmio.connectors.replayed import Replayed
+from shmio.errors import ConfigError, RecordingError
+from shmio.layout.model import Layout
+from shmio.segment.playhead import MAX_SPEED, MIN_SPEED
+
+File = Annotated[str, msgspec.Meta(min_length=1)]
+
+
+class Replay(Replayed):
+    """``connector = "replay"``: plays what a recording holds of one source. Nothing is written to any device."""
+
+    class Options(msgspec.Struct, forbid_unknown_fields=True):
+        """Its keys. ``clock``: ``recording`` if frames have the recording's clock, which is the whole instance's."""
+
+        file: File | Annotated[list[File], msgspec.Meta(min_length=1)]
+        source: str | None = None
+        start: float | str | None = None
+        end: float | str | None = None
+        speed: Annotated[float, msgspec.Meta(ge=MIN_SPEED, le=MAX_SPEED)] = 1.0
+        loop: bool = False
+        paused: bool = False
+        injections: Literal["keep", "leave out"] = "keep"
+        clock: Literal["instance", "recording"] = "instance"
+
+    def __init__(self, options: Options, name: str) -> None:
+        """ConfigError: it cannot be played; beginning with the key."""
+        self.options = options
+        try:
+            self.recording = Recording(files(options))
+        except RecordingError as error:
+            raise ConfigError(f"file: {error}") from None
+        try:
+            self.span: Span = self.recording.span(options.start, options.end)
+            self.tape = self.recording.tape(options.source or name, self.span)
+        except RecordingError as error:
+            self.recording.close()
+            raise ConfigError(str(error) if str(error).startswith(("start", "end")) else f"source: {error}") from None
+
+    @property
+    def layout(self) -> Layout:
+        """Of the frames."""
+        return self.tape.layout
+
+    @property
+    def keep(self) -> bool:
+        """Whether the injections of the recording are seen."""
+        return self.options.injections == "keep"
+
+    def close(self) -> None:
+        """Close the files."""
+        self.recording.close()
+
+
+def files(options: Replay.Options) -> Sequence[str]:
+    """The files of the recording."""
+    return [options.file] if isinstance(options.file, str) else options.file
