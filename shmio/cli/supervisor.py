@@ -10,6 +10,7 @@ from pathlib import Path
 
 from shmio import __version__
 from shmio.cli.run import at_least, run
+from shmio.cli.supervise.replaying import add_arguments
 
 PROGRAM = "shmio-supervisor"
 MODES = ("live", "log", "replay")
@@ -45,9 +46,10 @@ def _parser() -> argparse.ArgumentParser:
         "--mode",
         choices=MODES,
         default="live",
-        help="live (default), or log: record, serve nothing; replay is not in this version",
+        help="live (default); log: record, serve nothing; replay: play a recording in place of the sources",
     )
     up.add_argument("--detach", action="store_true", help="return when it runs, and leave it running")
+    add_arguments(up)
     up.add_argument("--report", type=int, help=argparse.SUPPRESS)  # descriptor on which a detached one tells its start
     verb("down", "stop the instance", target)
     status = verb("status", "tell how the instance and its processes are", target)

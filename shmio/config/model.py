@@ -173,6 +173,19 @@ class Recorder(Section):
         return round(self.buffer_mb * 1e6)
 
 
+class Replay(Section):
+    """``[replay]``: what ``--mode replay`` plays in place of the sources."""
+
+    file: Text | Texts | None = None
+    start: float | Text | None = None
+    end: float | Text | None = None
+    speed: Annotated[float, Meta(ge=0.01, le=1000)] = 1.0
+    loop: bool = False
+    paused: bool = False
+    injections: Literal["keep", "leave out"] = "keep"
+    record: bool = False
+
+
 class Declaration(Section, omit_defaults=True):
     """``[[injection]]``: an injection that the source's process runs by itself; docs/reference/injections.md.
 
@@ -210,6 +223,7 @@ class Config(Section):
     injection: list[Declaration] = []
     grpc: Grpc | None = None
     recorder: Recorder | None = None
+    replay: Replay | None = None
     folder: str = "."
 
     def path(self, text: str) -> Path:

@@ -21,6 +21,7 @@ from shmio.config.model import (
     Instance,
     Listening,
     Recorder,
+    Replay,
     Section,
     Source,
     Tls,
@@ -45,6 +46,7 @@ _TABLES: dict[str, type[Section]] = {
     "grpc.client": Client,
     "grpc.address": Listening,
     "recorder": Recorder,
+    "replay": Replay,
 }
 _OF_GRPC = ("token", "client", "address")
 _DERIVED = ("folder", "options", "texts")  # fields that are no keys of the file

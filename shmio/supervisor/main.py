@@ -129,6 +129,7 @@ class Supervisor:
             control=path,
             group=plan.group,
             stepped=plan.stepped,
+            origin=plan.origin,
         )
 
     def _on_signal(self, number: int) -> None:

@@ -12,7 +12,7 @@ import msgspec
 from shmio.config import Config
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout
-from shmio.segment import Attributes, BlockSpec, ProcessSpec, segment_size
+from shmio.segment import Attributes, BlockSpec, Origin, ProcessSpec, segment_size
 
 RANKS: Final[Mapping[str, int]] = {"emulator": 0, "recorder": 0, "source": 1, "grpc": 2}
 """Order of start by kind: what plays a device, what reads devices, what serves the readings.
@@ -32,8 +32,8 @@ RULES: Final[Mapping[str, tuple[str, ...]]] = {"grpc": ("token", "client")}
 """Keys of a section that its process takes anew while it runs, by its kind."""
 
 MAX_PROCESSES = 200
-MODES = ("live", "log")
-"""What this version can be started as; log: what serves others is left out."""
+MODES = ("live", "log", "replay")
+"""What it can be started as; log: what serves others is left out; replay: a recording has the sources' places."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +91,8 @@ class Plan:
     """What is odd about its configuration, a line each."""
     stepped: bool = False
     """Whether time stands from the start until somebody steps."""
+    origin: Origin | None = None
+    """The time of the recording that is played; None: it has its own."""
 
     @property
     def processes(self) -> list[ProcessSpec]:
@@ -115,6 +117,7 @@ def make_plan(
     computed: Collection[str] = (),
     replayed: Collection[str] = (),
     remote: Mapping[str, tuple[Sequence[str], Sequence[str]]] | None = None,
+    origin: Origin | None = None,
 ) -> Plan:
     """Plan an instance. ``layouts``: of each source, by its name; ``emulated``: all blocks of each emulator.
 
@@ -169,6 +172,7 @@ def make_plan(
         jobs=tuple(_job(name, kind, log_dir / f"{name}.log", section) for name, kind, section in sections),
         warnings=tuple(warnings),
         stepped=config.instance.clock == "stepped",
+        origin=origin,
     )
 
 

@@ -65,6 +65,8 @@ def _fitting(shared: SharedObject, plan: Plan) -> tuple[Segment | None, list[str
     if plan.stepped != segment.clock.stepped:
         began, wanted = ("stepped", "wall") if segment.clock.stepped else ("wall", "stepped")
         return None, [f"{plan.instance} was started with instance.clock {began}, not {wanted}: it starts anew"]
+    if plan.origin and segment.header.started_utc_ns != plan.origin.started_utc_ns:
+        return None, [f"{plan.instance} played another recording: it starts anew"]
     status = (shm.DIRECTORY / shared.name).stat()
     if status.st_uid != os.geteuid():
         return None, [f"segment {shared.name} belongs to another user: it starts anew"]

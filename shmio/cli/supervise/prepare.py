@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from shmio.cli.supervise.host import check_host
 from shmio.cli.supervise.layouts import LayoutFiles
 from shmio.cli.supervise.ports import check_listening
+from shmio.cli.supervise.replaying import replayed
 from shmio.cli.supervise.sources import check_sources
 from shmio.config import Address, Config, Emulator, Source, load
 from shmio.config.wording import named
@@ -38,22 +40,29 @@ class Prepared:
     """What is declared, in words."""
 
 
-def prepare(file: Path, mode: str = "live") -> Prepared:
-    """Read and check everything that can be checked without starting anything; ConfigError, LayoutError."""
+def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = None) -> Prepared:
+    """Read and check everything that can be checked without starting anything; ConfigError, LayoutError.
+
+    ``keys``: of ``[replay]``, in place of those of the file.
+    """
     config = load(file)
+    origin, notices = None, list[str]()
     if mode == "log" and config.recorder is None:
         raise ConfigError(
             f"{file}: --mode log reads the sources and records them, and there is no [recorder] section: "
             'add one, such as [recorder] with directory = "dumps", or leave out --mode log'
         )
-    files = LayoutFiles(config)
     try:
+        if mode == "replay":
+            config, origin, notices = replayed(config, keys or {})
+        files = LayoutFiles(config)
         check_host(config)
         check_listening(config)
-        layouts, computed, replayed, remote = check_sources(config, files)
+        sources = check_sources(config, files)
+        layouts = sources.layouts
         emulated = {emulator.name: _check_emulator(i, emulator, files) for i, emulator in enumerate(config.emulator)}
         declared, described = _check_injections(config, layouts)
-        odd = [*_odd(config, layouts), *_not_served(config, layouts, emulated), *_unread(emulated)]
+        odd = [*notices, *_odd(config, layouts), *_not_served(config, layouts, emulated), *_unread(emulated)]
     except ConfigError as error:
         raise ConfigError(f"{file}: {named(str(error), msgspec.to_builtins(config))}") from None
     warnings = [*files.warnings, *(f"{file}: warning: {text}" for text in odd)]
@@ -65,9 +74,10 @@ def prepare(file: Path, mode: str = "live") -> Prepared:
         mode=mode,
         declared=declared,
         warnings=warnings,
-        computed=computed,
-        replayed=replayed,
-        remote=remote,
+        computed=sources.computed,
+        replayed=sources.replayed,
+        remote=sources.remote,
+        origin=origin,
     )
     return Prepared(config, plan, layouts, emulated, described)
 

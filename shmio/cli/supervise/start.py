@@ -6,9 +6,10 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
@@ -19,20 +20,20 @@ from shmio.cli.supervise.ports import check_ports
 from shmio.cli.supervise.prepare import Prepared, peer, prepare
 from shmio.cli.supervise.up import Configured, Failed, Started, Told, headline
 from shmio.cli.target import ask
-from shmio.errors import AlreadyRunningError, ConfigError, ShmioError
+from shmio.errors import AlreadyRunningError, ShmioError
 from shmio.logs import printable
 from shmio.segment import Segment, State, instances, leftover
 from shmio.segment.segment import refuse_second
 from shmio.supervisor import control
 from shmio.supervisor.main import Supervisor
-from shmio.supervisor.plan import MODES, Job, Plan
+from shmio.supervisor.plan import Job, Plan
 
 WHERE_S = 5.0
 
 
-def foreground(file: Path, mode: str) -> int:
-    """Run it; return when it has stopped."""
-    prepared = _prepare(file, mode)
+def foreground(file: Path, mode: str, keys: Mapping[str, Any]) -> int:
+    """Run it; return when it has stopped. ``keys``: of ``[replay]``, from the command line."""
+    prepared = prepare(file, mode, keys)
     plan = prepared.plan
     for warning in plan.warnings:
         say(warning, sys.stderr)
@@ -47,11 +48,11 @@ def foreground(file: Path, mode: str) -> int:
     with logdir.held(plan.log_dir, plan.instance):
         logs.setup(_log_file(plan), "supervisor")
         logging.getLogger("shmio.supervisor").addHandler(console)
-        Supervisor(plan, replan=_replan(plan)).run()
+        Supervisor(plan, replan=_replan(plan, keys)).run()
     return 0
 
 
-def detached(file: Path, mode: str, report: int) -> int:
+def detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> int:
     """Run it, and tell who waits for it how the start went, through this descriptor."""
     told = False
 
@@ -67,7 +68,7 @@ def detached(file: Path, mode: str, report: int) -> int:
 
     try:
         signal.signal(signal.SIGHUP, signal.SIG_IGN)
-        prepared = _prepare(file, mode)
+        prepared = prepare(file, mode, keys)
         plan = prepared.plan
         tell(Configured(printable(str(_log_file(plan))), tuple(map(printable, plan.warnings))))
         _refuse(plan)
@@ -82,7 +83,7 @@ def detached(file: Path, mode: str, report: int) -> int:
             with _log_file(plan).open("ab") as log:
                 for stream in (sys.stdout, sys.stderr):
                     os.dup2(log.fileno(), stream.fileno())
-            supervisor = Supervisor(plan, replan=_replan(plan), on_state=on_state)
+            supervisor = Supervisor(plan, replan=_replan(plan, keys), on_state=on_state)
             supervisor.run()
     except ShmioError as error:
         tell(Failed(printable(str(error))))
@@ -92,12 +93,6 @@ def detached(file: Path, mode: str, report: int) -> int:
         return 1
     tell(Failed("it was told to stop while it started"))
     return 0
-
-
-def _prepare(file: Path, mode: str) -> Prepared:
-    if mode not in MODES:
-        raise ConfigError(f"--mode {mode}: this version of shmio has the modes {', '.join(MODES)} only")
-    return prepare(file, mode)
 
 
 def _log_file(plan: Plan) -> Path:
@@ -124,9 +119,9 @@ def _whose(plan: Plan) -> str:
     return f"; {down}"
 
 
-def _replan(plan: Plan) -> Callable[[], Plan]:
+def _replan(plan: Plan, keys: Mapping[str, Any]) -> Callable[[], Plan]:
     """What a reload makes of the same file by then."""
-    return lambda: prepare(plan.config_file, plan.mode).plan
+    return lambda: prepare(plan.config_file, plan.mode, keys).plan
 
 
 def _processes(prepared: Prepared) -> Iterator[str]:

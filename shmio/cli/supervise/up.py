@@ -11,12 +11,13 @@ import select
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import msgspec
 
 from shmio.cli.run import say
+from shmio.cli.supervise.replaying import given, options
 from shmio.cli.target import config_file, option_for
 from shmio.errors import ControlError
 from shmio.segment import PREFIX
@@ -54,14 +55,14 @@ Told = Configured | Started | Failed
 
 def execute(arguments: argparse.Namespace) -> int:
     """Start the instance; return when it has stopped, or with ``--detach`` when it runs."""
-    file = config_file(arguments)
+    file, keys = config_file(arguments), given(arguments)
     if arguments.detach:
-        return _detach(file, arguments.mode)
+        return _detach(file, arguments.mode, options(keys))
     from shmio.cli.supervise import start  # noqa: PLC0415
 
     if arguments.report is not None:
-        return start.detached(file, arguments.mode, arguments.report)
-    return start.foreground(file, arguments.mode)
+        return start.detached(file, arguments.mode, keys, arguments.report)
+    return start.foreground(file, arguments.mode, keys)
 
 
 def headline(instance: str, mode: str, segment_bytes: int | None, log_dir: Path) -> str:
@@ -70,12 +71,12 @@ def headline(instance: str, mode: str, segment_bytes: int | None, log_dir: Path)
     return f"{instance}: mode {mode}, segment {PREFIX}{instance}{size}, logs in {log_dir}"
 
 
-def _detach(file: Path, mode: str) -> int:
+def _detach(file: Path, mode: str, words: Sequence[str]) -> int:
     command = (sys.executable, "-P", "-m", "shmio.cli.supervisor", "up")
     reader, writer = os.pipe()
     with os.fdopen(reader, "rb") as answers:
         child = subprocess.Popen(
-            [*command, "-c", str(file), "--mode", mode, "--report", str(writer)],
+            [*command, "-c", str(file), "--mode", mode, "--report", str(writer), *words],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,  # its standard error is ours, until it has its log file
             pass_fds=(writer,),
