@@ -106,7 +106,7 @@ class Follower:
         item = side.held
         assert item is not None  # noqa: S101  _next has looked
         # Never back: the order of one block is that of its numbers, whatever its clock does.
-        self._log_ns = log_ns = max(self._log_ns, self._log_time(item.publish_ns))
+        self._log_ns = log_ns = max(self._log_ns, self._log_time(self.block.clock.monotonic_ns(item.clock_ns)))
         if item.number > side.last + 1:
             yield Entry(log_ns, self, self._gap(side, item.number - 1, log_ns))
         side.held, side.last, side.log_ns, side.reason = None, item.number, log_ns, Reason.OVERTAKEN

@@ -63,11 +63,14 @@ class Player:
         self._next = next(self._entries, None)
 
     def begin(self, position_ns: int, stamp: StampOf) -> None:
-        """Have what comes at or behind a position be the next; what is there before it is seen at once."""
+        """Have what comes at or behind a position be the next; what is there before it is seen at once.
+
+        Where no frame is, that are the events before the first one.
+        """
         entry = self._tape.newest(position_ns - 1)
         if entry is not None:
             self._publish(entry, stamp)
-        self.go(position_ns)
+        self.go(self._tape.first_ns if entry is None else position_ns)
 
     def resume(self, position_ns: int) -> None:
         """Go on behind a position, up to which the process before this one has published."""

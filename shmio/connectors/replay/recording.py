@@ -10,7 +10,7 @@ from typing import NamedTuple
 from mcap.opcode import Opcode
 
 from shmio.connectors.replay.tape import Chunk, Tape
-from shmio.dump.encoding import EVENT, FRAME
+from shmio.dump.encoding import FRAME
 from shmio.dump.reader import Reader
 from shmio.dump.survey import Track, survey
 from shmio.errors import RecordingError
@@ -49,7 +49,6 @@ class Recording:
         self._chunks: list[Chunk] = []
         self.blocks: list[Kept] = []
         """In the order of the files."""
-        self._times_ns: list[int] = []
         try:
             for file in map(Path, files):
                 self._open(file)
@@ -62,10 +61,10 @@ class Recording:
         """UTC of position 0: when the instance started that was recorded."""
         self._chunks.sort(key=lambda chunk: chunk.first_ns)
         self.whole = Span(
-            min(self._times_ns) - self.utc_ns,
-            max(*(kept.last_ns + kept.period_ns for kept in self.blocks), max(self._times_ns) + 1) - self.utc_ns,
+            min(kept.first_ns for kept in self.blocks) - self.utc_ns,
+            max(kept.last_ns + kept.period_ns for kept in self.blocks) - self.utc_ns,
         )
-        """From the first frame or event to a period behind the last frame."""
+        """From the first frame to a period behind the last one."""
 
     def _open(self, file: Path) -> None:
         try:
@@ -75,9 +74,6 @@ class Recording:
         self._readers.append(reader)
         found = survey(reader)
         self.blocks += [_kept(reader, track) for track in found.tracks.values() if track.channel.encoding == FRAME]
-        for track in found.tracks.values():
-            if track.channel.encoding in (FRAME, EVENT):
-                self._times_ns += [track.first_ns, track.last_ns]
         for record in reader.records.walk():
             if record.opcode == Opcode.CHUNK:
                 self._chunks.append(Chunk(reader, record, *reader.records.chunk_times(record)))

@@ -56,6 +56,11 @@ class Tape:
         self._firsts = [chunk.first_ns for chunk in chunks]
         self._utc_ns = utc_ns
 
+    @property
+    def first_ns(self) -> int:
+        """A position before which there is nothing."""
+        return self._firsts[0] - self._utc_ns
+
     def entries(self, from_ns: int) -> Iterator[Entry]:
         """All from a position on, in the order in which it happened. What is damaged is a hole."""
         from_log_ns = from_ns + self._utc_ns

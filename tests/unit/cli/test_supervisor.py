@@ -318,7 +318,7 @@ def test_a_fault_that_a_detached_one_finds_is_told_here(example: Edit, capsys: p
     example("perid_ms", "period_ms")
     Path("supervisor.toml").rename("other.toml")
     assert main(["up", "--detach", "--mode", "replay", "-c", "other.toml"]) == 1
-    assert capsys.readouterr().err.startswith("--mode replay: this version")
+    assert capsys.readouterr().err.startswith("other.toml: replay.file: what is to be played")
 
 
 @pytest.mark.parametrize("address", ["127.0.0.2:1102", "[::1]:1102", "localhost:0"])
@@ -371,16 +371,33 @@ def test_a_block_is_chosen_by_its_number_or_name(example: Edit, key: str, capsys
 def test_help_tells_what_init_takes_and_which_modes_there_are(capsys: pytest.CaptureFixture[str]) -> None:
     for verb, said in (
         ("init", "init [-h] [-c FILE] [--emulated] [plc.ini] [FILE.db [FILE.udt ...]]"),
-        ("up", "not in this version"),
+        ("up", "replay: play a recording in place of the sources"),
     ):
         with pytest.raises(SystemExit):
             main([verb, "--help"])
         assert said in " ".join(capsys.readouterr().out.split())
 
 
-def test_a_mode_to_come_is_refused(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["up", "--mode", "replay"]) == 1
-    assert "--mode replay: this version" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("options", "error"),
+    [
+        (["--mode", "replay"], "replay.file: what is to be played: --from FILE.mem, or "),
+        (["--mode", "replay", "--from", "none.mem"], "replay.file: "),
+        (["--mode", "replay", "--from", "db201.db"], "replay.file: "),
+        (["--mode", "replay", "--from", "none.mem", "--speed", "0"], "replay.speed: expected a number >= 0.01"),
+    ],
+)
+def test_a_replay_that_cannot_be_is_refused(
+    example: Edit, options: list[str], error: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["up", *options]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"supervisor.toml: {error}")
+
+
+def test_what_is_for_a_replay_goes_with_no_other_mode(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["up", "--paused"]) == 1
+    assert capsys.readouterr().err == "--paused goes with --mode replay only\n"
 
 
 def test_nothing_is_logged_without_a_recorder(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,257 @@
+"""A recording is played: each frame and event as it was, at its time, in wall time and step by step."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+
+from shmio.connectors.replay.player import OVER
+from shmio.segment import (
+    NO_WRITER,
+    EventKind,
+    Origin,
+    Provenance,
+    Quality,
+    Record,
+    Segment,
+)
+from shmio.segment.commander import Commander
+from shmio.segment.coordinator import Coordinator
+from tests.unit.connectors.replay.harness import (
+    BEGIN_NS,
+    MS,
+    PERIOD_NS,
+    Playing,
+    S,
+    built,
+    counts,
+    image,
+    record,
+    recorded,
+)
+
+GUEST = 0
+
+
+def took(commander: Commander, value: int) -> str:
+    [outcome] = commander.write({"count": value})
+    return f"{outcome.kind}: {outcome.text}"
+
+
+def test_frames_come_as_they_were_at_their_times(tmp_path: Path, instance: str) -> None:
+    """Beside live sources they have the instance's clock when they were due, without a jitter."""
+    file = record(tmp_path, instance)
+    with built(instance, stepped=False) as segment, Playing(segment, file, speed=4) as cell:
+        first = cell.next()
+        frames = [first, *(cell.next() for _ in range(19))]
+        last = cell.next()
+    assert counts(frames) == list(range(20))
+    assert [frame.cycle for frame in frames] == list(range(5001, 5021))
+    assert [frame.source_ns for frame in frames] == [BEGIN_NS + n * PERIOD_NS for n in range(20)]
+    assert {frame.clock_ns - first.clock_ns - n * PERIOD_NS // 4 for n, frame in enumerate(frames)} == {0}
+    assert {frame.publish_ns - first.publish_ns - n * PERIOD_NS for n, frame in enumerate(frames)} == {0}
+    assert {(frame.quality, frame.provenance, frame.delay_us) for frame in frames} == {
+        (Quality.GOOD, Provenance.REPLAYED, 3)
+    }
+    assert (last.quality, last.reason, last.raw) == (Quality.BAD, OVER, frames[-1].raw)
+    assert last.publish_ns - frames[-1].publish_ns == PERIOD_NS
+
+
+def test_none_comes_before_its_time(tmp_path: Path, instance: str) -> None:
+    file = record(tmp_path, instance)
+    with built(instance, stepped=False) as segment, Playing(segment, file) as cell:
+        for _ in range(20):
+            frame = cell.next()
+            assert segment.clock.present_ns() >= frame.clock_ns
+
+
+def test_the_instance_may_have_the_recordings_time(tmp_path: Path, instance: str) -> None:
+    file = record(tmp_path, instance)
+    origin = Origin(BEGIN_NS, 7_000 * S)
+    with built(instance, stepped=False, origin=origin) as segment, Playing(segment, file, clock="recording") as cell:
+        frames = [cell.next() for _ in range(20)]
+        assert segment.clock.utc_ns(frames[0].publish_ns) == 7_000 * S + BEGIN_NS
+    assert [frame.clock_ns for frame in frames] == [BEGIN_NS + n * PERIOD_NS for n in range(20)]
+    assert [segment.clock_ns(frame.publish_ns) for frame in frames] == [frame.clock_ns for frame in frames]
+
+
+def test_events_are_told_again_as_nobodys(tmp_path: Path, instance: str) -> None:
+    with recorded(tmp_path, instance) as [cell]:
+        cell.frame(BEGIN_NS, image(0))
+        cell.event(BEGIN_NS + MS, Record(EventKind.ACCEPTED, "", 3, 77, 1, 1, 0, 0, 2, b"\0\5"))
+        cell.event(BEGIN_NS + 2 * MS, Record(EventKind.WRITTEN, "", 3, 77, 1, 1, 0, 0, 2))
+        cell.frame(BEGIN_NS + PERIOD_NS, image(1), quality=Quality.UNCERTAIN, reason="doubt")
+        cell.event(BEGIN_NS + PERIOD_NS, Record(EventKind.QUALITY, "doubt"), Quality.UNCERTAIN)
+        cell.frame(BEGIN_NS + 2 * PERIOD_NS, image(2), quality=Quality.BAD, reason="gone")
+    [file] = tmp_path.glob("*.mem")
+    with built(instance) as segment, Playing(segment, file) as playing:
+        coordinator = Coordinator(segment)
+        coordinator.step(2 * S)
+        frames, events = playing.frames(), playing.happened()
+        coordinator.close()
+    told = [(event.kind, event.command, event.item, event.data, event.text, event.quality) for event in events]
+    assert told == [
+        (EventKind.ACCEPTED, 77, 1, b"\0\5", "", Quality.GOOD),
+        (EventKind.WRITTEN, 77, 1, b"", "", Quality.GOOD),
+        (EventKind.QUALITY, 0, 0, b"", "doubt", Quality.UNCERTAIN),
+    ]
+    assert {event.writer for event in events} == {NO_WRITER}
+    assert [event.utc_ns for event in events] == [7_000 * S + BEGIN_NS + n for n in (MS, 2 * MS, PERIOD_NS)]
+    assert [event.frame for event in events] == [1, 1, 2]
+    assert [(frame.quality, frame.reason) for frame in frames] == [
+        (Quality.GOOD, ""),
+        (Quality.UNCERTAIN, "doubt"),
+        (Quality.BAD, "gone"),
+    ], "a recording that ends badly needs no frame that says that it is over"
+
+
+@pytest.mark.parametrize("injections", ["keep", "leave out"])
+def test_injections_of_the_recording_are_seen_or_not(tmp_path: Path, instance: str, injections: str) -> None:
+    with recorded(tmp_path, instance) as [cell]:
+        cell.frame(BEGIN_NS, image(1), effective=image(99))
+        cell.event(BEGIN_NS, Record(EventKind.INJECTED, "mine", 3, 5, 0, 1, injection=5))
+        cell.event(BEGIN_NS + MS, Record(EventKind.QUALITY, ""))
+    [file] = tmp_path.glob("*.mem")
+    kept = injections == "keep"
+    with built(instance) as segment, Playing(segment, file, injections=injections) as playing:
+        coordinator, commander = Coordinator(segment), Commander(segment.blocks["cell"], GUEST)
+        coordinator.step(10 * MS)
+        [frame] = playing.frames()
+        assert (frame.raw, frame.image) == (image(1), image(99) if kept else image(1))
+        assert [event.kind for event in playing.happened()] == [EventKind.INJECTED] * kept + [EventKind.QUALITY]
+        segment.processes.guests[0].take()
+        number = commander.inject(["other"])
+        commander.shadow(number, {"other": 7})
+        shown = playing.next(lambda frame: frame.image[2:] == b"\0\7")
+        assert (shown.raw, shown.image) == (image(1), image(99 if kept else 1, 7)), "ours lies over theirs"
+        commander.lift(number)
+        assert playing.next(lambda frame: frame.image[2:] == b"\0\0").image == frame.image
+        coordinator.close()
+
+
+def test_nothing_is_written(tmp_path: Path, instance: str) -> None:
+    file = record(tmp_path, instance)
+    with built(instance) as segment, Playing(segment, file) as cell:
+        commander = Commander(segment.blocks["cell"], GUEST)
+        assert took(commander, 5) == "refused: source cell is a replay: nothing is written"
+        kinds = [event.kind for event in cell.happened()]
+    assert kinds == [EventKind.ACCEPTED, EventKind.REFUSED]
+
+
+def test_what_is_missing_is_bad_until_it_goes_on(tmp_path: Path, instance: str) -> None:
+    """The ring turned faster than the recorder: the gap is in the recording, and in the replay."""
+    with recorded(tmp_path, instance) as [cell]:
+        slots = cell.writer.block.ring.slot_count
+        for number in range(slots + 10):
+            cell.frame(BEGIN_NS + number * PERIOD_NS, image(number))
+            if not number:
+                cell.take()
+    [file] = tmp_path.glob("*.mem")
+    with built(instance) as segment, Playing(segment, file) as playing:
+        coordinator = Coordinator(segment)
+        coordinator.step(PERIOD_NS)
+        [_, frame] = playing.frames()
+        assert frame.quality is Quality.BAD
+        assert frame.reason.startswith("replay: not in the recording: ")
+        assert frame.reason.endswith("frames (overtaken)")
+        coordinator.step(10 * S)
+        frames = playing.frames()
+        assert {frame.quality for frame in frames} == {Quality.GOOD}
+        assert [event.text for event in playing.happened()][-1] == "replay: the recording goes on"
+        coordinator.close()
+
+
+# ---- virtual time ----------------------------------------------------------------------------------------------------
+
+
+def test_a_step_plays_what_lies_in_it(tmp_path: Path, instance: str) -> None:
+    file = record(tmp_path, instance)
+    with built(instance, origin=Origin(BEGIN_NS, 0)) as segment, Playing(segment, file, clock="recording") as cell:
+        coordinator = Coordinator(segment)
+        assert counts([cell.next()]) == [0], "what is there at the beginning is seen before the first step"
+        by_step = []
+        for _ in range(10):
+            step = coordinator.step(50 * MS)
+            by_step.append(counts(cell.frames()))
+            end_ns = min(step.time_ns, BEGIN_NS + 20 * PERIOD_NS)
+            assert segment.blocks["cell"].now_ns() == segment.clock.monotonic_ns(end_ns)
+        coordinator.close()
+    assert by_step[:4] == [[1, 2], [3, 4, 5], [6, 7], [8, 9, 10]]
+    assert [count for step in by_step for count in step][:19] == list(range(1, 20))
+    assert by_step[-1] == [], "when the recording is over, steps are answered all the same"
+
+
+def test_steps_give_the_same_each_time(tmp_path: Path, instance: str) -> None:
+    file = record(tmp_path, instance)
+    runs = []
+    for number in range(2):
+        with built(f"{instance}{number}") as segment, Playing(segment, file, speed=0.7, loop=True) as cell:
+            coordinator = Coordinator(segment)
+            for _ in range(20):
+                coordinator.step(50 * MS)
+            coordinator.close()
+            runs.append([(f.number, f.cycle, f.clock_ns, f.raw, f.quality, f.reason) for f in cell.frames()])
+    assert runs[0] == runs[1]
+    cycles = [cycle for _, cycle, *_ in runs[0]]
+    assert cycles == [5001 + n % 20 for n in range(len(cycles))]
+    assert len(cycles) > 30
+
+
+def test_two_of_one_recording_stay_in_step(tmp_path: Path, instance: str) -> None:
+    with recorded(tmp_path, instance, "cell", "other") as both:
+        for number in range(20):
+            for one in both:
+                one.frame(BEGIN_NS + number * PERIOD_NS, image(number))
+    [file] = tmp_path.glob("*.mem")
+    with (
+        built(instance, "cell", "other", stepped=False) as segment,
+        Playing(segment, file) as cell,
+        Playing(segment, file, "other") as other,
+    ):
+        pairs = [(cell.next().clock_ns, other.next().clock_ns) for _ in range(20)]
+    assert all(one == two for one, two in pairs)
+
+
+def test_a_step_goes_on_with_time_that_was_taken_over(tmp_path: Path, instance: str) -> None:
+    file = record(tmp_path, instance)
+    with built(instance, stepped=False) as segment, Playing(segment, file, speed=0.1) as cell:
+        first = cell.next()
+        coordinator = Coordinator(segment)
+        coordinator.take_over()
+        seen = counts([first, *cell.frames()])
+        coordinator.step(10 * S)
+        assert seen + counts(cell.frames())[:-1] == list(range(20))
+        coordinator.close()
+
+
+# ---- the process is another's successor ------------------------------------------------------------------------------
+
+
+def test_a_successor_goes_on_and_leaves_nothing_out(tmp_path: Path, instance: str) -> None:
+    file = record(tmp_path, instance)
+    with built(instance) as segment:
+        coordinator = Coordinator(segment)
+        cursor = segment.blocks["cell"].cursor()
+        with Playing(segment, file):
+            coordinator.step(100 * MS)
+        with Playing(segment, file):
+            coordinator.step(100 * MS)
+            coordinator.step(10 * S)
+        coordinator.close()
+        frames = [frame for frame in iter(cursor.poll, None) if frame.quality is Quality.GOOD]
+    assert counts(frames) == list(range(20))
+
+
+def test_age_is_the_recordings(tmp_path: Path, instance: str) -> None:
+    """A slow replay does not go stale, and one that stands does not either."""
+    file = record(tmp_path, instance)
+    with built(instance, stepped=False) as segment, Playing(segment, file, speed=0.01) as cell:
+        frame = cell.next()
+        begun_s = time.monotonic()
+        while time.monotonic() - begun_s < 0.7:  # more than `stale`, and less than till the next frame
+            age_ns = frame.age_ns(cell.block.now_ns())
+            assert age_ns < 20 * MS
+        assert cell.block.assess(frame)[0] is Quality.GOOD
+    assert isinstance(segment, Segment)
