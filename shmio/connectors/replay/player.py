@@ -57,8 +57,8 @@ class Player:
         """The position of what comes next; None: there is nothing more."""
         return None if self._next is None else self._next.position_ns
 
-    def go(self, position_ns: int) -> None:
-        """Have what comes at or behind a position be the next."""
+    def go(self, position_ns: int | None) -> None:
+        """Have what comes at or behind a position be the next; None: all there is."""
         self._entries = self._tape.entries(position_ns)
         self._next = next(self._entries, None)
 
@@ -70,7 +70,7 @@ class Player:
         entry = self._tape.newest(position_ns - 1)
         if entry is not None:
             self._publish(entry, stamp)
-        self.go(self._tape.first_ns if entry is None else position_ns)
+        self.go(None if entry is None else position_ns)
 
     def resume(self, position_ns: int) -> None:
         """Go on behind a position, up to which the process before this one has published."""

@@ -1,34 +1,22 @@
-"""The files of one recording: what sources it has, from when to when, and where their messages are."""
+"""The files of one recording: which sources can be played, and from when to when."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
-from mcap.opcode import Opcode
-
-from shmio.connectors.replay.tape import Chunk, Tape
-from shmio.dump.encoding import FRAME
-from shmio.dump.reader import Reader
-from shmio.dump.survey import Track, survey
+from shmio.connectors.replay.tape import Tape
+from shmio.dump.damage import Damage
+from shmio.dump.dump import open_dump
 from shmio.errors import RecordingError
-from shmio.layout.model import Layout
 
 Moment = float | str
 """Seconds from a recording's begin, or a date and time."""
 
-
-class Kept(NamedTuple):
-    """A block of a recording: its source, its layout, and from when to when it was recorded; log times."""
-
-    source: str
-    layout: Layout
-    period_ns: int
-    stale_ns: int
-    first_ns: int
-    last_ns: int
+log = logging.getLogger("shmio.source")
 
 
 class Span(NamedTuple):
@@ -41,64 +29,44 @@ class Span(NamedTuple):
 class Recording:
     """A recording, or several files of one, open for reading. A context manager.
 
-    RecordingError: a file cannot be read, is none, or they are of different runs of an instance.
+    RecordingError: a file cannot be read, is none, holds no frames, or they are of different runs of an instance.
     """
 
     def __init__(self, files: Sequence[str | Path]) -> None:
-        self._readers: list[Reader] = []
-        self._chunks: list[Chunk] = []
-        self.blocks: list[Kept] = []
-        """In the order of the files."""
+        self._damage: list[Damage] = []
         try:
-            for file in map(Path, files):
-                self._open(file)
-            self._check()
+            self._dump = open_dump(files, self._damaged)
+        except OSError as error:
+            raise RecordingError(f"{error.filename}: {error.strerror}") from None
+        self._file = self._dump.files[0]
+        try:
+            self._measure()
         except BaseException:
-            self.close()
+            self._dump.close()
             raise
-        about = self._readers[0].about
-        self.utc_ns = int(about["started_utc_ns"])
+
+    def _measure(self) -> None:
+        started = self._dump.about.get("started_utc_ns", "")
+        if not (started.isdecimal() and len(started) < 20):
+            raise RecordingError(f"{self._file} does not say when its instance was started: it cannot be played")
+        self.utc_ns = int(started)
         """UTC of position 0: when the instance started that was recorded."""
-        self._chunks.sort(key=lambda chunk: chunk.first_ns)
+        names = self._dump.sources
+        firsts = {name: next(self._dump.frames(name), None) for name in names}
+        self.sources = [name for name in names if firsts[name] is not None]
+        """Names of those that have frames."""
+        lasts = [self._dump.latest(name) for name in self.sources]
+        if not self.sources:
+            raise RecordingError(f"{self._file} holds no frames: there is nothing to play")
         self.whole = Span(
-            min(kept.first_ns for kept in self.blocks) - self.utc_ns,
-            max(kept.last_ns + kept.period_ns for kept in self.blocks) - self.utc_ns,
+            min(first.time_ns for first in firsts.values() if first) - self.utc_ns,
+            max(last.time_ns + last.block.period_ns for last in lasts if last and last.block) - self.utc_ns,
         )
         """From the first frame to a period behind the last one."""
 
-    def _open(self, file: Path) -> None:
-        try:
-            reader = Reader(file)
-        except OSError as error:
-            raise RecordingError(f"{file}: {error.strerror}") from None
-        self._readers.append(reader)
-        found = survey(reader)
-        self.blocks += [_kept(reader, track) for track in found.tracks.values() if track.channel.encoding == FRAME]
-        for record in reader.records.walk():
-            if record.opcode == Opcode.CHUNK:
-                self._chunks.append(Chunk(reader, record, *reader.records.chunk_times(record)))
-
-    def _check(self) -> None:
-        """RecordingError: they do not go together, or there is nothing to be played."""
-        first = self._readers[0]
-        for reader in self._readers:
-            number = reader.about.get("started_utc_ns", "")
-            if not (number.isdecimal() and len(number) < 20):
-                raise RecordingError(f"{reader.file} does not say when its instance was started: it cannot be played")
-            if reader.about.get("epoch") != first.about.get("epoch"):
-                raise RecordingError(f"{first.file} and {reader.file} are of different runs: play one after the other")
-        if not self.blocks:
-            raise RecordingError(f"{first.file} holds no frames: there is nothing to play")
-
-    @property
-    def sources(self) -> list[str]:
-        """Names of the sources that have frames."""
-        return list(dict.fromkeys(kept.source for kept in self.blocks))
-
-    @property
-    def instance(self) -> str:
-        """Name of the instance that was recorded."""
-        return self._readers[0].about.get("instance", "")
+    def _damaged(self, file: Path, damage: Damage) -> None:
+        log.warning("%s: bytes %d to %d are lost: %s", file, damage.first, damage.last, damage.why)
+        self._damage.append(damage)
 
     def span(self, start: Moment | None, end: Moment | None) -> Span:
         """What is played. RecordingError: there is nothing between these."""
@@ -107,9 +75,9 @@ class Recording:
         span = Span(max(begin_ns, self.whole.begin_ns), min(end_ns, self.whole.end_ns))
         if span.begin_ns >= span.end_ns:
             length_s = (self.whole.end_ns - self.whole.begin_ns) / 1e9
+            begin = datetime.fromtimestamp((self.utc_ns + self.whole.begin_ns) / 1e9).astimezone().isoformat()
             raise RecordingError(
-                f"start, end: there is nothing to play between them; {self._readers[0].file} has {length_s:.3f} s from "
-                f"{datetime.fromtimestamp((self.utc_ns + self.whole.begin_ns) / 1e9).astimezone().isoformat()} on"
+                f"start, end: there is nothing to play between them; {self._file} has {length_s:.3f} s from {begin} on"
             )
         return span
 
@@ -126,34 +94,29 @@ class Recording:
 
     def tape(self, source: str, span: Span | None = None) -> Tape:
         """What there is of a source. RecordingError: nothing, or its layout changes within what is played."""
-        blocks = [kept for kept in self.blocks if kept.source == source]
-        if not blocks:
-            raise RecordingError(f"{self._readers[0].file} has no source {source!r}; it has: {', '.join(self.sources)}")
-        begin_ns, end_ns = ((span or self.whole).begin_ns + self.utc_ns, (span or self.whole).end_ns + self.utc_ns)
-        played = [kept for kept in blocks if kept.first_ns < end_ns and kept.last_ns >= begin_ns] or blocks[:1]
+        if source not in self.sources:
+            raise RecordingError(
+                f"{self._file} has no frames of a source {source!r}; it has: {', '.join(self.sources)}"
+            )
+        blocks = [block for block in self._dump.blocks if block.source == source and block.frames]
+        begin_ns, end_ns = (position_ns + self.utc_ns for position_ns in span or self.whole)
+        played = [block for block in blocks if block.begin_ns < end_ns and block.end_ns >= begin_ns] or blocks[:1]
         last = played[-1]
-        if any(kept.layout.hash != last.layout.hash for kept in played):
-            at_s = (last.first_ns - self.utc_ns - self.whole.begin_ns) / 1e9
+        if any(block.layout_hash != last.layout_hash for block in played):
+            at_s = (last.begin_ns - self.utc_ns - self.whole.begin_ns) / 1e9
             raise RecordingError(
                 f"source {source}: its layout was changed within what is to be played, at {at_s:.3f} s: end before "
                 "that, or start there"
             )
-        return Tape(source, last.layout, last.period_ns, last.stale_ns, self._chunks, self.utc_ns)
+        period_ns, stale_ns = last.period_ns, last.stale_ns
+        return Tape(self._dump, self._damage, source, last.layout, period_ns, stale_ns, self.utc_ns)
 
     def close(self) -> None:
         """Close the files."""
-        for reader in self._readers:
-            reader.close()
+        self._dump.close()
 
     def __enter__(self) -> Recording:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _kept(reader: Reader, track: Track) -> Kept:
-    channel = track.channel
-    period_ns = channel.period_ns or 20_000_000
-    stale_ns = channel.stale_ns or 500_000_000
-    return Kept(channel.source, reader.layout(channel), period_ns, stale_ns, track.first_ns, track.last_ns)

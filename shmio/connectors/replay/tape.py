@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import logging
-from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
-from shmio.dump.channels import Channel
+from shmio.dump.damage import Damage
+from shmio.dump.dump import Dump
 from shmio.dump.encoding import Gap
-from shmio.dump.reader import Reader
-from shmio.dump.records import Record
-from shmio.errors import RecordingError
 from shmio.layout.model import Layout
 from shmio.segment import Event, Frame
 
@@ -31,87 +28,61 @@ class Entry(NamedTuple):
     item: Frame | Event | Hole
 
 
-class Chunk(NamedTuple):
-    """A part of a file, and the log times of its first and its last message."""
-
-    reader: Reader
-    record: Record
-    first_ns: int
-    last_ns: int
-
-
 class Tape:
     """One source of a recording. Several of its iterators may be under way; for one thread."""
 
     def __init__(
-        self, source: str, layout: Layout, period_ns: int, stale_ns: int, chunks: Sequence[Chunk], utc_ns: int
+        self, dump: Dump, damage: list[Damage], source: str, layout: Layout, period_ns: int, stale_ns: int, utc_ns: int
     ) -> None:
-        """``chunks``: in the order of time, those of the source among them. ``utc_ns``: of position 0."""
+        """``damage``: what the dump has told of damaged places; ``utc_ns``: of position 0."""
+        self._dump = dump
+        self._damage = damage
         self.source = source
         self.layout = layout
         self.period_ns = period_ns
         self.stale_ns = stale_ns
-        self._digest = layout.hash.hex()  # what has another layout is of another block, which is not played
-        self._chunks = chunks
-        self._firsts = [chunk.first_ns for chunk in chunks]
         self._utc_ns = utc_ns
+        self._hash = layout.hash.hex()  # what has another layout is of another block, which is not played
+        self._holes = [gap for gap in dump.gaps if gap.source == source and gap.what == "frames"]
 
-    @property
-    def first_ns(self) -> int:
-        """A position before which there is nothing."""
-        return self._firsts[0] - self._utc_ns
-
-    def entries(self, from_ns: int) -> Iterator[Entry]:
-        """All from a position on, in the order in which it happened. What is damaged is a hole."""
-        from_log_ns = from_ns + self._utc_ns
+    def entries(self, from_ns: int | None) -> Iterator[Entry]:
+        """All from a position on, in the order in which it happened; None: from the first. What is damaged is a hole."""
         at_ns = from_ns
-        for chunk in self._chunks:
-            if chunk.last_ns < from_log_ns:
+        for time_ns, block, item in self._dump.items(self.source, 0 if from_ns is None else from_ns + self._utc_ns):
+            position_ns = time_ns - self._utc_ns
+            if self._damage:
+                self._damage.clear()
+                yield Entry(position_ns if at_ns is None else min(at_ns + self.period_ns, position_ns), _DAMAGED)
+            if isinstance(item, Gap):
+                if item.what == "frames":
+                    yield self._hole(item, position_ns)
+            elif isinstance(item, Frame | Event) and block is not None and block.layout_hash == self._hash:
+                yield Entry(position_ns, item)
+            else:
                 continue
-            for entry in self._in(chunk, at_ns):
-                if entry.position_ns >= from_ns:
-                    at_ns = max(at_ns, entry.position_ns)
-                    yield entry._replace(position_ns=at_ns)
+            at_ns = position_ns
 
     def newest(self, position_ns: int) -> Entry | None:
         """The last frame at or before a position, or the hole that it lies in; None: there is none before."""
-        place = bisect_right(self._firsts, position_ns + self._utc_ns)
-        for chunk in reversed(self._chunks[:place]):
-            found = None
-            for entry in self._in(chunk, chunk.first_ns - self._utc_ns):
-                if entry.position_ns > position_ns:
-                    break
-                if not isinstance(entry.item, Event):
-                    found = entry
-            if found is not None:
-                return found
-        return None
-
-    def _in(self, chunk: Chunk, at_ns: int) -> Iterator[Entry]:
-        """What a chunk has of the source; ``at_ns``: the position before it."""
-        reader = chunk.reader
-        try:
-            for channel, log_ns, data in reader.raw(chunk.record):
-                if not self._ours(channel):
-                    continue
-                item = reader.decode(channel, data)
-                if isinstance(item, Gap):
-                    if item.source == self.source and item.what == "frames":
-                        yield self._hole(item, at_ns)
-                elif isinstance(item, Frame | Event):
-                    at_ns = log_ns - self._utc_ns
-                    yield Entry(at_ns, item)
-        except RecordingError as error:
-            log.warning("%s", error)
-            yield Entry(at_ns + self.period_ns, Hole(f"not in the recording: it is damaged ({error})"))
-
-    def _ours(self, channel: Channel) -> bool:
-        return not channel.source or (channel.source == self.source and channel.layout == self._digest)
+        found = self._dump.latest(self.source, position_ns + self._utc_ns)
+        self._damage.clear()
+        last = None
+        if found is not None and found.block is not None and found.block.layout_hash == self._hash:
+            last = Entry(found.time_ns - self._utc_ns, found.item)
+        holes = (self._hole(gap, position_ns) for gap in self._holes)
+        return max(
+            (entry for entry in (last, *holes) if entry is not None and entry.position_ns <= position_ns),
+            key=lambda entry: (entry.position_ns, isinstance(entry.item, Frame)),
+            default=None,
+        )
 
     def _hole(self, gap: Gap, at_ns: int) -> Entry:
         """It begins a period after the frame before it, or with the one behind it."""
-        after_ns = gap.after_ns - self._utc_ns + self.period_ns if gap.after_ns else at_ns
+        position_ns = gap.after_ns - self._utc_ns + self.period_ns if gap.after_ns else at_ns
         if gap.before_ns:
-            after_ns = min(after_ns, gap.before_ns - self._utc_ns)
+            position_ns = min(position_ns, gap.before_ns - self._utc_ns)
         count = f"{gap.count} frame{'s' * (gap.count != 1)}"
-        return Entry(after_ns, Hole(f"not in the recording: {count} ({gap.reason})"))
+        return Entry(position_ns, Hole(f"not in the recording: {count} ({gap.reason})"))
+
+
+_DAMAGED = Hole("not in the recording: it is damaged here")
