@@ -46,9 +46,10 @@ class Tape:
         self._holes = [gap for gap in dump.gaps if gap.source == source and gap.what == "frames"]
 
     def entries(self, from_ns: int | None) -> Iterator[Entry]:
-        """All from a position on, in the order in which it happened; None: from the first. What is damaged is a hole."""
+        """All from a position on (None: from the first), in the order in which it happened; damage is a hole."""
         at_ns = from_ns
-        for time_ns, block, item in self._dump.items(self.source, 0 if from_ns is None else from_ns + self._utc_ns):
+        begin_ns = 0 if from_ns is None else max(0, from_ns + self._utc_ns)
+        for time_ns, block, item in self._dump.items(self.source, begin_ns):
             position_ns = time_ns - self._utc_ns
             if self._damage:
                 self._damage.clear()
