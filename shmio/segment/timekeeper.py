@@ -9,6 +9,7 @@ from typing import Final
 from shmio.errors import NotRunningError, ShmioError, TimeError
 from shmio.segment.clock import ClockState
 from shmio.segment.coordinator import Coordinator, Step, check_step
+from shmio.segment.replays import Replays
 from shmio.segment.segment import Segment
 
 PATIENCE_S: Final = 2.0
@@ -90,6 +91,8 @@ class Timed:
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._time = Timekeeper(segment)
+        self.replay = Replays(segment)
+        """What plays recordings, and moves them; the attachment must be ``writable`` to do more than look."""
 
     @property
     def clock(self) -> ClockState:

@@ -176,6 +176,7 @@ class ReplayLoop:
             if over:
                 self._player.end(OVER, self._stamp(settled.end_ns, settled.end_ns))
             self._keep(settled._replace(over=over))
+            self._writer.block.ring.wake()  # for who waits until it has come there
             return False
         self._keep(settled)
         self._player.go(settled.begin_ns)
@@ -245,6 +246,8 @@ class ReplayLoop:
             length_s = (play.end_ns - play.begin_ns) / 1e9
             return Found(f"that is not within what is played, which is {length_s:.3f} s long")
         until_ns = play.end_ns if ask.until_ns is None else min(ask.until_ns, play.end_ns)
+        if ask.until_ns is None and ask.paused is None and position_ns is None:
+            until_ns = play.until_ns
         self._keep(
             play._replace(
                 paused=paused,

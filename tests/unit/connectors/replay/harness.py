@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import struct
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -149,6 +150,16 @@ class Playing:
         """What was told since, of processes nothing."""
         told = list(iter(self.events.poll, None))
         return [event for event in told if event.kind not in (EventKind.STARTED, EventKind.STOPPED)]
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        """Wait for what the process brings about, which rings the doorbell."""
+        until_s = time.monotonic() + PATIENCE_S
+        while True:
+            seen = self.block.ring.doorbell()
+            if condition():
+                return
+            assert time.monotonic() < until_s, "not seen"
+            self.block.ring.wait(seen, round(PATIENCE_S * 1e9))
 
     def stop(self) -> None:
         """End it in good order."""

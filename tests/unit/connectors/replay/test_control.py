@@ -1,0 +1,149 @@
+"""A replay is moved by a local program: it stands, goes on, seeks, and plays to what is looked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
+from shmio.segment import EventKind, Quality, Record
+from shmio.segment.attach import Attachment, attach
+from tests.unit.connectors.replay.harness import (
+    BEGIN_NS,
+    MS,
+    PERIOD_NS,
+    Playing,
+    built,
+    counts,
+    image,
+    record,
+    recorded,
+)
+
+
+@pytest.fixture
+def file(tmp_path: Path, instance: str) -> Path:
+    return record(tmp_path, instance)
+
+
+@pytest.fixture
+def here(instance: str, file: Path) -> Iterator[tuple[Playing, Attachment]]:
+    with (
+        built(instance, stepped=False) as segment,
+        Playing(segment, file, paused=True) as playing,
+        attach(instance, writable=True) as attachment,
+    ):
+        assert counts([playing.next()]) == [0], "what is there at the beginning is seen"
+        yield playing, attachment
+
+
+def test_it_stands_until_it_is_played(here: tuple[Playing, Attachment]) -> None:
+    playing, attachment = here
+    [status] = attachment.replay.status()
+    assert (status.source, status.paused, status.position_s, status.length_s) == ("cell", True, 0.0, 0.4)
+    assert attachment.read("cell/count").quality is Quality.GOOD
+    [status] = attachment.replay.play(4)
+    assert (status.paused, status.speed) == (False, 4)
+    assert counts([playing.next() for _ in range(19)]) == list(range(1, 20))
+    assert playing.next().reason == "replay: the recording is over"
+    [status] = attachment.replay.status()
+    assert (status.over, status.paused, status.position_s) == (True, True, 0.4)
+    attachment.replay.play()
+    assert counts([playing.next() for _ in range(20)]) == list(range(20)), "from the end it goes on at the beginning"
+
+
+def test_it_seeks_and_shows_what_was_there(here: tuple[Playing, Attachment]) -> None:
+    playing, attachment = here
+    for position_s, count in ((0.2, 10), (0.35, 17), (0.05, 2), (0.0, 0)):
+        [status] = attachment.replay.seek(position_s)
+        assert status.position_s == position_s
+        frame = playing.next()
+        assert counts([frame]) == [count]
+        assert frame.age_ns(playing.block.now_ns()) == round(position_s * 1e9) - count * PERIOD_NS + 3000
+    [status] = attachment.replay.seek("1970-01-01T01:58:20.1+00:00")
+    assert (status.position_s, status.time_s) == (0.1, 7100.1)
+
+
+def test_it_plays_to_the_next_change_and_pauses(here: tuple[Playing, Attachment]) -> None:
+    playing, attachment = here
+    attachment.replay.to_change("cell/other")
+    frames = [playing.next() for _ in range(10)]
+    assert counts(frames) == list(range(1, 11))
+    playing.until(lambda: attachment.replay.status()[0].paused)
+    [status] = attachment.replay.status()
+    assert (status.position_s, playing.frames()) == (0.2, [])
+    with pytest.raises(CommandError, match="there is no change of other from here to the end"):
+        attachment.replay.to_change("other")
+    assert attachment.replay.seek(0)
+    [status] = attachment.replay.to_change("other", jump=True)
+    assert (status.position_s, status.paused) == (0.2, True)
+
+
+def test_it_plays_to_the_next_event(tmp_path: Path, instance: str) -> None:
+    with recorded(tmp_path, instance) as [cell]:
+        for number in range(10):
+            cell.frame(BEGIN_NS + number * PERIOD_NS, image(number))
+            if number == 6:
+                cell.event(BEGIN_NS + number * PERIOD_NS + MS, Record(EventKind.ACCEPTED))
+    [file] = tmp_path.glob("*.mem")
+    with (
+        built(instance) as segment,
+        Playing(segment, file) as playing,
+        attach(instance, writable=True) as attachment,
+    ):
+        attachment.replay.to_event("accepted")
+        attachment.step(1.0)
+        assert counts(playing.frames()) == list(range(7))
+        assert [event.kind for event in playing.happened()] == [EventKind.ACCEPTED]
+        assert attachment.replay.status()[0].paused
+        with pytest.raises(CommandError, match="there is no kind of event 'none'"):
+            attachment.replay.to_event("none")
+
+
+@pytest.mark.parametrize(
+    ("what", "error"),
+    [
+        (lambda replay: replay.speed(0), ValueRangeError),
+        (lambda replay: replay.speed(float("nan")), ValueRangeError),
+        (lambda replay: replay.seek(1), ValueRangeError),
+        (lambda replay: replay.seek("yesterday"), ValueRangeError),
+        (lambda replay: replay.to_change("cell/none"), PathError),
+        (lambda replay: replay.to_change("none/count"), PathError),
+    ],
+)
+def test_what_cannot_be_is_refused(here: tuple[Playing, Attachment], what: object, error: type[ShmioError]) -> None:
+    playing, attachment = here
+    with pytest.raises(error):
+        what(attachment.replay)  # type: ignore[operator]
+    assert playing.frames() == []
+
+
+def test_without_a_replay_there_is_nothing_to_move(instance: str) -> None:
+    with built(instance), attach(instance) as attachment:
+        with pytest.raises(CommandError, match="plays no recording"):
+            attachment.replay.status()
+        with pytest.raises(CommandError, match="attach with writable=True"):
+            attachment.replay.pause()
+
+
+def test_sources_of_one_recording_move_together(tmp_path: Path, instance: str) -> None:
+    with recorded(tmp_path, instance, "cell", "other") as both:
+        for number in range(20):
+            for one in both:
+                one.frame(BEGIN_NS + number * PERIOD_NS, image(number, number // 5))
+    [file] = tmp_path.glob("*.mem")
+    with (
+        built(instance, "cell", "other", stepped=False) as segment,
+        Playing(segment, file, paused=True) as cell,
+        Playing(segment, file, "other", paused=True) as other,
+        attach(instance, writable=True) as attachment,
+    ):
+        assert [status.position_s for status in attachment.replay.seek(0.1)] == [0.1, 0.1]
+        attachment.replay.to_change("other/other")
+        assert counts([other.next(lambda frame: frame.raw[3] == 2)]) == [10]
+        assert counts([cell.next(lambda frame: frame.raw[3] == 2)]) == [10]
+        for playing in (cell, other):
+            playing.until(lambda: all(status.paused for status in attachment.replay.status()))
+        assert {status.position_s for status in attachment.replay.status()} == {0.2}
