@@ -51,20 +51,50 @@ def _parser() -> argparse.ArgumentParser:
 
     info = verb("info", "tell what is in recordings")
     info.add_argument("files", nargs="+", type=Path, metavar="FILE")
-    info.add_argument(
-        "--check", action="store_true", help="read all of each file, and tell what is damaged; exit status 1 if any is"
-    )
     info.add_argument("--json", action="store_true", help="print JSON: one object, or a list for several files")
+
+    verify = verb("verify", "read all of recordings, and tell what is damaged; exit status 1 if anything is")
+    verify.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    verify.add_argument("--json", action="store_true", help="print JSON: one object, or a list for several files")
+
+    recover = verb("recover", "write what is whole of a damaged recording to a new file")
+    recover.add_argument("file", type=Path, metavar="FILE")
+    _output(recover, "the new file (default: FILE-recovered.mem)", required=False)
+
+    cut = verb("cut", "write a part of a recording to a new file")
+    cut.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    _output(cut, "the new file")
+    _times(cut)
+    _some(cut)
+
+    merge = verb("merge", "write several recordings of one run to one new file")
+    merge.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    _output(merge, "the new file")
 
     cat = verb("cat", "print values as they changed, events, and what was missed")
     cat.add_argument("file", type=Path, metavar="FILE")
     cat.add_argument("patterns", nargs="*", metavar="PATH", help="register, element, structure or glob (default: all)")
-    for option, what in (("--from", "begin"), ("--to", "end")):
-        cat.add_argument(
-            option, dest=what, metavar="TIME", help=f"{what} there: 2026-11-21T08:30:00, or seconds of the recording"
-        )
+    _times(cat)
     cat.add_argument("--json", action="store_true", help="print a JSON object a line")
     return parser
+
+
+def _output(verb: argparse.ArgumentParser, text: str, *, required: bool = True) -> None:
+    verb.add_argument("-o", dest="output", type=Path, required=required, metavar="FILE", help=text)
+
+
+def _times(verb: argparse.ArgumentParser) -> None:
+    for option, what in (("--from", "begin"), ("--to", "end")):
+        verb.add_argument(
+            option, dest=what, metavar="TIME", help=f"{what} there: 2026-11-21T08:30:00, or seconds of the recording"
+        )
+
+
+def _some(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument("--source", dest="sources", nargs="+", action="extend", metavar="NAME", help="only these")
+    verb.add_argument(
+        "--only", nargs="+", action="extend", metavar="PATH", help="only these registers, structures or globs"
+    )
 
 
 def _seconds(text: str) -> float:

@@ -32,6 +32,8 @@ class DumpBlock:
     frames: int = 0
     """How many were recorded; those that two files have are counted twice."""
     events: int = 0
+    after: dict[str, int] = field(default_factory=dict)
+    """Numbers behind which the recording of its ``frames`` and ``events`` began."""
     begin_ns: int = 0
     end_ns: int = 0
     """Log times of its first and last frame or event."""
@@ -105,6 +107,7 @@ def contents(part: Part, blocks: dict[tuple[str, int, str], DumpBlock]) -> Conte
                 channel.source, channel.section, layout, channel.layout, channel.period_ns, channel.stale_ns
             )
         block = blocks[key]
+        block.after.setdefault("frames" if channel.encoding == FRAME else "events", channel.after)
         if track := part.found.tracks.get(channel.number):
             block.add(channel.encoding, track)
         found.blocks[channel.number] = found.numbered[channel.source, channel.block] = block

@@ -16,7 +16,7 @@ from shmio.dump.columns import Collector, Columns
 from shmio.dump.encoding import Gap
 from shmio.dump.names import Names
 from shmio.dump.part import MAX_NS, Damaged, Part
-from shmio.dump.reader import Item
+from shmio.dump.reader import Item, Reader
 from shmio.dump.sequence import Sequence
 from shmio.errors import RecordingError
 from shmio.layout.model import Register
@@ -92,6 +92,11 @@ class Dump:
     def files(self) -> tuple[Path, ...]:
         """In the order of time."""
         return tuple(part.file for part in self._parts)
+
+    @property
+    def readers(self) -> tuple[Reader, ...]:
+        """Of the files, for what is not of a time: attachments."""
+        return tuple(part.reader for part in self._parts)
 
     @property
     def instance(self) -> str:

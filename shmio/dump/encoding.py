@@ -47,7 +47,7 @@ u16 data size, u16 text size; then data, text (UTF-8)."""
 GAP_SCHEMA: Final = b"""{"type": "object", "properties": {"source": {"type": "string"}, "block": {"type": "integer"}, \
 "what": {"enum": ["frames", "events"]}, "first": {"type": "integer"}, "last": {"type": "integer"}, \
 "count": {"type": "integer"}, "reason": {"enum": ["overtaken", "not running", "elsewhere", \
-"no room", "unsure"]}, \
+"no room", "unsure", "damaged"]}, \
 "after_ns": {"type": "integer"}, "before_ns": {"type": "integer"}}}"""
 
 
@@ -68,6 +68,8 @@ class Reason(StrEnum):
     """The disk was full or too slow, and so was the memory set aside for that."""
     UNSURE = "unsure"
     """It is in the file before, at whose fsync the disk failed: it may be lost."""
+    DAMAGED = "damaged"
+    """It was in a file that this one was made from, and could not be read there."""
 
 
 class Gap(msgspec.Struct, frozen=True):

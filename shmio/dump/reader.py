@@ -55,10 +55,11 @@ class Message(NamedTuple):
 
 
 class AttachmentEntry(NamedTuple):
-    """An attachment: where its data are."""
+    """An attachment: where its data are, and the record that holds them."""
 
     at: int
     size: int
+    record: Record
 
 
 class Reader:
@@ -213,6 +214,12 @@ class Reader:
                 raise RecordingError(f"{self.file}: the layout of {channel.topic}: {error}") from None
         return self._layouts[digest]
 
+    def attachment(self, name: str, limit: int = MAX_LAYOUT_BYTES) -> bytes:
+        """The bytes of an attachment, whole by their CRC; RecordingError: damaged, or more than the limit."""
+        entry = self.attachments[name]
+        self.records.check_crc(entry.record)
+        return self.records.read(entry.at, entry.size, limit)
+
     def note(self, record: Record) -> None:
         """Take in a record that is not of a chunk: what it tells of the instance, or an attachment. RecordingError."""
         if record.opcode == BROKEN:
@@ -239,7 +246,7 @@ class Reader:
         size = data.read8()
         if data.count + size + 4 != record.size:
             raise ValueError("its sizes contradict each other")
-        self.attachments[name] = AttachmentEntry(record.at + data.count, size)
+        self.attachments[name] = AttachmentEntry(record.at + data.count, size, record)
 
     def _channel(self, content: memoryview) -> None:
         if len(content) > MAX_CHANNEL_BYTES or len(self.channels) >= MAX_CHANNELS:

@@ -165,7 +165,7 @@ def _damaged(found: Survey, why: str) -> None:
 
 
 def _must_read(reader: Reader, number: int) -> bool:
-    channel = reader.channel(number)
+    channel = reader.channels.get(number)  # which a chunk describes, with a CRC; the summary is only for want of that
     return channel is None or channel.encoding == GAP
 
 

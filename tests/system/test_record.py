@@ -53,7 +53,7 @@ def test_log_mode_records_a_cell_through_a_killed_recorder(make_cell: Callable[.
     assert new["first_frame"] == old["last_frame"] + 1 + missed
     assert new["frames"] == new["last_frame"] - new["first_frame"] + 1
     assert {"config/supervisor.toml", "sources/cell/1/db201.db"} < set(whole["attachments"])
-    checked = cell.run("shmio-dump", "info", "--check", str(first), str(second))
+    checked = cell.run("shmio-dump", "verify", str(first), str(second))
     assert (checked.returncode, checked.stdout.count("no damage")) == (0, 2), checked.stdout
     assert len(values(cell, second)) > 1
     events = [json.loads(line) for line in cell.run("shmio-dump", "cat", "--json", str(second)).stdout.splitlines()]

@@ -10,9 +10,8 @@ from typing import Any
 
 import msgspec
 
-from shmio.cli.dumping.moments import iso, local, lost
+from shmio.cli.dumping.moments import iso, local
 from shmio.cli.run import dumps
-from shmio.dump.check import check
 from shmio.dump.encoding import EVENT, FRAME
 from shmio.dump.reader import Reader
 from shmio.dump.survey import Survey, Track, survey
@@ -27,8 +26,6 @@ def execute(arguments: argparse.Namespace) -> int:
         try:
             with Reader(file) as reader:
                 described = _describe(reader, survey(reader))
-                if arguments.check:
-                    described |= _check(reader)
         except (RecordingError, OSError) as error:
             text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
             print(printable(text), file=sys.stderr)
@@ -56,7 +53,6 @@ def _describe(reader: Reader, found: Survey) -> dict[str, Any]:
         "size": size,
         "closed": reader.records.closed,
         "end": reader.records.damage,
-        "checked": False,
         "damage": found.damage,
         "instance": about.get("instance", ""),
         "epoch": about.get("epoch", ""),
@@ -78,16 +74,6 @@ def _describe(reader: Reader, found: Survey) -> dict[str, Any]:
         "gaps": [msgspec.to_builtins(gap) for gap in found.gaps],
         "attachments": {name: entry.size for name, entry in reader.attachments.items()},
     }
-
-
-def _check(reader: Reader) -> dict[str, Any]:
-    """What a look at all of the file tells."""
-    found = check(reader)
-    texts = [lost(damage) for damage in found.damage] + found.problems
-    more = found.count - len(texts)
-    if more:
-        texts.append(f"and {more} more such places")
-    return {"checked": True, "chunks": found.chunks, "messages": found.messages, "damage": texts}
 
 
 def _missed(found: Survey, what: str) -> int:
@@ -158,8 +144,6 @@ def _lines(found: dict[str, Any]) -> list[str]:
     missed = f"{found['missed_frames']} frames and {found['missed_events']} events missed"
     lines.append(f"  {missed} in {found['gap_count']} gaps" if found["gap_count"] else "  nothing missed")
     lines += [f"    {_gap(gap)}" for gap in found["gaps"][:10]]
-    if found["checked"] and not found["damage"]:
-        lines.append(f"  all of it was read: {found['chunks']} chunks, {found['messages']} messages, no damage")
     return lines + [f"  damage: {text}" for text in found["damage"]]
 
 

@@ -52,6 +52,7 @@ class Build:
         self.writer = Writer(self.output, about)
         self.first = first
         self.blocks: dict[str, Channels] = {}
+        self.events: dict[str, int] = {}
 
     def block(self, source: str, layout: Layout = LAYOUT, section: int = 1, after_event: int = 0) -> None:
         """Begin a block."""
@@ -75,7 +76,7 @@ class Build:
             "incarnation": 1,
             "quality": Quality.GOOD,
             "provenance": Provenance.LIVE,
-            "event": 0,
+            "event": self.events.get(source, 0),
             "delay_us": 100,
             "reason": "",
             "raw": data,
@@ -85,6 +86,7 @@ class Build:
 
     def event(self, number: int, after: int, text: str = "", source: str = "cell") -> None:
         """An event behind a frame."""
+        self.events[source] = number
         clock_ns = after * PERIOD_NS
         utc_ns = START_NS + clock_ns
         event = Event(
@@ -146,7 +148,6 @@ def varied(file: Path) -> Path:
             elif number in (31, 32, 33):
                 if number == 33:
                     work.gap(31, 33)
-                continue
             else:
                 work.frame(number, image(number))
             work.frame(number, image(-number), "press")

@@ -79,13 +79,14 @@ def test_everything_of_a_source_in_recorded_order(tmp_path: Path) -> None:
         [gap] = [e.item for e in entries if isinstance(e.item, Gap)]
         assert (gap.first, gap.last) == (31, 33)
         position = [e.item for e in entries].index(gap)
-        after = entries[position + 1].item
+        before, after = entries[position - 1].item, entries[position + 1].item
+        assert isinstance(before, Event)
         assert isinstance(after, Frame)
-        assert after.number == 34
+        assert (before.frame, after.number) == (30, 34)
         assert [e.item.step for e in entries if isinstance(e.item, StepMark)] == list(range(51, 61))
         assert [e.item.text for e in entries if isinstance(e.item, Event)] == [f"event {n}" for n in range(1, 5)]
         assert not any(isinstance(e.item, Gap) for e in dump.items("press"))
-        assert len(list(dump.items())) == len(entries) + 57
+        assert len(list(dump.items())) == len(entries) + 60
         later = list(dump.items("cell", at(34)))
         assert later == entries[-len(later) :]
         assert later[0].item == gap  # it has the time of what follows

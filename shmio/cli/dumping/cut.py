@@ -1,0 +1,46 @@
+"""``shmio-dump cut``: a part of a recording as a new one."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+
+from shmio.cli.dumping.moments import MAX_NS, parse_time
+from shmio.cli.dumping.parts import Parts
+from shmio.cli.dumping.rewriting import rewrite, verified
+from shmio.cli.run import say
+from shmio.dump.dump import Dump, Entry, open_dump
+from shmio.dump.reader import Item
+from shmio.errors import RecordingError
+
+
+def execute(arguments: argparse.Namespace) -> int:
+    """Write what lies between two times, of some sources or registers, to a new file."""
+    with open_dump(arguments.files) as dump:
+        from_ns = parse_time("--from", arguments.begin, dump.begin_ns, 0)
+        to_ns = parse_time("--to", arguments.end, dump.begin_ns, MAX_NS)
+        parts = Parts(dump, arguments.only) if arguments.only else None
+        work = rewrite(
+            dump, arguments.output, "shmio-dump cut", _entries(dump, arguments, parts, from_ns, to_ns), whole=False
+        )
+    for line in verified(arguments.output):
+        say(line)
+    say(f"  {work.counts['frames']} frames and {work.counts['events']} events")
+    return 0
+
+
+def _entries(
+    dump: Dump, arguments: argparse.Namespace, parts: Parts | None, from_ns: int, to_ns: int
+) -> Iterator[Entry[Item]]:
+    sources = arguments.sources
+    if parts is not None:
+        sources = parts.sources if sources is None else [source for source in parts.sources if source in sources]
+    anything = False
+    for entry in dump.items(sources, from_ns, to_ns):
+        anything = True
+        if parts is None:
+            yield entry
+        elif (part := parts.of(entry)) is not None:
+            yield part
+    if not anything:
+        raise RecordingError(f"nothing of {dump.files[0]} is in that time")
