@@ -13,6 +13,8 @@ from shmio import __version__
 from shmio.cli.run import run
 
 PROGRAM = "shmio-dump"
+IGNORABLE = ("times", "cycle", "reason", "events", "ends")
+"""What ``diff`` may pass over: shmio.dump.compare, which is not imported for other verbs."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -67,6 +69,22 @@ def _parser() -> argparse.ArgumentParser:
     _times(cut)
     _some(cut)
 
+    diff = verb("diff", "tell where two recordings differ; exit status 1 if they do")
+    diff.add_argument("files", nargs=2, type=Path, metavar="FILE")
+    _some(diff)
+    diff.add_argument(
+        "--ignore",
+        nargs="+",
+        action="extend",
+        default=[],
+        type=_ignorable,
+        metavar="WHAT",
+        help=f"what may differ: {', '.join(IGNORABLE)}",
+    )
+    diff.add_argument("--tolerance", type=_amount, default=0.0, metavar="X", help="REAL and LREAL may differ by this")
+    diff.add_argument("--relative", type=_amount, default=0.0, metavar="X", help="or by this part of the larger one")
+    diff.add_argument("--json", action="store_true", help="print a JSON object")
+
     merge = verb("merge", "write several recordings of one run to one new file")
     merge.add_argument("files", nargs="+", type=Path, metavar="FILE")
     _output(merge, "the new file")
@@ -95,6 +113,23 @@ def _some(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--only", nargs="+", action="extend", metavar="PATH", help="only these registers, structures or globs"
     )
+
+
+def _ignorable(text: str) -> str:
+    for word in text.split(","):
+        if word not in IGNORABLE:
+            raise argparse.ArgumentTypeError(f"{word!r} is none of {', '.join(IGNORABLE)}")
+    return text
+
+
+def _amount(text: str) -> float:
+    try:
+        amount = float(text)
+    except ValueError:
+        amount = math.nan
+    if not 0 <= amount < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number from 0 on")
+    return amount
 
 
 def _seconds(text: str) -> float:

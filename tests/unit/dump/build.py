@@ -64,12 +64,12 @@ class Build:
         number = len(self.blocks) + 1
         self.blocks[source] = self.writer.open_block(cast("Block", block), number, self.first - 1, after_event)
 
-    def frame(self, number: int, data: bytes, source: str = "cell", **other: Any) -> None:
-        """A frame, at its number's time."""
-        clock_ns = number * PERIOD_NS
+    def frame(self, at: int, data: bytes, source: str = "cell", *, late_ns: int = 0, **other: Any) -> None:
+        """A frame, at its number's time or so much later."""
+        clock_ns = at * PERIOD_NS
         fields: dict[str, Any] = {
-            "number": number,
-            "cycle": number,
+            "number": at,
+            "cycle": at,
             "publish_ns": clock_ns,
             "clock_ns": clock_ns,
             "source_ns": START_NS + clock_ns,
@@ -82,7 +82,7 @@ class Build:
             "raw": data,
             "effective": None,
         }
-        self.writer.frame(self.blocks[source], Frame(**(fields | other)), START_NS + clock_ns)
+        self.writer.frame(self.blocks[source], Frame(**(fields | other)), START_NS + clock_ns + late_ns)
 
     def event(self, number: int, after: int, text: str = "", source: str = "cell") -> None:
         """An event behind a frame."""

@@ -1,0 +1,207 @@
+"""``shmio-dump diff``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from shmio.cli.dump import IGNORABLE, main
+from shmio.dump import compare
+from shmio.layout.model import Layout, Register
+from shmio.segment import Provenance, Quality
+from tests.unit.dump.build import Build, build, image, plain, varied
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def diff(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, dict[str, Any]]]:
+    """Status, and what --json says of the source cell."""
+
+    def call(*arguments: str) -> tuple[int, dict[str, Any]]:
+        status = main(["diff", "a.mem", "b.mem", "--json", *arguments])
+        said = capsys.readouterr()
+        assert said.err == ""
+        found = json.loads(said.out)
+        assert found["same"] == (status == 0)
+        return status, next(source for source in found["sources"] if source["source"] == "cell")
+
+    return call
+
+
+Diff = Callable[..., tuple[int, dict[str, Any]]]
+
+
+def counting(file: str, change: Callable[[Build, int], bool] = lambda _work, _number: False, last: int = 50) -> None:
+    """50 frames; ``change`` may write one itself."""
+    with build(Path(file)) as work:
+        work.block("cell")
+        for number in range(1, last + 1):
+            if not change(work, number):
+                work.frame(number, image(number, number / 4))
+
+
+def test_what_can_be_ignored_is_what_the_command_says() -> None:
+    assert compare.IGNORABLE == IGNORABLE
+
+
+def test_the_same(capsys: pytest.CaptureFixture[str]) -> None:
+    varied(Path("a.mem"))
+    varied(Path("b.mem"))
+    assert main(["diff", "a.mem", "b.mem"]) == 0
+    out = capsys.readouterr().out.splitlines()
+    assert out == [
+        "cell: 57 frames are the same; 4 events are the same",
+        "press: 60 frames are the same; 0 events are the same",
+        "the same",
+    ]
+
+
+def test_where_it_comes_from_is_no_difference(diff: Diff) -> None:
+    counting("a.mem")
+
+    def replayed(work: Build, number: int) -> bool:
+        other: dict[str, Any] = {"provenance": Provenance.REPLAYED, "incarnation": 9, "publish_ns": 5, "delay_us": 3}
+        work.frame(number, image(number, number / 4), **other)
+        return True
+
+    counting("b.mem", replayed)
+    assert diff()[0] == 0
+
+
+def test_values_quality_and_times(diff: Diff) -> None:
+    counting("a.mem")
+
+    def change(work: Build, number: int) -> bool:
+        others: dict[int, dict[str, Any]] = {
+            20: {"data": image(number, number / 4 + 0.5)},
+            21: {"data": image(number + 3, number / 4 + 0.75)},
+            30: {"data": image(number, number / 4), "quality": Quality.BAD, "reason": "no answer"},
+            40: {"data": image(number, number / 4), "source_ns": 7},
+            45: {"data": image(number, number / 4), "effective": image(0)},
+        }
+        if number in others:
+            work.frame(number, **others[number])
+        return number in others
+
+    counting("b.mem", change)
+    status, found = diff()
+    assert status == 1
+    frames = found["frames"]
+    assert (frames["compared"], frames["differing"], frames["only_first"], frames["only_second"]) == (50, 5, 0, 0)
+    assert frames["first"]["numbers"] == [20, 20]
+    assert frames["first"]["what"] == ["speed: 5.0 and 5.5"]
+    assert found["fields"] == {"quality": 1, "reason": 1, "source time": 1}
+    assert {path: (r["count"], r["largest"]) for path, r in found["registers"].items()} == {
+        "speed": (3, 11.25),
+        "count": (2, 45),
+        "row": (2, 0.0),
+    }
+    assert diff("--ignore", "times,reason")[1]["fields"] == {"quality": 1}
+    assert diff("--only", "cell/on")[1]["registers"] == {}
+    assert diff("--only", "cell/speed", "--tolerance", "0.8")[1]["registers"]["speed"]["count"] == 1
+    assert diff("--only", "speed", "--relative", "0.2")[1]["registers"]["speed"]["count"] == 1
+
+
+def test_the_tolerance_is_for_floating_point_alone(diff: Diff) -> None:
+    counting("a.mem")
+
+    def change(work: Build, number: int) -> bool:
+        if number == 9:
+            work.frame(9, image(10, 9 / 4))
+        return number == 9
+
+    counting("b.mem", change)
+    assert set(diff("--tolerance", "5")[1]["registers"]) == {"count", "row"}
+
+
+def test_frames_that_one_does_not_have(diff: Diff) -> None:
+    counting("a.mem")
+
+    def fewer(work: Build, number: int) -> bool:
+        if number == 12:
+            work.gap(10, 12)
+        return number in (10, 11, 12) or number > 45 or number < 3
+
+    counting("b.mem", fewer)
+    status, found = diff()
+    assert status == 1
+    frames = found["frames"]
+    assert (frames["compared"], frames["differing"], frames["only_first"], frames["only_second"]) == (40, 0, 10, 0)
+    frames = diff("--ignore", "ends")[1]["frames"]
+    assert (frames["only_first"], frames["first"]["numbers"]) == (3, [10, None])
+    frames = diff("--ignore", "times", "cycle")[1]["frames"]
+    assert (frames["compared"], frames["only_first"]) == (40, 10), "one by one, in their order"
+
+
+def test_a_source_that_one_does_not_have(diff: Diff) -> None:
+    varied(Path("a.mem"))
+    with build(Path("b.mem")) as work:
+        work.block("press", section=2)
+    status, found = diff()
+    assert (status, found["frames"]["only_first"]) == (1, 57)
+    assert main(["diff", "a.mem", "b.mem", "--source", "other"]) == 1
+
+
+def test_events(diff: Diff) -> None:
+    for file, text in (("a.mem", "one"), ("b.mem", "other")):
+        with build(Path(file)) as work:
+            work.block("cell")
+            work.frame(1, image(1))
+            work.event(1, 1, text)
+    status, found = diff()
+    assert (status, found["events"]["first"]["what"]) == (1, ["text: one and other"])
+    assert diff("--ignore", "events")[0] == 0
+
+
+def test_layouts_that_differ(diff: Diff) -> None:
+    """What both have by name and type is compared wherever it lies; the rest is told."""
+    other = Layout("DB1", 1, 8, False, (
+        Register("speed", "REAL", (), 0, None, 4, 1),
+        Register("count", "DINT", (), 4, None, 4, 1),
+    ))  # fmt: skip
+    counting("a.mem", last=3)
+    with build(Path("b.mem")) as work:
+        work.block("cell", other)
+        for number in range(1, 4):
+            work.frame(number, image(number, number / 4)[2:6] + bytes(4))
+    status, found = diff()
+    assert (status, found["missing"], found["registers"]) == (1, ["count", "on", "row"], {})
+    assert diff("--only", "cell/speed")[0] == 0
+
+
+def test_timing(diff: Diff) -> None:
+    counting("a.mem")
+    with build(Path("b.mem")) as work:
+        work.block("cell")
+        for number in range(1, 51):
+            late_ns = 2_000_000 if number == 50 else 0
+            frame: dict[str, Any] = {
+                "number": number,
+                "cycle": number,
+                "source_ns": 1_700_000_000_000_000_000 + number * 20_000_000,
+            }
+            work.frame(number + 100, image(number, number / 4), late_ns=late_ns, **frame)
+    status, found = diff()
+    assert status == 0
+    assert found["timing_ms"]["median"] == 0
+    assert found["timing_ms"]["max"] == 2.0
+
+
+def test_wrong_usage(capsys: pytest.CaptureFixture[str]) -> None:
+    plain(Path("a.mem"))
+    for wrong in (["--ignore", "everything"], ["--tolerance", "-1"], ["--tolerance", "x"]):
+        with pytest.raises(SystemExit) as status:
+            main(["diff", "a.mem", "a.mem", *wrong])
+        assert status.value.code == 2
+    capsys.readouterr()
+    assert main(["diff", "a.mem", "no.mem"]) == 1
+    assert capsys.readouterr().err == "no.mem: No such file or directory\n"
