@@ -10,6 +10,7 @@ from shmio.config import Declaration
 from shmio.layout.model import Layout, Register
 from shmio.segment.clock import ClockState
 from shmio.segment.commander import Outcome
+from shmio.segment.replays import Playing, Wanted
 from shmio.segment.standing import Standing
 from shmio.segment.view import Reading
 
@@ -111,3 +112,6 @@ class Cell(Protocol):
 
     def pause(self) -> None:
         """Have it step no more by itself."""
+
+    def replay(self, wanted: Wanted) -> list[Playing]:
+        """Move what plays recordings, if anything is wanted; how they play then."""

@@ -17,6 +17,7 @@ from shmio.segment import Block, Cursor, Event, EventKind, Frame, Quality
 from shmio.segment.attach import Attachment
 from shmio.segment.clock import ClockState
 from shmio.segment.commander import Outcome
+from shmio.segment.replays import Playing, Wanted
 from shmio.segment.shadow import Shadow
 from shmio.segment.standing import Standing
 from shmio.segment.view import Reading, reading
@@ -141,6 +142,10 @@ class Local:
     def pause(self) -> None:
         """Have it step no more by itself."""
         self.attachment.pause()
+
+    def replay(self, wanted: Wanted) -> list[Playing]:
+        """Move what plays recordings, if anything is wanted; how they play then."""
+        return self.attachment.replay.status() if wanted == Wanted() else self.attachment.replay.change(wanted)
 
 
 class LocalCampaign:

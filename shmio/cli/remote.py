@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import queue
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,6 +29,7 @@ from shmio.layout.types import element_type
 from shmio.segment import EventKind, Quality
 from shmio.segment.clock import ClockMode, ClockState
 from shmio.segment.commander import Outcome as LocalOutcome
+from shmio.segment.replays import Playing, Wanted
 from shmio.segment.standing import Running, Standing
 from shmio.segment.view import Reading
 
@@ -167,6 +169,11 @@ class Remote:
     def pause(self) -> None:
         """Have it step no more by itself."""
         self._client.pause()
+
+    def replay(self, wanted: Wanted) -> list[Playing]:
+        """Move what plays recordings, if anything is wanted; how they play then."""
+        wish = msgspec.to_builtins(wanted)  # what is wanted alone
+        return [Playing(**dataclasses.asdict(one)) for one in self._client.replay(**wish)]
 
 
 class _RemoteShadow:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from shmio import __version__
-from shmio.cli import get, inject, registers, step, watch
+from shmio.cli import get, inject, registers, replay, step, watch
 from shmio.cli import set as set_verb
 from shmio.cli.cell import Cell
 from shmio.cli.local import Local
@@ -52,9 +52,17 @@ def _parser() -> argparse.ArgumentParser:
     common.add_argument("--key", type=Path, metavar="FILE", help="its key (PEM)")
     common.add_argument("--token-file", type=Path, metavar="FILE", help="what the endpoint knows us by")
     verbs = parser.add_subparsers(required=True, metavar="VERB")
-    modules = {"list": registers, "get": get, "watch": watch, "set": set_verb, "inject": inject, "step": step}
+    modules = {
+        "list": registers,
+        "get": get,
+        "watch": watch,
+        "set": set_verb,
+        "inject": inject,
+        "step": step,
+        "replay": replay,
+    }
     for name, module in modules.items():
         sub = verbs.add_parser(name, parents=[common], help=module.HELP, description=module.HELP)
         module.arguments(sub)
-        sub.set_defaults(verb=module.execute, writable=module in (set_verb, inject, step))
+        sub.set_defaults(verb=module.execute, writable=module in (set_verb, inject, step, replay))
     return parser

@@ -21,6 +21,7 @@ from shmio.client.calls import Clock, Outcome, Stepped, Target
 from shmio.client.injections import Declared, Happening, Injection, Lifted, Running
 from shmio.client.layout import BlockLayout
 from shmio.client.model import Work
+from shmio.client.replay import Playing, Wish
 from shmio.client.sync import Client, Subscription
 from shmio.client.sync_campaign import Campaign
 from shmio.client.sync_model import Simulation
@@ -42,6 +43,7 @@ __all__ = [
     "Lifted",
     "Outcome",
     "Piece",
+    "Playing",
     "Provenance",
     "Quality",
     "Register",
@@ -55,6 +57,7 @@ __all__ = [
     "Table",
     "Target",
     "Update",
+    "Wish",
     "Work",
     "connect",
     "connect_aio",

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
-from typing import Any, Self
+from typing import Any, Self, Unpack
 
 import grpc
 
-from shmio.client import calls, injections, shadow
+from shmio.client import calls, injections, replay, shadow
 from shmio.client.aio_calls import receive
 from shmio.client.aio_campaign import Campaign
 from shmio.client.aio_model import Simulation, Step, serve
@@ -18,6 +18,7 @@ from shmio.client.calls import Clock, Outcome, Target
 from shmio.client.injections import Injection, Lifted
 from shmio.client.layout import BlockLayout, layouts
 from shmio.client.model import PATIENCE_S
+from shmio.client.replay import Playing, Wish
 from shmio.client.update import Snapshot, Tables, Update
 from shmio.errors import CommandError
 from shmio.wire import shmio_v1_pb2 as wire
@@ -185,6 +186,15 @@ class Client:
     async def pause(self) -> Clock:
         """Have time step no more by itself; takes it over. CommandError."""
         return Clock.of(await self._call(self._stub.Pause, wire.PauseRequest()))
+
+    async def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
+        """Move the sources that play recordings (:class:`Wish`); without a wish only tell how they play.
+
+        One that is over begins anew. ValueRangeError: a speed or a time; PathError: a source or a register;
+        CommandError: nothing is played, what is looked for is not there, or a source does not answer.
+        """
+        found = await self._call(self._stub.Replay, replay.request(wish), replay.patience_s(wish))
+        return list(map(Playing.of, found.sources))
 
     async def _call(self, method: Callable[..., Any], request: Any, timeout_s: float | None = None) -> Any:
         try:

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any, Self
+from typing import Any, Self, Unpack
 
 import grpc
 
-from shmio.client import calls, injections, shadow
+from shmio.client import calls, injections, replay, shadow
 from shmio.client.arrays import InjectResponse, ReadResponse, SimulateResponse, SubscribeResponse
 from shmio.client.calls import Clock, Outcome, Target
 from shmio.client.injections import Injection, Lifted
 from shmio.client.layout import BlockLayout, layouts
 from shmio.client.model import PATIENCE_S
+from shmio.client.replay import Playing, Wish
 from shmio.client.sync_campaign import Campaign
 from shmio.client.sync_model import Simulation, Step, serve
 from shmio.client.sync_shadow import Shadow
@@ -216,6 +217,15 @@ class Client:
     def pause(self) -> Clock:
         """Have time step no more by itself; takes it over. CommandError."""
         return Clock.of(self._call(self._stub.Pause, wire.PauseRequest()))
+
+    def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
+        """Move the sources that play recordings (:class:`Wish`); without a wish only tell how they play.
+
+        One that is over begins anew. ValueRangeError: a speed or a time; PathError: a source or a register;
+        CommandError: nothing is played, what is looked for is not there, or a source does not answer.
+        """
+        found = self._call(self._stub.Replay, replay.request(wish), replay.patience_s(wish))
+        return list(map(Playing.of, found.sources))
 
     def _call(self, method: Callable[..., Any], request: Any, timeout_s: float | None = None) -> Any:
         try:

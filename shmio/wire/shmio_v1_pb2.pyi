@@ -973,3 +973,53 @@ class Clock(_message.Message):
     rate: float
     note: str
     def __init__(self, virtual: bool = ..., step: _Optional[int] = ..., time_ns: _Optional[int] = ..., step_size_ns: _Optional[int] = ..., playing: bool = ..., rate: _Optional[float] = ..., note: _Optional[str] = ...) -> None: ...
+
+class ReplayRequest(_message.Message):
+    __slots__ = ("paused", "speed", "loop", "seek", "until", "change", "event", "jump", "sources")
+    PAUSED_FIELD_NUMBER: _ClassVar[int]
+    SPEED_FIELD_NUMBER: _ClassVar[int]
+    LOOP_FIELD_NUMBER: _ClassVar[int]
+    SEEK_FIELD_NUMBER: _ClassVar[int]
+    UNTIL_FIELD_NUMBER: _ClassVar[int]
+    CHANGE_FIELD_NUMBER: _ClassVar[int]
+    EVENT_FIELD_NUMBER: _ClassVar[int]
+    JUMP_FIELD_NUMBER: _ClassVar[int]
+    SOURCES_FIELD_NUMBER: _ClassVar[int]
+    paused: bool
+    speed: float
+    loop: bool
+    seek: str
+    until: str
+    change: str
+    event: str
+    jump: bool
+    sources: _containers.RepeatedScalarFieldContainer[str]
+    def __init__(self, paused: bool = ..., speed: _Optional[float] = ..., loop: bool = ..., seek: _Optional[str] = ..., until: _Optional[str] = ..., change: _Optional[str] = ..., event: _Optional[str] = ..., jump: bool = ..., sources: _Optional[_Iterable[str]] = ...) -> None: ...
+
+class ReplayResponse(_message.Message):
+    __slots__ = ("sources",)
+    SOURCES_FIELD_NUMBER: _ClassVar[int]
+    sources: _containers.RepeatedCompositeFieldContainer[Playing]
+    def __init__(self, sources: _Optional[_Iterable[_Union[Playing, _Mapping]]] = ...) -> None: ...
+
+class Playing(_message.Message):
+    __slots__ = ("source", "time_s", "position_s", "length_s", "speed", "paused", "loop", "over", "until_s")
+    SOURCE_FIELD_NUMBER: _ClassVar[int]
+    TIME_S_FIELD_NUMBER: _ClassVar[int]
+    POSITION_S_FIELD_NUMBER: _ClassVar[int]
+    LENGTH_S_FIELD_NUMBER: _ClassVar[int]
+    SPEED_FIELD_NUMBER: _ClassVar[int]
+    PAUSED_FIELD_NUMBER: _ClassVar[int]
+    LOOP_FIELD_NUMBER: _ClassVar[int]
+    OVER_FIELD_NUMBER: _ClassVar[int]
+    UNTIL_S_FIELD_NUMBER: _ClassVar[int]
+    source: str
+    time_s: float
+    position_s: float
+    length_s: float
+    speed: float
+    paused: bool
+    loop: bool
+    over: bool
+    until_s: float
+    def __init__(self, source: _Optional[str] = ..., time_s: _Optional[float] = ..., position_s: _Optional[float] = ..., length_s: _Optional[float] = ..., speed: _Optional[float] = ..., paused: bool = ..., loop: bool = ..., over: bool = ..., until_s: _Optional[float] = ...) -> None: ...

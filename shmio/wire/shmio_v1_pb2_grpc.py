@@ -119,6 +119,11 @@ class ShmioStub(object):
                 request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.WatchClockRequest.SerializeToString,
                 response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
                 _registered_method=True)
+        self.Replay = channel.unary_unary(
+                '/shmio.v1.Shmio/Replay',
+                request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.ReplayRequest.SerializeToString,
+                response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.ReplayResponse.FromString,
+                _registered_method=True)
 
 
 class ShmioServicer(object):
@@ -243,6 +248,13 @@ class ShmioServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def Replay(self, request, context):
+        """Moves the sources that play recordings; without a wish it only tells how they play.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
 
 def add_ShmioServicer_to_server(servicer, server):
     rpc_method_handlers = {
@@ -330,6 +342,11 @@ def add_ShmioServicer_to_server(servicer, server):
                     servicer.WatchClock,
                     request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.WatchClockRequest.FromString,
                     response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.SerializeToString,
+            ),
+            'Replay': grpc.unary_unary_rpc_method_handler(
+                    servicer.Replay,
+                    request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.ReplayRequest.FromString,
+                    response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.ReplayResponse.SerializeToString,
             ),
     }
     generic_handler = grpc.method_handlers_generic_handler(
@@ -791,6 +808,33 @@ class Shmio(object):
             '/shmio.v1.Shmio/WatchClock',
             shmio_dot_wire_dot_shmio__v1__pb2.WatchClockRequest.SerializeToString,
             shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Replay(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/shmio.v1.Shmio/Replay',
+            shmio_dot_wire_dot_shmio__v1__pb2.ReplayRequest.SerializeToString,
+            shmio_dot_wire_dot_shmio__v1__pb2.ReplayResponse.FromString,
             options,
             channel_credentials,
             insecure,

@@ -26,7 +26,7 @@ _SERVICES: Final[Mapping[str, Mapping[str, str]]] = {
         READ: "GetLayouts GetStatus Read Subscribe ListInjections WatchClock",
         WRITE: "Write Simulate",
         INJECT: "Inject Declare Lift LiftAll",
-        CONTROL: "Step Steps SetStepSize Play Pause",
+        CONTROL: "Step Steps SetStepSize Play Pause Replay",
     },
     "com.ttsnetwork.simulator3.SimServerAPI": {
         READ: "subscribe",

@@ -107,6 +107,7 @@ CALLS = (
     Call(OURS + "SetStepSize", ours.SetStepSizeRequest(dt_ns=50_000_000).SerializeToString()),
     Call(OURS + "Pause", b""),
     Call(OURS + "WatchClock", b"", stays=True),
+    Call(OURS + "Replay", b"", ends=grpc.StatusCode.FAILED_PRECONDITION),
     Call(HEALTH + "Check", health_pb2.HealthCheckRequest(service="source.cell").SerializeToString()),
     Call(HEALTH + "Watch", health_pb2.HealthCheckRequest(service="source.cell").SerializeToString(), stays=True),
     Call(

@@ -18,6 +18,7 @@ from shmio.endpoints.grpc.native.clock import Clocks
 from shmio.endpoints.grpc.native.follow import aged
 from shmio.endpoints.grpc.native.orders import Orders
 from shmio.endpoints.grpc.native.refusal import Context, refuse
+from shmio.endpoints.grpc.native.replay import Moves
 from shmio.endpoints.grpc.native.selection import Selections
 from shmio.endpoints.grpc.native.simulate import Simulations
 from shmio.endpoints.grpc.native.subscribe import Subscription
@@ -59,6 +60,7 @@ class NativeService:
         stepper.also(self._deliver)
         self._orders = Orders(topics, feeds, self._selections, self._bells)
         self._simulations = Simulations(feeds, segment)
+        self._moves = Moves(segment)
         self._open: set[Subscription] = set()
         self._ended_updates = 0
 
@@ -83,7 +85,7 @@ class NativeService:
             "Read": unary(self.read, wire.ReadRequest.FromString),
             "Subscribe": streaming(self.subscribe, wire.SubscribeRequest.FromString),
         }
-        for part in (self._orders, self._simulations, self._clocks):
+        for part in (self._orders, self._simulations, self._clocks, self._moves):
             calls |= part.handlers()
         return grpc.method_handlers_generic_handler(SERVICE, calls)
 

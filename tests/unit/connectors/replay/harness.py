@@ -101,7 +101,7 @@ def built(instance: str, *names: str, stepped: bool = True, origin: Origin | Non
     """The segment of an instance that replays."""
     attributes = Attributes("replay", ("count",), stepped=True, replay=True)
     blocks = [BlockSpec(name, LAYOUT, PERIOD_NS, 500 * MS, 1 << 22, attributes) for name in names or ("cell",)]
-    processes = [ProcessSpec(block.source, "source") for block in blocks]
+    processes = [*(ProcessSpec(block.source, "source") for block in blocks), ProcessSpec("grpc", "grpc")]
     with Segment.create(instance, blocks, processes, stepped=stepped, origin=origin) as segment:
         yield segment
         segment.unlink()

@@ -1,0 +1,98 @@
+"""``shmio replay``: moves what plays recordings."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable
+from datetime import datetime
+from typing import Any, Final
+
+import msgspec
+
+from shmio.cli.cell import Cell
+from shmio.cli.run import dumps
+from shmio.logs import printable
+from shmio.segment.replays import Playing, Wanted
+
+HELP = "Tell how recordings play, and move them: pause, play, seek, and more."
+
+_VERBS: Final = {
+    "status": "tell how they play (default)",
+    "pause": "stand",
+    "play": "go on; from the end at the beginning",
+    "seek": "TIME: be there",
+    "until": "TIME: play until then, and pause",
+    "speed": "X: times as fast as the instance's clock, 0.01 to 1000",
+    "loop": "on or off: begin anew at the end",
+    "to-change": "PATH: play to the next change of a register, and pause",
+    "to-event": "KIND: play to the next event of a kind, such as accepted, quality, injected, and pause",
+}
+_ALONE: Final = ("status", "pause", "play")
+
+
+def arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the verb's own arguments."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    lines = "\n".join(f"  {verb:<10} {text}" for verb, text in _VERBS.items())
+    parser.description = f"{HELP}\n\nACTION is one of\n{lines}\n\nTIME: seconds from the begin, or a date and time."
+    parser.add_argument("action", choices=_VERBS, nargs="?", default="status", metavar="ACTION")
+    parser.add_argument("value", nargs="?", metavar="VALUE")
+    parser.add_argument("--speed", type=float, metavar="X", help="with play: how fast")
+    parser.add_argument("--jump", action="store_true", help="with to-change, to-event: be there at once")
+    parser.add_argument(
+        "--source", action="append", default=[], metavar="NAME", help="only what plays the recording of this source"
+    )
+    parser.set_defaults(refuse=parser.error)
+
+
+def execute(cell: Cell, options: argparse.Namespace) -> int:
+    """Do it, and tell how they play then. CommandError, PathError, ValueRangeError."""
+    found = cell.replay(_wanted(options))
+    if options.json:
+        print(dumps([msgspec.to_builtins(one) for one in found]))
+    else:
+        print("\n".join(map(printable, _lines(found))))
+    return 0
+
+
+def _wanted(options: argparse.Namespace) -> Wanted:
+    action, value = options.action, options.value
+    if (value is None) != (action in _ALONE):
+        options.refuse(f"{action} takes no VALUE" if value is not None else f"{action} needs a VALUE: {_VERBS[action]}")
+    if options.speed is not None and action != "play":
+        options.refuse("--speed goes with play")
+    if options.jump and action not in ("to-change", "to-event"):
+        options.refuse("--jump goes with to-change and to-event")
+    wanted: dict[str, dict[str, Any]] = {
+        "pause": {"paused": True},
+        "play": {"paused": False, "speed": options.speed},
+        "seek": {"seek": value},
+        "until": {"paused": False, "until": value},
+        "speed": {"speed": _number(options) if action == "speed" else None},
+        "loop": {"loop": value == "on"},
+        "to-change": {"change": value, "jump": options.jump},
+        "to-event": {"event": value, "jump": options.jump},
+    }
+    if action == "loop" and value not in ("on", "off"):
+        options.refuse(f"loop is on or off, not {value!r}")
+    return Wanted(**wanted[action], sources=tuple(options.source)) if action != "status" else Wanted()
+
+
+def _number(options: argparse.Namespace) -> float:
+    try:
+        return float(options.value)
+    except ValueError:
+        options.refuse(f"{options.value!r} is no number")
+        raise
+
+
+def _lines(found: Iterable[Playing]) -> Iterable[str]:
+    for one in found:
+        state = "over" if one.over else "paused" if one.paused else "playing"
+        at = datetime.fromtimestamp(one.time_s).astimezone().isoformat(" ", timespec="milliseconds")[:23]
+        until = f", until {one.until_s:.3f} s" if one.until_s is not None else ""
+        loop = ", in a loop" if one.loop else ""
+        yield (
+            f"{one.source}: {state} at {one.position_s:.3f} s of {one.length_s:.3f} s ({at}), "
+            f"speed {one.speed:g}{until}{loop}"
+        )

@@ -1,0 +1,72 @@
+"""``shmio replay``: what it prints, and what it takes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shmio.cli.user import main
+from tests.unit.connectors.replay.harness import Playing, built, record
+
+
+@pytest.fixture
+def playing(tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[Playing]:
+    monkeypatch.chdir(tmp_path)
+    file = record(tmp_path / "dumps", instance)
+    with built(instance) as segment, Playing(segment, file) as playing:
+        playing.next()
+        yield playing
+
+
+def replay(instance: str, *words: str) -> int:
+    return main(["replay", "--instance", instance, *words])
+
+
+def test_it_tells_how_they_play(playing: Playing, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert replay(instance) == 0
+    line = capsys.readouterr().out
+    assert line.startswith("cell: playing at 0.000 s of 0.400 s (1970-01-01 ")
+    assert line.endswith("), speed 1\n")
+    assert replay(instance, "seek", "0.1") == 0
+    assert replay(instance, "pause") == 0
+    assert replay(instance, "loop", "on") == 0
+    capsys.readouterr()
+    assert replay(instance, "speed", "0.5", "--json") == 0
+    [told] = json.loads(capsys.readouterr().out)
+    assert (told["position_s"], told["paused"], told["loop"], told["speed"]) == (0.1, True, True, 0.5)
+    assert replay(instance, "to-change", "cell/other", "--jump") == 0
+    assert capsys.readouterr().out.startswith("cell: paused at 0.200 s")
+    assert replay(instance, "play", "--speed", "1", "--source", "cell") == 0
+    assert replay(instance, "until", "0.3") == 0
+    assert capsys.readouterr().out.endswith(", speed 1, until 0.300 s, in a loop\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "error"),
+    [
+        (["seek"], "seek needs a VALUE"),
+        (["pause", "1"], "pause takes no VALUE"),
+        (["loop", "maybe"], "loop is on or off"),
+        (["speed", "fast"], "'fast' is no number"),
+        (["seek", "1", "--jump"], "--jump goes with"),
+        (["pause", "--speed", "1"], "--speed goes with play"),
+        (["rewind"], "invalid choice"),
+    ],
+)
+def test_wrong_usage_is_told(
+    playing: Playing, instance: str, words: list[str], error: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        replay(instance, *words)
+    assert ended.value.code == 2
+    assert error in capsys.readouterr().err
+
+
+def test_what_cannot_be_is_one_line(playing: Playing, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert replay(instance, "seek", "900") == 1
+    assert capsys.readouterr().err == "900 is not within what is played, which is 0.400 s long\n"
+    assert replay(instance, "to-event", "accepted") == 1
+    assert capsys.readouterr().err == "there is no event accepted from here to the end of the recording\n"
