@@ -51,6 +51,14 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument("--for", dest="duration_s", type=_seconds, metavar="SECONDS", help="end by itself")
     record.add_argument("--source", dest="sources", nargs="+", action="extend", metavar="NAME", help="only these")
 
+    note = verb("note", "put a note into the events of a running instance, and so into its recordings")
+    note.add_argument("text", metavar="TEXT")
+    note.add_argument("-c", dest="config", type=Path, metavar="FILE", help="the instance of this supervisor.toml")
+    note.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
+    note.add_argument(
+        "--source", metavar="NAME", help="whose events (default: grpc.default_source, or the first source)"
+    )
+
     info = verb("info", "tell what is in recordings")
     info.add_argument("files", nargs="+", type=Path, metavar="FILE")
     info.add_argument("--json", action="store_true", help="print JSON: one object, or a list for several files")

@@ -209,6 +209,9 @@ class CommandDesk:
         layer = self._injector.toward_device(command)
         write = command.kind is CommandKind.WRITE or layer is not None
         reason = self._refusal(command)
+        if not reason and command.kind is CommandKind.NOTE:
+            self._writer.event(Record(EventKind.NOTED, command.name, command.writer, command.id, 0, 1))
+            return True
         if not reason and layer is not None:
             reason = uncovered(layer, command.writes)
         if not reason:

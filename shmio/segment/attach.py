@@ -16,14 +16,14 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 
 from shmio.config import Declaration
 from shmio.errors import CommandError, NotRunningError, PathError, QualityError, SegmentError
 from shmio.layout.codec import Value
 from shmio.layout.model import Register
-from shmio.layout.topic import Topic, look_up, parse_topic
+from shmio.layout.topic import look_up, parse_topic
 from shmio.segment.block import Block
 from shmio.segment.campaign import Laid, declare
 from shmio.segment.commander import Commander, Outcome
@@ -35,6 +35,7 @@ from shmio.segment.segment import Segment, running_instances
 from shmio.segment.shadow import Diversion, Shadow, lift_all, written
 from shmio.segment.standing import Standing
 from shmio.segment.timekeeper import Timed
+from shmio.segment.topics import of_one_source
 from shmio.segment.view import Reading, View, reading
 
 TURN_S = 1.0
@@ -181,7 +182,7 @@ class Attachment(Timed):
         The attachment must be ``writable``. All values are accepted by the source or none; what the device says is
         told for each. PathError, ValueRangeError, CommandError: nothing has been sent.
         """
-        block, topics = self._of_one_source("write", values)
+        block, topics = of_one_source("write", values, self._blocks())
         for path, topic in zip(values, topics, strict=True):
             if topic.direction == "out":
                 raise PathError(f"{path}: what comes out of a source is not written; leave out /out")
@@ -196,7 +197,7 @@ class Attachment(Timed):
         outermost, of equal ones the newest. With ``keep`` it stays when this program ends, until somebody lifts it. The
         attachment must be ``writable``. PathError; CommandError: the source refuses, or does not answer.
         """
-        block, topics = self._of_one_source("injection", paths)
+        block, topics = of_one_source("injection", paths, self._blocks())
         directions = {topic.direction or "out" for topic in topics}
         if len(directions) != 1:
             raise PathError("an injection is over /out or over /in, not over both")
@@ -213,7 +214,7 @@ class Attachment(Timed):
 
         Each command when its end is known; it ends after ``timeout_s`` without one. PathError; NotRunningError.
         """
-        block, topics = self._of_one_source("call", paths)
+        block, topics = of_one_source("call", paths, self._blocks())
         for path, topic in zip(paths, topics, strict=True):
             if topic.direction == "out":
                 raise PathError(f"{path}: what comes out of a source is not written; leave out /out")
@@ -245,18 +246,13 @@ class Attachment(Timed):
         lift_all([(self._commander(self.block(source)), one.id) for source, one in standing])
         return standing
 
-    def _of_one_source(self, what: str, paths: Collection[str]) -> tuple[Block, list[Topic]]:
-        """The block and the topics of paths that must be of one source; PathError."""
-        blocks = self._blocks()
-        default = next(iter(blocks)) if len(blocks) == 1 else None
-        topics = [parse_topic(path, blocks, default) for path in paths]
-        for path, topic in zip(paths, topics, strict=True):
-            if topic.source not in blocks:
-                raise PathError(f"{path}: nothing is served under {topic.source} in this version")
-        sources = {topic.source for topic in topics}
-        if len(sources) != 1:
-            raise PathError(f"one {what} is for one source, these are for {', '.join(sorted(sources)) or 'none'}")
-        return blocks[sources.pop()], topics
+    def note(self, text: str, source: str | None = None) -> None:
+        """Put a note into a source's events, where it stands between its frames; None: of the first source.
+
+        The attachment must be ``writable``. PathError; ValueRangeError: too long; CommandError: the source's process
+        does not answer.
+        """
+        self._commander(self.block(source if source is not None else self.sources[0])).note(text)
 
     def _commander(self, block: Block) -> Commander:
         """The commander for a block, in the name of one of the guests' places, kept from the first write on."""

@@ -15,7 +15,7 @@ from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
 from shmio.layout.write import Write, apply, bits_of, cover, encode, merge
-from shmio.segment.commands import CommandKind, CommandSender, Laid
+from shmio.segment.commands import MAX_NAME_BYTES, CommandKind, CommandSender, Laid
 from shmio.segment.events import DONE, ENDS, Event, EventKind
 
 if TYPE_CHECKING:
@@ -152,6 +152,13 @@ class Commander:
         """The first half of :meth:`declare`; the number will be the ticket's. CommandError: not sent. Never waits."""
         writes = [Write(0, 0, msgspec.json.encode(declaration))]
         return self._send(("",), writes, timeout_s, CommandKind.DECLARE, keep=keep, name=declaration.name)
+
+    def note(self, text: str, timeout_s: float | None = None) -> None:
+        """Put a note into the source's events. ValueRangeError: it is empty or too long; CommandError: no answer."""
+        size = len(text.encode())
+        if not 0 < size <= MAX_NAME_BYTES:
+            raise ValueRangeError(f"a note has 1 to {MAX_NAME_BYTES} bytes in UTF-8, this has {size}")
+        self._expect(self._send(("",), [], timeout_s, CommandKind.NOTE, name=text), EventKind.NOTED)
 
     def lift(self, injection: int, timeout_s: float | None = None) -> None:
         """Lift an injection, whoever laid it. CommandError: there is none, or the source does not answer."""

@@ -51,6 +51,12 @@ class CommandKind(IntEnum):
     """An injection is lifted; there are no items."""
     DECLARE = 5
     """An injection is laid that the source runs by itself: its declaration, as JSON, is the one item's data."""
+    NOTE = 6
+    """The name is put into the events as a note; there are no items. Whatever the device does."""
+
+
+EMPTY: Final = frozenset({CommandKind.LIFT, CommandKind.NOTE})
+"""Kinds without items."""
 
 
 class Direction(IntEnum):
@@ -65,7 +71,8 @@ class Command:
     """What a writer wants done. ``deadline_ns``: CLOCK_MONOTONIC after which it must not be begun.
 
     ``injection``: the one to lift, or whose values these are. With INJECT: ``direction``, ``priority`` (the highest is
-    outermost), ``keep`` (it outlives its client), ``name`` (at most MAX_NAME_BYTES in UTF-8).
+    outermost), ``keep`` (it outlives its client), ``name`` (at most MAX_NAME_BYTES in UTF-8). With NOTE:
+    ``name`` is the note.
     """
 
     writer: int
@@ -102,7 +109,7 @@ class Command:
         try:
             head = _COMMAND.unpack_from(record)
             number, incarnation, count, deadline_ns, kind, flags, name_size, priority, injection = head
-            if (count > 0) != (CommandKind(kind) is not CommandKind.LIFT) or count > MAX_WRITES:
+            if (count > 0) == (CommandKind(kind) in EMPTY) or count > MAX_WRITES:
                 raise ValueError(f"kind {kind} with {count} items")
             name = record[_COMMAND.size : _COMMAND.size + name_size]
             if len(name) != name_size or name_size > MAX_NAME_BYTES or flags > Direction.IN | _KEEP:
@@ -223,7 +230,7 @@ class CommandSender:
         CommandError: the queue is full, or can never hold that much. Never waits.
         """
         source = self.block.source
-        if not (len(writes) > 0) == (kind is not CommandKind.LIFT) or len(writes) > MAX_WRITES:
+        if (len(writes) > 0) == (kind in EMPTY) or len(writes) > MAX_WRITES:
             raise CommandError(f"{source}: a command has 1 to {MAX_WRITES} items, this has {len(writes)}")
         with self._turn:
             number, self._next = self._next, self._next + 1

@@ -61,6 +61,8 @@ class EventKind(IntEnum):
     """A declared injection became active: over ``/out`` in the frame before; ``item`` counts its activations."""
     DEACTIVATED = 16
     """It is no longer."""
+    NOTED = 17
+    """Somebody has noted something, as text; the end of the command that brought it."""
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -77,6 +79,7 @@ ENDS: Final = frozenset(
         EventKind.INJECTED,
         EventKind.LIFTED,
         EventKind.SHADOWED,
+        EventKind.NOTED,
     }
 )
 """Kinds after which nothing more is said of an item; REJECTED: of a command."""
@@ -90,8 +93,8 @@ class Event(NamedTuple):
     ``frame``: number of the last frame before it. ``kind`` is a plain number where this version does not know it.
     ``writer``: the command ring it is about, or NO_WRITER; ``command``: the writer's number of the command. It tells
     of ``items`` of its items from ``item`` on; ``offset``, ``mask``, ``size``: what the first of them writes (mask 0:
-    whole bytes); ``data``: these bytes, with ACCEPTED, DIVERTED, SHADOWED and INJECTED only. ``text``: the reason, or
-    the name of ``injection``, the one it is about (0: none).
+    whole bytes); ``data``: these bytes, with ACCEPTED, DIVERTED, SHADOWED and INJECTED only. ``text``: the reason, the
+    note, or the name of ``injection``, the one it is about (0: none).
     """
 
     number: int

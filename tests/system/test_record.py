@@ -46,7 +46,7 @@ def test_log_mode_records_a_cell_through_a_killed_recorder(make_cell: Callable[.
     cell.down()
     [second] = set((cell.folder / "dumps").iterdir()) - {first}
     killed, whole = info(cell, first), info(cell, second)
-    assert (killed["closed"], whole["closed"]) == (False, True), cell.logs()
+    assert (killed["closed"], whole["closed"]) == (True, True), cell.logs()
     [old], [new] = killed["blocks"], whole["blocks"]
     assert (old["first_frame"], old["frames"]) == (1, old["last_frame"]), "from the source's first frame"
     missed = whole["missed_frames"]
@@ -110,3 +110,19 @@ def test_a_reload_is_recorded_in_the_same_file(make_cell: Callable[..., Cell]) -
     assert all(
         set(line["values"]) == {"Robot_800/Axis1"} for line in map(json.loads, lines.splitlines()) if "frame" in line
     )
+
+
+def test_a_note_stands_in_the_recording(make_cell: Callable[..., Cell]) -> None:
+    cell = make_cell(config=RECORDED)
+    cell.up()
+    done = cell.run("shmio-dump", "note", "Greifer getauscht")
+    assert (done.returncode, done.stderr) == (0, ""), cell.logs()
+    for arguments, message in (
+        (["x" * 257], "a note has 1 to 256 bytes in UTF-8, this has 257"),
+        (["x", "--source", "press"], "no source 'press'; there are: cell"),
+    ):
+        failed = cell.run("shmio-dump", "note", *arguments)
+        assert (failed.returncode, message in failed.stderr) == (1, True), failed.stderr
+    cell.down()
+    [file] = (cell.folder / "dumps").iterdir()
+    assert ": noted: Greifer getauscht" in cell.run("shmio-dump", "cat", str(file)).stdout

@@ -253,7 +253,7 @@ class Table:
     def event(self, time_ns: int, source: str, event: Event) -> str:
         """Kind and reason, and of a command which bytes."""
         what = f"{_kind(event)} {event.quality}" if event.kind == EventKind.QUALITY else _kind(event)
-        if event.command:
+        if event.command and event.kind != EventKind.NOTED:
             what += (
                 f" command {event.command}.{event.item} of writer {event.writer}: {event.size} bytes at {event.offset}"
             )

@@ -19,6 +19,7 @@ from shmio.segment import (
     BlockSpec,
     BlockWriter,
     Command,
+    CommandKind,
     CommandSender,
     Cursor,
     Event,
@@ -114,6 +115,20 @@ def test_a_command_is_accepted_carried_out_and_confirmed(bench: Bench) -> None:
     done = bench.event()
     assert (done.kind, done.command, done.writer, done.item, done.items) == (EventKind.WRITTEN, number, 4, 0, 2)
     assert not bench.desk.waiting
+
+
+def test_a_note_is_an_event_whatever_the_device_does(bench: Bench) -> None:
+    bench.desk.close("cable out")
+    number = bench.sender.submit([], FAR, CommandKind.NOTE, name="Greifer getauscht")
+    event = bench.event()
+    assert (event.kind, event.text, event.writer, event.command) == (EventKind.NOTED, "Greifer getauscht", 4, number)
+    assert (event.data, event.size, event.items) == (b"", 0, 1)
+
+
+def test_a_note_that_comes_too_late_is_not_taken(bench: Bench) -> None:
+    bench.now_ns = FAR
+    bench.sender.submit([], FAR - 1, CommandKind.NOTE, name="late")
+    assert bench.event().kind == EventKind.REJECTED
 
 
 def test_of_one_cycle_the_last_value_wins_and_is_written_once(bench: Bench) -> None:
