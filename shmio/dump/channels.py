@@ -7,13 +7,13 @@ from typing import Final
 
 from mcap.records import Channel as ChannelRecord
 
-from shmio.dump.encoding import EVENT, FRAME, GAP, GAPS_TOPIC, PLAIN, STEP, STEPS_TOPIC
+from shmio.dump.encoding import EVENT, FRAME, GAP, GAPS_TOPIC, PLAIN, PROCESS, PROCESSES_TOPIC, STEP, STEPS_TOPIC
 from shmio.dump.records import stream
 
 MAX_CHANNELS: Final = 10_000
 MAX_CHANNEL_BYTES: Final = 4096
 
-_OWN: Final = {GAPS_TOPIC: GAP, STEPS_TOPIC: STEP}
+_OWN: Final = {GAPS_TOPIC: GAP, STEPS_TOPIC: STEP, PROCESSES_TOPIC: PROCESS}
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,13 +23,15 @@ PLACES: Final = "places"
 """Name of the metadata that tell behind which numbers the recording begins."""
 GAPS_TOPIC: Final = "gaps"
 STEPS_TOPIC: Final = "steps"
+PROCESSES_TOPIC: Final = "processes"
 
 FRAME: Final = "shmio.frame.v1"
 EVENT: Final = "shmio.event.v1"
 PLAIN: Final = "json"
 GAP: Final = "gap"
 STEP: Final = "step"
-"""What gaps and steps are called here; in the file both are PLAIN, and their topics tell them apart."""
+PROCESS: Final = "process"
+"""What gaps, steps and changes of processes are called here; in the file all are PLAIN, told apart by their topics."""
 
 _FRAME: Final = struct.Struct("<QQqqqQIBBHHHII")
 _EVENT: Final = struct.Struct("<QQQqqqQQIIIIIIHBBHH")
@@ -53,6 +55,12 @@ GAP_SCHEMA: Final = b"""{"type": "object", "properties": {"source": {"type": "st
 
 STEP_SCHEMA: Final = b"""{"type": "object", "properties": {"step": {"type": "integer"}, \
 "time_ns": {"type": "integer"}, "dt_ns": {"type": "integer"}}}"""
+
+
+PROCESS_SCHEMA: Final = b"""{"type": "object", "properties": {"name": {"type": "string"}, \
+"kind": {"type": "string"}, "pid": {"type": "integer"}, \
+"what": {"enum": ["is", "started", "ended", "died", "gave up", "removed"]}, \
+"why": {"type": "string"}, "restarts": {"type": "integer"}}}"""
 
 
 class Reason(StrEnum):
@@ -98,6 +106,34 @@ class StepMark(msgspec.Struct, frozen=True):
     step: int
     time_ns: int
     dt_ns: int
+
+
+class Life(StrEnum):
+    """What has happened to a process of the instance."""
+
+    IS = "is"
+    """It runs where the recording, or what the recorder sees of it, begins."""
+    STARTED = "started"
+    """It works: its predecessor's end was told before."""
+    ENDED = "ended"
+    """It ended as told, or was told to begin anew."""
+    DIED = "died"
+    """It ended otherwise; it is started again."""
+    GAVE_UP = "gave up"
+    """It cannot work as configured; it is not started again."""
+    REMOVED = "removed"
+    """A reload has taken it out of the instance."""
+
+
+class ProcessChange(msgspec.Struct, frozen=True):
+    """What has happened to a process, and why; ``pid`` is 0 if it is not known, ``restarts`` counts its life long."""
+
+    name: str
+    kind: str
+    pid: int
+    what: Life
+    why: str
+    restarts: int
 
 
 class Place(NamedTuple):
@@ -196,6 +232,18 @@ def decode_step(data: bytes) -> StepMark:
     if min(mark.step, mark.time_ns, mark.dt_ns) < 0:
         raise ValueError("a step is negative")
     return mark
+
+
+def encode_process(change: ProcessChange) -> bytes:
+    """A change of a process as JSON."""
+    return msgspec.json.encode(change)
+
+
+def decode_process(data: bytes) -> ProcessChange:
+    """The change of a process of a message; ValueError."""
+    if len(data) > MAX_JSON_BYTES:
+        raise ValueError(f"a change of a process of {len(data)} bytes")
+    return msgspec.json.decode(data, type=ProcessChange)
 
 
 def encode_place(place: Place) -> str:

@@ -20,13 +20,17 @@ from shmio.dump.encoding import (
     FRAME,
     GAP,
     PLACES,
+    PROCESS,
+    STEP,
     Gap,
     Place,
+    ProcessChange,
     StepMark,
     decode_event,
     decode_frame,
     decode_gap,
     decode_place,
+    decode_process,
     decode_step,
 )
 from shmio.dump.records import BROKEN, Record, Records, stream
@@ -43,7 +47,14 @@ _ATTACHMENT_HEAD: Final = 4096  # times, name, media type and size of any attach
 _LAYOUTS: Final = "layouts/"
 
 
-Item = Frame | Event | Gap | StepMark
+Item = Frame | Event | Gap | StepMark | ProcessChange
+
+_DECODERS: Final[dict[str, Callable[[bytes], Item]]] = {
+    EVENT: decode_event,
+    GAP: decode_gap,
+    STEP: decode_step,
+    PROCESS: decode_process,
+}
 
 
 class Message(NamedTuple):
@@ -191,9 +202,7 @@ class Reader:
                 if len(frame.raw) != self.layout(channel).size:
                     raise ValueError("a frame is not of its layout's size")
                 return frame
-            if channel.encoding == EVENT:
-                return decode_event(bytes(data))
-            return decode_gap(bytes(data)) if channel.encoding == GAP else decode_step(bytes(data))
+            return _DECODERS[channel.encoding](bytes(data))
         except ValueError as error:
             raise RecordingError(f"{self.file}: {channel.topic}: {error}") from None
 

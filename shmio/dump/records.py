@@ -127,11 +127,6 @@ class Records:
                 f"it ends within a record at byte {at} of {self.size}" if at < self.size else "it has no footer"
             )
 
-    @property
-    def ends(self) -> bool:
-        """Whether a footer ends the file, told without a walk: somebody has closed it."""
-        return bool(self._footer(len(MAGIC)))
-
     def summary(self) -> Iterator[Record]:
         """The records between data and footer of a file that was closed, which tell of channels once more."""
         footer = self._footer(len(MAGIC))

@@ -39,6 +39,7 @@ class ConfigFiles:
 
     def __init__(self, file: Path) -> None:
         self._file = file
+        self._told: set[str] = set()
 
     def __call__(self, source: str | None, block: int) -> list[Attachment]:
         """The configuration itself for None, the layout's sources for a source's block: as they are now."""
@@ -47,7 +48,7 @@ class ConfigFiles:
         try:
             config = load(self._file)
         except ConfigError as error:
-            log.warning("the layout's sources of %s are not attached: %s", source, error)
+            self._tell(f"the layout's sources of {source} are not attached: {error}")
             return []
         layouts = [section.layout for section in config.source if section.name == source and section.layout]
         names = [name for layout in layouts for name in ([layout] if isinstance(layout, str) else layout)]
@@ -61,10 +62,16 @@ class ConfigFiles:
                     data = stream.read(MAX_FILE_BYTES + 1)
                 changed_ns = file.stat().st_mtime_ns
             except OSError as error:
-                log.warning("%s is not attached: %s", file, error.strerror)
+                self._tell(f"{file} is not attached: {error.strerror}")
                 continue
             if len(data) > MAX_FILE_BYTES:
-                log.warning("%s is not attached: larger than %d bytes", file, MAX_FILE_BYTES)
+                self._tell(f"{file} is not attached: larger than {MAX_FILE_BYTES} bytes")
                 continue
             found.append(Attachment(f"{folder}/{file.name}", media_type, data, max(0, changed_ns)))
         return found
+
+    def _tell(self, why: str) -> None:
+        """Log it, once: it is looked at again and again."""
+        if why not in self._told:
+            self._told.add(why)
+            log.warning("%s", why)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Generic, NamedTuple, TypeVar
 
-from shmio.dump.encoding import Gap, Place, Reason, StepMark
+from shmio.dump.encoding import Gap, Place, ProcessChange, Reason, StepMark
 from shmio.segment import Block, Cursor, Event, Frame
 
 Item = TypeVar("Item", bound=Frame | Event)
@@ -23,7 +23,7 @@ class Aside(NamedTuple):
     """Something of the instance that is to be recorded, with the time it has there."""
 
     log_ns: int
-    item: StepMark
+    item: StepMark | ProcessChange
 
 
 class _Side(Generic[Item]):

@@ -93,7 +93,7 @@ class Keeper:
                 self._strange.add(file)
                 return
             with Reader(file.path, own=True) as reader:
-                closed = reader.records.ends
+                closed = reader.records.footer() is not None
             if not closed and finalise(file.path):
                 log.info("%s is closed: its recorder did not come to that", file.path)
                 file, closed = _file(file.path) or file, True

@@ -6,22 +6,25 @@ import os
 import socket
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 from shmio import __version__
-from shmio.dump.encoding import Gap, Place, Reason
+from shmio.dump.encoding import Gap, Place, ProcessChange
 from shmio.recording.attach import Attachment, Attachments, no_attachments
+from shmio.recording.followed import Followed
 from shmio.recording.follower import Aside, Entry, Follower
 from shmio.recording.output import Output
 from shmio.recording.tap import TURN_S, Tap
-from shmio.recording.writer import JSON, Channels, Writer
+from shmio.recording.writer import JSON, Writer
 from shmio.segment import Frame
 
 CHUNK_S: Final = 0.8
 """A chunk is no longer than this: with a turn, and the time to write it, less than the second that a kill may cost."""
 CLOSE_S: Final = 3.0
 CHECK_S: Final = 1.0
+CONFIG_S: Final = 5.0
+"""How often it is looked whether the configuration has changed."""
 
 
 @dataclass(slots=True)
@@ -31,41 +34,6 @@ class Counters:
     frames: int = 0
     events: int = 0
     missed: int = 0
-
-
-@dataclass(slots=True)
-class _Lost:
-    """What could not be taken because there was no room: numbers from, to."""
-
-    first: int
-    last: int
-    after_ns: int
-
-
-@dataclass(slots=True)
-class _Followed:
-    """A block, and how far this recording has come with it."""
-
-    follower: Follower
-    begin: Place
-    frame: int
-    event: int
-    log_ns: int
-    channels: Channels | None = None
-    lost: dict[str, _Lost] = field(default_factory=dict)
-
-    @property
-    def place(self) -> Place:
-        """Behind what was written last."""
-        return Place(self.frame, self.event, self.log_ns)
-
-    def come_to(self, what: str, number: int, log_ns: int) -> None:
-        """Up to this frame or event it was written, or is in a gap that was."""
-        self.log_ns = log_ns
-        if what == "frames":
-            self.frame = number
-        else:
-            self.event = number
 
 
 class Recorder:
@@ -98,14 +66,17 @@ class Recorder:
         """Whether nothing has happened yet."""
         self._attachments = attachments
         self._writer = Writer(output, {**self._about(by), **(about or {})})
-        self._followed: dict[int, _Followed] = {}
+        self._followed: dict[int, Followed] = {}
         self._attached: set[bytes] = set()
-        self._attach(attachments(None, 0))
+        self._config = attachments(None, 0)
+        self._attach(self._config)
+        self._unaware = True
+        """Whether the file does not say how the processes are."""
         self._to_confirm: tuple[int, dict[int, Place]] | None = None
         self._writer.places(self.places)
         for follower in tap.followers:
             self._known(follower)
-        self._flushed_s = self._checked_s = time.monotonic()
+        self._flushed_s = self._checked_s = self._looked_s = time.monotonic()
 
     def _about(self, by: str) -> dict[str, str]:
         segment = self.tap.segment
@@ -136,6 +107,9 @@ class Recorder:
         for follower in self.tap.followers:
             self._known(follower)
         full = self.output.full
+        if self._unaware and not full:
+            self._unaware = False
+            entries = [*(entry for entry in entries if not _of_a_process(entry)), *self.tap.standing()]
         for entry in entries:
             if full:
                 self._lose(entry)
@@ -153,6 +127,9 @@ class Recorder:
         if now_s - self._checked_s >= CHECK_S:
             self._checked_s = now_s
             self.output.check()
+        if now_s - self._looked_s >= CONFIG_S:
+            self._looked_s = now_s
+            self._look()
 
     def _confirm(self) -> None:
         """See what the disk has for certain; what was written by now is the next that it is to have."""
@@ -175,9 +152,7 @@ class Recorder:
     def problem(self) -> str:
         """What is wrong at present, in words; empty: nothing."""
         problem = self.output.problem
-        lost = sum(
-            lost.last - lost.first + 1 for followed in self._followed.values() for lost in followed.lost.values()
-        )
+        lost = sum(followed.losses for followed in self._followed.values())
         return f"{problem}; {lost} frames and events lost so far" if problem and lost else problem
 
     def end(self) -> None:
@@ -198,14 +173,14 @@ class Recorder:
 
     # ---- blocks ------------------------------------------------------------------------------------------------------
 
-    def _known(self, follower: Follower) -> _Followed:
+    def _known(self, follower: Follower) -> Followed:
         return self._followed.get(follower.block.section) or self._follow(follower)
 
-    def _follow(self, follower: Follower) -> _Followed:
+    def _follow(self, follower: Follower) -> Followed:
         """Begin with a block: attach what is needed to read it."""
         block = follower.block
         place = self.places.get(block.section, follower.begin)
-        followed = self._followed[block.section] = _Followed(follower, place, *place)
+        followed = self._followed[block.section] = Followed(follower, place, *place)
         if block.layout.hash not in self._attached:
             self._attached.add(block.layout.hash)
             name = f"layouts/{block.layout.hash.hex()}.json"
@@ -214,6 +189,13 @@ class Recorder:
             self._attach(self._attachments(block.source, follower.number))
         return followed
 
+    def _look(self) -> None:
+        """Attach the configuration again if it is not what it was."""
+        now = self._attachments(None, 0)
+        if now and [(one.name, one.data) for one in now] != [(one.name, one.data) for one in self._config]:
+            self._config = now
+            self._attach(now)
+
     def _attach(self, attachments: list[Attachment]) -> None:
         for name, media_type, data, changed_ns in attachments:
             self._writer.attach(name, media_type, data, self.tap.now(), changed_ns)
@@ -221,9 +203,9 @@ class Recorder:
     # ---- entries -----------------------------------------------------------------------------------------------------
 
     def _write(self, entry: Entry | Aside) -> None:
-        self.empty = False
+        self.empty = self.empty and _of_a_process(entry)
         if isinstance(entry, Aside):
-            self._writer.step(entry.item, entry.log_ns)
+            self._aside(entry)
             return
         log_ns, follower, item = entry
         followed = self._known(follower)
@@ -245,29 +227,25 @@ class Recorder:
             self._writer.event(followed.channels, item, log_ns)
             followed.come_to("events", item.number, log_ns)
 
+    def _aside(self, aside: Aside) -> None:
+        if isinstance(aside.item, ProcessChange):
+            self._writer.process(aside.item, aside.log_ns)
+        else:
+            self._writer.step(aside.item, aside.log_ns)
+
     def _lose(self, entry: Entry | Aside) -> None:
         if isinstance(entry, Aside):
-            return
-        _, follower, item = entry
-        if isinstance(item, Gap):
-            what, first, last = item.what, item.first, item.last
+            self._unaware |= _of_a_process(entry)
         else:
-            what, first, last = "frames" if isinstance(item, Frame) else "events", item.number, item.number
-        self.counters.missed += last - first + 1
-        followed = self._known(follower)
-        lost = followed.lost.setdefault(what, _Lost(first, last, followed.log_ns))
-        lost.last = last
+            self.counters.missed += self._known(entry.follower).lose(entry.item)
 
-    def _tell_lost(self, followed: _Followed, before_ns: int) -> None:
+    def _tell_lost(self, followed: Followed, before_ns: int) -> None:
         """Put down what there was no room for, before what follows it."""
-        follower = followed.follower
-        for what, lost in followed.lost.items():
-            count = lost.last - lost.first + 1
-            gap = Gap(
-                follower.block.source, follower.number, what, lost.first, lost.last, count, Reason.NO_ROOM,
-                lost.after_ns, before_ns,
-            )  # fmt: skip
+        for gap in followed.found(before_ns):
             log_ns = before_ns or self.tap.now()
             self._writer.gap(gap, log_ns)
-            followed.come_to(what, lost.last, log_ns)
-        followed.lost.clear()
+            followed.come_to(gap.what, gap.last, log_ns)
+
+
+def _of_a_process(entry: Entry | Aside) -> bool:
+    return isinstance(entry.item, ProcessChange)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Final, NamedTuple
 
-from shmio.dump.encoding import Place, Reason, StepMark
+from shmio.dump.encoding import Place, ProcessChange, Reason, StepMark
 from shmio.recording.follower import Aside, Entry, Follower
+from shmio.recording.processes import Watch
 from shmio.segment import Segment
 from shmio.segment.clock import ClockState
 from shmio.segment.events import EVENT_SIZE
@@ -51,6 +52,8 @@ class Tap:
         """Sections whose blocks are followed, were, or need not be."""
         self._blocks = 0
         self._lively = False
+        self._watch = Watch(segment)
+        self._watched_s = time.monotonic()
         self._follow(start)
 
     def again(self, start: Start) -> Tap:
@@ -89,7 +92,19 @@ class Tap:
         entries.sort(key=lambda entry: entry.log_ns)  # stable: a block's own order stays
         if state.virtual and state.done > self.done and not more:
             entries += self._step(state)
+        now_s = time.monotonic()
+        if now_s - self._watched_s >= TURN_S:
+            self._watched_s = now_s
+            entries += self._asides(self._watch.look())
         return entries, more
+
+    def standing(self) -> list[Aside]:
+        """How the processes are at present."""
+        return self._asides(self._watch.standing())
+
+    def _asides(self, changes: Iterable[ProcessChange]) -> list[Aside]:
+        now_ns = self.now()
+        return [Aside(now_ns, change) for change in changes]
 
     def rest(self) -> list[Entry]:
         """What was missed at the very end, which no later entry has shown: there will be none."""

@@ -1,4 +1,4 @@
-"""A recording as MCAP: channels for the frames and for the events of each block, for gaps and for steps."""
+"""A recording as MCAP: channels for the frames and events of each block, for gaps, steps and processes."""
 
 from __future__ import annotations
 
@@ -19,16 +19,20 @@ from shmio.dump.encoding import (
     GAPS_TOPIC,
     PLACES,
     PLAIN,
+    PROCESS_SCHEMA,
+    PROCESSES_TOPIC,
     PROFILE,
     STEP_SCHEMA,
     STEPS_TOPIC,
     Gap,
     Place,
+    ProcessChange,
     StepMark,
     encode_event,
     encode_frame,
     encode_gap,
     encode_place,
+    encode_process,
     encode_step,
 )
 from shmio.recording.output import Output
@@ -111,6 +115,11 @@ class Writer:
         """Tell that a step is done; it comes after all its frames."""
         channel = self._channel(STEPS_TOPIC, "shmio.step.v1", STEP_SCHEMA)
         self._mcap.add_message(channel, log_ns, encode_step(mark), log_ns, mark.step & 0xFFFFFFFF)
+
+    def process(self, change: ProcessChange, log_ns: int) -> None:
+        """Tell what has happened to a process."""
+        channel = self._channel(PROCESSES_TOPIC, "shmio.process.v1", PROCESS_SCHEMA)
+        self._mcap.add_message(channel, log_ns, encode_process(change), log_ns)
 
     def _channel(self, topic: str, schema: str, text: bytes) -> int:
         """A channel of the instance's own, described in the chunk of its first message."""

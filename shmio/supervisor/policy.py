@@ -109,6 +109,8 @@ def _note(life: Life, to: State, note: str) -> str:
         return f"{life.hang}, {note}"
     if to in (State.BACKOFF, State.FATAL):
         return note
+    if to is State.STARTING and life.state is State.BACKOFF:
+        return life.note  # that may have lasted for a moment only; whoever looks is to see why
     return {State.STOPPING: "stopping", State.RESTARTING: "restarting"}.get(to, "")
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from shmio.dump.channels import Channel
-from shmio.dump.encoding import FRAME, Gap, StepMark
+from shmio.dump.encoding import FRAME, Gap, ProcessChange, StepMark
 from shmio.dump.reader import Reader
 from shmio.dump.survey import survey
 from shmio.segment import Event, Frame
@@ -111,7 +111,7 @@ def check(file: Path, away_ns: int, checks: Mapping[str, BlockCheck]) -> None:
                 for block in checks.values():
                     block.begin(reader.about["epoch"], int(reader.about["started_ns"]), away_ns)
             item, channel = message.item, message.channel
-            if isinstance(item, StepMark):
+            if isinstance(item, StepMark | ProcessChange):
                 continue
             if isinstance(item, Gap):
                 channel = next(c for c in reader.channels.values() if c.encoding == FRAME and c.block == item.block)

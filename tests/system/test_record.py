@@ -57,7 +57,7 @@ def test_log_mode_records_a_cell_through_a_killed_recorder(make_cell: Callable[.
     assert (checked.returncode, checked.stdout.count("no damage")) == (0, 2), checked.stdout
     assert len(values(cell, second)) > 1
     events = [json.loads(line) for line in cell.run("shmio-dump", "cat", "--json", str(second)).stdout.splitlines()]
-    assert events[-1]["kind"] == "stopped", "to the source's last event"
+    assert [event for event in events if "source" in event][-1]["kind"] == "stopped", "to the source's last event"
     assert values(cell, second)[-1]["quality"] == "bad"
 
 
@@ -112,7 +112,7 @@ def test_a_reload_is_recorded_in_the_same_file(make_cell: Callable[..., Cell]) -
     )
 
 
-def test_a_note_stands_in_the_recording(make_cell: Callable[..., Cell]) -> None:
+def test_notes_and_deaths_stand_in_the_recording(make_cell: Callable[..., Cell]) -> None:
     cell = make_cell(config=RECORDED)
     cell.up()
     done = cell.run("shmio-dump", "note", "Greifer getauscht")
@@ -123,6 +123,12 @@ def test_a_note_stands_in_the_recording(make_cell: Callable[..., Cell]) -> None:
     ):
         failed = cell.run("shmio-dump", "note", *arguments)
         assert (failed.returncode, message in failed.stderr) == (1, True), failed.stderr
+    pid = cell.processes()["cell"]["pid"]
+    kill(pid)
+    until(lambda: cell.processes()["cell"]["state"] == "running" and cell.processes()["cell"]["pid"] != pid, "its end")
     cell.down()
     [file] = (cell.folder / "dumps").iterdir()
-    assert ": noted: Greifer getauscht" in cell.run("shmio-dump", "cat", str(file)).stdout
+    printed = cell.run("shmio-dump", "cat", str(file)).stdout
+    assert f"process cell died, pid {pid}: killed by SIGKILL" in printed
+    assert "process plc is, pid" in printed
+    assert ": noted: Greifer getauscht" in printed

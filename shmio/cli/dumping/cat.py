@@ -8,12 +8,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
+import msgspec
+
 from shmio.cli.dumping.moments import MAX_NS, iso, local, lost, parse_time
 from shmio.cli.readings import shown
 from shmio.cli.run import dumps
 from shmio.dump.channels import Channel
 from shmio.dump.damage import Damage
-from shmio.dump.encoding import EVENT, FRAME, GAP, STEP, Gap, StepMark
+from shmio.dump.encoding import EVENT, FRAME, GAP, PROCESS, STEP, Gap, ProcessChange, StepMark
 from shmio.dump.reader import Message, Reader
 from shmio.dump.survey import Survey, survey
 from shmio.errors import PathError, RecordingError
@@ -43,7 +45,11 @@ def execute(arguments: argparse.Namespace) -> int:
         sources = {view.source for view in views.values()} if arguments.patterns else {c.source for c in channels}
         printer: Printer = JsonLines() if arguments.json else Table()
         wanted = {c.number for c in channels if c.number in views or (c.encoding == EVENT and c.source in sources)}
-        wanted |= {c.number for c in channels if c.encoding == GAP or (c.encoding == STEP and not arguments.patterns)}
+        wanted |= {
+            c.number
+            for c in channels
+            if c.encoding == GAP or (c.encoding in (STEP, PROCESS) and not arguments.patterns)
+        }
         damaged, silent = complaints.damage, True
         for message in reader.messages(lambda channel: channel.number in wanted, from_ns, to_ns, damaged):
             for line in _lines(message, views, sources, printer):
@@ -120,6 +126,9 @@ class Printer(Protocol):
     def step(self, time_ns: int, mark: StepMark) -> str:
         """The end of a step."""
 
+    def process(self, time_ns: int, change: ProcessChange) -> str:
+        """What has happened to a process."""
+
 
 def _views(
     reader: Reader, channels: Sequence[Channel], patterns: Sequence[str], complaints: Complaints
@@ -167,6 +176,8 @@ def _lines(message: Message, views: dict[int, View], sources: set[str], printer:
         yield printer.event(time_ns, channel.source, item)
     elif isinstance(item, StepMark):
         yield printer.step(time_ns, item)
+    elif isinstance(item, ProcessChange):
+        yield printer.process(time_ns, item)
     elif item.source in sources:
         yield printer.gap(time_ns, item)
 
@@ -224,6 +235,10 @@ class JsonLines:
         """``step`` is its number, ``clock_ns`` the instance's clock after it; it is of no source."""
         return dumps({"time": iso(time_ns), "step": mark.step, "clock_ns": mark.time_ns, "dt_ns": mark.dt_ns})
 
+    def process(self, time_ns: int, change: ProcessChange) -> str:
+        """As it is in the file."""
+        return dumps({"time": iso(time_ns), "process": msgspec.to_builtins(change)})
+
     def _line(self, time_ns: int, source: str, **fields: Any) -> str:
         return dumps({"time": iso(time_ns), "source": source, **fields})
 
@@ -268,6 +283,12 @@ class Table:
     def step(self, time_ns: int, mark: StepMark) -> str:
         """Number, and the time after it."""
         return f"{local(time_ns)}  step {mark.step} of {mark.dt_ns / 1e6:g} ms is done: {mark.time_ns / 1e9:g} s"
+
+    def process(self, time_ns: int, change: ProcessChange) -> str:
+        """Name, what, why."""
+        pid = f", pid {change.pid}" if change.pid else ""
+        why = f": {printable(change.why)}" if change.why else ""
+        return f"{local(time_ns)}  process {printable(change.name)} {change.what}{pid}{why}"
 
     def _row(self, cells: Sequence[str]) -> str:
         return "  ".join(cell.ljust(width) for cell, width in zip(cells, self._widths, strict=True))

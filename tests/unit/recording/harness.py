@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from shmio.dump.encoding import Gap
+from shmio.dump.encoding import Gap, ProcessChange
 from shmio.dump.reader import Message, Reader
 from shmio.dump.survey import survey
 from shmio.layout.model import Layout, Register
@@ -45,9 +45,19 @@ def recorder(
 
 
 def read(file: Path) -> list[Message]:
+    """All messages but those about processes."""
+    return [message for message in everything(file) if not isinstance(message.item, ProcessChange)]
+
+
+def everything(file: Path) -> list[Message]:
     """All messages."""
     with Reader(file) as reader:
         return list(reader.messages())
+
+
+def changes(file: Path) -> list[ProcessChange]:
+    """What happened to processes."""
+    return [message.item for message in everything(file) if isinstance(message.item, ProcessChange)]
 
 
 def numbers(file: Path, source: str = "cell", kind: type[Frame] | type[Event] = Frame) -> list[int]:

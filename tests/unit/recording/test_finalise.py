@@ -224,4 +224,4 @@ def numbers_of(process: Process) -> list[int]:
 
 def closed(file: Path) -> bool:
     with Reader(file) as reader:
-        return reader.records.ends
+        return reader.records.footer() is not None

@@ -66,7 +66,7 @@ def test_files_follow_each_other_without_a_frame_twice_or_missing(segment: Segme
     for before, file in pairwise(found[:-1]):  # the last one may have been begun for nothing
         with Reader(before) as reader:
             assert check(reader).whole
-            assert reader.records.ends
+            assert reader.records.footer()
             end = [message.channel.section for message in reader.messages()]
         with Reader(file) as reader:
             begin = next(reader.messages()).channel
