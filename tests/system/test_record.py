@@ -130,5 +130,5 @@ def test_notes_and_deaths_stand_in_the_recording(make_cell: Callable[..., Cell])
     [file] = (cell.folder / "dumps").iterdir()
     printed = cell.run("shmio-dump", "cat", str(file)).stdout
     assert f"process cell died, pid {pid}: killed by SIGKILL" in printed
-    assert "process plc is, pid" in printed
+    assert "process recorder is, pid" in printed
     assert ": noted: Greifer getauscht" in printed

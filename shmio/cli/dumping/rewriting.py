@@ -13,7 +13,7 @@ from shmio.cli.dumping.progress import Progress
 from shmio.cli.dumping.verify import lines, verify
 from shmio.dump.blocks import DumpBlock
 from shmio.dump.dump import Dump, Entry
-from shmio.dump.encoding import Gap, Reason, StepMark
+from shmio.dump.encoding import Gap, ProcessChange, Reason, StepMark
 from shmio.dump.reader import Item
 from shmio.errors import RecordingError
 from shmio.recording.output import Output
@@ -85,6 +85,8 @@ class Rewriter:
         """The next item, in order."""
         if isinstance(entry.item, StepMark):
             self._writer.step(entry.item, entry.time_ns)
+        elif isinstance(entry.item, ProcessChange):
+            self._writer.process(entry.item, entry.time_ns)
         elif entry.block is not None:
             self._of_block(entry.block, entry)
 
