@@ -108,6 +108,7 @@ def _part(worker: Worker) -> _Part:
 
 def _replay(worker: Worker, options: Any) -> _Part:
     """What plays a recording."""
+    from shmio.connectors.replay.beginning import begin, start_stamp  # noqa: PLC0415
     from shmio.connectors.replay.loop import ReplayLoop  # noqa: PLC0415  the other sources read no recordings
     from shmio.connectors.replay.source import Replay  # noqa: PLC0415
 
@@ -115,11 +116,13 @@ def _replay(worker: Worker, options: Any) -> _Part:
     source = Replay(options, worker.name)
     if source.layout.hash != segment.blocks[worker.name].layout.hash:
         raise ConfigError(f"the recording of source {worker.name} has another layout by now: shmio-supervisor reload")
+    block = segment.blocks[worker.name]
+    play = begin(source, block, segment.header.started_ns, segment.blocks.values())
     clock = PageClock(segment.clock, worker.slot.index)
     loop = ReplayLoop(
         source,
-        segment.writer(worker.name),
-        segment.header.started_ns,
+        segment.writer(worker.name, start_stamp(play, block)),
+        play,
         clock,
         worker.config["writable"],
         owner_of=partial(_owner_of, segment),

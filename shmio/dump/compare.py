@@ -13,7 +13,8 @@ from shmio.dump.dump import Dump, Entry
 from shmio.errors import PathError
 from shmio.layout.codec import Value, codec
 from shmio.layout.model import Register
-from shmio.segment import Event, EventKind, Frame
+from shmio.segment import Event, EventKind, Frame, Provenance
+from shmio.segment.playhead import OWN_WORDS
 from shmio.segment.scan import ChangeScan
 
 IGNORABLE: Final = ("times", "cycle", "reason", "events", "ends")
@@ -80,7 +81,7 @@ class _Source:
 
     def compare(self) -> SourceDifference:
         found = self._found
-        frames = [dump.frames(self._name) if self._name in dump.sources else iter(()) for dump in self._dumps]
+        frames = [_frames(dump, self._name) for dump in self._dumps]
         self._join(found.frames, frames[0], frames[1], self._frame_key(), self._frames)
         if "events" not in self._how.ignore:
             events = [_events(dump, self._name) for dump in self._dumps]
@@ -256,9 +257,21 @@ def _kind(register: Register) -> tuple[str, object]:
     return register.type, register.dims
 
 
+def _frames(dump: Dump, source: str) -> Iterator[Entry[Frame]]:
+    """Those of the source itself: what a replay says of its own is not."""
+    if source in dump.sources:
+        for entry in dump.frames(source):
+            if entry.item.provenance is not Provenance.REPLAYED or not entry.item.reason.startswith(OWN_WORDS):
+                yield entry
+
+
 def _events(dump: Dump, source: str) -> Iterator[Entry[Event]]:
-    """Those that are of the source itself: starts and ends of its process are not."""
+    """Those that are of the source itself: starts and ends of its process, and what a replay tells, are not."""
     if source in dump.sources:
         for entry in dump.events(source):
-            if entry.item.kind not in _OF_PROCESSES:
+            if entry.item.kind not in _OF_PROCESSES and not _is_replays(entry.item):
                 yield entry
+
+
+def _is_replays(event: Event) -> bool:
+    return event.kind == EventKind.QUALITY and event.text.startswith(OWN_WORDS)

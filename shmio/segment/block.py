@@ -194,8 +194,8 @@ class Block:
 class BlockWriter:
     """Writing side of a block: exactly one, in its source's process; its threads take turns."""
 
-    def __init__(self, block: Block, clock_ns: Callable[[int], int]) -> None:
-        """``clock_ns`` turns CLOCK_MONOTONIC into the instance's clock."""
+    def __init__(self, block: Block, clock_ns: Callable[[int], int], at: Stamp | None = None) -> None:
+        """``clock_ns`` turns CLOCK_MONOTONIC into the instance's clock. ``at``: when the start is told."""
         self.block = block
         self._clock_ns = clock_ns
         self._turn = threading.Lock()  # so that frames and events are in one order
@@ -206,7 +206,7 @@ class BlockWriter:
         self._quality = Quality.BAD
         self.incarnation = block.ring.begin()
         block.events.ring.begin(self.incarnation)
-        self.event(Record(EventKind.STARTED, f"pid {os.getpid()}"))
+        self.event(Record(EventKind.STARTED, f"pid {os.getpid()}"), at=at)
 
     def now_ns(self) -> int:
         """The time that a frame would be stamped with now."""

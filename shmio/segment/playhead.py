@@ -26,6 +26,8 @@ from shmio.segment.shm import SharedObject
 if TYPE_CHECKING:
     from shmio.segment.clock import ClockPage
 
+OWN_WORDS: Final = "replay: "
+"""How what a replay says of itself begins, in reasons of frames and texts of events; all else was recorded."""
 MIN_SPEED: Final = 0.01
 MAX_SPEED: Final = 1000.0
 

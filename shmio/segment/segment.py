@@ -9,7 +9,7 @@ from contextlib import suppress
 
 from shmio.errors import AlreadyRunningError, NotRunningError, SegmentError, UnfinishedError
 from shmio.segment import _atomics, header, shm
-from shmio.segment.block import Block, BlockWriter
+from shmio.segment.block import Block, BlockWriter, Stamp
 from shmio.segment.build import SECTIONS_PER_BLOCK, BlockSpec, Origin, align, build_segment, wake, write_blocks
 from shmio.segment.header import HEADER_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
 from shmio.segment.processes import SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
@@ -200,10 +200,13 @@ class Segment:
         """The instance's clock, ns since its start, at a time of CLOCK_MONOTONIC, or one that is comparable."""
         return now_ns - self.header.started_ns
 
-    def writer(self, source: str) -> BlockWriter:
-        """The writing side of a source's block; for its process alone, which holds the role's lock."""
+    def writer(self, source: str, at: Stamp | None = None) -> BlockWriter:
+        """The writing side of a source's block; for its process alone, which holds the role's lock.
+
+        ``at``: when its start is told, other than now.
+        """
         block = self.blocks[source]
-        return BlockWriter(block, self.clock_ns if block.playhead is None else block.playhead.clock_ns)
+        return BlockWriter(block, self.clock_ns if block.playhead is None else block.playhead.clock_ns, at)
 
     @property
     def supervisor(self) -> tuple[int, State]:

@@ -11,7 +11,8 @@ from shmio.connectors.campaign import Blocks
 from shmio.connectors.desk import CommandDesk
 from shmio.connectors.injector import OwnerOf
 from shmio.connectors.output import Output
-from shmio.connectors.replay.player import OVER, OWN, Player
+from shmio.connectors.replay.beginning import stamp
+from shmio.connectors.replay.player import OVER, Player
 from shmio.connectors.replay.search import Search
 from shmio.connectors.replay.source import Replay
 from shmio.connectors.stepped import StepClock
@@ -19,7 +20,7 @@ from shmio.connectors.telling import Counters
 from shmio.errors import PathError, SegmentError
 from shmio.layout.write import Write
 from shmio.segment import BlockWriter, EventKind, Record, Stamp
-from shmio.segment.playhead import MAX_SPEED, MIN_SPEED, Find, Found, Move, Play, answered
+from shmio.segment.playhead import MAX_SPEED, MIN_SPEED, OWN_WORDS, Find, Found, Move, Play, answered
 
 PIECE: Final = 64
 """So many frames and events between two looks at what else there is to do."""
@@ -38,14 +39,14 @@ class ReplayLoop:
         self,
         source: Replay,
         writer: BlockWriter,
-        started_ns: int,
+        play: Play,
         clock: StepClock,
         writable: Iterable[str] = (),
         *,
         owner_of: OwnerOf = lambda _: None,
         blocks: Blocks | None = None,
     ) -> None:
-        """``started_ns``: of the segment. ``blocks``: all of the instance's, other replays among them."""
+        """``play``: how it begins, as :func:`begin` has it."""
         block = writer.block
         if block.playhead is None:
             raise SegmentError(f"the block of source {block.source} has no playhead")
@@ -53,9 +54,7 @@ class ReplayLoop:
         self._writer = writer
         self._head = block.playhead
         self._page = block.clock
-        self._started_ns = started_ns
         self._clock = clock
-        self._blocks = blocks or (lambda: {block.source: block})
         self._output = Output(writer, clock.now_ns)
         # Whatever is injected here reaches no plant, so that no arming is needed.
         self.desk = CommandDesk(
@@ -63,7 +62,7 @@ class ReplayLoop:
         )
         self._player = Player(source.tape, self._output, keep=source.keep)
         self._search: tuple[int, Search] | None = None
-        self._play = self._first()
+        self._play = play
         self.counters = Counters()
 
     @property
@@ -79,39 +78,10 @@ class ReplayLoop:
                 pass
         finally:
             self.desk.stop()
-            reason = f"{OWN}the source was stopped"
+            reason = f"{OWN_WORDS}the source was stopped"
             self.desk.close(reason)
             self._player.end(reason, self._stamp_now())
             self._writer.event(Record(EventKind.STOPPED))
-
-    # ---- the beginning -------------------------------------------------------------------------------------------
-
-    def _first(self) -> Play:
-        """How it is to play: as the process before this one did, else as other sources of this recording do."""
-        span, options = self._source.span, self._source.options
-        replays = [block.playhead for block in self._blocks().values() if block.playhead is not None]
-        with replays[0].held():  # sources that begin at the same time begin together
-            own = self._head.read()
-            alike = [play for play in (head.read() for head in replays) if play and self._is_of(play)]
-            if own is not None and self._is_of(own):
-                return own
-            if alike:
-                play = alike[0]._replace(step=0, asked=0, answer="", failure="")
-            else:
-                now_ns = self._page.read().present_ns
-                recorded = options.clock == "recording"
-                at_ns = span.begin_ns if recorded else now_ns
-                base_ns = self._started_ns + (0 if recorded else now_ns - span.begin_ns)
-                play = Play(
-                    span.begin_ns, span.end_ns, at_ns, span.begin_ns, span.end_ns, base_ns,
-                    self._source.recording.utc_ns, options.speed, options.paused, options.loop, recorded,
-                )  # fmt: skip
-            self._head.write(play)
-            return play
-
-    def _is_of(self, play: Play) -> bool:
-        span = self._source.span
-        return (play.begin_ns, play.end_ns, play.utc_ns) == (*span, self._source.recording.utc_ns)
 
     def _begin(self) -> None:
         """Go on from what the process before this one has published, if there was one."""
@@ -184,10 +154,7 @@ class ReplayLoop:
 
     def _stamp(self, position_ns: int, clock_ns: int) -> Stamp:
         """When what is at a position is published; ``clock_ns``: of the recording."""
-        play = self._play
-        if play.own_clock:
-            return Stamp(play.base_ns + position_ns, clock_ns)
-        return Stamp(play.base_ns + position_ns, play.due_ns(max(position_ns, play.position_ns)))
+        return stamp(self._play, position_ns, clock_ns)
 
     def _stamp_now(self) -> Stamp:
         at_ns = self._writer.now_ns()

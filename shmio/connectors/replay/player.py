@@ -9,12 +9,11 @@ from typing import Final, cast
 from shmio.connectors.output import Image, Output
 from shmio.connectors.replay.tape import Entry, Tape
 from shmio.segment import NO_WRITER, BlockWriter, Event, EventKind, Frame, Provenance, Quality, Record, Stamp
+from shmio.segment.playhead import OWN_WORDS
 
-OWN: Final = "replay: "
-"""How what a replay says of itself begins, in reasons and in the texts of events."""
-OVER: Final = f"{OWN}the recording is over"
-NOTHING: Final = f"{OWN}nothing of this source was recorded up to here"
-GOES_ON: Final = f"{OWN}the recording goes on"
+OVER: Final = f"{OWN_WORDS}the recording is over"
+NOTHING: Final = f"{OWN_WORDS}nothing of this source was recorded up to here"
+GOES_ON: Final = f"{OWN_WORDS}the recording goes on"
 
 _OF_PROCESSES: Final = frozenset({EventKind.STARTED, EventKind.STOPPED})
 _OF_INJECTIONS: Final = frozenset(
@@ -140,7 +139,7 @@ class Player:
         elif isinstance(item, Event):
             self._happen(item, stamp(position_ns, item.clock_ns))
         else:
-            self.fail(f"{OWN}{item.reason}", stamp(position_ns, position_ns))
+            self.fail(f"{OWN_WORDS}{item.reason}", stamp(position_ns, position_ns))
 
     def _image(self, frame: Frame, at: Stamp | None) -> Image:
         asked_ns = None if at is None else at.publish_ns - 1000 * frame.delay_us

@@ -1,0 +1,72 @@
+"""How a source begins to play: as its process before did, else as others of its recording do, else as configured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from shmio.connectors.replay.source import Replay
+from shmio.errors import SegmentError
+from shmio.segment import Block, Stamp
+from shmio.segment.playhead import Play, Playhead
+
+
+def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]) -> Play:
+    """Set the playhead of a block, unless it is. ``started_ns``: of the segment; ``blocks``: all there are.
+
+    SegmentError: the block is none for a replay.
+    """
+    heads = [other.playhead for other in blocks if other.playhead is not None]
+    if block.playhead is None or not heads:
+        raise SegmentError(f"the block of source {block.source} has no playhead")
+    with heads[0].held():  # sources that begin at the same time begin together
+        own = block.playhead.read()
+        if own is not None and _is_of(source, own):
+            return own
+        play = _as_others(source, heads) or _as_configured(source, block, started_ns)
+        block.playhead.write(play)
+        return play
+
+
+def _is_of(source: Replay, play: Play) -> bool:
+    return (play.begin_ns, play.end_ns, play.utc_ns) == (*source.span, source.recording.utc_ns)
+
+
+def _as_others(source: Replay, heads: Iterable[Playhead]) -> Play | None:
+    for head in heads:
+        play = head.read()
+        if play is not None and _is_of(source, play):
+            return play._replace(step=0, asked=0, answer="", failure="")
+    return None
+
+
+def _as_configured(source: Replay, block: Block, started_ns: int) -> Play:
+    span, options = source.span, source.options
+    recorded = options.clock == "recording"
+    now_ns = block.clock.read().present_ns
+    return Play(
+        span.begin_ns,
+        span.end_ns,
+        anchor_ns=span.begin_ns if recorded else now_ns,
+        position_ns=span.begin_ns,
+        until_ns=span.end_ns,
+        base_ns=started_ns + (0 if recorded else now_ns - span.begin_ns),
+        utc_ns=source.recording.utc_ns,
+        speed=options.speed,
+        paused=options.paused,
+        loop=options.loop,
+        own_clock=recorded,
+    )
+
+
+def stamp(play: Play, position_ns: int, clock_ns: int) -> Stamp:
+    """When what is at a position is published; ``clock_ns``: of the recording."""
+    if not play.own_clock:
+        clock_ns = play.due_ns(max(position_ns, play.position_ns))
+    return Stamp(play.base_ns + position_ns, clock_ns)
+
+
+def start_stamp(play: Play, block: Block) -> Stamp:
+    """When the process's start is told: with what comes next, however long it took."""
+    last = block.latest()
+    position_ns = play.begin_ns if last is None else last.publish_ns - play.base_ns
+    return stamp(play, position_ns, position_ns)

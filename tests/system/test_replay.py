@@ -1,0 +1,245 @@
+"""A whole cell is recorded, and its recording played in its place: nobody can tell, but by the provenance."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+
+import shmio
+from shmio.client import connect
+from shmio.errors import RemoteError
+from shmio.testing.cell import PATIENCE_S, Cell, kill, until
+from shmio.wire import simlog_v1_pb2 as v1
+from shmio.wire import simlog_v2_pb2 as v2
+from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub as V1Stub
+from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as V2Stub
+from tests.system.armed import ARMED
+
+RECORDED = ARMED + '\n[recorder]\ndirectory = "dumps"\n'
+POSITION = "cell/Robot_800/Axs1_Pos"
+PLACE = "cell/Outputs/100"
+
+
+class Streams:
+    """What clients of all interfaces get, each read by a thread, until the instance ends."""
+
+    def __init__(self, cell: Cell) -> None:
+        self._stack = ExitStack()
+        self.v1: list[bytes] = []
+        self.v2: list[bytes] = []
+        self.native: list[tuple[Any, ...]] = []
+        channel = self._stack.enter_context(grpc.insecure_channel(str(cell.grpc)))
+        first = V1Stub(channel).Subscribe(v1.TopicDescriptor(path=POSITION), wait_for_ready=True)  # type: ignore[no-untyped-call]
+        stub = V2Stub(channel)  # type: ignore[no-untyped-call]
+        second = stub.CreateSubscriber(v2.Subscriber(name="test", uuid="test"))
+        second.initial_metadata()
+        stub.Subscribe(v2.SubscriptionRequest(path=POSITION, subscriberUUID="test"), timeout=PATIENCE_S)
+        client = self._stack.enter_context(connect(str(cell.grpc)))
+        self._client = client
+        wholes = client.subscribe(POSITION, PLACE, every_frame=True)
+        self._threads = [
+            threading.Thread(target=_read, args=(first, lambda message: self.v1.append(message.SerializeToString()))),
+            threading.Thread(target=_read, args=(second, lambda message: self.v2.append(message.SerializeToString()))),
+            threading.Thread(target=_read, args=(wholes, lambda update: self.native.append(_shown(update)))),
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    def close(self) -> None:
+        """When the instance has ended, so that the streams have."""
+        for thread in self._threads:
+            thread.join(PATIENCE_S)
+            assert not thread.is_alive()
+        self._stack.close()
+
+
+def _read(stream: Any, take: Callable[[Any], object]) -> None:
+    try:
+        for message in stream:
+            take(message)
+    except (grpc.RpcError, RemoteError):
+        return
+
+
+def _shown(update: Any) -> tuple[Any, ...]:
+    values = tuple(update[path] for path in (POSITION, PLACE))
+    return update.cycle, update.clock_ns, update.source_ns, str(update.quality), update.reason, *values
+
+
+def good(cell: Cell) -> bool:
+    return bool(cell.processes()["cell"]["quality"] == "good")
+
+
+def dump(cell: Cell, *known: Path) -> Path:
+    [file] = set((cell.folder / "dumps").glob("*.mem")) - set(known)
+    return file
+
+
+def written(cell: Cell, value: int) -> None:
+    done = cell.run("shmio", "set", PLACE, str(value))
+    assert done.returncode == 0, done.stderr
+
+
+@contextmanager
+def replaying(cell: Cell, file: Path, *options: str) -> Iterator[shmio.Attachment]:
+    up = cell.supervisor("up", "--detach", "--mode", "replay", "--from", str(file), *options)
+    assert up.returncode == 0, up.stderr
+    with shmio.attach(cell.instance, writable=True) as attached:
+        yield attached
+    cell.down()
+
+
+def over(attached: shmio.Attachment) -> bool:
+    return all(one.over for one in attached.replay.status())
+
+
+@pytest.mark.timeout(240)
+def test_the_recording_of_a_replay_is_the_recording_and_its_streams_are_the_cells(
+    make_cell: Callable[..., Cell],
+) -> None:
+    cell = make_cell(config=RECORDED)
+    cell.up()
+    until(lambda: good(cell), "good quality")
+    live = Streams(cell)
+    written(cell, 5)
+    with shmio.attach(cell.instance, writable=True) as attached:
+        with attached.inject("cell/Robot_800/Axs2_Pos") as shadow:
+            shadow.set({"cell/Robot_800/Axs2_Pos": 77.5})
+            until(lambda: len(live.native) > 100, "frames")
+        written(cell, 6)
+        with attached.inject(f"{PLACE}/in"):
+            done = cell.run("shmio", "set", PLACE, "9")
+            assert done.stdout == f"{PLACE}  taken\n"
+    until(lambda: len(live.native) > 150, "frames")
+    cell.down()
+    live.close()
+    first = dump(cell)
+    with replaying(cell, first, "--paused", "--record") as attached:
+        assert cell.status()["mode"] == "replay"
+        assert sorted(cell.processes()) == ["cell", "grpc", "recorder"]
+        replayed = Streams(cell)
+        until(lambda: bool(replayed.v1 and replayed.v2 and replayed.native), "what is there at the beginning")
+        refused = cell.run("shmio", "set", PLACE, "1")
+        assert "refused" in refused.stdout + refused.stderr
+        attached.replay.play()
+        until(lambda: over(attached), "the end")
+    replayed.close()
+    second = dump(cell, first)
+    found = cell.run("shmio-dump", "diff", "--ignore", "events", "--json", str(first), str(second))
+    assert found.returncode == 0, found.stdout
+    [told] = json.loads(found.stdout)["sources"]
+    assert told["frames"]["compared"] > 150
+    assert told["timing_ms"]["max"] == 0, "each at its time, to the ns"
+    same_events(cell, first, second)
+    for name in ("v1", "v2", "native"):
+        assert_continues(name, getattr(live, name), getattr(replayed, name))
+
+
+def same_events(cell: Cell, first: Path, second: Path) -> None:
+    """All that happened is told again, in the same order; what was refused in the replay, beside it."""
+    with shmio.open_dump(first) as one, shmio.open_dump(second) as other:
+        told, again = (
+            [
+                (event.kind, event.text, event.quality, event.offset, event.data, event.clock_ns, event.command)
+                for event in (entry.item for entry in dump.events("cell"))
+                if event.kind > 2 and not event.text.startswith("replay: ")
+            ]
+            for dump in (one, other)
+        )
+        ours = [event for event in again if event[0] in (4, 7) and event not in told]
+    assert len(ours) == 2
+    assert [event for event in again if event not in ours] == told
+
+
+def assert_continues(name: str, live: list[Any], replayed: list[Any]) -> None:
+    """What a client got behind its first message, the other got, too, who was there earlier, and longer."""
+    assert len(live) > 10, name
+    at = replayed.index(live[1])
+    assert replayed[at : at + len(live) - 1] == live[1:], name
+
+
+def test_a_replay_beside_a_model_and_kills(make_cell: Callable[..., Cell]) -> None:
+    cell = make_cell(config=RECORDED)
+    cell.up()
+    until(lambda: cell.processes()["recorder"]["counters"]["frames"] >= 100, "frames")
+    cell.down()
+    file = dump(cell)
+    recorded = (
+        (cell.folder / "supervisor.toml").read_text().partition("[[source]]")[0]
+        + f"""
+[[source]]
+name = "cell"
+connector = "replay"
+file = "{file.relative_to(cell.folder)}"
+loop = true
+
+[[source]]
+name = "sim"
+connector = "simulation"
+model = "shmio.simulation.loopback:Loopback"
+[source.connections]
+"joints/Kuka.j1/R" = "{POSITION}"
+
+[recorder]
+directory = "again"
+"""
+    )
+    (cell.folder / "supervisor.toml").write_text(recorded)
+    checked = cell.supervisor("check")
+    assert checked.returncode == 0, checked.stderr
+    assert "source cell: DB201, 22 registers" in checked.stdout
+    cell.up()
+    with shmio.attach(cell.instance, writable=True) as attached:
+        until(
+            lambda: all(one["quality"] == "good" for one in cell.processes().values() if one["kind"] == "source"),
+            "good",
+        )
+        before = cell.processes()["cell"]["pid"]
+        kill(before)
+        until(lambda: cell.processes()["cell"]["pid"] not in (before, None), "another process")
+        until(lambda: attached.read(POSITION).quality.name == "GOOD", "good again")
+        with attached.inject(POSITION) as shadow:
+            shadow.set({POSITION: 123.0})
+            assert attached[POSITION] == 123.0
+            until(lambda: attached["sim/joints/Kuka.j1/R"] == 123.0, "the model sees it")
+        attached.step(0.5)
+        assert attached.clock.virtual
+        frame = attached.frame("cell").frame.number
+        attached.step(0.1)
+        assert attached.frame("cell").frame.number - frame in (4, 5, 6)
+    cell.down()
+    [again] = (cell.folder / "again").iterdir()
+    with shmio.open_dump(again) as found:
+        cycles = [entry.item.cycle for entry in found.frames("cell") if entry.item.effective is None]
+    with shmio.open_dump(file) as found:
+        known = [entry.item.cycle for entry in found.frames("cell")]
+    lost = [(one, two) for one, two in pairwise(cycles) if two - one not in (0, 1) and two > one]
+    assert all(two - one == known[known.index(one) + 1] - one for one, two in lost), "the kill has lost nothing"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error"),
+    [
+        (lambda file: file.write_bytes(b""), "replay.file: "),
+        (lambda file: file.write_bytes(b"\x89MCAP0\r\n"), "replay.file: "),
+        (lambda file: file.unlink(), "replay.file: "),
+    ],
+)
+def test_what_cannot_be_played_is_told_in_one_line(
+    make_cell: Callable[..., Cell], spoil: Callable[[Path], object], error: str
+) -> None:
+    cell = make_cell(config=RECORDED)
+    file = cell.folder / "some.mem"
+    file.touch()
+    spoil(file)
+    up = cell.supervisor("up", "--detach", "--mode", "replay", "--from", str(file))
+    assert (up.returncode, up.stderr.count("\n")) == (1, 1)
+    assert up.stderr.startswith(f"supervisor.toml: {error}{file}"), up.stderr
