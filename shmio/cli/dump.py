@@ -50,6 +50,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     record.add_argument("--for", dest="duration_s", type=_seconds, metavar="SECONDS", help="end by itself")
     record.add_argument("--source", dest="sources", nargs="+", action="extend", metavar="NAME", help="only these")
+    record.add_argument(
+        "--register", dest="registers", nargs="+", action="extend", metavar="PATH", help="only these: paths or globs"
+    )
 
     note = verb("note", "put a note into the events of a running instance, and so into its recordings")
     note.add_argument("text", metavar="TEXT")

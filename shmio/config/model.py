@@ -166,6 +166,8 @@ class Recorder(Section):
     rotate_mb: Annotated[float, Meta(ge=0, le=1e9)] = 1000.0
     keep_days: Annotated[float, Meta(ge=0, le=100_000)] = 0.0
     keep_mb: Annotated[float, Meta(ge=0, le=1e9)] = 0.0
+    sources: list[Text] = []
+    registers: Annotated[list[Text], Meta(max_length=1000)] = []
 
     @property
     def buffer_bytes(self) -> int:

@@ -184,12 +184,14 @@ def _check_names(config: Config) -> None:
                     f"{key}: {section.name!r} is already the name of {seen[folded]} (case does not count)"
                 )
             seen[folded] = f"{table}[{index}]"
-    if config.grpc and config.grpc.default_source is not None:
-        names = [source.name for source in config.source]
-        if config.grpc.default_source not in names:
-            raise ConfigError(
-                f"grpc.default_source: no source {config.grpc.default_source!r}; there are: {', '.join(names)}"
-            )
+    names = [source.name for source in config.source]
+    for name in config.recorder.sources if config.recorder else ():
+        if name not in names:
+            raise ConfigError(f"recorder.sources: no source {name!r}; there are: {', '.join(names)}")
+    if config.grpc and config.grpc.default_source is not None and config.grpc.default_source not in names:
+        raise ConfigError(
+            f"grpc.default_source: no source {config.grpc.default_source!r}; there are: {', '.join(names)}"
+        )
 
 
 def _check_times(config: Config) -> None:

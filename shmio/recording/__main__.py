@@ -13,6 +13,7 @@ from shmio.dump.encoding import Reason
 from shmio.recording.attach import ConfigFiles
 from shmio.recording.keeper import Keeper
 from shmio.recording.predecessor import places
+from shmio.recording.selection import Selection
 from shmio.recording.series import Series
 from shmio.recording.tap import Start, Tap
 from shmio.segment import Report
@@ -32,7 +33,10 @@ def run(worker: Worker) -> None:
     known = places(directory, segment, BY, worker.slot.beat)
     elsewhere = _elsewhere(worker.before, directory)
     start = Start(known, reason=Reason.ELSEWHERE if elsewhere else Reason.NOT_RUNNING)
-    series = Series(Tap(segment, start), settings, BY, ConfigFiles(Path(worker.config["config_file"])))
+    selection = Selection(settings.sources or None, settings.registers)
+    for missing in selection.nothing(segment.blocks):
+        worker.log.warning("recorder.registers: %s", missing)
+    series = Series(Tap(segment, start, selection), settings, BY, ConfigFiles(Path(worker.config["config_file"])))
     goes_on = ", going on where its predecessor ended" if known else ""
     worker.log.info("recording to %s%s%s", series.recorder.output.path, goes_on, elsewhere)
     keeper = Keeper(segment.instance, settings, BY, series.present)

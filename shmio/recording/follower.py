@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from typing import Generic, NamedTuple, TypeVar
 
 from shmio.dump.encoding import Gap, Place, ProcessChange, Reason, StepMark
+from shmio.recording.selection import Part
 from shmio.segment import Block, Cursor, Event, Frame
 
 Item = TypeVar("Item", bound=Frame | Event)
@@ -55,15 +56,18 @@ class Follower:
         log_time: Callable[[int], int],
         *,
         over: bool = False,
+        part: Part | None = None,
     ) -> None:
         """``number``: of the block in the recording. ``reason``: why something may be missing at the beginning.
 
         ``log_time`` turns CLOCK_MONOTONIC into the time in the recording. ``over``: a reload had ended it before.
+        ``part``: what is recorded of it; default: all.
         """
         self.block = block
         self.number = number
         self.begin = place
         self.over = over
+        self.part = part or Part(block.layout)
         self.done = False
         self._log_time = log_time
         self._log_ns = place.log_ns

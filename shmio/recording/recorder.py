@@ -181,10 +181,10 @@ class Recorder:
         block = follower.block
         place = self.places.get(block.section, follower.begin)
         followed = self._followed[block.section] = Followed(follower, place, *place)
-        if block.layout.hash not in self._attached:
-            self._attached.add(block.layout.hash)
-            name = f"layouts/{block.layout.hash.hex()}.json"
-            self._attach([Attachment(name, JSON, block.layout.to_json())])
+        layout = follower.part.layout
+        if layout.hash not in self._attached:
+            self._attached.add(layout.hash)
+            self._attach([Attachment(f"layouts/{layout.hash.hex()}.json", JSON, layout.to_json())])
         if not follower.over:  # the files on the disk are of its successor
             self._attach(self._attachments(block.source, follower.number))
         return followed
@@ -217,10 +217,12 @@ class Recorder:
             return
         if followed.channels is None:
             after = followed.begin
-            followed.channels = self._writer.open_block(follower.block, follower.number, after.frame, after.event)
+            followed.channels = self._writer.open_block(
+                follower.block, follower.number, after.frame, after.event, follower.part.layout
+            )
         if isinstance(item, Frame):
             self.counters.frames += 1
-            self._writer.frame(followed.channels, item, log_ns)
+            self._writer.frame(followed.channels, follower.part.keep(item), log_ns)
             followed.come_to("frames", item.number, log_ns)
         else:
             self.counters.events += 1

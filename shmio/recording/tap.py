@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Final, NamedTuple
 
 from shmio.dump.encoding import Place, ProcessChange, Reason, StepMark
 from shmio.recording.follower import Aside, Entry, Follower
 from shmio.recording.processes import Watch
+from shmio.recording.selection import Selection
 from shmio.segment import Segment
 from shmio.segment.clock import ClockState
 from shmio.segment.events import EVENT_SIZE
@@ -39,15 +40,15 @@ class Tap:
     nothing is lost between them.
     """
 
-    def __init__(self, segment: Segment, start: Start = FROM_THE_FIRST, sources: Collection[str] | None = None) -> None:
-        """``sources``: only these."""
+    def __init__(self, segment: Segment, start: Start = FROM_THE_FIRST, selection: Selection | None = None) -> None:
+        """``selection``: what of it; default: all."""
         self.segment = segment
         self.start = start
         self.followers: list[Follower] = []
         """Of the blocks that are there, or whose end has not been taken yet."""
         self.done = 0
         """The last step of virtual time of which all has been taken."""
-        self._sources = sources
+        self._selection = selection or Selection()
         self._seen: set[int] = set()
         """Sections whose blocks are followed, were, or need not be."""
         self._blocks = 0
@@ -58,7 +59,7 @@ class Tap:
 
     def again(self, start: Start) -> Tap:
         """Another tap of the same, from elsewhere on."""
-        tap = Tap(self.segment, start, self._sources)
+        tap = Tap(self.segment, start, self._selection)
         tap.done = self.done
         return tap
 
@@ -131,9 +132,12 @@ class Tap:
         self._known = self.segment.blocks
         ended = self.segment.ended
         for block in (*ended, *self._known.values()):
-            if block.section in self._seen or (self._sources is not None and block.source not in self._sources):
+            if block.section in self._seen:
                 continue
             self._seen.add(block.section)
+            part = self._selection.part(block, self._known)
+            if part is None:
+                continue
             place = start.places.get(block.section)
             reason = start.reason if place or start.first else Reason.OVERTAKEN
             if place is None:
@@ -142,4 +146,4 @@ class Tap:
             if over and (place.frame, place.event) == (block.ring.head(), block.events.head()):
                 continue
             self._blocks += 1
-            self.followers.append(Follower(block, self._blocks, place, reason, self.log_time, over=over))
+            self.followers.append(Follower(block, self._blocks, place, reason, self.log_time, over=over, part=part))

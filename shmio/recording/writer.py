@@ -35,6 +35,7 @@ from shmio.dump.encoding import (
     encode_process,
     encode_step,
 )
+from shmio.layout.model import Layout
 from shmio.recording.output import Output
 from shmio.segment import Block, Event, Frame
 
@@ -75,17 +76,25 @@ class Writer:
         """Attach a file."""
         self._mcap.add_attachment(changed_ns, now_ns, name, media_type, data)
 
-    def open_block(self, block: Block, number: int, after_frame: int, after_event: int) -> Channels:
-        """Begin a block: the ``number``-th in this recording, behind these numbers. Its layout was attached before."""
+    def open_block(
+        self, block: Block, number: int, after_frame: int, after_event: int, layout: Layout | None = None
+    ) -> Channels:
+        """Begin a block: the ``number``-th in this recording, behind these numbers. Its layout was attached before.
+
+        ``layout``: what is recorded of it, if that is not all.
+        """
+        layout = layout or block.layout
         self.flush()  # a channel's record is in the chunk of its block's first message, for readers without an index
         about = {
             "source": block.source,
             "block": str(number),
             "section": str(block.section),
-            "layout": block.layout.hash.hex(),
+            "layout": layout.hash.hex(),
             "period_ns": str(block.period_ns),
             "stale_ns": str(block.stale_ns),
         }
+        if layout.hash != block.layout.hash:
+            about["of"] = block.layout.hash.hex()
         frames, events = about | {"after": str(after_frame)}, about | {"after": str(after_event)}
         return Channels(
             self._mcap.register_channel(f"{block.source}/frames", FRAME, self._schema(FRAME, FRAME_SCHEMA), frames),

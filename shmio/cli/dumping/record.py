@@ -17,6 +17,7 @@ from shmio.logs import printable
 from shmio.recording.attach import Attachments, ConfigFiles, no_attachments
 from shmio.recording.output import Output, create
 from shmio.recording.recorder import Recorder
+from shmio.recording.selection import Selection
 from shmio.recording.tap import Start, Tap
 from shmio.segment import Segment
 from shmio.supervisor import control
@@ -33,12 +34,12 @@ def execute(arguments: argparse.Namespace) -> int:
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
     with Segment.open(instance_name(arguments)) as segment, told_to_stop() as stopping:
         sources = arguments.sources
-        for source in sources or ():
-            if source not in segment.blocks:
-                raise PathError(f"no source {source!r}; there are: {', '.join(segment.blocks)}")
+        selection = Selection(sources, arguments.registers or ())
+        for missing in selection.nothing(segment.blocks):
+            raise PathError(missing)
         path, fd = create(arguments.directory, segment.instance)
         recorder = Recorder(
-            Tap(segment, Start(first=False), sources),
+            Tap(segment, Start(first=False), selection),
             Output(path, fd, limit_bytes=BUFFER_BYTES),
             by=BY,
             attachments=_attachments(segment),

@@ -130,7 +130,9 @@ class Rewriter:
             name = f"layouts/{block.layout.hash.hex()}.json"
             self._writer.attach(name, JSON, block.layout.to_json(), waiting[0].time_ns)
         track.number = len([one for one in self._tracks.values() if one.channels]) + 1
-        track.channels = self._writer.open_block(cast("Block", block), track.number, *track.last.values())
+        track.channels = self._writer.open_block(
+            cast("Block", block), track.number, track.last["frames"], track.last["events"]
+        )
         for entry in waiting:
             self._of_block(block, entry)
 

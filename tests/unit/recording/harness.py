@@ -14,6 +14,7 @@ from shmio.dump.survey import survey
 from shmio.layout.model import Layout, Register
 from shmio.recording.output import Output, create
 from shmio.recording.recorder import Recorder
+from shmio.recording.selection import Selection
 from shmio.recording.tap import FROM_THE_FIRST, Start, Tap
 from shmio.segment import BlockSpec, BlockWriter, Event, Frame, Segment
 
@@ -37,11 +38,11 @@ def publish(writer: BlockWriter, count: int, first: int = 0) -> None:
 
 
 def recorder(
-    segment: Segment, folder: Path, start: Start = FROM_THE_FIRST, sources: list[str] | None = None, **options: Any
+    segment: Segment, folder: Path, start: Start = FROM_THE_FIRST, selection: Selection | None = None, **options: Any
 ) -> Recorder:
     """A recorder in this process."""
     path, fd = create(folder, segment.instance)
-    return Recorder(Tap(segment, start, sources), Output(path, fd, limit_bytes=1 << 24), by="test", **options)
+    return Recorder(Tap(segment, start, selection), Output(path, fd, limit_bytes=1 << 24), by="test", **options)
 
 
 def read(file: Path) -> list[Message]:

@@ -18,6 +18,7 @@ from shmio.recording import recorder as module
 from shmio.recording.attach import Attachment
 from shmio.recording.output import Output, create
 from shmio.recording.recorder import Recorder
+from shmio.recording.selection import Selection
 from shmio.recording.tap import Start, Tap
 from shmio.segment import Event, EventKind, Frame, Provenance, Quality, Record, Segment
 from tests.unit.recording.harness import OTHER, RING, gaps, numbers, publish, read, recorder, spec
@@ -108,7 +109,7 @@ def test_from_outside_it_begins_with_the_present(segment: Segment, tmp_path: Pat
 
 
 def test_only_the_sources_asked_for(segment: Segment, tmp_path: Path) -> None:
-    recording = recorder(segment, tmp_path, sources=["press"])
+    recording = recorder(segment, tmp_path, selection=Selection(["press"]))
     for source in ("cell", "press"):
         publish(segment.writer(source), 2)
     assert recording.close()

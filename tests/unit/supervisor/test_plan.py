@@ -96,6 +96,8 @@ def test_log_mode_records_and_serves_nothing(tmp_path: Path) -> None:
         "rotate_mb": 1000,
         "keep_days": 0,
         "keep_mb": 0,
+        "sources": [],
+        "registers": [],
         "config_file": str(tmp_path / "s.toml"),
     }
 
