@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from typing import Final
 
 from shmio.segment import Block
 from shmio.segment.relay import TURN_NS, Relay, Word
 
 Ring = Callable[[], object]
+
+REST_S: Final = 0.001
+"""So long a bell is not heard when nobody listens to it but those that have time."""
 
 
 class Bell:
@@ -17,8 +21,11 @@ class Bell:
     def __init__(self, word: Word, name: str, turn_ns: int = TURN_NS) -> None:
         """``turn_ns``: it rings after so long without a ring, too."""
         self.listeners: dict[Ring, None] = {}  # in the order in which they came
+        self.patient: set[Ring] = set()
+        """Those of them that have time for a while."""
         self._loop = asyncio.get_running_loop()
         self._relay = Relay(word, name, turn_ns)
+        self._resting: asyncio.TimerHandle | None = None
         self.unmute()
 
     @property
@@ -34,8 +41,22 @@ class Bell:
         """Ring again."""
         self._loop.add_reader(self._relay.descriptor, self._ring)
 
+    def rest(self) -> None:
+        """Ring not for a while, if all listeners have time."""
+        if self._resting is None and self.patient >= self.listeners.keys():
+            self.mute()
+            self._resting = self._loop.call_later(REST_S, self.resume)
+
+    def resume(self) -> None:
+        """Rest no more."""
+        if self._resting is not None:
+            self._resting.cancel()
+            self._resting = None
+            self.unmute()
+
     def stop(self) -> None:
         """Ring no more."""
+        self.resume()
         self.mute()
         self._relay.stop()
 
@@ -56,13 +77,32 @@ class Bells:
         self._bells: dict[int, Bell] = {}
         self._stopped: list[Bell] = []
 
-    def join(self, block: Block, ring: Ring) -> None:
-        """Have ``ring`` called when there is a frame or an event, and now and then."""
+    def join(self, block: Block, ring: Ring, *, patient: bool = False) -> None:
+        """Have ``ring`` called when there is a frame or an event, and now and then.
+
+        ``patient``: if nobody else listens but who :meth:`rest`, it has time, too.
+        """
         bell = self._bells.get(block.section)
         if bell is None:
             bell = Bell(block.ring, f"bell-{block.source}", min(TURN_NS, block.stale_ns))
             self._bells[block.section] = bell
         bell.listeners[ring] = None
+        if patient:
+            bell.patient.add(ring)
+        else:
+            bell.resume()
+
+    def rest(self, block: Block, ring: Ring) -> None:
+        """Have ``ring`` not called for a while; it still is if others listen that have no time."""
+        if bell := self._bells.get(block.section):
+            bell.patient.add(ring)
+            bell.rest()
+
+    def resume(self, block: Block, ring: Ring) -> None:
+        """Have it called again."""
+        if bell := self._bells.get(block.section):
+            bell.patient.discard(ring)
+            bell.resume()
 
     def leave(self, block: Block, ring: Ring) -> None:
         """The last one takes the bell with it."""
@@ -70,6 +110,7 @@ class Bells:
         if bell is None:
             return  # all are closed
         bell.listeners.pop(ring, None)
+        bell.patient.discard(ring)
         if not bell.listeners:
             bell.stop()
             del self._bells[block.section]

@@ -2,15 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sized
-from typing import Protocol
+from collections.abc import Callable, Sized
+from typing import NamedTuple, Protocol
 
 from shmio.endpoints.grpc.subject import Subject
-from shmio.segment.scan import entries
+from shmio.segment.scan import ChangeScan, entries
+
+
+class Stream(Protocol):
+    """What goes to one client."""
+
+    refills: dict[Callable[[], object], None]
+    """Called, once, as soon as it has nothing to send."""
+
+    @property
+    def lags(self) -> bool:
+        """Whether its client is far behind, and takes what there was for it."""
 
 
 class Listener(Protocol):
-    """One stream; called in the event loop's thread."""
+    """A stream's part in one subject; called in the event loop's thread."""
+
+    @property
+    def stream(self) -> Stream:
+        """The whole of it."""
 
     since: int
     """Frame whose value the stream already has."""
@@ -38,3 +53,12 @@ class Channel:
         """Of those that a step has changed, whoever came first."""
         self.changed = subject.changed
         self.entries = b"" if self.changed else entries(subject.registers, slot)
+
+
+class Table(NamedTuple):
+    """The channels of a block."""
+
+    slots: tuple[Channel | None, ...]
+    scan: ChangeScan
+    apart: tuple[Channel, ...]
+    """Those that the scan does not look at."""

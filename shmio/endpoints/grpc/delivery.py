@@ -9,7 +9,7 @@ from typing import Final
 
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.hold import Hold, Moment
-from shmio.endpoints.grpc.outbox import Outboxes
+from shmio.endpoints.grpc.outboxes import Outboxes
 from shmio.errors import SegmentError
 from shmio.segment.clock import ClockState
 from shmio.segment.coordinator import Step

@@ -46,7 +46,7 @@ class Ear:
     def start(self) -> None:
         """Begin to listen."""
         self.alive = True
-        self._bells.join(self._block, self._look)
+        self._bells.join(self._block, self._look, patient=True)
 
     def stop(self) -> None:
         """Listen no more."""

@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable, Iterable, Sized
-from typing import NamedTuple
 
 from shmio.endpoints.grpc.bells import Bells
-from shmio.endpoints.grpc.channel import Channel, Listener
+from shmio.endpoints.grpc.channel import Channel, Listener, Table
+from shmio.endpoints.grpc.crowd import Crowd
 from shmio.endpoints.grpc.hold import Hold, Moment, Still
 from shmio.endpoints.grpc.inlet import Inlet
 from shmio.endpoints.grpc.subject import Subject
@@ -25,13 +25,6 @@ So does one that nobody listens to.
 
 TURN_FRAMES = 8
 """So many are shown before streams have their turn."""
-
-
-class _Table(NamedTuple):
-    slots: tuple[Channel | None, ...]
-    scan: ChangeScan
-    apart: tuple[Channel, ...]
-    """Those that the scan does not look at."""
 
 
 class Feed:
@@ -63,8 +56,9 @@ class Feed:
         self._bells = bells
         self._on_quality = on_quality
         self._channels: dict[Subject, Channel] = {}
+        self._crowd = Crowd(self._refill)
         self._free: list[int] = []  # slots
-        self._table = _Table((), ChangeScan([]), ())
+        self._table = Table((), ChangeScan([]), ())
         self._outdated = False
         self._owed: dict[Listener, Channel] = {}  # joined while there was no good value
         _ = block.layout.members("")  # builds what paths are looked up in, before the first client waits for it
@@ -104,7 +98,9 @@ class Feed:
             slot = self._free.pop() if self._free else len(self._channels)
             channel = self._channels[subject] = Channel(subject, slot)
             self._rebuild()
-        channel.listeners[listener] = None
+        if listener not in channel.listeners:
+            channel.listeners[listener] = None
+            self._crowd.join(listener.stream)
         listener.since = 0
         self._owed[listener] = channel
         self._settle()
@@ -113,7 +109,9 @@ class Feed:
         """Leave; the last listener takes the channel with it."""
         self._owed.pop(listener, None)
         channel = self._channels[subject]
-        channel.listeners.pop(listener, None)
+        if listener in channel.listeners:
+            del channel.listeners[listener]
+            self._crowd.leave(listener.stream)
         if not channel.listeners:
             del self._channels[subject]
             self._free.append(channel.slot)
@@ -193,7 +191,7 @@ class Feed:
             slots[channel.slot] = channel
         apart = tuple(channel for channel in self._channels.values() if channel.changed)
         scan = ChangeScan.joined(channel.entries for channel in self._channels.values())
-        self._table = _Table(tuple(slots), scan, apart)
+        self._table = Table(tuple(slots), scan, apart)
         self._outdated = False
 
     # ---- what the source publishes -----------------------------------------------------------------------------
@@ -207,6 +205,9 @@ class Feed:
         """Take the frames that have come, a few at a time; if there are none, look at the age of the last one."""
         if not self._following:
             return  # it has left while the bell rang
+        if not self._held and self._crowd.passes():
+            self._bells.rest(self.block, self._look)
+            return
         try:
             self._follow()
         except Exception:
@@ -217,9 +218,16 @@ class Feed:
         self._again = False
         self._look()
 
+    def _refill(self) -> None:
+        """A stream that was too slow has nothing to send now: what is newest."""
+        if self._following:
+            self._look()
+            if not self._crowd.passes():
+                self._bells.resume(self.block, self._look)
+
     def _follow(self) -> None:
         block = self.block
-        if self._cursor.behind > (CATCH_UP_FRAMES if self._channels else 1):
+        if self._cursor.behind > (CATCH_UP_FRAMES if self._channels and not self._crowd.passed() else 1):
             self._cursor = block.cursor(after=block.ring.head() - 1)
         retired = block.retired  # before looking: what was published before the end is still shown
         take = self._regard if self._held else self._take

@@ -9,7 +9,8 @@ from typing import Any
 import grpc
 
 from shmio.endpoints.grpc.injection import Injection
-from shmio.endpoints.grpc.outbox import EventLane, Outbox, Outboxes
+from shmio.endpoints.grpc.outbox import EventLane, Outbox
+from shmio.endpoints.grpc.outboxes import Outboxes
 from shmio.endpoints.grpc.rosmessage import encoder, message_type
 from shmio.endpoints.grpc.shadows import Shadows, Way, shadow_path
 from shmio.endpoints.grpc.shape import Shape

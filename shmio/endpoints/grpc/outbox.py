@@ -5,12 +5,10 @@ from __future__ import annotations
 import asyncio
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterator, Sized
-from contextlib import contextmanager
+from collections.abc import Callable, Sized
 from functools import partial
 from typing import Any, Final
 
-from shmio.endpoints.grpc.audience import Audience
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.load import Load, Total
 from shmio.endpoints.grpc.pace import LATE_S, Pace
@@ -49,7 +47,15 @@ class Outbox:
         self._owed = 0  # messages up to this number are waited for
         self._taken = 0  # those before this number have left, or were dropped
         self._told: asyncio.Future[None] | None = None
+        self._asked = False  # whether the reader waits
         self.pace = Pace()
+        self.refills: dict[Callable[[], object], None] = {}
+        """Called, once, as soon as nothing waits: who has more, and waits for that."""
+
+    @property
+    def lags(self) -> bool:
+        """Whether its client is far behind, and takes what there was for it."""
+        return self.pace.behind and not (self._asked and not self._waiting)
 
     def add(self, lane: _Lane, message: Sized, now_s: float = 0.0) -> int:
         """Take a message; its number. ``now_s``: for :meth:`since`."""
@@ -130,15 +136,22 @@ class Outbox:
         self._taken = next(iter(waiting)) if waiting else self._next
         if self._told is not None:
             self._tell()
+        self._asked = True
         while not waiting:
             if self._ended:
-                self._ended = False
+                self._ended = self._asked = False
                 return None
+            if self.refills:
+                refills, self.refills = self.refills, {}
+                for refill in refills:
+                    refill()
+                continue
             self._waiter = asyncio.get_running_loop().create_future()
             try:
                 await self._waiter
             finally:
                 self._waiter = None
+        self._asked = False
         _, (lane, message, _) = waiting.popitem(last=False)
         return lane.take(message)
 
@@ -193,6 +206,7 @@ class StateLane(_Lane):
     def __init__(self, outbox: Outbox, finish: Finish = bytes) -> None:
         """``finish``: what a message still lacks when it is sent."""
         super().__init__(outbox, outbox.states, finish)
+        self.stream = outbox
         self.since = 0
 
     def deliver(self, message: Sized) -> None:
@@ -247,54 +261,3 @@ class EventLane(_Lane):
 
 
 Lane = StateLane | EventLane
-
-
-class Outboxes:
-    """Those of all open streams, counted."""
-
-    def __init__(self, audience: Audience | None = None) -> None:
-        """``audience``: what they are a part of."""
-        self._audience = Audience() if audience is None else audience
-        self._open: set[Outbox] = set()
-        self._dropped = 0
-        self._total = Total()
-
-    @property
-    def waiting_bytes(self) -> int:
-        """Of all messages that wait."""
-        return self._total.size
-
-    def __len__(self) -> int:
-        return len(self._open)
-
-    @property
-    def dropped(self) -> int:
-        """Messages dropped on streams too slow for them, since the start."""
-        return self._dropped + sum(outbox.dropped for outbox in self._open)
-
-    @contextmanager
-    def opened(self) -> Iterator[Outbox]:
-        """One for a stream as long as that is open."""
-        outbox = Outbox(self._total)
-        self._open.add(outbox)
-        self._total.streams += 1
-        try:
-            with self._audience.joined():
-                yield outbox
-        finally:
-            self._open.discard(outbox)
-            self._total.streams -= 1
-            self._dropped += outbox.dropped
-            outbox.close()
-
-    async def taken(self, patience_s: float) -> None:
-        """Wait until all clients have taken what they are owed; the streams of those that do not in time end."""
-        owing = [outbox for outbox in self._open if outbox.owing]
-        try:
-            async with asyncio.timeout(patience_s):
-                for outbox in owing:
-                    await outbox.taken()
-        except TimeoutError:
-            for outbox in owing:
-                if outbox.owing:
-                    outbox.fail(f"the client has not taken the values of a step within {patience_s:g} s")

@@ -11,7 +11,7 @@ from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.hold import Hold
 from shmio.endpoints.grpc.native.service import NativeService
-from shmio.endpoints.grpc.outbox import Outboxes
+from shmio.endpoints.grpc.outboxes import Outboxes
 from shmio.endpoints.grpc.publish import Publisher
 from shmio.endpoints.grpc.shadows import Shadows
 from shmio.endpoints.grpc.simlog_v1 import SimlogV1

@@ -13,7 +13,8 @@ from google.protobuf.empty_pb2 import Empty
 
 from shmio.endpoints.grpc.hold import Moment
 from shmio.endpoints.grpc.inject_v1 import Injecting
-from shmio.endpoints.grpc.outbox import EventLane, Lane, Outbox, Outboxes, StateLane
+from shmio.endpoints.grpc.outbox import EventLane, Lane, Outbox, StateLane
+from shmio.endpoints.grpc.outboxes import Outboxes
 from shmio.endpoints.grpc.publish import Publisher, Request
 from shmio.endpoints.grpc.rosmessage import encoder, message_type, read, time_stamp
 from shmio.endpoints.grpc.shadows import Shadows

@@ -11,7 +11,7 @@ from google.protobuf.empty_pb2 import Empty
 
 from shmio.endpoints.grpc.access import holder_of
 from shmio.endpoints.grpc.marks import Marks
-from shmio.endpoints.grpc.outbox import Outboxes
+from shmio.endpoints.grpc.outboxes import Outboxes
 from shmio.endpoints.grpc.publish import Publisher, Request
 from shmio.endpoints.grpc.shadows import Shadow, Shadows, Way, shadow_paths
 from shmio.endpoints.grpc.shape import Shape, shape

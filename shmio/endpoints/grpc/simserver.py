@@ -10,7 +10,8 @@ import grpc
 from google.protobuf.empty_pb2 import Empty
 
 from shmio.endpoints.grpc.hold import Status
-from shmio.endpoints.grpc.outbox import Outboxes, StateLane
+from shmio.endpoints.grpc.outbox import StateLane
+from shmio.endpoints.grpc.outboxes import Outboxes
 from shmio.endpoints.grpc.stepper import Stepper
 from shmio.errors import ShmioError, TimeError, ValueRangeError
 from shmio.wire import simserver_pb2 as wire

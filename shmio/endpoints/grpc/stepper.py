@@ -16,7 +16,7 @@ from shmio.endpoints.grpc.driver import Driver
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.hold import Hold, Moment, Status
 from shmio.endpoints.grpc.marks import Marks
-from shmio.endpoints.grpc.outbox import Outboxes
+from shmio.endpoints.grpc.outboxes import Outboxes
 from shmio.endpoints.grpc.publish import Publisher
 from shmio.errors import ShmioError, TimeError
 from shmio.segment import ProcessSlot, Segment

@@ -14,6 +14,7 @@ from grpc_health.v1 import health_pb2
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
 from shmio.config import Address, Tls
+from shmio.endpoints.grpc.outbox import Outbox
 from shmio.endpoints.grpc.server import Server
 from shmio.endpoints.grpc.subject import Subject
 from shmio.errors import ConfigError, EndpointError
@@ -278,6 +279,7 @@ class Recorder:
 
     def __init__(self) -> None:
         self.since = 0
+        self.stream = Outbox()
         self.got: list[Any] = []
         self.lost = 0
 

@@ -10,7 +10,8 @@ import pytest
 
 from shmio.endpoints.grpc import load, pace
 from shmio.endpoints.grpc import outbox as module
-from shmio.endpoints.grpc.outbox import TOPIC_BOUND, EventLane, Outbox, Outboxes, StateLane
+from shmio.endpoints.grpc.outbox import TOPIC_BOUND, EventLane, Outbox, StateLane
+from shmio.endpoints.grpc.outboxes import Outboxes
 
 
 async def rest(outbox: Outbox) -> list[bytes]:
