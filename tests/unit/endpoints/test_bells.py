@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 
+import pytest
+
 from shmio.endpoints.grpc.bells import Bells
 from shmio.segment import Segment
 from tests.unit.endpoints.harness import TIMEOUT_S, image
@@ -56,6 +58,51 @@ def test_who_leaves_while_it_rings_takes_nobody_with_him(segment: Segment) -> No
         async with asyncio.timeout(TIMEOUT_S):
             await over.wait()
         bells.leave(block, over.set)
+        bells.close()
+
+    asyncio.run(test())
+
+
+def test_a_bell_rests_while_all_who_listen_have_time(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shmio.endpoints.grpc.bells.REST_S", 1000.0)
+
+    async def test() -> None:
+        block, writer, bells = segment.blocks["cell"], segment.writer("cell"), Bells()
+        heard = list[str]()
+        rung = asyncio.Event()
+
+        def busy() -> None:
+            heard.append("busy")
+
+        def patient() -> None:
+            heard.append("patient")
+
+        def prompt() -> None:
+            heard.append("prompt")
+            rung.set()
+
+        bells.join(block, busy)
+        bells.join(block, patient, patient=True)
+        bells.rest(block, busy)
+        heard.clear()
+        for number in range(100):
+            writer.publish(image(step=number), cycle=number)
+            await asyncio.sleep(0)
+        assert not heard
+        bells.join(block, prompt)  # who has no time ends it for all
+        async with asyncio.timeout(TIMEOUT_S):
+            await rung.wait()
+            assert heard == ["busy", "patient", "prompt"]
+            bells.rest(block, busy)
+            rung.clear()
+            writer.publish(image(), cycle=100)
+            await rung.wait()
+            bells.leave(block, prompt)
+            bells.rest(block, busy)
+            heard.clear()
+            bells.resume(block, busy)
+            while not heard:  # noqa: ASYNC110  another thread's doing
+                await asyncio.sleep(0)
         bells.close()
 
     asyncio.run(test())

@@ -1,0 +1,129 @@
+"""A feed whose streams are all too slow reads no more than they can take; what they take is the newest."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from shmio.endpoints.grpc import bells, crowd
+from shmio.endpoints.grpc.bells import Bells
+from shmio.endpoints.grpc.feed import Feed
+from shmio.endpoints.grpc.outbox import Outbox, StateLane
+from shmio.endpoints.grpc.pace import Pace
+from shmio.segment import Segment
+from tests.unit.endpoints.harness import TIMEOUT_S, WRITER, image
+from tests.unit.endpoints.test_grpc import STEP
+
+MANY = 300
+
+
+class Known(Pace):
+    """Says what it is told to."""
+
+    def __init__(self, *, behind: bool) -> None:
+        super().__init__()
+        self.behind = behind
+
+    def offer(self, now_s: float) -> None: ...
+
+
+class Followed:
+    """A feed, its source, and streams of one register, of which each has had its first value."""
+
+    def __init__(self, segment: Segment, *behind: bool) -> None:
+        self._writer = segment.writer("cell")
+        self._bells = Bells()
+        self.feed = Feed(segment.blocks["cell"], WRITER, self._bells, lambda source, good: None)
+        self._count = 0
+        self.feed.start()
+        self.streams = [Outbox() for _ in behind]
+        for stream, late in zip(self.streams, behind, strict=True):
+            stream.pace = Known(behind=late)
+            StateLane(stream).join(self.feed, STEP)
+
+    async def begin(self) -> None:
+        await self.publish(1)
+        for stream in self.streams:
+            assert await self.next(stream) == 1
+
+    async def publish(self, count: int) -> None:
+        """Frames with the next numbers, each shown or passed over before the next one comes."""
+        for _ in range(count):
+            self._count += 1
+            self._writer.publish(image(step=self._count), cycle=self._count)
+            for _ in range(3):
+                await asyncio.sleep(0)
+
+    async def next(self, stream: Outbox) -> int:
+        async with asyncio.timeout(TIMEOUT_S):
+            message = await stream.pop()
+        assert message is not None
+        return int.from_bytes(message, "big")
+
+    def stop(self) -> None:
+        self.feed.stop()
+        self._bells.close()
+
+
+def follow(segment: Segment, test: Callable[[Followed], Awaitable[None]], *behind: bool) -> None:
+    async def run() -> None:
+        followed = Followed(segment, *behind)
+        try:
+            await followed.begin()
+            await test(followed)
+        finally:
+            followed.stop()
+
+    asyncio.run(run())
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is looked at for its age."""
+    monkeypatch.setattr(crowd, "LATE_S", 1000.0)
+    monkeypatch.setattr(bells, "REST_S", 1000.0)
+
+
+def test_frames_that_nobody_could_take_are_not_read(segment: Segment) -> None:
+    async def test(followed: Followed) -> None:
+        feed, (first, second) = followed.feed, followed.streams
+        before = feed.messages
+        await followed.publish(MANY)
+        assert feed.messages == before
+        assert await followed.next(first) == MANY + 1, "the newest when it can be taken"
+        assert await followed.next(second) == MANY + 1
+        assert feed.messages == before + 1
+        await followed.publish(1)
+        waiting = asyncio.ensure_future(followed.next(first))
+        assert await waiting == MANY + 2
+        waiting = asyncio.ensure_future(followed.next(first))
+        await asyncio.sleep(0)
+        await followed.publish(1)
+        assert await waiting == MANY + 3, "who waits is rung for"
+
+    follow(segment, test, True, True)
+
+
+def test_beside_one_that_keeps_up_every_frame_is_read(segment: Segment) -> None:
+    async def test(followed: Followed) -> None:
+        late, good = followed.streams
+        for number in range(2, 40):
+            await followed.publish(1)
+            assert await followed.next(good) == number
+        assert await followed.next(late) <= 39
+
+    follow(segment, test, True, False)
+
+
+def test_what_waits_does_not_get_too_old(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crowd, "LATE_S", 0.0)
+
+    async def test(followed: Followed) -> None:
+        before = followed.feed.messages
+        async with asyncio.timeout(TIMEOUT_S):
+            while followed.feed.messages < before + 20:
+                await followed.publish(1)
+
+    follow(segment, test, True)
