@@ -80,6 +80,14 @@ def _parser() -> argparse.ArgumentParser:
     _times(cut)
     _some(cut)
 
+    export = verb("export", "write values for other programs: Parquet, CSV, or MCAP for viewers")
+    export.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    _output(export, "the new folder; of --format mcap the new file")
+    export.add_argument("--format", choices=("parquet", "csv", "mcap"), default="parquet", help="default: parquet")
+    _times(export)
+    _some(export)
+    export.add_argument("--raw", action="store_true", help="what sources delivered, without what was injected")
+
     diff = verb("diff", "tell where two recordings differ; exit status 1 if they do")
     diff.add_argument("files", nargs=2, type=Path, metavar="FILE")
     _some(diff)
@@ -104,7 +112,9 @@ def _parser() -> argparse.ArgumentParser:
     cat.add_argument("file", type=Path, metavar="FILE")
     cat.add_argument("patterns", nargs="*", metavar="PATH", help="register, element, structure or glob (default: all)")
     _times(cat)
-    cat.add_argument("--json", action="store_true", help="print a JSON object a line")
+    forms = cat.add_mutually_exclusive_group()
+    for form, text in (("json", "print a JSON object a line"), ("csv", "print CSV")):
+        forms.add_argument(f"--{form}", dest="form", action="store_const", const=form, default="table", help=text)
     return parser
 
 

@@ -48,6 +48,8 @@ def _nested(arrow: Any, values: npt.NDArray[Any], unknown: npt.NDArray[np.bool_]
     """(n, …) values as an array of n values, or of lists of lists."""
     mask = np.repeat(unknown, values[0].size) if len(values) and values.ndim > 1 else unknown
     plain = np.ascontiguousarray(values).reshape(-1)
+    if plain.dtype.kind in "mM":
+        mask = mask | np.isnat(plain)
     if plain.dtype.kind == "V":
         size = plain.dtype.itemsize
         hidden = [None if hide else bytes(value) for value, hide in zip(plain, mask, strict=True)]

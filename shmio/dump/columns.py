@@ -147,8 +147,13 @@ class Collector:
             self._decoded.append(self._codec.decode(records))
         self._waiting, self._waiting_bytes = [], 0
 
+    @property
+    def bytes(self) -> int:
+        """About how much is held."""
+        return self._waiting_bytes + sum(some.nbytes for some in self._decoded)
+
     def columns(self) -> Columns:
-        """What was added."""
+        """What was added since the last call."""
         self._flush()
         assert self._codec is not None  # noqa: S101  begin() came first
         decoded = np.concatenate([np.empty(0, self._codec.dtype), *self._decoded])
@@ -156,6 +161,7 @@ class Collector:
         header = {name: np.ascontiguousarray(heads[name]) for name in FIELDS}
         values = {register.path: np.ascontiguousarray(decoded[register.path]) for register in self._registers}
         time_ns = np.concatenate([np.empty(0, np.int64), *self._times])
+        self._times, self._heads, self._decoded = [], [], []
         return Columns(self._source, self._registers, time_ns, **header, values_by_path=values)
 
 

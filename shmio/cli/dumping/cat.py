@@ -4,29 +4,28 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import Any, Protocol
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
-import msgspec
-
-from shmio.cli.dumping.moments import MAX_NS, iso, local, lost, parse_time
-from shmio.cli.readings import shown
-from shmio.cli.run import dumps
+from shmio.cli.dumping.complaints import Complaints
+from shmio.cli.dumping.moments import MAX_NS, local, parse_time
+from shmio.cli.dumping.printers import Csv, JsonLines, Printer, Table, View
 from shmio.dump.channels import Channel
-from shmio.dump.damage import Damage
-from shmio.dump.encoding import EVENT, FRAME, GAP, PROCESS, STEP, Gap, ProcessChange, StepMark
+from shmio.dump.encoding import EVENT, FRAME, GAP, PROCESS, STEP, ProcessChange, StepMark
 from shmio.dump.reader import Message, Reader
 from shmio.dump.survey import Survey, survey
 from shmio.errors import PathError, RecordingError
-from shmio.layout.codec import codec
 from shmio.layout.glob import named
-from shmio.layout.model import Layout, Register
-from shmio.layout.text import json_value
+from shmio.layout.model import Register
 from shmio.layout.topic import parse_topic
 from shmio.logs import printable
-from shmio.segment import Event, EventKind, Frame, Quality
-from shmio.segment.scan import ChangeScan
+from shmio.segment import Event, Frame
+
+PRINTERS: dict[str, Callable[[Sequence[View]], Printer]] = {
+    "table": lambda _: Table(),
+    "json": lambda _: JsonLines(),
+    "csv": Csv,
+}
 
 
 def execute(arguments: argparse.Namespace) -> int:
@@ -34,7 +33,7 @@ def execute(arguments: argparse.Namespace) -> int:
 
     1 if something was damaged: all the rest is printed, and where something is lost is told.
     """
-    complaints = Complaints(arguments.file)
+    complaints = Complaints()
     with Reader(arguments.file) as reader:
         found = survey(reader)
         start_ns = min((track.first_ns for track in found.tracks.values() if track.channel.source), default=0)
@@ -43,15 +42,17 @@ def execute(arguments: argparse.Namespace) -> int:
         channels = [track.channel for track in found.tracks.values()]
         views = _views(reader, channels, arguments.patterns, complaints)
         sources = {view.source for view in views.values()} if arguments.patterns else {c.source for c in channels}
-        printer: Printer = JsonLines() if arguments.json else Table()
+        printer: Printer = PRINTERS[arguments.form](list(views.values()))
         wanted = {c.number for c in channels if c.number in views or (c.encoding == EVENT and c.source in sources)}
         wanted |= {
             c.number
             for c in channels
             if c.encoding == GAP or (c.encoding in (STEP, PROCESS) and not arguments.patterns)
         }
-        damaged, silent = complaints.damage, True
-        for message in reader.messages(lambda channel: channel.number in wanted, from_ns, to_ns, damaged):
+        silent = True
+        for message in reader.messages(
+            lambda channel: channel.number in wanted, from_ns, to_ns, partial(complaints.damage, arguments.file)
+        ):
             for line in _lines(message, views, sources, printer):
                 print(line)
                 silent = False
@@ -71,63 +72,6 @@ def _nothing(found: Survey) -> str:
         return "nothing is recorded in it"
     first_ns, last_ns = min(track.first_ns for track in tracks), max(track.last_ns for track in tracks)
     return f"nothing of what was asked for is in it then; it goes from {local(first_ns)} to {local(last_ns)}"
-
-
-class Complaints:
-    """Tells on standard error what cannot be printed, where the rest of the output has come to."""
-
-    def __init__(self, file: Path) -> None:
-        self._file = file
-        self.any = False
-
-    def damage(self, damage: Damage) -> None:
-        """A part of the file is lost."""
-        self.say(f"{self._file}: {lost(damage)}")
-
-    def say(self, text: str) -> None:
-        """One line; the exit status will be 1."""
-        self.any = True
-        sys.stdout.flush()
-        print(printable(text), file=sys.stderr, flush=True)
-
-
-class View:
-    """The chosen registers of one block, and what was shown of them last."""
-
-    def __init__(self, channel: Channel, layout: Layout, registers: Sequence[Register]) -> None:
-        self.source = channel.source
-        self.registers = registers
-        self.codecs = [codec(register, layout.byte_order) for register in registers]
-        self._scan = ChangeScan(registers)
-        self._shown: Frame | None = None
-
-    def news(self, frame: Frame) -> bool:
-        """Whether a value or the quality differs from the frame shown before; if so, this one is shown."""
-        shown = self._shown
-        same = shown is not None and (shown.quality, shown.reason) == (frame.quality, frame.reason)
-        if shown is not None and same and not self._scan.changed(shown.image, frame.image):
-            return False
-        self._shown = frame
-        return True
-
-
-class Printer(Protocol):
-    """How things are put into lines."""
-
-    def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
-        """A frame's chosen values."""
-
-    def event(self, time_ns: int, source: str, event: Event) -> str:
-        """An event."""
-
-    def gap(self, time_ns: int, gap: Gap) -> str:
-        """What was missed."""
-
-    def step(self, time_ns: int, mark: StepMark) -> str:
-        """The end of a step."""
-
-    def process(self, time_ns: int, change: ProcessChange) -> str:
-        """What has happened to a process."""
 
 
 def _views(
@@ -180,115 +124,3 @@ def _lines(message: Message, views: dict[int, View], sources: set[str], printer:
         yield printer.process(time_ns, item)
     elif item.source in sources:
         yield printer.gap(time_ns, item)
-
-
-def _kind(event: Event) -> str:
-    try:
-        return str(EventKind(event.kind))
-    except ValueError:  # of a later version
-        return f"kind {event.kind}"
-
-
-class JsonLines:
-    """An object a line, times in UTC."""
-
-    def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
-        """``values`` by path, null for all of them where the source never had any."""
-        known = frame.source_ns != 0
-        values = {
-            register.path: json_value(decode.decode(frame.image), register.element) if known else None
-            for register, decode in zip(view.registers, view.codecs, strict=True)
-        }
-        yield self._line(
-            time_ns,
-            view.source,
-            frame=frame.number,
-            cycle=frame.cycle,
-            quality=str(frame.quality),
-            reason=frame.reason,
-            provenance=str(frame.provenance),
-            values=values,
-        )
-
-    def event(self, time_ns: int, source: str, event: Event) -> str:
-        """``event`` is its number; ``data`` in hexadecimal digits."""
-        fields = {name: getattr(event, name) for name in ("cycle", "incarnation", "writer", "command", "item", "items")}
-        fields |= {name: getattr(event, name) for name in ("offset", "mask", "size", "text")}
-        return self._line(
-            time_ns,
-            source,
-            event=event.number,
-            kind=_kind(event),
-            after_frame=event.frame,
-            quality=str(event.quality),
-            **fields,
-            data=event.data.hex(),
-        )
-
-    def gap(self, time_ns: int, gap: Gap) -> str:
-        """``missed`` is how many."""
-        return self._line(
-            time_ns, gap.source, missed=gap.count, what=gap.what, first=gap.first, last=gap.last, why=str(gap.reason)
-        )
-
-    def step(self, time_ns: int, mark: StepMark) -> str:
-        """``step`` is its number, ``clock_ns`` the instance's clock after it; it is of no source."""
-        return dumps({"time": iso(time_ns), "step": mark.step, "clock_ns": mark.time_ns, "dt_ns": mark.dt_ns})
-
-    def process(self, time_ns: int, change: ProcessChange) -> str:
-        """As it is in the file."""
-        return dumps({"time": iso(time_ns), "process": msgspec.to_builtins(change)})
-
-    def _line(self, time_ns: int, source: str, **fields: Any) -> str:
-        return dumps({"time": iso(time_ns), "source": source, **fields})
-
-
-class Table:
-    """A line with columns, under headings when the block is another than before."""
-
-    def __init__(self) -> None:
-        self._view: View | None = None
-        self._widths: list[int] = []
-
-    def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
-        """The values; quality is said unless it is good."""
-        known = frame.source_ns != 0
-        cells = [
-            shown(decode.decode(frame.image) if known else None, register)
-            for register, decode in zip(view.registers, view.codecs, strict=True)
-        ]
-        if view is not self._view:
-            self._view = view
-            names = [printable(register.path) for register in view.registers]
-            self._widths = [max(map(len, pair)) for pair in zip(names, cells, strict=True)]
-            yield f"{'time':<23}  {view.source}  frame  {self._row(names)}".rstrip()
-        quality = "" if frame.quality is Quality.GOOD else f"  {frame.quality}: {printable(frame.reason)}"
-        yield f"{local(time_ns)}  {view.source}  {frame.number:<5}  {self._row(cells)}{quality}".rstrip()
-
-    def event(self, time_ns: int, source: str, event: Event) -> str:
-        """Kind and reason, and of a command which bytes."""
-        what = f"{_kind(event)} {event.quality}" if event.kind == EventKind.QUALITY else _kind(event)
-        if event.command and event.kind != EventKind.NOTED:
-            what += (
-                f" command {event.command}.{event.item} of writer {event.writer}: {event.size} bytes at {event.offset}"
-            )
-        text = f": {printable(event.text)}" if event.text else ""
-        return f"{local(time_ns)}  {source}  event {event.number} after frame {event.frame}: {what}{text}"
-
-    def gap(self, time_ns: int, gap: Gap) -> str:
-        """How many, which, why."""
-        source = printable(gap.source)
-        return f"{local(time_ns)}  {source}  {gap.count} {gap.what} missed, {gap.first} to {gap.last}: {gap.reason}"
-
-    def step(self, time_ns: int, mark: StepMark) -> str:
-        """Number, and the time after it."""
-        return f"{local(time_ns)}  step {mark.step} of {mark.dt_ns / 1e6:g} ms is done: {mark.time_ns / 1e9:g} s"
-
-    def process(self, time_ns: int, change: ProcessChange) -> str:
-        """Name, what, why."""
-        pid = f", pid {change.pid}" if change.pid else ""
-        why = f": {printable(change.why)}" if change.why else ""
-        return f"{local(time_ns)}  process {printable(change.name)} {change.what}{pid}{why}"
-
-    def _row(self, cells: Sequence[str]) -> str:
-        return "  ".join(cell.ljust(width) for cell, width in zip(cells, self._widths, strict=True))

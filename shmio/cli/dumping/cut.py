@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Iterator
 
+from shmio.cli.dumping.complaints import Complaints
 from shmio.cli.dumping.moments import MAX_NS, parse_time
 from shmio.cli.dumping.parts import Parts
 from shmio.cli.dumping.rewriting import rewrite, verified
@@ -16,7 +17,10 @@ from shmio.errors import RecordingError
 
 def execute(arguments: argparse.Namespace) -> int:
     """Write what lies between two times, of some sources or registers, to a new file."""
-    with open_dump(arguments.files) as dump:
+    complaints = Complaints()
+    with open_dump(arguments.files, complaints.damage) as dump:
+        for text in dump.damage:
+            complaints.say(text)
         from_ns = parse_time("--from", arguments.begin, dump.begin_ns, 0)
         to_ns = parse_time("--to", arguments.end, dump.begin_ns, MAX_NS)
         parts = Parts(dump, arguments.only) if arguments.only else None
@@ -26,7 +30,7 @@ def execute(arguments: argparse.Namespace) -> int:
     for line in verified(arguments.output):
         say(line)
     say(f"  {work.counts['frames']} frames and {work.counts['events']} events")
-    return 0
+    return int(complaints.any)
 
 
 def _entries(

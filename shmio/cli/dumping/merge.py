@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 
+from shmio.cli.dumping.complaints import Complaints
 from shmio.cli.dumping.rewriting import rewrite, verified
 from shmio.cli.run import say
 from shmio.dump.dump import open_dump
@@ -11,9 +12,12 @@ from shmio.dump.dump import open_dump
 
 def execute(arguments: argparse.Namespace) -> int:
     """Write what is in any of the files, once and in the order of time, to a new one."""
-    with open_dump(arguments.files) as dump:
+    complaints = Complaints()
+    with open_dump(arguments.files, complaints.damage) as dump:
+        for text in dump.damage:
+            complaints.say(text)
         work = rewrite(dump, arguments.output, "shmio-dump merge", dump.items())
     for line in verified(arguments.output):
         say(line)
     say(f"  {work.counts['frames']} frames and {work.counts['events']} events of {len(arguments.files)} files")
-    return 0
+    return int(complaints.any)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import signal
@@ -254,6 +255,24 @@ def test_verify_tells_what_is_damaged_and_where(damaged: tuple[str, str], said: 
     assert main(["verify", "--json", bad]) == 1
     found = json.loads("\n".join(said()[0]))
     assert (found["closed"], found["chunks"], found["messages"], len(found["damage"])) == (True, 2, 22, 3)
+
+
+def test_cat_as_csv(file: str, said: Output) -> None:
+    assert main(["cat", "--csv", file, "cell"]) == 0
+    out, err = said()
+    rows = list(csv.reader(out))
+    assert err == []
+    assert rows[0] == ["time", "source", "what", "number", "quality", "text", "count", "speed"]
+    assert [row[1:] for row in rows if row[2] == "frame"] == [
+        ["cell", "frame", "1", "good", "", "7", ""],
+        ["cell", "frame", "3", "good", "", "8", ""],
+        ["cell", "frame", "4", "bad", "cable out", "8", ""],
+        ["cell", "frame", "1", "good", "", "5", "2.5"],
+    ], "the last of the layout that came with a reload"
+    assert ["cell", "quality", "bad", "cable out"] in [row[1:3] + row[4:6] for row in rows]
+    assert {len(row) for row in rows} == {8}
+    with pytest.raises(SystemExit):
+        main(["cat", "--csv", "--json", file])
 
 
 def test_cat_goes_on_behind_a_damaged_chunk_and_says_what_is_lost(damaged: tuple[str, str], said: Output) -> None:

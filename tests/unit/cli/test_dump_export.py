@@ -1,0 +1,184 @@
+"""``shmio-dump export``: what other programs read."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+import shmio
+from shmio.cli.dump import main
+from shmio.layout.codec import codec
+from shmio.layout.model import Layout, Register
+from shmio.segment import Quality
+from tests.unit.dump.build import PERIOD_NS, START_NS, build, image, varied
+
+parquet: Any = pytest.importorskip("pyarrow.parquet")
+
+KINDS = Layout("DB9", 9, 92, False, (
+    Register("Robot/speed", "REAL", (), 0, None, 4, 1),
+    Register("Robot/far", "LREAL", (), 4, None, 8, 1),
+    Register("on", "BOOL", (), 12, 2, 1, 1),
+    Register("bits", "BOOL", ((0, 3),), 13, 0, 1, 4),
+    Register("word", "WORD", (), 14, None, 2, 1),
+    Register("big", "ULINT", (), 16, None, 8, 1),
+    Register("grid", "INT", ((0, 1), (1, 2)), 24, None, 8, 4),
+    Register("name", "STRING[6]", (), 32, None, 8, 1),
+    Register("for", "TIME", (), 40, None, 4, 1),
+    Register("day", "DATE", (), 44, None, 2, 1),
+    Register("when", "DTL", (), 46, None, 12, 1),
+    Register("where", "POINTER", (), 58, None, 6, 1),
+    Register("clock", "LTOD", (), 64, None, 8, 1),
+))  # fmt: skip
+VALUES: dict[str, Any] = {
+    "Robot/speed": 0.1, "Robot/far": -2.5e300, "on": True, "bits": [True, False, True, True], "word": 65535,
+    "big": 2**64 - 1, "grid": [[1, -2], [3, 4]], "name": "Zoë", "for": -1500, "day": "2024-02-29",
+    "when": "2024-02-29T12:34:56.123456789", "where": "0102030405ff", "clock": 5,
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """With a recording of all kinds: a good frame, one that never had an image, one of NaN and no clock."""
+    monkeypatch.chdir(tmp_path)
+    data = bytearray(KINDS.size)
+    for register in KINDS.registers:
+        codec(register).encode_into(VALUES[register.path], data)
+    with build(tmp_path / "kinds.mem") as work:
+        work.block("cell", KINDS)
+        work.frame(1, bytes(data))
+        work.frame(2, bytes(KINDS.size), source_ns=0, quality=Quality.BAD, reason="no data yet")
+        codec(KINDS.registers[0]).encode_into(math.nan, data)
+        data[64:72] = b"\xff" * 8
+        work.frame(3, bytes(data), quality=Quality.UNCERTAIN)
+    return tmp_path
+
+
+def test_parquet_has_the_types_of_the_registers(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", "kinds.mem", "-o", "out"]) == 0
+    assert capsys.readouterr().out == "out/cell.parquet: 3 rows\n"
+    table = parquet.read_table("out/cell.parquet")
+    types = {field.name: str(field.type) for field in table.schema}
+    assert {path: types[path] for path in VALUES} == {
+        "Robot/speed": "float", "Robot/far": "double", "on": "bool",
+        "bits": "fixed_size_list<element: bool>[4]", "word": "uint16", "big": "uint64",
+        "grid": "fixed_size_list<element: fixed_size_list<element: int16>[2]>[2]", "name": "string",
+        "for": "duration[ms]", "day": "date32[day]", "when": "timestamp[ns]", "where": "fixed_size_binary[6]",
+        "clock": "duration[ns]",
+    }  # fmt: skip
+    assert table["when"].cast("int64").to_pylist()[0] % 10**9 == 123456789
+    first, nothing, last = table.drop(["time", "source_time", "when", "clock"]).to_pylist()
+    assert table["time"].cast("int64").to_pylist() == [START_NS + n * PERIOD_NS for n in (1, 2, 3)]
+    assert (first["quality"], nothing["quality"], last["quality"]) == ("good", "bad", "uncertain")
+    for path in ("on", "bits", "word", "big", "grid", "name"):
+        assert first[path] == VALUES[path], path
+        assert last[path] == VALUES[path], path
+    assert np.float32(first["Robot/speed"]) == np.float32(0.1)
+    assert (first["where"].hex(), str(first["day"])) == ("0102030405ff", "2024-02-29")
+    assert [table[name].is_null().to_pylist() for name in ("source_time", "when", "word")] == [[False, True, False]] * 3
+    assert not any(nothing[path] for path in VALUES if path not in ("bits", "grid", "when", "clock"))
+    assert math.isnan(last["Robot/speed"])
+    assert table["clock"].cast("int64").to_pylist() == [5, None, None]
+
+
+def test_csv(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", "kinds.mem", "-o", "out", "--format", "csv"]) == 0
+    with Path("out/cell.csv").open(newline="", encoding="utf-8") as file:
+        first, nothing, last = csv.DictReader(file)
+    assert first["time"] == "2023-11-14T22:13:20.020000000Z"
+    expected = {
+        "Robot/speed": "0.1", "Robot/far": "-2.5e+300", "on": "true", "bits/0": "true", "bits/1": "false",
+        "word": "65535", "big": str(2**64 - 1), "grid/0/1": "1", "grid/0/2": "-2", "grid/1/2": "4", "name": "Zoë",
+        "for": "-1500", "day": "2024-02-29", "when": "2024-02-29T12:34:56.123456789", "where": "0102030405ff",
+        "clock": "5",
+    }  # fmt: skip
+    assert {path: first[path] for path in expected} == expected
+    assert (nothing["quality"], nothing["word"], nothing["name"]) == ("bad", "", "")
+    assert (last["Robot/speed"], last["clock"]) == ("nan", "")
+
+
+def test_mcap_for_viewers(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", "kinds.mem", "-o", "out.mcap", "--format", "mcap"]) == 0
+    with Path("out.mcap").open("rb") as file:
+        messages = list(make_reader(file, validate_crcs=True).iter_messages())
+    assert [(channel.topic, channel.message_encoding) for _, channel, _ in messages] == [("/cell", "json")] * 3
+    schema, _, message = messages[0]
+    assert schema is not None
+    assert schema.encoding == "jsonschema"
+    properties = json.loads(schema.data)["properties"]
+    assert properties["Robot"]["properties"]["speed"] == {"type": "number"}
+    assert properties["grid"] == {"type": "array", "items": {"type": "array", "items": {"type": "integer"}}}
+    assert message.log_time == START_NS + PERIOD_NS
+    first, nothing, last = (json.loads(message.data) for _, _, message in messages)
+    assert first.pop("frame") == {"number": 1, "cycle": 1, "quality": 2, "provenance": 0}
+    robot = first.pop("Robot")
+    assert (np.float32(robot["speed"]), robot["far"]) == (np.float32(0.1), -2.5e300)
+    assert first == {path: value for path, value in VALUES.items() if "/" not in path}
+    assert list(nothing) == ["frame"]
+    assert (last["Robot"]["speed"], last["clock"]) == (None, None)
+
+
+def test_time_sources_registers_and_originals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    varied(tmp_path / "a.mem")
+    some = ["--from", "0.1", "--to", "0.3", "--only", "cell/count", "press/row"]
+    assert main(["export", "a.mem", "-o", "out", *some]) == 0
+    assert capsys.readouterr().out.splitlines() == ["out/cell.parquet: 11 rows", "out/press.parquet: 11 rows"]
+    assert parquet.read_table("out/cell.parquet")["count"].to_pylist()[3] == 1009
+    assert parquet.read_table("out/press.parquet").column_names[6:] == ["row"]
+    assert main(["export", "a.mem", "-o", "raw", "--raw", *some]) == 0
+    assert parquet.read_table("raw/cell.parquet")["count"].to_pylist() == list(range(6, 17))
+    assert main(["export", "a.mem", "-o", "v.mcap", "--format", "mcap", "--source", "cell"]) == 0
+    with Path("v.mcap").open("rb") as file:
+        topics = [channel.topic for _, channel, _ in make_reader(file).iter_messages()]
+    assert (topics.count("/cell"), topics.count("/cell/events"), len(topics)) == (57, 4, 61)
+
+
+def test_a_block_a_file(tmp_path: Path) -> None:
+    other = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))
+    with build(tmp_path / "a.mem") as work:
+        work.block("cell")
+        work.frame(1, image(1))
+        work.block("cell", other, section=9)
+        work.frame(2, b"\0\7")
+    assert main(["export", "a.mem", "-o", "out"]) == 0
+    assert parquet.read_table("out/cell.parquet")["count"].to_pylist() == [1]
+    assert parquet.read_table("out/cell-2.parquet")["count"].to_pylist() == [7]
+
+
+def test_what_is_refused_leaves_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert main(["export", "kinds.mem", "-o", "out", "--from", "100"]) == 1
+    assert "no frames of kinds.mem are in that time" in capsys.readouterr().err
+    assert main(["export", "kinds.mem", "-o", "out", "--source", "x"]) == 1
+    assert capsys.readouterr().err == "no source 'x'; there are: cell\n"
+    assert main(["export", "kinds.mem", "-o", "out"]) == 0
+    before = Path("out/cell.parquet").read_bytes()
+    assert main(["export", "kinds.mem", "-o", "out"]) == 1
+    assert Path("out/cell.parquet").read_bytes() == before
+    capsys.readouterr()
+    monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    assert main(["export", "kinds.mem", "-o", "more"]) == 1
+    assert capsys.readouterr().err == "pyarrow is not installed: pip install 'shmio[parquet]'\n"
+    assert not list(Path("more").iterdir())
+
+
+def test_a_damaged_chunk_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What is whole is exported, and the status says that something is missing."""
+    file = varied(tmp_path / "a.mem")
+    data = bytearray(file.read_bytes())
+    with shmio.open_dump(file) as dump:
+        chunks = [chunk for chunk, _, _ in dump._parts[0].found.chunks.between(0, 2**62)]
+    data[chunks[2].at + 70] ^= 1
+    file.write_bytes(data)
+    assert main(["export", "a.mem", "-o", "out", "--only", "press/count"]) == 1
+    assert "a.mem: lost after " in capsys.readouterr().err
+    assert 45 < len(parquet.read_table("out/press.parquet")) < 60
