@@ -35,6 +35,8 @@ PROCESS: Final = "process"
 
 _FRAME: Final = struct.Struct("<QQqqqQIBBHHHII")
 _EVENT: Final = struct.Struct("<QQQqqqQQIIIIIIHBBHH")
+_QUALITIES: Final = (*Quality, Quality.BAD)  # what is none is not to be trusted
+_PROVENANCES: Final = tuple(Provenance)
 _EFFECTIVE: Final = 1  # flag: an effective image follows the raw one
 
 FRAME_SCHEMA: Final = b"""Little-endian. u64 number, u64 cycle, i64 publish (ns, CLOCK_MONOTONIC), i64 clock (ns since \
@@ -167,7 +169,7 @@ def decode_frame(data: bytes) -> Frame:
         raise ValueError("a frame contradicts its header")
     return Frame(
         number, cycle, publish_ns, clock_ns, source_ns, incarnation,
-        Quality(quality) if quality <= Quality.GOOD else Quality.BAD, Provenance(provenance), event, delay_us,
+        _QUALITIES[min(quality, 3)], _PROVENANCES[provenance], event, delay_us,
         data[_FRAME.size : raw_at].decode("utf-8", "replace"),
         data[raw_at : raw_at + size],
         data[raw_at + size :] if images == 2 else None,

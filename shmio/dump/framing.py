@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import threading
 import zlib
 from typing import Final
 
@@ -17,6 +18,16 @@ FOOTER: Final = struct.Struct("<QQI")  # start of the summary, start of its offs
 U32: Final = struct.Struct("<I")
 U64: Final = struct.Struct("<Q")
 SIZES: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: FOOTER.size}
+
+
+class _OfThread(threading.local):
+    """A decompressor costs more to make than a chunk to unpack, and is for one thread."""
+
+    def __init__(self) -> None:
+        self.decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK_BYTES)
+
+
+_of_thread = _OfThread()
 
 
 def framed(opcode: int, size: int, look: bytes) -> bool:
@@ -53,7 +64,7 @@ def unpack(content: bytes) -> bytes:
     at = CHUNK.size + 4 + name_size
     compression = content[CHUNK.size + 4 : at].decode()
     (packed_size,) = struct.unpack_from("<Q", content, at)
-    packed = content[at + 8 :]
+    packed = memoryview(content)[at + 8 :]
     if packed_size != len(packed):
         raise ValueError("its sizes contradict each other")
     if size > MAX_CHUNK_BYTES:
@@ -61,9 +72,9 @@ def unpack(content: bytes) -> bytes:
     if compression == "zstd":
         if zstandard.get_frame_parameters(packed).content_size not in (size, zstandard.CONTENTSIZE_UNKNOWN):
             raise ValueError("its sizes contradict each other")
-        data = zstandard.ZstdDecompressor(max_window_size=MAX_CHUNK_BYTES).decompress(packed, max_output_size=size)
+        data = _of_thread.decompressor.decompress(packed, max_output_size=size)
     elif not compression:
-        data = packed
+        data = bytes(packed)
     else:
         raise ValueError(f"its compression {compression[:20]!r} is none that is known here")
     if len(data) != size:

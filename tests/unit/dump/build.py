@@ -9,7 +9,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
-from shmio.dump.encoding import Gap, Reason, StepMark
+from shmio.dump.encoding import Gap, Life, ProcessChange, Reason, StepMark
 from shmio.layout.model import Layout, Register
 from shmio.recording.output import Output
 from shmio.recording.writer import Channels, Writer
@@ -107,6 +107,10 @@ class Build:
         """A step is done."""
         self.writer.step(StepMark(step, step * PERIOD_NS, PERIOD_NS), START_NS + step * PERIOD_NS)
 
+    def process(self, what: Life, at: int) -> None:
+        """Something happened to the source's process."""
+        self.writer.process(ProcessChange("cell", "source", 4711, what, "", 0), START_NS + at * PERIOD_NS)
+
     def chunk(self) -> None:
         """End the chunk."""
         self.writer.flush()
@@ -140,6 +144,7 @@ def varied(file: Path) -> Path:
     with build(file) as work:
         work.block("cell")
         work.block("press", section=2)
+        work.process(Life.IS, 1)
         for number in range(1, 61):
             if number % 20 == 7:
                 work.frame(number, image(number), quality=Quality.BAD, reason="no answer")
