@@ -1,4 +1,4 @@
-"""A cell left alone: DB201 at 50 Hz for half an hour, five gRPC subscribers, a recorder. Does it grow, does it lose?
+"""A cell left alone: DB201 at 50 Hz or faster, five gRPC subscribers, a recorder. Does it grow, does it lose?
 
 A reader of its own follows every frame: cycles must follow each other, quality must stay good. What the subscribers got
 is held against how often their registers changed; the recording against the frames. Memory and descriptors of each
@@ -21,6 +21,7 @@ import time
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from common import Child, machine, table
 from instance import Instance, instance
@@ -29,13 +30,10 @@ from shmio.layout.codec import codec
 from shmio.layout.topic import find
 from shmio.segment import Block, Quality
 
-PERIOD_MS = 20
 REGISTERS = [f"Robot_800/Axs{axis}_Pos" for axis in range(1, 6)]
 FIRST_S = 1.0
 """Overruns in the first second do not count: everybody is starting."""
 SAMPLE_S = 5.0
-STALL_MS = PERIOD_MS / 2
-"""A witness that comes so late tells of a stall."""
 NEAR_S = 0.1
 """A cycle that is skipped so soon after a stall was skipped by it: the device and the network catch up, too."""
 
@@ -104,24 +102,28 @@ class Size:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--for", dest="duration_s", type=float, default=1800.0, help="seconds (default: half an hour)")
+    parser.add_argument("--period-ms", type=int, default=20, help="of the source (default: 20)")
     parser.add_argument("--quick", action="store_true", help="10 s: does it work")
     parser.add_argument("--priority", type=int, help="real-time, of the source and its emulated controller")
     arguments = parser.parse_args()
     duration_s = 10.0 if arguments.quick else arguments.duration_s
     rank = f", real-time priority {arguments.priority}" if arguments.priority else ""
-    print(f"# Soak: DB201 at 50 Hz{rank}, 5 subscribers, a recorder, {duration_s:g} s\n{machine()}")
+    period_ms = arguments.period_ms
+    rate_hz = 1000 / period_ms
+    print(f"# Soak: DB201 at {rate_hz:g} Hz{rank}, 5 subscribers, a recorder, {duration_s:g} s\n{machine()}")
     with tempfile.TemporaryDirectory() as folder:
         recorder = f'[recorder]\ndirectory = "{folder}"\n'
-        with instance(PERIOD_MS, more=recorder, priority=arguments.priority) as running:
-            problems = soak(running, duration_s)
+        with instance(period_ms, more=recorder, priority=arguments.priority) as running:
+            problems = soak(running, period_ms, duration_s)
         problems += recorded(Path(folder))
     for problem in problems:
         print(f"BROKEN: {problem}")
     raise SystemExit(1 if problems else 0)
 
 
-def soak(running: Instance, duration_s: float) -> list[str]:
+def soak(running: Instance, period_ms: int, duration_s: float) -> list[str]:
     """Watch for so long; what is not as it should be."""
+    stall_ms = period_ms / 2  # a witness that comes so late tells of a stall
     slots = {slot.name: slot for slot in running.segment.processes}
     time.sleep(FIRST_S)
     before = slots["cell"].counters
@@ -132,7 +134,7 @@ def soak(running: Instance, duration_s: float) -> list[str]:
     with ExitStack() as stack:
         subscribers = stack.enter_context(Child("subscriber.py", running.grpc, *paths))
         cores = sorted(os.sched_getaffinity(0))
-        witnesses = [stack.enter_context(Child("witness.py", STALL_MS, core)) for core in cores]
+        witnesses = [stack.enter_context(Child("witness.py", stall_ms, core)) for core in cores]
         thread.start()
         begun_s, stolen_before_s = time.monotonic(), stolen_cpu_s()
         end_s = begun_s + duration_s
@@ -167,14 +169,14 @@ def soak(running: Instance, duration_s: float) -> list[str]:
     )
     own = 0
     for at_s, count in follower.skips:
-        near = [late_s for when_s, late_s in stalls if when_s - STALL_MS / 1000 <= at_s <= when_s + late_s + NEAR_S]
+        near = [late_s for when_s, late_s in stalls if when_s - stall_ms / 1000 <= at_s <= when_s + late_s + NEAR_S]
         own += 0 if near else count
         why = f"the machine stood still for {max(near) * 1000:.0f} ms" if near else "the machine did not stand still"
         print(f"at {at_s - begun_s:.1f} s: {count} cycles skipped; {why}")
     rank = "before all others" if all(one["first"] for one in seen) else "at the priority of others"
     longest_ms = max((late_s for _, late_s in stalls), default=0) * 1000
     print(
-        f"the machine stood still for {STALL_MS:g} ms and more {len(stalls)} times, by the witnesses, {rank}; for "
+        f"the machine stood still for {stall_ms:g} ms and more {len(stalls)} times, by the witnesses, {rank}; for "
         f"{longest_ms:.0f} ms at most; {own} of {follower.skipped} skipped cycles came without that; the hypervisor "
         f"took {stolen_s:.1f} s of {os.cpu_count()} x {duration_s:.0f} s of the cores"
     )
@@ -189,28 +191,36 @@ def soak(running: Instance, duration_s: float) -> list[str]:
         if value:
             problems.append(f"{value} {name}")
     # The subscribers joined before the follower and left after it: a few frames at each end.
-    if not 0 <= messages - changes <= len(REGISTERS) * 5 / (PERIOD_MS / 1000):
+    if not 0 <= messages - changes <= len(REGISTERS) * 5 / (period_ms / 1000):
         problems.append(f"{messages} messages for {changes} changes")
     return problems
 
 
 def recorded(folder: Path) -> list[str]:
-    """What the recording says of itself; what is not as it should be."""
-    problems, frames = [], 0
+    """What the recording is worth: all of it is read; what is not as it should be."""
     files = sorted(folder.glob("*.mem"))
-    for file in files:
-        command = [sys.executable, "-m", "shmio.cli.dump", "info", "--json", str(file)]
-        info = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
-        print(json.dumps(info))
-        for one in info if isinstance(info, list) else [info]:
-            for block in one["blocks"]:
-                frames += block["frames"]
-                if missed := block["missed_frames"] + block["missed_events"]:
-                    problems.append(f"{file.name}: {missed} frames and events of {block['source']} missed")
-    if len(files) != 1:
-        problems.append(f"{len(files)} recordings instead of one")
-    print(f"{frames} frames recorded")
+    problems, frames, size, last = [], 0, 0, 0
+    for file, whole, one in zip(files, dump("verify", files), dump("info", files), strict=True):
+        problems += [f"{file.name}: {damage}" for damage in whole["damage"]]
+        for block in one["blocks"]:
+            if missed := block["missed_frames"] + block["missed_events"]:
+                problems.append(f"{file.name}: {missed} frames and events missed")
+            if last and block["first_frame"] != last + 1:
+                problems.append(
+                    f"{file.name} begins with frame {block['first_frame']}, the one before ends with {last}"
+                )
+            frames, last = frames + block["frames"], block["last_frame"]
+        size += one["size"]
+        print(f"{one['from']} to {one['to']}: {frames} frames so far, {one['bytes_per_minute'] / 1e6:.2f} MB/min")
+    print(f"{frames} frames recorded in {len(files)} files, {size / 1e6:.1f} MB")
     return problems
+
+
+def dump(verb: str, files: list[Path]) -> list[dict[str, Any]]:
+    """What ``shmio-dump`` says of each file."""
+    command = [sys.executable, "-m", "shmio.cli.dump", verb, "--json", *map(str, files)]
+    found = json.loads(subprocess.run(command, capture_output=True, check=False).stdout)
+    return found if isinstance(found, list) else [found]
 
 
 if __name__ == "__main__":
