@@ -17,6 +17,7 @@ DbNumber = Annotated[int, Meta(ge=1, le=65535)]
 Seconds = Annotated[float, Meta(ge=0, le=1e9)]
 Operand = bool | int | float | str | list[Any]
 ClockName = Literal["wall", "stepped"]
+ReplayedInjections = Literal["keep", "leave out"]
 DistributionName = Literal["uniform", "gaussian"]
 OperationName = Literal["set", "offset", "scale", "clamp", "noise", "random", "freeze", "delay", "drop", "flip"]
 RealtimePriority = Annotated[int, Meta(ge=1, le=99)]
@@ -184,7 +185,7 @@ class Replay(Section):
     speed: Annotated[float, Meta(ge=0.01, le=1000)] = 1.0
     loop: bool = False
     paused: bool = False
-    injections: Literal["keep", "leave out"] = "keep"
+    injections: ReplayedInjections = "keep"
     record: bool = False
 
 

@@ -9,13 +9,25 @@ from typing import Any, get_args
 
 from msgspec import ValidationError
 
-from shmio.config.model import NAME_PATTERN, NAME_RULE, ClockName, DistributionName, OperationName
+from shmio.config.model import (
+    NAME_PATTERN,
+    NAME_RULE,
+    ClockName,
+    DistributionName,
+    OperationName,
+    ReplayedInjections,
+)
 
 MAX_LINE = 80
 _PLACE = re.compile(r"\(at line (\d+), column (\d+)\)\Z")
 _BARE = re.compile(r"[^\s,=#\[\]{}\"']+")
 _TEXT = re.compile(r"[^\W\d].*|.*[:/].*|\d+(?:\.\d+){2,}")  # a name, a path, an address
-_WORDS = {"clock": ClockName, "distribution": DistributionName, "operation": OperationName}
+_WORDS = {
+    "clock": ClockName,
+    "distribution": DistributionName,
+    "injections": ReplayedInjections,
+    "operation": OperationName,
+}
 """Keys that take one of a few words."""
 _TYPES = {
     "int": "a whole number",

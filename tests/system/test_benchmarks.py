@@ -129,3 +129,10 @@ def test_what_neighbours_cost_is_measured() -> None:
         re.MULTILINE,
     )
     assert found == ["alone", "one never reads", "50 come and go"]
+
+
+def test_a_replays_timing_and_speed_are_measured() -> None:
+    text = printed("replay")
+    assert re.findall(r"^(50|1000) Hz +([1-9]\d*)( +\d+){4}$", text, re.MULTILINE)
+    [missed] = re.findall(r"^50 Hz +[1-9]\d* +[1-9]\d* +(\d+)$", text, re.MULTILINE)
+    assert missed == "0"

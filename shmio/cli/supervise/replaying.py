@@ -128,7 +128,7 @@ def _source(name: str, own: Source | None, section: Replay, files: list[str]) ->
         connector="replay",
         writable=own.writable if own else [],
         realtime_priority=own.realtime_priority if own else None,
-        options={"file": files, "source": name, "clock": "recording", **options},
+        options={"file": files, "source": name, "own_clock": True, **options},
     )
 
 

@@ -41,7 +41,7 @@ def _as_others(source: Replay, heads: Iterable[Playhead]) -> Play | None:
 
 def _as_configured(source: Replay, block: Block, started_ns: int) -> Play:
     span, options = source.span, source.options
-    recorded = options.clock == "recording"
+    recorded = options.own_clock
     now_ns = block.clock.read().present_ns
     return Play(
         span.begin_ns,

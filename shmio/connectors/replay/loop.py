@@ -126,7 +126,8 @@ class ReplayLoop:
     def _advance(self, clock_ns: int) -> bool:
         """Play what is due at a time of the instance's clock, a piece of it; whether there is more."""
         play = self._play
-        target_ns = min(play.reach_ns(clock_ns), play.until_ns)
+        # What lies at the place where it is to pause is played, what lies at the end is not.
+        target_ns = min(play.reach_ns(clock_ns), play.until_ns, play.end_ns - 1)
         next_ns = self._player.next_ns
         late_ns = 0 if next_ns is None or play.paused else clock_ns - play.due_ns(next_ns)
         if late_ns > LATE_NS and self._writer.at_ns is None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated
 
 import msgspec
 
+from shmio.config.model import ReplayedInjections
 from shmio.connectors.replay.recording import Recording, Span
 from shmio.connectors.replayed import Replayed
 from shmio.errors import ConfigError, RecordingError
@@ -20,7 +21,7 @@ class Replay(Replayed):
     """``connector = "replay"``: plays what a recording holds of one source. Nothing is written to any device."""
 
     class Options(msgspec.Struct, forbid_unknown_fields=True):
-        """Its keys. ``clock``: ``recording`` if frames have the recording's clock, which is the whole instance's."""
+        """Its keys. ``own_clock``: frames have the clock of the recording, which is the whole instance's then."""
 
         file: File | Annotated[list[File], msgspec.Meta(min_length=1)]
         source: str | None = None
@@ -29,8 +30,8 @@ class Replay(Replayed):
         speed: Annotated[float, msgspec.Meta(ge=MIN_SPEED, le=MAX_SPEED)] = 1.0
         loop: bool = False
         paused: bool = False
-        injections: Literal["keep", "leave out"] = "keep"
-        clock: Literal["instance", "recording"] = "instance"
+        injections: ReplayedInjections = "keep"
+        own_clock: bool = False
 
     def __init__(self, options: Options, name: str) -> None:
         """ConfigError: it cannot be played; beginning with the key."""

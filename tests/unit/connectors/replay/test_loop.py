@@ -70,7 +70,7 @@ def test_none_comes_before_its_time(tmp_path: Path, instance: str) -> None:
 def test_the_instance_may_have_the_recordings_time(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     origin = Origin(BEGIN_NS, 7_000 * S)
-    with built(instance, stepped=False, origin=origin) as segment, Playing(segment, file, clock="recording") as cell:
+    with built(instance, stepped=False, origin=origin) as segment, Playing(segment, file, own_clock=True) as cell:
         frames = [cell.next() for _ in range(20)]
         assert segment.clock.utc_ns(frames[0].publish_ns) == 7_000 * S + BEGIN_NS
     assert [frame.clock_ns for frame in frames] == [BEGIN_NS + n * PERIOD_NS for n in range(20)]
@@ -168,7 +168,7 @@ def test_what_is_missing_is_bad_until_it_goes_on(tmp_path: Path, instance: str) 
 
 def test_a_step_plays_what_lies_in_it(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
-    with built(instance, origin=Origin(BEGIN_NS, 0)) as segment, Playing(segment, file, clock="recording") as cell:
+    with built(instance, origin=Origin(BEGIN_NS, 0)) as segment, Playing(segment, file, own_clock=True) as cell:
         coordinator = Coordinator(segment)
         assert counts([cell.next()]) == [0], "what is there at the beginning is seen before the first step"
         by_step = []

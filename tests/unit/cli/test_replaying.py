@@ -1,0 +1,141 @@
+"""``--mode replay``: what becomes of the configuration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from shmio.cli.supervise.prepare import prepare
+from shmio.cli.supervise.replaying import options
+from shmio.cli.supervisor import main
+from shmio.errors import ConfigError
+from shmio.segment import Origin
+from tests.unit.connectors.replay.harness import BEGIN_NS, S, image, recorded
+
+CONFIG = """
+[instance]
+name = "line"
+[[source]]
+name = "panel"
+connector = "memory"
+layout = "panel.toml"
+[[source]]
+name = "cell"
+connector = "memory"
+layout = "panel.toml"
+writable = ["count"]
+[[emulator]]
+name = "plc"
+kind = "s7"
+layout = "db1.db"
+listen = "127.0.0.1:1102"
+[[injection]]
+name = "off"
+target = "cell/count"
+operation = "set"
+value = 3
+[grpc]
+listen = ["127.0.0.1:8089"]
+default_source = "panel"
+[recorder]
+directory = "dumps"
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path, instance: str) -> Path:
+    with recorded(tmp_path, instance, "cell", "arm") as both:
+        for one in both:
+            one.frame(BEGIN_NS, image(1))
+            one.frame(BEGIN_NS + S, image(2))
+    [found] = tmp_path.glob("*.mem")
+    (tmp_path / "panel.toml").write_text('[registers]\nspeed = { type = "REAL" }\n')
+    (tmp_path / "supervisor.toml").write_text(CONFIG)
+    return found
+
+
+def test_its_sources_take_the_places_of_the_configurations(file: Path) -> None:
+    prepared = prepare(file.with_name("supervisor.toml"), "replay", {"file": [str(file)], "loop": True})
+    plan = prepared.plan
+    assert [(job.name, job.kind) for job in plan.jobs] == [("cell", "source"), ("arm", "source"), ("grpc", "grpc")]
+    assert plan.mode == "replay"
+    assert plan.origin == Origin(BEGIN_NS - 2 * S, 7_000 * S)
+    assert [block.attributes.replay for block in plan.blocks] == [True, True]
+    assert [block.attributes.writable for block in plan.blocks] == [("count",), ()]
+    assert all(block.period_ns == 20_000_000 and block.stale_ns == 500_000_000 for block in plan.blocks)
+    options = plan.jobs[0].config["options"]
+    assert (options["own_clock"], options["loop"], options["file"]) == (True, True, [str(file)])
+    notices = "\n".join(plan.warnings)
+    assert "source panel is left out: the recording has none of it; it has cell, arm" in notices
+    assert "the configuration's injections are left out" in notices
+    assert "grpc.default_source is left out" in notices
+
+
+def test_what_is_asked_for_is_there(file: Path) -> None:
+    keys = {"file": [str(file)], "injections": "leave out", "record": True}
+    plan = prepare(file.with_name("supervisor.toml"), "replay", keys).plan
+    assert [job.kind for job in plan.jobs] == ["source", "source", "grpc", "recorder"]
+    assert plan.blocks[0].declared != b"[]"
+
+
+def test_the_section_says_it_too_and_the_command_line_goes_before(file: Path) -> None:
+    config = file.with_name("supervisor.toml")
+    config.write_text(f'{CONFIG}[replay]\nfile = "{file.name}"\nspeed = 2.0\nstart = 0.5\n')
+    plan = prepare(config, "replay", {"speed": 3.0}).plan
+    found = plan.jobs[0].config["options"]
+    assert (found["speed"], found["start"], found["file"]) == (3.0, 0.5, [str(file)])
+    assert prepare(config, "replay").plan.jobs[0].config["options"]["speed"] == 2.0
+
+
+def test_a_replay_beside_others_has_the_recordings_registers(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(file.parent)
+    text = f'[instance]\nname = "line"\n[[source]]\nname = "cell"\nconnector = "replay"\nfile = "{file.name}"\n'
+    config = Path("supervisor.toml")
+    config.write_text(text)
+    assert main(["check"]) == 0
+    assert "source cell: DB1, 2 registers, 4 bytes" in capsys.readouterr().out
+    for more, error in (
+        ('layout = "db1.db"', "source[0].layout: a replay has none"),
+        ("speed = 0", "source[0].speed: "),
+        ("start = 99", "source[0].start, end: there is nothing to play"),
+        ('source = "none"', "source[0].source: "),
+        ('injections = "some"', "source[0].injections: "),
+        ("spede = 1.0", "source[0].spede: unknown key; did you mean speed?"),
+    ):
+        config.write_text(text + more)
+        assert main(["check"]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"supervisor.toml: {error}"), line
+
+
+@pytest.mark.parametrize(
+    ("keys", "error"),
+    [
+        ({}, "replay.file: what is to be played"),
+        ({"file": ["none.mem"]}, "replay.file: "),
+        ({"start": 90.0}, "replay.start, end: there is nothing to play"),
+        ({"start": "then"}, "replay.start: 'then' is neither"),
+        ({"speed": -1.0}, "replay.speed: "),
+    ],
+)
+def test_what_cannot_be_is_named(file: Path, keys: dict[str, object], error: str) -> None:
+    keys = {"file": [str(file)], **keys} if keys else {}
+    with pytest.raises(ConfigError, match=f"supervisor.toml: {error}"):
+        prepare(file.with_name("supervisor.toml"), "replay", keys)
+
+
+def test_a_detached_supervisor_is_told_the_same() -> None:
+    keys = {"file": ["/a.mem", "/b.mem"], "start": 1.5, "injections": "leave out", "loop": True}
+    assert options(keys) == ["--from", "/a.mem", "/b.mem", "--start=1.5", "--injections=leave out", "--loop"]
+
+
+def test_a_recorded_name_is_not_trusted(tmp_path: Path, instance: str) -> None:
+    with recorded(tmp_path, instance, "grpc") as [one]:
+        one.frame(BEGIN_NS, image(1))
+    [found] = tmp_path.glob("*.mem")
+    (tmp_path / "supervisor.toml").write_text('[instance]\nname = "line"\n')
+    with pytest.raises(ConfigError, match="has a source 'grpc', and that name is reserved"):
+        prepare(tmp_path / "supervisor.toml", "replay", {"file": [str(found)]})
