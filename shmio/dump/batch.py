@@ -13,7 +13,7 @@ from mcap.opcode import Opcode
 
 from shmio.dump.encoding import decode_frame
 from shmio.errors import RecordingError
-from shmio.segment.frame import Provenance
+from shmio.segment.frame import Frame, Provenance
 
 HEAD: Final = np.dtype(
     [
@@ -101,6 +101,34 @@ def batch(data: bytes, channel: int, size: int, from_ns: int, to_ns: int, *, raw
     return Batch(np.concatenate([item[0] for item in found]), np.concatenate([item[1] for item in found]), reasons)
 
 
+def frames(data: bytes, channel: int, size: int, from_ns: int, to_ns: int) -> list[tuple[int, Frame]]:
+    """The same frames as objects, with their log times; RecordingError."""
+    found = []
+    at, end, unpack = 0, len(data), _MESSAGE.unpack_from
+    while at < end:
+        if end - at < _HEAD_SIZE:
+            raise RecordingError("it ends within a record")
+        following = at + _HEAD_SIZE + int.from_bytes(data[at + 1 : at + _HEAD_SIZE], "little")
+        if following > end:
+            raise RecordingError("it ends within a record")
+        if data[at] == Opcode.MESSAGE and following - at >= _MESSAGE.size:
+            _, _, number, _, log_ns, _ = unpack(data, at)
+            if number == channel and from_ns <= log_ns <= to_ns:
+                found.append((log_ns, _frame(data[at + _MESSAGE.size : following], size)))
+        at = following
+    return found
+
+
+def _frame(piece: bytes, size: int) -> Frame:
+    try:
+        frame = decode_frame(piece)
+    except ValueError as error:
+        raise RecordingError(str(error)) from None
+    if len(frame.raw) != size:
+        raise RecordingError("a frame is not of its layout's size")
+    return frame
+
+
 def _runs(array: _Bytes, data: bytes, wanted: int) -> Iterator[_Bytes]:
     """The messages of a channel: (n, bytes of a message) of such as have one size and one distance.
 
@@ -165,12 +193,7 @@ def _decoded(frames: _Bytes, size: int, *, raw: bool) -> tuple[_Bytes, list[str]
     """The same of any frames, one by one, and their reasons."""
     records, reasons = [], []
     for piece in map(bytes, frames):
-        try:
-            frame = decode_frame(piece)
-        except ValueError as error:
-            raise RecordingError(str(error)) from None
-        if len(frame.raw) != size:
-            raise RecordingError("a frame is not of its layout's size")
+        frame = _frame(piece, size)
         records += [piece[: HEAD.itemsize], frame.raw if raw else frame.image]
         reasons.append(frame.reason)
     return np.frombuffer(b"".join(records), np.uint8).reshape(len(frames), HEAD.itemsize + size), reasons

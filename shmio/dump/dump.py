@@ -144,9 +144,18 @@ class Dump:
     def frames(self, source: str | None = None, from_ns: int = 0, to_ns: int = MAX_NS) -> Iterator[Entry[Frame]]:
         """Frames of a source, decoded; None if there is only one source. PathError."""
         name = self._names.one(source)
-        for time_ns, block, item in self._read([within.frames(name) for within in self._contents], from_ns, to_ns):
-            if isinstance(item, Frame):
-                yield Entry(time_ns, block, item)
+        if self._overlap:
+            for time_ns, block, item in self._read([within.frames(name) for within in self._contents], from_ns, to_ns):
+                if isinstance(item, Frame):
+                    yield Entry(time_ns, block, item)
+            return
+        last: dict[DumpBlock, int] = {}
+        for part, number, block in self._channels(name, from_ns, to_ns):
+            before = last.get(block, 0)
+            for time_ns, frame in part.frames(number, block.layout.size, from_ns, to_ns):
+                if frame.number > before:
+                    yield Entry(time_ns, block, frame)
+                    last[block] = frame.number
 
     def events(
         self, sources: str | Collection[str] | None = None, from_ns: int = 0, to_ns: int = MAX_NS
@@ -203,16 +212,12 @@ class Dump:
         """
         name = self._names.one(source)
         last: dict[DumpBlock, int] = {}
-        for part, within in zip(self._parts, self._contents, strict=True):
-            if part.end_ns < from_ns or part.begin_ns > to_ns:
-                continue
-            for number in within.frames(name):
-                block = within.blocks[number]
-                for found in part.batches(number, block.layout.size, from_ns, to_ns, raw=raw):
-                    batch = found[int((found.head["number"] <= last.get(block, 0)).sum()) :]
-                    if len(batch):
-                        last[block] = int(batch.head["number"][-1])
-                        yield block, batch
+        for part, number, block in self._channels(name, from_ns, to_ns):
+            for found in part.batches(number, block.layout.size, from_ns, to_ns, raw=raw):
+                batch = found[int((found.head["number"] <= last.get(block, 0)).sum()) :]
+                if len(batch):
+                    last[block] = int(batch.head["number"][-1])
+                    yield block, batch
 
     def columns(
         self, paths: str | Iterable[str], from_ns: int = 0, to_ns: int = MAX_NS, *, raw: bool = False
@@ -236,6 +241,13 @@ class Dump:
     def select(self, paths: Iterable[str]) -> dict[DumpBlock, list[Register]]:
         """By block the registers that paths name, of whatever form, as :meth:`columns` takes them; PathError."""
         return self._names.select(paths)
+
+    def _channels(self, source: str, from_ns: int, to_ns: int) -> Iterator[tuple[Part, int, DumpBlock]]:
+        """Files and channels in them that may have frames of a source in a range of times, in order."""
+        for part, within in zip(self._parts, self._contents, strict=True):
+            if part.end_ns >= from_ns and part.begin_ns <= to_ns:
+                for number in within.frames(source):
+                    yield part, number, within.blocks[number]
 
     # ---- reading -----------------------------------------------------------------------------------------------------
 

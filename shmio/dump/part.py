@@ -4,21 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 from mcap.opcode import Opcode
 
-from shmio.dump.batch import Batch, batch
+from shmio.dump.batch import Batch, batch, frames
 from shmio.dump.damage import Damage, DamageLog
 from shmio.dump.reader import Message, Reader
 from shmio.dump.records import Record
 from shmio.dump.summary import survey_by_index
 from shmio.dump.survey import survey
 from shmio.errors import RecordingError
+from shmio.segment.frame import Frame
 
 MAX_NS: Final = (1 << 63) - 1
 
 Damaged = Callable[[Path, Damage], object]
+T = TypeVar("T")
 
 
 class Part:
@@ -57,27 +59,39 @@ class Part:
 
     def batches(self, channel: int, size: int, from_ns: int, to_ns: int, *, raw: bool) -> Iterator[Batch]:
         """Frames of a channel, whose images have this size, chunk by chunk."""
+        for found in self._each(
+            channel, from_ns, to_ns, lambda data: batch(data, channel, size, from_ns, to_ns, raw=raw)
+        ):
+            if found is not None:
+                yield found
+
+    def frames(self, channel: int, size: int, from_ns: int, to_ns: int) -> Iterator[tuple[int, Frame]]:
+        """The same as objects, with their log times."""
+        for found in self._each(channel, from_ns, to_ns, lambda data: frames(data, channel, size, from_ns, to_ns)):
+            yield from found
+
+    def _each(self, channel: int, from_ns: int, to_ns: int, decode: Callable[[bytes], T]) -> Iterator[T]:
+        """What is made of each chunk that may have something of a channel in a range of log times."""
         log = DamageLog(self._tell)
         for record, first_ns, last_ns in self._chunks(from_ns, to_ns, [channel]):
             try:
-                found = self._batch(record, channel, size, from_ns, to_ns, raw=raw)
+                found = self._decoded(record, decode)
             except RecordingError as error:
                 if self._damaged is None:
                     raise
                 log.add(record, error)
                 continue
             log.end(first_ns)
-            if found is not None:
-                yield found
+            yield found
             log.after(last_ns)
         log.end()
 
-    def _batch(self, record: Record, channel: int, size: int, from_ns: int, to_ns: int, *, raw: bool) -> Batch | None:
+    def _decoded(self, record: Record, decode: Callable[[bytes], T]) -> T:
         if record.opcode != Opcode.CHUNK:
             self.reader.note(record)  # which says what is wrong with it
         data = self.reader.records.unpacked(record)
         try:
-            return batch(data, channel, size, from_ns, to_ns, raw=raw)
+            return decode(data)
         except RecordingError as error:
             raise RecordingError(f"{self.file}: the chunk at byte {record.at}: {error}") from None
 

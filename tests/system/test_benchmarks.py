@@ -84,6 +84,14 @@ def test_a_benchmark_compares(benchmark: str, row: re.Pattern[str], tables: dict
     assert all((ratio == "") == (name == ours) for name, *_, ratio in found if name in (ours, *list(tables)[1:2]))
 
 
+def test_reading_recordings_is_measured() -> None:
+    found = printed("dump_read")
+    for contender in ("shmio columns", "shmio, frame by frame", "mcap library and struct"):
+        assert re.search(rf"^{contender} +[1-9]\d* +[1-9]\d*", found, re.MULTILINE)
+    assert len(re.findall(r"^(?:shmio|mcap library, .*?) +\d+\.\d+ +\d+\.\d+ +\d+\.\d+", found, re.MULTILINE)) == 4
+    assert len(re.findall(r"^(?:parquet|csv|mcap) +[1-9]\d* +\d+\.\d$", found, re.MULTILINE)) == 3
+
+
 def test_cycles_under_way_are_counted() -> None:
     assert len(re.findall(r"^[0-9]+ jobs: [124] under way +[1-9]", printed("s7_cycle"), re.MULTILINE)) == 3
 
