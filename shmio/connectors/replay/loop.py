@@ -103,7 +103,7 @@ class ReplayLoop:
         # In virtual time what is published belongs to the end of the step.
         at_ns = self._play.base_ns + self._play.at_ns(state.time_ns) if state.virtual else None
         self._writer.at_ns = at_ns
-        more = self._advance(state.time_ns)
+        more = self.counters.watch(self._clock.now_ns, lambda: self._advance(state.time_ns))
         if not more and state.stepping and state.step != self._play.step:
             self._keep(self._play._replace(step=state.step))
             self._writer.block.ring.wake()

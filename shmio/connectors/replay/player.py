@@ -9,6 +9,7 @@ from typing import Final, cast
 from shmio.connectors.output import Image, Output
 from shmio.connectors.replay.tape import Entry, Tape
 from shmio.segment import NO_WRITER, BlockWriter, Event, EventKind, Frame, Provenance, Quality, Record, Stamp
+from shmio.segment.commands import MAX_WRITES
 from shmio.segment.playhead import OWN_WORDS
 
 OVER: Final = f"{OWN_WORDS}the recording is over"
@@ -160,8 +161,8 @@ class Player:
             return
         record = Record(
             cast(EventKind, event.kind),  # or a number that this version does not know
-            event.text, NO_WRITER, event.command, event.item, event.items, event.offset, event.mask, event.size,
-            event.data, event.injection,
+            event.text, NO_WRITER, event.command, event.item, min(event.items, MAX_WRITES), event.offset, event.mask,
+            event.size, event.data, event.injection,
         )  # fmt: skip
         self._writer.cycle = event.cycle
         self._writer.event(record, quality=event.quality, at=at._replace(utc_ns=event.utc_ns))

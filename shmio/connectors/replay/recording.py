@@ -6,7 +6,7 @@ import logging
 from collections.abc import Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from shmio.connectors.replay.tape import Tape
 from shmio.dump.damage import Damage
@@ -15,6 +15,9 @@ from shmio.errors import RecordingError
 
 Moment = float | str
 """Seconds from a recording's begin, or a date and time."""
+
+MAX_NS: Final = 1 << 61
+"""No time is beyond this: some 70 years."""
 
 log = logging.getLogger("shmio.source")
 
@@ -63,6 +66,8 @@ class Recording:
             max(last.time_ns + last.block.period_ns for last in lasts if last and last.block) - self.utc_ns,
         )
         """From the first frame to a period behind the last one."""
+        if max(self.utc_ns, *map(abs, self.whole)) > MAX_NS:
+            raise RecordingError(f"{self._file} has times that make no sense: it cannot be played")
 
     def _damaged(self, file: Path, damage: Damage) -> None:
         log.warning("%s: bytes %d to %d are lost: %s", file, damage.first, damage.last, damage.why)
