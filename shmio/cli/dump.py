@@ -54,6 +54,13 @@ def _parser() -> argparse.ArgumentParser:
         "--register", dest="registers", nargs="+", action="extend", metavar="PATH", help="only these: paths or globs"
     )
 
+    record.add_argument("--when", metavar="CONDITION", help="only what happens around the times when this is true")
+    for option, what in (("--before", "before it is true"), ("--after", "after it was true last")):
+        record.add_argument(
+            option, dest=f"{option[2:]}_s", type=_seconds, default=10.0, metavar="SECONDS",
+            help=f"with --when: so much {what} (default 10)",
+        )  # fmt: skip
+
     note = verb("note", "put a note into the events of a running instance, and so into its recordings")
     note.add_argument("text", metavar="TEXT")
     note.add_argument("-c", dest="config", type=Path, metavar="FILE", help="the instance of this supervisor.toml")

@@ -1,7 +1,7 @@
 """``supervisor.toml``: read, checked, resolved (architecture: *Config*)."""
 
 from shmio.config.address import Address, UnixAddress, parse_address
-from shmio.config.model import Config, Declaration, Emulator, Grpc, Instance, Recorder, Source, Tls, Token
+from shmio.config.model import Config, Declaration, Emulator, Grpc, Instance, Recorder, Source, Tls, Token, Trigger
 from shmio.config.read import RESERVED_SOURCES, load
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "Source",
     "Tls",
     "Token",
+    "Trigger",
     "UnixAddress",
     "load",
     "parse_address",

@@ -157,6 +157,15 @@ class Grpc(Section):
         return found | {f"grpc.address[{index}].listen": address for index, address in enumerate(self.address)}
 
 
+class Trigger(Section):
+    """``[recorder.trigger]``: record only what happens around the moments when a condition is true."""
+
+    when: Text
+    before_s: Annotated[float, Meta(ge=0, le=3600)] = 10.0
+    after_s: Annotated[float, Meta(ge=0, le=86_400)] = 10.0
+    before_mb: Annotated[float, Meta(gt=0, le=65536)] = 64.0
+
+
 class Recorder(Section):
     """``[recorder]``: the process that records all sources to ``.mem`` files."""
 
@@ -169,6 +178,7 @@ class Recorder(Section):
     keep_mb: Annotated[float, Meta(ge=0, le=1e9)] = 0.0
     sources: list[Text] = []
     registers: Annotated[list[Text], Meta(max_length=1000)] = []
+    trigger: Trigger | None = None
 
     @property
     def buffer_bytes(self) -> int:

@@ -26,6 +26,7 @@ from shmio.config.model import (
     Source,
     Tls,
     Token,
+    Trigger,
 )
 from shmio.config.properties import read_properties
 from shmio.config.wording import explain, explain_toml, named
@@ -46,6 +47,7 @@ _TABLES: dict[str, type[Section]] = {
     "grpc.client": Client,
     "grpc.address": Listening,
     "recorder": Recorder,
+    "recorder.trigger": Trigger,
     "replay": Replay,
 }
 _OF_GRPC = ("token", "client", "address")

@@ -12,16 +12,18 @@ from shmio.config import Recorder as Settings
 from shmio.dump.encoding import Reason
 from shmio.recording.attach import ConfigFiles
 from shmio.recording.keeper import Keeper
-from shmio.recording.predecessor import places
+from shmio.recording.predecessor import interrupted, places
 from shmio.recording.selection import Selection
 from shmio.recording.series import Series
 from shmio.recording.tap import Start, Tap
+from shmio.recording.triggered import Triggered
 from shmio.segment import Report
 from shmio.worker import BEAT_S, Worker
 
 BY = "supervised"
 NOTE = "to "
 """How a recorder that is well begins its note; the name of its file follows."""
+WAITS = f"{NOTE}a file as soon as its trigger comes"
 
 
 def run(worker: Worker) -> None:
@@ -36,9 +38,15 @@ def run(worker: Worker) -> None:
     selection = Selection(settings.sources or None, settings.registers)
     for missing in selection.nothing(segment.blocks):
         worker.log.warning("recorder.registers: %s", missing)
-    series = Series(Tap(segment, start, selection), settings, BY, ConfigFiles(Path(worker.config["config_file"])))
+    tap, attachments = Tap(segment, start, selection), ConfigFiles(Path(worker.config["config_file"]))
+    series: Series | Triggered
+    if settings.trigger:
+        going = interrupted(directory, segment, BY, worker.slot.beat)
+        series = Triggered(tap, settings, settings.trigger, BY, attachments, going=going)
+    else:
+        series = Series(tap, settings, BY, attachments)
     goes_on = ", going on where its predecessor ended" if known else ""
-    worker.log.info("recording to %s%s%s", series.recorder.output.path, goes_on, elsewhere)
+    worker.log.info("recording %s%s%s", _note(series), goes_on, elsewhere)
     keeper = Keeper(segment.instance, settings, BY, series.present)
     keeper.start()
     _record(worker, series)
@@ -53,12 +61,12 @@ def run(worker: Worker) -> None:
 def _elsewhere(before: Report, directory: Path) -> str:
     """What to say of a predecessor whose file is not in this folder; empty if there was none, or it is here."""
     name = before.note.removeprefix(NOTE)
-    if name == before.note or (directory / name).exists():
+    if before.note in (name, WAITS) or (directory / name).exists():
         return ""
     return f"; {name} of the recorder before is not in this folder: what the rings no longer hold is there alone"
 
 
-def _record(worker: Worker, series: Series) -> None:
+def _record(worker: Worker, series: Series | Triggered) -> None:
     """Turn after turn; in virtual time a step is over only when there was one for it, so that none of it is missed."""
     clock, slot = worker.segment.clock, worker.slot.index
     bell = clock.slot_bell(slot)
@@ -78,14 +86,18 @@ def _record(worker: Worker, series: Series) -> None:
         if problem and not before:
             worker.log.error("%s", problem)
         elif before and not problem:
-            worker.log.info("%s is being written again", series.recorder.output.path)
+            worker.log.info("%s is being written again", series.file)
         _report(worker, series, problem)
 
 
-def _report(worker: Worker, series: Series, problem: str) -> None:
-    counters, output = series.counters, series.recorder.output
-    numbers = (counters.frames, counters.events, counters.missed, output.written)
-    worker.report(numbers, note=problem or f"{NOTE}{output.path.name}")
+def _report(worker: Worker, series: Series | Triggered, problem: str) -> None:
+    counters = series.counters
+    numbers = (counters.frames, counters.events, counters.missed, series.written)
+    worker.report(numbers, note=problem or _note(series))
+
+
+def _note(series: Series | Triggered) -> str:
+    return f"{NOTE}{series.file.name}" if series.file else WAITS
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -38,6 +39,14 @@ def places(directory: Path, segment: Segment, by: str, beat: Callable[[], object
         if found.keys() >= blocks.keys():
             break
     return found
+
+
+def interrupted(directory: Path, segment: Segment, by: str, beat: Callable[[], object] = lambda: None) -> bool:
+    """Whether the recorder before died within what a trigger had begun."""
+    for file in _of_this_run(directory, segment, by, beat)[:1]:
+        with suppress(OSError, RecordingError), Reader(file, own=True, beat=beat) as reader:
+            return reader.records.footer() is None and "trigger" in about_of(file, segment.instance, by)
+    return False
 
 
 def _of_this_run(directory: Path, segment: Segment, by: str, beat: Callable[[], object]) -> list[Path]:

@@ -62,6 +62,7 @@ class Recorder:
         """Where the recording had come to, by section, when :meth:`settle` was called last."""
         self.confirmed: Mapping[int, Place] = dict(self.places)
         """Where it had come to when what was written last that is on the disk for certain."""
+        self._ended = False
         self.empty = True
         """Whether nothing has happened yet."""
         self._attachments = attachments
@@ -156,7 +157,10 @@ class Recorder:
         return f"{problem}; {lost} frames and events lost so far" if problem and lost else problem
 
     def end(self) -> None:
-        """Have index and footer written behind what was put in; the disk may take its time."""
+        """Have index and footer written behind what was put in; the disk may take its time. Once is enough."""
+        if self._ended:
+            return
+        self._ended = True
         for followed in self._followed.values():
             self._tell_lost(followed, 0)
         self.settle()

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
 from shmio.config import Recorder as Settings
-from shmio.dump.encoding import Reason
+from shmio.dump.encoding import Place, Reason
 from shmio.errors import RecordingError
 from shmio.recording.attach import Attachments
+from shmio.recording.follower import Aside, Entry
 from shmio.recording.output import Output, create
 from shmio.recording.recorder import CLOSE_S, Counters, Recorder
 from shmio.recording.tap import Start, Tap
@@ -30,8 +32,21 @@ class Series:
     there.
     """
 
-    def __init__(self, tap: Tap, settings: Settings, by: str, attachments: Attachments) -> None:
-        """RecordingError: no file can be made."""
+    def __init__(
+        self,
+        tap: Tap,
+        settings: Settings,
+        by: str,
+        attachments: Attachments,
+        *,
+        places: Mapping[int, Place] | None = None,
+        about: Mapping[str, str] | None = None,
+        counters: Counters | None = None,
+    ) -> None:
+        """``places``: where it begins, by section, if the caller takes from the tap: then it must :meth:`put`.
+
+        ``about``: what else is to be told of this recording. RecordingError: no file can be made.
+        """
         self._tap = tap
         self._settings = settings
         self._by = by
@@ -40,10 +55,18 @@ class Series:
         self._again_s = 0.0
         self._ending: list[Recorder] = []
         """Files that are complete but for what the disk has not taken yet."""
-        self.counters = Counters()
-        self.recorder = self._begin(self._tap, None, {})
+        self.counters = counters or Counters()
+        self._takes = places is None
+        self._why = dict(about or {})
+        self.recorder = self._begin(tap, places, {})
 
-    def _begin(self, tap: Tap, before: Recorder | None, about: dict[str, str]) -> Recorder:
+    def _begin(
+        self,
+        tap: Tap,
+        places: Mapping[int, Place] | None,
+        about: Mapping[str, str],
+        after: Output | None = None,
+    ) -> Recorder:
         settings = self._settings
         path, fd = create(Path(settings.directory), tap.segment.instance)
         output = Output(
@@ -51,19 +74,43 @@ class Series:
             fd,
             limit_bytes=settings.buffer_bytes,
             fsync_s=settings.fsync_s,
-            after=before.output if before else None,
+            after=after,
         )
         self._begun_s = time.monotonic()
         return Recorder(
-            tap, output, by=self._by, places=before.places if before else None, about=about, counters=self.counters,
+            tap, output, by=self._by, places=places, about={**self._why, **about}, counters=self.counters,
             attachments=self._attachments,
         )  # fmt: skip
 
     def turn(self) -> bool:
         """Record what has been published; whether there is more at once. RecordingError: the file was removed."""
         entries, more = self._tap.take()
-        self.recorder.put(entries)
+        self.put(entries)
         return more
+
+    def put(self, entries: Iterable[Entry | Aside]) -> None:
+        """Record what the tap gave. RecordingError: the file was removed."""
+        self.recorder.put(entries)
+
+    def end(self) -> Mapping[int, Place]:
+        """Nothing more comes: have all files closed, however long the disk takes; where it ended, by section."""
+        self.recorder.end()
+        return self.recorder.places
+
+    @property
+    def ended(self) -> bool:
+        """Whether the disk has all, after :meth:`end`."""
+        return all(recorder.output.ended for recorder in (*self._ending, self.recorder))
+
+    @property
+    def file(self) -> Path:
+        """What is being written."""
+        return self.recorder.output.path
+
+    @property
+    def written(self) -> int:
+        """Bytes in the present file."""
+        return self.recorder.output.written
 
     @property
     def pause_s(self) -> float:
@@ -110,7 +157,7 @@ class Series:
         old = self.recorder
         old.settle()
         try:
-            self.recorder = self._begin(self._tap, old, {})
+            self.recorder = self._begin(self._tap, old.places, {}, after=old.output)
         except RecordingError as error:
             log.error("%s; going on in %s", error, old.output.path)
             self._again_s = time.monotonic() + MAX_WAIT_S
@@ -126,9 +173,14 @@ class Series:
         self._wait_s = min(2 * self._wait_s, MAX_WAIT_S)
         output = doubtful.output
         about = {"doubtful": output.path.name, "doubtful_from": str(output.synced)}
-        tap = self._tap.again(Start(doubtful.confirmed, True, Reason.UNSURE))
+        tap, places = self._tap, None
+        if self._takes:
+            tap = tap.again(Start(doubtful.confirmed, True, Reason.UNSURE))
+        else:  # somebody else's, who has no more of what is in doubt
+            self.recorder.settle()
+            places = self.recorder.places
         try:
-            recorder = self._begin(tap, None, about)
+            recorder = self._begin(tap, places, about)
         except RecordingError as error:
             log.error("%s; %s", output.problem, error)
             return False
@@ -136,16 +188,22 @@ class Series:
         if self.recorder is not doubtful:
             self._ending.remove(doubtful)
             output.close(0)
-        self.recorder.close()
+        self._finish(CLOSE_S)
         self._tap, self.recorder = tap, recorder
         return True
+
+    def _finish(self, patience_s: float) -> bool:
+        if self._takes:
+            return self.recorder.close(patience_s)
+        self.recorder.end()
+        return self.recorder.output.close(patience_s)
 
     def close(self, patience_s: float = CLOSE_S) -> list[str]:
         """Take what is there, write it, close all files; what is wrong with those that are not whole."""
         until_s = time.monotonic() + patience_s
         files = [*self._ending, self.recorder]
         closed = [old.output.close(max(0.0, until_s - time.monotonic())) for old in self._ending]
-        closed.append(self.recorder.close(max(0.1, until_s - time.monotonic())))
+        closed.append(self._finish(max(0.1, until_s - time.monotonic())))
         return [_unclosed(recorder.output) for recorder, whole in zip(files, closed, strict=True) if not whole]
 
 

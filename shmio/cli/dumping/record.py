@@ -12,18 +12,19 @@ from pathlib import Path
 
 from shmio.cli.interrupt import told_to_stop
 from shmio.cli.target import instance_name
+from shmio.config import Recorder as Settings
+from shmio.config import Trigger
 from shmio.errors import ControlError, PathError, RecordingError
 from shmio.logs import printable
 from shmio.recording.attach import Attachments, ConfigFiles, no_attachments
-from shmio.recording.output import Output, create
-from shmio.recording.recorder import Recorder
 from shmio.recording.selection import Selection
+from shmio.recording.series import Series
 from shmio.recording.tap import Start, Tap
+from shmio.recording.triggered import Triggered
 from shmio.segment import Segment
 from shmio.supervisor import control
 
 BY = "shmio-dump"
-BUFFER_BYTES = 16_000_000
 WHERE_S = 2.0
 LOOK_S = 0.5
 """How often it is looked whether the instance still is, and the disk well."""
@@ -37,42 +38,51 @@ def execute(arguments: argparse.Namespace) -> int:
         selection = Selection(sources, arguments.registers or ())
         for missing in selection.nothing(segment.blocks):
             raise PathError(missing)
-        path, fd = create(arguments.directory, segment.instance)
-        recorder = Recorder(
-            Tap(segment, Start(first=False), selection),
-            Output(path, fd, limit_bytes=BUFFER_BYTES),
-            by=BY,
-            attachments=_attachments(segment),
-        )
-        _say(f"recording {', '.join(sources or segment.blocks)} of {segment.instance} to {path}; Ctrl-C ends it")
+        tap = Tap(segment, Start(first=False), selection)
+        work = _work(arguments, tap, _attachments(segment))
+        what = f"{', '.join(sources or segment.blocks)} of {segment.instance}"
+        if work.file:
+            _say(f"recording {what} to {work.file}; Ctrl-C ends it")
+        else:
+            _say(f"recording {what} to {arguments.directory} whenever {arguments.when}; Ctrl-C ends it")
         try:
-            whole = _record(segment, recorder, stopping, arguments.duration_s)
+            whole = _record(segment, work, stopping, arguments.duration_s)
         finally:
-            closed = recorder.close()
-        _sum_up(recorder, path)
-        if not closed:
-            output = recorder.output
-            raise RecordingError(
-                output.problem if output.doubt else f"{output.problem or path}; the file was not closed"
-            )
+            file = work.file
+            unclosed = work.close()
+        _sum_up(work, file or arguments.directory)
+        for text in unclosed:
+            raise RecordingError(text)
         return 0 if whole else 1
 
 
-def _record(segment: Segment, recorder: Recorder, stopping: threading.Event, duration_s: float | None) -> bool:
+def _work(arguments: argparse.Namespace, tap: Tap, attachments: Attachments) -> Series | Triggered:
+    settings = Settings(directory=str(arguments.directory), rotate_min=0, rotate_mb=0)
+    if arguments.when is None:
+        return Series(tap, settings, BY, attachments)
+    trigger = Trigger(arguments.when, arguments.before_s, arguments.after_s)
+    return Triggered(tap, settings, trigger, BY, attachments)
+
+
+def _record(segment: Segment, work: Series | Triggered, stopping: threading.Event, duration_s: float | None) -> bool:
     """Whether it went on as long as was asked."""
     until_s = None if duration_s is None else time.monotonic() + duration_s
-    look_s, more, problem = 0.0, False, ""
+    look_s, more, problem, file = 0.0, False, "", work.file
     while True:
-        rest_s = recorder.tap.pause_s if until_s is None else min(recorder.tap.pause_s, until_s - time.monotonic())
+        rest_s = work.pause_s if until_s is None else min(work.pause_s, until_s - time.monotonic())
         if rest_s <= 0 or stopping.wait(0 if more else rest_s):
             return True
-        more = recorder.turn()
+        more = work.turn()
+        if work.file != file:
+            file = work.file
+            _say(f"recording to {file}" if file else "waiting for the next time")
         if time.monotonic() - look_s < LOOK_S:
             continue
         look_s = time.monotonic()
-        before, problem = problem, recorder.problem
+        work.tend()
+        before, problem = problem, work.problem
         if bool(problem) != bool(before):
-            _say(problem or f"{recorder.output.path} is being written again")
+            _say(problem or f"{file} is being written again")
         if not segment.shared.current():
             _say(f"instance {segment.instance!r} has stopped")
             return until_s is None
@@ -87,10 +97,10 @@ def _attachments(segment: Segment) -> Attachments:
         return no_attachments
 
 
-def _sum_up(recorder: Recorder, path: Path) -> None:
-    counters = recorder.counters
-    size = f"{recorder.output.written / 1e6:.2f} MB"
-    _say(f"{path}: {counters.frames} frames, {counters.events} events, {counters.missed} missed, {size}")
+def _sum_up(work: Series | Triggered, path: Path) -> None:
+    counters = work.counters
+    size = f", {work.written / 1e6:.2f} MB" if work.written else ""
+    _say(f"{path}: {counters.frames} frames, {counters.events} events, {counters.missed} missed{size}")
 
 
 def _say(line: str) -> None:

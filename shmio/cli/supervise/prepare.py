@@ -62,6 +62,8 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
         layouts = sources.layouts
         emulated = {emulator.name: _check_emulator(i, emulator, files) for i, emulator in enumerate(config.emulator)}
         declared, described = _check_injections(config, layouts)
+        if config.recorder and config.recorder.trigger:
+            _check_trigger(config.recorder.trigger.when, layouts)
         odd = [*notices, *_odd(config, layouts), *_not_served(config, layouts, emulated), *_unread(emulated)]
     except ConfigError as error:
         raise ConfigError(f"{file}: {named(str(error), msgspec.to_builtins(config))}") from None
@@ -94,6 +96,15 @@ def _check_injections(config: Config, layouts: dict[str, Layout]) -> tuple[dict[
     from shmio.cli.supervise.injections import check_injections  # noqa: PLC0415
 
     return check_injections(config, layouts)
+
+
+def _check_trigger(when: str, layouts: dict[str, Layout]) -> None:
+    from shmio.injection.program import compile_condition  # noqa: PLC0415
+
+    try:
+        compile_condition(when, layouts)
+    except ConfigError as error:
+        raise ConfigError(f"recorder.trigger.{error}") from None
 
 
 def _check_emulator(index: int, emulator: Emulator, files: LayoutFiles) -> tuple[Layout, ...]:

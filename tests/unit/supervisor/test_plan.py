@@ -98,6 +98,7 @@ def test_log_mode_records_and_serves_nothing(tmp_path: Path) -> None:
         "keep_mb": 0,
         "sources": [],
         "registers": [],
+        "trigger": None,
         "config_file": str(tmp_path / "s.toml"),
     }
 

@@ -1,0 +1,150 @@
+"""Recordings of what a trigger is about: a file a trigger, with the seconds before."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from shmio.config import Recorder as Settings
+from shmio.config import Trigger as TriggerSettings
+from shmio.dump.encoding import Place
+from shmio.errors import RecordingError
+from shmio.recording.attach import Attachments
+from shmio.recording.follower import Aside, Entry
+from shmio.recording.recorder import CLOSE_S, Counters
+from shmio.recording.series import Series
+from shmio.recording.tap import TURN_S, Tap
+from shmio.recording.trigger import Backlog, Trigger
+
+TURN_NS: Final = round(TURN_S * 1e9)
+
+log = logging.getLogger("shmio.recorder")
+
+
+class Triggered:
+    """As :class:`~shmio.recording.series.Series`, but for the time between triggers. One that comes prolongs a file."""
+
+    def __init__(
+        self, tap: Tap, settings: Settings, trigger: TriggerSettings, by: str, attachments: Attachments,
+        *, going: bool = False,
+    ) -> None:  # fmt: skip
+        """``going``: a recorder that died was within such a recording. ConfigError: the condition cannot be."""
+        self.counters = Counters()
+        self._tap = tap
+        self._settings = settings
+        self._trigger = Trigger(trigger.when, tap.segment.blocks)
+        self._times = trigger
+        self._by = by
+        self._attachments = attachments
+        self._series: Series | None = None
+        self._ending: list[Series] = []
+        self._backlog = self._anew(tap.start.places)
+        self._until_ns = 0
+        self._problem = ""
+        if going:
+            self._begin(tap.now())
+
+    def turn(self) -> bool:
+        """Look what has been published, and record what is to be; whether there is more at once. RecordingError."""
+        self._trigger.follow(self._tap.segment.blocks)
+        entries, more = self._tap.take()
+        batch: list[Entry | Aside] = []
+        for entry in entries:
+            if self._series and entry.log_ns > self._until_ns:
+                self._end(batch)
+                batch = []
+            if self._trigger.sees(entry):
+                self._begin(entry.log_ns)
+            if self._series:
+                batch.append(entry)
+            else:
+                self._backlog.add(entry)
+        if self._series:
+            self._series.put(batch)
+            if not self._tap.segment.clock.read().virtual and self._tap.now() > self._until_ns + TURN_NS:
+                self._end([])  # nothing comes any more that would tell
+        return more
+
+    def _begin(self, log_ns: int) -> None:
+        """Begin a file with what was before, or have the present one go on."""
+        self._until_ns = log_ns + round(self._times.after_s * 1e9)
+        if self._series is not None:
+            return
+        before = self._backlog.before(log_ns)
+        about = {"trigger": self._trigger.when, "triggered_ns": str(log_ns)}
+        try:
+            series = Series(
+                self._tap, self._settings, self._by, self._attachments,
+                places=self._backlog.places, about=about, counters=self.counters,
+            )  # fmt: skip
+        except RecordingError as error:  # the seconds before are kept; with the next frame that fires it is tried again
+            if not self._problem:
+                log.error("%s: %s", self._trigger.when, error)
+            self._problem = str(error)
+            return
+        self._problem = ""
+        self._series = series
+        series.put(before)
+        log.info("%s: recording to %s", self._trigger.when, series.file)
+
+    def _end(self, last: Sequence[Entry | Aside]) -> None:
+        series, self._series = self._series, None
+        if series:
+            series.put(last)
+            self._backlog = self._anew(series.end())
+            self._ending.append(series)
+
+    def _anew(self, places: Mapping[int, Place]) -> Backlog:
+        return Backlog(self._times.before_s, round(self._times.before_mb * 1e6), places)
+
+    @property
+    def _all(self) -> list[Series]:
+        return [*self._ending, *([self._series] if self._series else [])]
+
+    def tend(self) -> bool:
+        """Look after the files; whether a doubtful one was given up."""
+        for series in [series for series in self._ending if series.ended]:
+            for unclosed in series.close(0):
+                log.error("%s", unclosed)
+            self._ending.remove(series)
+        return bool(self._series and self._series.tend())
+
+    @property
+    def pause_s(self) -> float:
+        """How long to wait between two turns."""
+        return self._tap.pause_s
+
+    @property
+    def done(self) -> int:
+        """The last step of virtual time of which all has been taken."""
+        return self._tap.done
+
+    @property
+    def problem(self) -> str:
+        """What is wrong at present, in words; empty: nothing."""
+        return next(filter(None, (series.problem for series in self._all)), self._problem)
+
+    @property
+    def file(self) -> Path | None:
+        """What is being written; None: it waits for its trigger."""
+        return self._series.file if self._series else None
+
+    @property
+    def written(self) -> int:
+        """Bytes in the present file."""
+        return self._series.written if self._series else 0
+
+    def present(self) -> set[Path]:
+        """What is being written; asked from another thread."""
+        return {path for series in self._all for path in series.present()}
+
+    def close(self, patience_s: float = CLOSE_S) -> list[str]:
+        """Take what is there, close all files; what is wrong with those that are not whole."""
+        while self.turn():
+            pass
+        self._end(self._tap.rest())
+        until_s = time.monotonic() + patience_s
+        return [text for series in self._ending for text in series.close(max(0.1, until_s - time.monotonic()))]
