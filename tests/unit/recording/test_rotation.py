@@ -95,7 +95,8 @@ def test_by_time(segment: Segment, tmp_path: Path) -> None:
         writer = segment.writer("cell")
 
         def enough() -> bool:
-            publish(writer, 1, first=writer.block.ring.head())
+            if process.counts("frames") == writer.block.ring.head():  # a busy host must not have the ring run over
+                publish(writer, 1, first=writer.block.ring.head())
             return len(list(process.folder.glob("*.mem"))) >= 3
 
         until(enough, "three files")
