@@ -1,7 +1,21 @@
 """``supervisor.toml``: read, checked, resolved (architecture: *Config*)."""
 
 from shmio.config.address import Address, UnixAddress, parse_address
-from shmio.config.model import Config, Declaration, Emulator, Grpc, Instance, Recorder, Source, Tls, Token, Trigger
+from shmio.config.model import (
+    Config,
+    Declaration,
+    Emulator,
+    Grpc,
+    Instance,
+    Mqtt,
+    MqttTls,
+    MqttTopic,
+    Recorder,
+    Source,
+    Tls,
+    Token,
+    Trigger,
+)
 from shmio.config.read import RESERVED_SOURCES, load
 
 __all__ = [
@@ -12,6 +26,9 @@ __all__ = [
     "Emulator",
     "Grpc",
     "Instance",
+    "Mqtt",
+    "MqttTls",
+    "MqttTopic",
     "Recorder",
     "Source",
     "Tls",

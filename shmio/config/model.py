@@ -19,6 +19,8 @@ Operand = bool | int | float | str | list[Any]
 ClockName = Literal["wall", "stepped"]
 ReplayedInjections = Literal["keep", "leave out"]
 DistributionName = Literal["uniform", "gaussian"]
+BrokerName = Literal["embedded", "mosquitto", "external"]
+PayloadName = Literal["text", "json", "frames"]
 OperationName = Literal["set", "offset", "scale", "clamp", "noise", "random", "freeze", "delay", "drop", "flip"]
 RealtimePriority = Annotated[int, Meta(ge=1, le=99)]
 """Of SCHED_FIFO, sched(7)."""
@@ -157,6 +159,54 @@ class Grpc(Section):
         return found | {f"grpc.address[{index}].listen": address for index, address in enumerate(self.address)}
 
 
+class MqttTls(Section):
+    """``[mqtt.tls]``: PEM files. ``ca``: whose certificates are trusted, of an external broker the host's if not given.
+
+    ``certificate`` and ``key``: what an external broker is shown, or what our own one shows its clients.
+    """
+
+    ca: Text | None = None
+    certificate: Text | None = None
+    key: Text | None = None
+
+
+class MqttTopic(Section):
+    """``[[mqtt.topic]]``: how the registers that ``match`` names are published; of several rules the first counts."""
+
+    match: Text | Texts
+    publish: bool = True
+    payload: PayloadName = "text"
+    qos: Annotated[int, Meta(ge=0, le=1)] = 1
+    retain: bool = True
+    deadband: Annotated[float, Meta(ge=0, le=1e300)] = 0.0
+    max_rate_hz: Annotated[float, Meta(gt=0, le=1e6)] | None = None
+    elements: bool = False
+
+    @property
+    def patterns(self) -> list[str]:
+        """Globs over paths that begin with their source."""
+        return [self.match] if isinstance(self.match, str) else self.match
+
+
+class Mqtt(Section):
+    """``[mqtt]``: the bridge to a broker, and the broker itself unless it is ``external``."""
+
+    broker: BrokerName = "embedded"
+    listen: Text | None = None
+    host: Text | Texts | None = None
+    port: Annotated[int, Meta(ge=1, le=65535)] | None = None
+    prefix: Text | None = None
+    insecure: bool = False
+    tls: MqttTls | None = None
+    username: Text | None = None
+    password_file: Text | None = None
+    client_id: Annotated[str, Meta(min_length=1, max_length=128)] | None = None
+    keep_alive_s: Annotated[int, Meta(ge=5, le=3600)] = 30
+    session_expiry_s: Annotated[int, Meta(ge=0, le=2**32 - 2)] = 0
+    backlog_mb: Annotated[float, Meta(ge=0, le=65536)] = 16.0
+    topic: list[MqttTopic] = []
+
+
 class Trigger(Section):
     """``[recorder.trigger]``: record only what happens around the moments when a condition is true."""
 
@@ -235,6 +285,7 @@ class Config(Section):
     emulator: list[Emulator] = []
     injection: list[Declaration] = []
     grpc: Grpc | None = None
+    mqtt: Mqtt | None = None
     recorder: Recorder | None = None
     replay: Replay | None = None
     folder: str = "."

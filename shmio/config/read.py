@@ -20,6 +20,9 @@ from shmio.config.model import (
     Grpc,
     Instance,
     Listening,
+    Mqtt,
+    MqttTls,
+    MqttTopic,
     Recorder,
     Replay,
     Section,
@@ -28,12 +31,13 @@ from shmio.config.model import (
     Token,
     Trigger,
 )
+from shmio.config.mqtt import check_mqtt, resolve_mqtt
 from shmio.config.properties import read_properties
 from shmio.config.wording import explain, explain_toml, named
 from shmio.errors import ConfigError
 
 RESERVED_SOURCES = frozenset({"simlog", "model", "shmio"})
-SECTION_PROCESSES = frozenset({"grpc", "mqtt", "recorder", "supervisor", "web"})
+SECTION_PROCESSES = frozenset({"broker", "grpc", "mqtt", "recorder", "supervisor", "web"})
 MAX_FILE_BYTES = 1 << 20
 
 _TABLES: dict[str, type[Section]] = {
@@ -46,6 +50,9 @@ _TABLES: dict[str, type[Section]] = {
     "grpc.token": Token,
     "grpc.client": Client,
     "grpc.address": Listening,
+    "mqtt": Mqtt,
+    "mqtt.tls": MqttTls,
+    "mqtt.topic": MqttTopic,
     "recorder": Recorder,
     "recorder.trigger": Trigger,
     "replay": Replay,
@@ -92,14 +99,14 @@ def read_tables(file: Path) -> dict[str, Any]:
 def _resolve(tables: dict[str, Any], folder: Path) -> Config:
     if "folder" in tables:
         raise ConfigError(_unknown("folder", ""))
-    grpc = tables.get("grpc")
+    inner = [("grpc", name) for name in _OF_GRPC] + [("mqtt", "topic")]
     for name, table in [
         ("source", tables),
         ("emulator", tables),
         ("injection", tables),
-        *((f"grpc.{n}", grpc) for n in _OF_GRPC),
+        *((f"{section}.{name}", tables.get(section)) for section, name in inner),
     ]:
-        if isinstance(table, dict) and isinstance(table.get(name.removeprefix("grpc.")), dict):
+        if isinstance(table, dict) and isinstance(table.get(name.rpartition(".")[2]), dict):
             raise ConfigError(f"{name}: write [[{name}]], in two brackets: there can be several")
     check_text(tables, "")
     sources = tables.get("source", [])
@@ -110,8 +117,11 @@ def _resolve(tables: dict[str, Any], folder: Path) -> Config:
     _check_times(config)
     check_declarations(config.injection)
     check_listening(config)
+    check_mqtt(config)
     if config.grpc:
         resolve(config.grpc, config)
+    if config.mqtt:
+        resolve_mqtt(config.mqtt, config)
     return config
 
 

@@ -12,9 +12,11 @@ from msgspec import ValidationError
 from shmio.config.model import (
     NAME_PATTERN,
     NAME_RULE,
+    BrokerName,
     ClockName,
     DistributionName,
     OperationName,
+    PayloadName,
     ReplayedInjections,
 )
 
@@ -23,10 +25,12 @@ _PLACE = re.compile(r"\(at line (\d+), column (\d+)\)\Z")
 _BARE = re.compile(r"[^\s,=#\[\]{}\"']+")
 _TEXT = re.compile(r"[^\W\d].*|.*[:/].*|\d+(?:\.\d+){2,}")  # a name, a path, an address
 _WORDS = {
+    "broker": BrokerName,
     "clock": ClockName,
     "distribution": DistributionName,
     "injections": ReplayedInjections,
     "operation": OperationName,
+    "payload": PayloadName,
 }
 """Keys that take one of a few words."""
 _TYPES = {

@@ -85,7 +85,7 @@ def chosen(layout: Layout, pattern: str) -> Iterator[Register]:
         if glob.matches(register.path):
             yield register
         elif register.dims and glob.reaches(register.path):
-            yield from (element for element in _elements(layout, register) if glob.matches(element.path))
+            yield from (element for element in elements(layout, register) if glob.matches(element.path))
 
 
 def merge(image: bytes | bytearray, mask: bytes | bytearray, ranges: Iterable[tuple[int, int]]) -> list[Write]:
@@ -117,7 +117,8 @@ def _joined(ranges: Iterable[tuple[int, int]]) -> list[tuple[int, int]]:
     return joined
 
 
-def _elements(layout: Layout, register: Register) -> Iterator[Register]:
+def elements(layout: Layout, register: Register) -> Iterator[Register]:
+    """The elements of an array, the last index running fastest."""
     index = [low for low, _ in register.dims]
     for _ in range(register.count):
         yield layout.element(register, tuple(index))

@@ -34,6 +34,7 @@ COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "source": ("polls", "overruns", "failures", "connects", "round_trip_us", "rate_mhz"),
     "emulator": ("cycles", "overruns"),
     "grpc": ("streams", "messages", "dropped", "published", "refused"),
+    "mqtt": ("messages", "commands", "refused", "waiting", "backlog", "dropped", "connects"),
     "recorder": ("frames", "events", "missed", "bytes"),
 }
 """Names of a worker's counters by its kind, in the order of their slots (at most 8)."""
@@ -43,7 +44,7 @@ GUESTS: Final = 4
 """Places for programs from outside that write; the last slots of the table, with the first command queues."""
 
 WRITERS: Final[Mapping[str, int]] = {"grpc": 4, "mqtt": 5}
-"""The command queue of a process that writes, by its kind."""
+"""The command queue of a process that writes, by its kind, which is its name."""
 
 
 class Phase(IntEnum):
@@ -70,10 +71,15 @@ class Activity(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class ProcessSpec:
-    """A process the instance has a slot for. ``kind``: source, emulator, grpc, recorder."""
+    """A process the instance has a slot for. ``kind``: source, emulator, grpc, mqtt, recorder."""
 
     name: str
     kind: str
+
+    @property
+    def writer(self) -> int | None:
+        """Its command queue; None: it writes nothing. (Of kind mqtt there is the broker, too, which does not.)."""
+        return WRITERS.get(self.kind) if self.name == self.kind else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +197,7 @@ class ProcessTable(Sequence[ProcessSlot]):
     def write(memory: memoryview, header: Header, specs: Sequence[ProcessSpec]) -> None:
         """Name the slots of a new segment, the guests' included."""
         first = header.process_capacity - GUESTS
-        slots = [(index, spec.name, spec.kind, WRITERS.get(spec.kind)) for index, spec in enumerate(specs)]
+        slots = [(index, spec.name, spec.kind, spec.writer) for index, spec in enumerate(specs)]
         slots += [(first + guest, f"guest-{guest + 1}", "guest", guest) for guest in range(GUESTS)]
         for index, name, kind, writer in slots:
             at = header.processes_offset + index * SLOT_SIZE
@@ -212,7 +218,7 @@ class ProcessTable(Sequence[ProcessSlot]):
         taken = {slot.index for slot in (*self._slots, *self.guests)}
         index = next(i for i in range(self._header.process_capacity) if i not in taken)
         at = self._header.processes_offset + index * SLOT_SIZE
-        writer = WRITERS.get(spec.kind)
+        writer = spec.writer
         fields = _FIXED.pack(spec.name.encode(), spec.kind.encode(), 0 if writer is None else writer + 1)
         self._memory[at + _NAME_SIZE : at + len(fields)] = fields[_NAME_SIZE:]
         self._memory[at : at + _NAME_SIZE] = fields[:_NAME_SIZE]  # last: a slot with a name is whole

@@ -9,7 +9,7 @@ from shmio.segment import Activity, ProcessSlot
 from shmio.segment.status import complaint as complaint_of
 from shmio.supervisor import policy
 from shmio.supervisor.control import Answer
-from shmio.supervisor.plan import RANKS, Job
+from shmio.supervisor.plan import Job, rank
 from shmio.supervisor.policy import Life, Limits
 from shmio.supervisor.process import Adopted, Child, describe_end
 from shmio.supervisor.states import Action, State
@@ -42,7 +42,7 @@ class Managed:
     @property
     def rank(self) -> int:
         """Place in the order of start; what this version does not know is stopped last."""
-        return RANKS.get(self.slot.kind, 0)
+        return rank(self.slot.name, self.slot.kind)
 
     @property
     def job(self) -> Job:
@@ -84,9 +84,10 @@ class Managed:
         """Take what it reports as wrong; the log tells the end of it, and what was lost by then."""
         running = self.life.state is State.RUNNING
         complaint = complaint_of(self.slot.kind, self.slot.report.note) if running else ""
-        missed = self.slot.counters.get("missed", 0) if running else 0  # a process counts from its start
+        lost = ("dropped", "changes") if self.slot.kind == "mqtt" else ("missed", "frames and events")
+        missed = self.slot.counters.get(lost[0], 0) if running else 0  # a process counts from its start
         if self.complaint and running and not complaint:
-            log.info("%s is well again; %d frames and events were lost", self.name, max(0, missed - self._missed))
+            log.info("%s is well again; %d %s were lost", self.name, max(0, missed - self._missed), lost[1])
         if not complaint:
             self._missed = missed
         self.complaint = complaint

@@ -9,21 +9,31 @@ from typing import Any, Final
 
 import msgspec
 
-from shmio.config import Config
+from shmio.config import Config, Mqtt
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout
 from shmio.segment import Attributes, BlockSpec, Origin, ProcessSpec, segment_size
 
-RANKS: Final[Mapping[str, int]] = {"emulator": 0, "recorder": 0, "source": 1, "grpc": 2}
+RANKS: Final[Mapping[str, int]] = {"emulator": 0, "recorder": 0, "source": 1, "grpc": 2, "mqtt": 2}
 """Order of start by kind: what plays a device, what reads devices, what serves the readings.
 
 The recorder is there before the sources and after them: their last frames and events are recorded, too.
 """
 
+BROKER: Final = "broker"
+"""The process of our own MQTT broker, of kind mqtt: there before the bridge, and after it, which takes leave of it."""
+
+
+def rank(name: str, kind: str) -> int:
+    """Place of a process in the order of start; what this version does not know is stopped last."""
+    return 0 if (name, kind) == (BROKER, "mqtt") else RANKS.get(kind, 0)
+
+
 MODULES: Final[Mapping[str, str]] = {
     "source": "shmio.connectors",
     "emulator": "shmio.emulators",
     "grpc": "shmio.endpoints.grpc",
+    "mqtt": "shmio.endpoints.mqtt",
     "recorder": "shmio.recording",
 }
 """The module that is a process of each kind."""
@@ -52,7 +62,7 @@ class Job:
     @property
     def rank(self) -> int:
         """Place in the order of start."""
-        return RANKS[self.kind]
+        return rank(self.name, self.kind)
 
     def describe(self, instance: str, epoch: int) -> bytes:
         """The JSON object that the process reads from its standard input."""
@@ -155,6 +165,8 @@ def make_plan(
     if config.grpc and mode != "log":
         place = {"group": config.instance.group, "config_file": str(config_file.resolve())}
         sections.append(("grpc", "grpc", msgspec.to_builtins(config.grpc) | place))
+    if config.mqtt and mode != "log":
+        sections += _mqtt(config.mqtt)
     if config.recorder:
         paths = {"directory": config.path(config.recorder.directory), "config_file": config_file.resolve()}
         recorder = msgspec.to_builtins(config.recorder) | {key: str(path) for key, path in paths.items()}
@@ -174,6 +186,17 @@ def make_plan(
         stepped=config.instance.clock == "stepped",
         origin=origin,
     )
+
+
+def _mqtt(mqtt: Mqtt) -> list[tuple[str, str, dict[str, Any]]]:
+    """The bridge, and the broker if it is ours: each gets the keys that it needs, so that it alone is replaced."""
+    section = msgspec.to_builtins(mqtt)
+    listen, accounts = section.pop("listen"), section["password_file"]
+    if mqtt.broker == "external":
+        return [("mqtt", "mqtt", section)]
+    broker = {"broker": mqtt.broker, "listen": listen, "password_file": accounts, "tls": section["tls"]}
+    bridge = section | {"password_file": None, "tls": None}
+    return [(BROKER, "mqtt", broker), ("mqtt", "mqtt", bridge)]
 
 
 def _job(name: str, kind: str, log_file: Path, section: dict[str, Any]) -> Job:

@@ -7,7 +7,9 @@ import os
 from pathlib import Path
 
 from shmio import realtime
-from shmio.config import Config
+from shmio.config import Config, Mqtt
+from shmio.config.accounts import read_accounts, read_password
+from shmio.config.mqtttls import client_context, server_context
 from shmio.config.tls import read_tls
 from shmio.config.tokens import read_tokens
 from shmio.errors import ConfigError
@@ -27,6 +29,22 @@ def check_host(config: Config) -> None:
         if config.grpc.tls:
             read_tls(config.grpc.tls)
         read_tokens(config.grpc.token)
+    if config.mqtt:
+        _check_mqtt(config.mqtt)
+
+
+def _check_mqtt(mqtt: Mqtt) -> None:
+    """What its processes will read, and start."""
+    external = mqtt.broker == "external"
+    if mqtt.tls:
+        (client_context if external else server_context)(mqtt.tls)
+    if mqtt.password_file:
+        (read_password if external else read_accounts)(mqtt.password_file)
+    if mqtt.broker == "mosquitto":
+        from shmio.endpoints.mqtt import mosquitto  # noqa: PLC0415
+
+        if mosquitto.find() is None:
+            raise ConfigError(mosquitto.NONE)
 
 
 def _check_group(name: str | None) -> None:

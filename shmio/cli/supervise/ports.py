@@ -29,6 +29,8 @@ def check_listening(config: Config) -> None:
     listening = [(f"emulator[{i}].listen", emulator.listen) for i, emulator in enumerate(config.emulator)]
     if config.grpc:
         listening += [(key, address.listen) for key, address in config.grpc.listening.items()]
+    if config.mqtt and config.mqtt.listen:
+        listening.append(("mqtt.listen", config.mqtt.listen))
     seen: list[tuple[str, str, int, set[str]]] = []
     sockets: dict[UnixAddress, str] = {}
     for key, text in listening:

@@ -64,7 +64,13 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
         declared, described = _check_injections(config, layouts)
         if config.recorder and config.recorder.trigger:
             _check_trigger(config.recorder.trigger.when, layouts)
-        odd = [*notices, *_odd(config, layouts), *_not_served(config, layouts, emulated), *_unread(emulated)]
+        odd = [
+            *notices,
+            *_odd(config, layouts),
+            *_odd_topics(config, layouts),
+            *_not_served(config, layouts, emulated),
+            *_unread(emulated),
+        ]
     except ConfigError as error:
         raise ConfigError(f"{file}: {named(str(error), msgspec.to_builtins(config))}") from None
     warnings = [*files.warnings, *(f"{file}: warning: {text}" for text in odd)]
@@ -156,6 +162,24 @@ def _odd(config: Config, layouts: dict[str, Layout]) -> list[str]:
     if not config.source:
         odd.append("there is no [[source]]: the instance will hold no registers")
     return odd
+
+
+def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
+    """Rules of ``[[mqtt.topic]]`` that name nothing. ConfigError: a pattern that is none."""
+    for index, rule in enumerate(config.mqtt.topic if config.mqtt else ()):
+        key = f"mqtt.topic[{index}].match"
+        for pattern in rule.patterns:
+            if rule.payload == "frames":
+                if pattern not in layouts:
+                    raise ConfigError(f"{key}: {pattern!r}: frames are those of a whole source, so name one")
+                continue
+            try:
+                glob = Glob(pattern)
+            except PathError as error:
+                raise ConfigError(f"{key}: {error}") from None
+            paths = (f"{source}/{register.path}" for source, layout in layouts.items() for register in layout.registers)
+            if not any(map(glob.matches, paths)):
+                yield f"{key}: {pattern!r} names no register; the path of one begins with its source"
 
 
 def _near(pattern: str, layout: Layout) -> str:

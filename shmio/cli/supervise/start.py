@@ -26,7 +26,7 @@ from shmio.segment import Segment, State, instances, leftover
 from shmio.segment.segment import refuse_second
 from shmio.supervisor import control
 from shmio.supervisor.main import Supervisor
-from shmio.supervisor.plan import Job, Plan
+from shmio.supervisor.plan import BROKER, Job, Plan
 
 WHERE_S = 5.0
 
@@ -143,6 +143,8 @@ def _describe(job: Job, prepared: Prepared) -> str:
         return f"{config['kind']} on {config['listen']}, program {config['program']}"
     if job.kind == "recorder":
         return f"to {config['directory']}"
+    if job.kind == "mqtt":
+        return f"{config['broker']} on {config['listen']}" if job.name == BROKER else f"under {config['prefix']}/"
     return f"on {', '.join(config['listen'])}"
 
 

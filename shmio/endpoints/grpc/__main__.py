@@ -16,11 +16,11 @@ from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.doors import Doors
 from shmio.endpoints.grpc.feeds import Feeds
 from shmio.endpoints.grpc.hold import Hold
-from shmio.endpoints.grpc.ration import Ration
 from shmio.endpoints.grpc.server import Server
 from shmio.endpoints.grpc.services import Services
 from shmio.errors import SegmentError, ShmioError
 from shmio.logs import fields
+from shmio.ration import Ration
 from shmio.worker import BEAT_S, Worker
 
 CALLS_S: Final = 1.0

@@ -161,7 +161,7 @@ def test_tls_files_are_relative_to_the_config(folder: Path) -> None:
             r"grpc\.default_source: no source 'sell'; there are: cell",
         ),
         ('"plc.ini"', '"nowhere.ini"', r"source\[0\]\.properties: .*nowhere\.ini: No such file"),
-        ("[grpc]", "[mqtt]\nprefix = 'x'\n[grpc]", r"mqtt: unknown key"),
+        ("[grpc]", "[web]\nprefix = 'x'\n[grpc]", r"web: unknown key"),
         ("[instance]", 'folder = "/"\n[instance]', r"folder: unknown key"),
         ("[instance]", "[instance", r"not TOML"),
         ("[instance]", f"digits = {'9' * 5000}\n[instance]", r"a number in it has too many digits"),

@@ -6,7 +6,7 @@ import logging
 
 import pytest
 
-from shmio.endpoints.grpc.ration import LINES, TURN_S, Ration
+from shmio.ration import LINES, TURN_S, Ration
 
 
 def test_lines_of_a_kind_are_rationed_and_the_rest_is_counted(caplog: pytest.LogCaptureFixture) -> None:

@@ -1,0 +1,114 @@
+"""Passwords of MQTT: ours at a broker elsewhere, and those of our own broker's clients."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import hmac
+import os
+import secrets
+import stat
+from typing import Final
+
+from shmio.errors import ConfigError
+
+MAX_BYTES: Final = 1 << 20
+ROUNDS: Final = 101
+"""Of mosquitto's own hashes, as its versions up to 2.0 make them; passwords come once a connection."""
+_OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
+KEY: Final = "mqtt.password_file"
+
+
+def read_password(name: str) -> str:
+    """Our password: the file's first line. ConfigError; never says what is in it."""
+    password = _read(name).split("\n", 1)[0].rstrip("\r")
+    if not password:
+        raise ConfigError(f"{KEY}: {name}: its first line, the password, is empty")
+    return password
+
+
+def read_accounts(name: str) -> dict[str, str]:
+    """Names and hashes of who may connect to our broker.
+
+    A line each: ``name:password``, or ``name:hash`` as mosquitto_passwd writes it.
+
+    ConfigError names the line that will not do, and never says what is in it.
+    """
+    accounts: dict[str, str] = {}
+    for number, line in enumerate(_read(name).splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        user, colon, secret = line.partition(":")
+        if not colon or not user.strip() or not secret:
+            raise ConfigError(f"{KEY}: {name}: line {number}: expected name:password")
+        if user in accounts:
+            raise ConfigError(f"{KEY}: {name}: line {number}: this name has a line already")
+        known = _parts(secret)
+        accounts[user] = secret if known else hashed(secret)
+    if not accounts:
+        raise ConfigError(f"{KEY}: {name}: it has no account: a line each, name:password")
+    return accounts
+
+
+def hashed(password: str) -> str:
+    """A hash as mosquitto knows it: PBKDF2 with SHA-512 (mosquitto-passwd(5))."""
+    salt = secrets.token_bytes(12)
+    digest = hashlib.pbkdf2_hmac("sha512", password.encode(), salt, ROUNDS)
+    return f"$7${ROUNDS}${base64.b64encode(salt).decode()}${base64.b64encode(digest).decode()}"
+
+
+def matches(password: str, secret: str) -> bool:
+    """Whether a password is the one of such a hash."""
+    parts = _parts(secret)
+    if parts is None:
+        return False
+    rounds, salt, digest = parts
+    if rounds:
+        found = hashlib.pbkdf2_hmac("sha512", password.encode(), salt, rounds, len(digest))
+    else:
+        found = hashlib.sha512(password.encode() + salt).digest()
+    return hmac.compare_digest(found, digest)
+
+
+def _parts(secret: str) -> tuple[int, bytes, bytes] | None:
+    """(rounds, salt, digest) of a hash; 0 rounds: salted SHA-512 alone. None: it is none."""
+    fields = secret.split("$")
+    try:
+        if fields[:2] == ["", "7"] and len(fields) == 5 and 0 < int(fields[2]) <= 10_000_000:
+            return (
+                int(fields[2]),
+                _bytes(fields[3]),
+                _bytes(fields[4]),
+            )
+        if fields[:2] == ["", "6"] and len(fields) == 4:
+            return 0, _bytes(fields[2]), _bytes(fields[3])
+    except ValueError:
+        return None
+    return None
+
+
+def _bytes(text: str) -> bytes:
+    return base64.b64decode(text, validate=True)
+
+
+def _read(name: str) -> str:
+    key = f"{KEY}: {name}"
+    try:
+        fd = os.open(name, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # which a pipe without a writer would block
+    except OSError as error:
+        raise ConfigError(f"{key}: {error.strerror}") from None
+    try:
+        mode = os.fstat(fd).st_mode
+        if not stat.S_ISREG(mode):
+            raise ConfigError(f"{key}: not a file")
+        if mode & _OTHERS:
+            raise ConfigError(f"{key}: mode {stat.S_IMODE(mode):04o} lets others in: chmod 600, and new passwords")
+        data = os.read(fd, MAX_BYTES + 1)
+    finally:
+        os.close(fd)
+    if len(data) > MAX_BYTES:
+        raise ConfigError(f"{key}: larger than {MAX_BYTES} bytes")
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        raise ConfigError(f"{key}: not UTF-8") from None

@@ -1,0 +1,106 @@
+"""The rules of ``[mqtt]``: where the broker is, who may reach it, what topics may be called."""
+
+from __future__ import annotations
+
+import re
+from typing import Final
+
+from shmio.config.address import Address
+from shmio.config.model import Config, Mqtt
+from shmio.errors import ConfigError
+
+PORT: Final = 1883
+TLS_PORT: Final = 8883
+MAX_PREFIX: Final = 256
+_ELSEWHERE: Final = ("host", "port", "username")
+"""Keys that say where a broker is that is not ours, and who we are there."""
+
+
+def check_mqtt(config: Config) -> None:
+    """Addresses, what may be reached there in plain text, and the keys that go together. ConfigError."""
+    mqtt = config.mqtt
+    if mqtt is None:
+        return
+    if mqtt.prefix is not None:
+        _check_prefix(mqtt.prefix)
+    if mqtt.broker == "external":
+        _check_external(mqtt)
+    else:
+        _check_own(mqtt)
+
+
+def resolve_mqtt(mqtt: Mqtt, config: Config) -> None:
+    """Make the section's paths absolute, and give it its prefix."""
+    mqtt.prefix = mqtt.prefix or f"shmio/{config.instance.name}"
+    if mqtt.password_file is not None:
+        mqtt.password_file = str(config.path(mqtt.password_file))
+    if mqtt.tls:
+        for field in ("ca", "certificate", "key"):
+            if name := getattr(mqtt.tls, field):
+                setattr(mqtt.tls, field, str(config.path(name)))
+
+
+def brokers(mqtt: Mqtt) -> list[Address]:
+    """The external brokers, in the order in which they are tried; ConfigError."""
+    port = mqtt.port or (PORT if mqtt.tls is None else TLS_PORT)
+    hosts = [mqtt.host] if isinstance(mqtt.host, str) else mqtt.host or []
+    found = []
+    for index, host in enumerate(hosts):
+        try:
+            found.append(Address.parse(host if _has_port(host) else f"{host}:{port}"))
+        except ConfigError as error:
+            key = "mqtt.host" if isinstance(mqtt.host, str) else f"mqtt.host[{index}]"
+            raise ConfigError(f"{key}: {error}") from None
+    return found
+
+
+def _has_port(host: str) -> bool:
+    return re.search(r"(^|\]|[^:\]]):[0-9]+\Z", host) is not None and (host.count(":") == 1 or "]" in host)
+
+
+def _check_prefix(prefix: str) -> None:
+    if len(prefix) > MAX_PREFIX or prefix.startswith("$") or "" in prefix.split("/") or set("+#").intersection(prefix):
+        raise ConfigError(
+            f"mqtt.prefix: {prefix!r} cannot begin a topic: at most {MAX_PREFIX} characters, no + and #, no $ at its "
+            "beginning, no / at its ends and no two of them together; such as shmio/a50"
+        )
+
+
+def _check_external(mqtt: Mqtt) -> None:
+    if mqtt.listen is not None:
+        raise ConfigError('mqtt.listen: an external broker listens by itself; leave it out, or broker = "embedded"')
+    if mqtt.host is None:
+        raise ConfigError(
+            'mqtt.host: broker = "external" needs it: the broker\'s host, or host:port, or a list of them'
+        )
+    for address in brokers(mqtt):
+        if not (address.loopback or mqtt.tls or mqtt.insecure):
+            _refuse_plain_text("mqtt.host", f"{address} would be spoken to in plain text over the network")
+    if mqtt.password_file is not None and mqtt.username is None:
+        raise ConfigError("mqtt.username: a password_file needs it: the password is this user's")
+    if mqtt.tls and (mqtt.tls.certificate is None) != (mqtt.tls.key is None):
+        raise ConfigError("mqtt.tls: certificate and key go together")
+
+
+def _check_own(mqtt: Mqtt) -> None:
+    for key in _ELSEWHERE:
+        if getattr(mqtt, key) is not None:
+            raise ConfigError(f'mqtt.{key}: is for broker = "external"; with "{mqtt.broker}" there is listen')
+    if mqtt.listen is None:
+        raise ConfigError(f"mqtt.listen: this key is needed, such as 127.0.0.1:{PORT}")
+    try:
+        address = Address.parse(mqtt.listen)
+    except ConfigError as error:
+        raise ConfigError(f"mqtt.listen: {error}") from None
+    if not address.port:
+        raise ConfigError(f"mqtt.listen: {address} has no port; the usual one is {PORT}")
+    if not (address.loopback or mqtt.tls or mqtt.insecure):
+        _refuse_plain_text("mqtt.listen", f"{address} can be reached from other hosts in plain text")
+    if mqtt.tls:
+        for key in ("certificate", "key"):
+            if getattr(mqtt.tls, key) is None:
+                raise ConfigError(f"mqtt.tls.{key}: this key is needed: the broker shows its clients a certificate")
+
+
+def _refuse_plain_text(key: str, why: str) -> None:
+    raise ConfigError(f"{key}: {why}; that needs a [mqtt.tls] table, or insecure = true beside it")

@@ -1,0 +1,221 @@
+"""The bridge: one thread that turns the feeds, the outbox, the link and the commands."""
+
+from __future__ import annotations
+
+import logging
+import os
+import selectors
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from typing import Final
+
+from shmio.config import Mqtt
+from shmio.endpoints.mqtt.channel import Gone, Message, status
+from shmio.endpoints.mqtt.commands import Commands, filters
+from shmio.endpoints.mqtt.feed import Feed
+from shmio.endpoints.mqtt.link import Link
+from shmio.endpoints.mqtt.outbox import Outbox
+from shmio.endpoints.mqtt.place import own_socket
+from shmio.endpoints.mqtt.rules import Rules
+from shmio.endpoints.mqtt.steps import Steps
+from shmio.endpoints.mqtt.target import Dialling
+from shmio.segment import ProcessSlot, Quality, Segment
+from shmio.segment.relay import TURN_NS, Relay
+
+ONLINE: Final = b"online"
+OFFLINE: Final = b"offline"
+STOPPED: Final = "the bridge was stopped"
+LEAVE_S: Final = 2.0
+"""For the broker to take our leave."""
+TURN_S: Final = 0.2
+
+log = logging.getLogger("shmio.mqtt")
+
+
+class Bridge:
+    """Between a segment and a broker. Use from one thread: :meth:`turn` again and again, then :meth:`close`."""
+
+    def __init__(self, segment: Segment, slot: ProcessSlot, settings: Mqtt) -> None:
+        """``slot``: of this process. PathError: a pattern of a rule is none."""
+        self.prefix = settings.prefix or f"shmio/{segment.instance}"
+        self._segment, self._settings = segment, settings
+        self._writer = slot.writer or 0
+        self._rules = Rules(settings.topic)
+        self._selector = selectors.DefaultSelector()
+        self._wakeup = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+        self._selector.register(self._wakeup, selectors.EVENT_READ, lambda _: os.eventfd_read(self._wakeup))
+        client_id = settings.client_id or f"shmio-{segment.instance}"
+        self._status = f"{self.prefix}/status"
+        self._feeds: dict[str, Feed] = {}
+        self._relays: dict[int, Relay] = {}
+        self.link = Link(
+            Dialling(settings, client_id, partial(own_socket, segment)),
+            self._selector,
+            self.wake,
+            Message(self._status, OFFLINE, 1, True),
+        )
+        self.outbox = Outbox(self.link, round(settings.backlog_mb * 1e6))
+        self._commands = Commands(self.prefix, self._rules, self._feeds, self.outbox.answer)
+        self.link.on_message = self._commands.take
+        self._more: set[Feed] = set()
+        self._generation = -1
+        self._reader = ThreadPoolExecutor(1, "reader")
+        self._reading: Future[list[Feed]] | None = None
+        self._adopt(self._read())
+        self.steps = Steps(segment.clock, slot.index, f"{self.prefix}/simlog/step", self.link, self.outbox)
+        self._bell = Relay(segment.clock.slot_bell(slot.index), "bell-steps", TURN_NS)
+        self._selector.register(self._bell.descriptor, selectors.EVENT_READ, lambda _: self._bell.heard())
+
+    @property
+    def counters(self) -> tuple[int, ...]:
+        """As the process table names them."""
+        commands, outbox = self._commands, self.outbox
+        refused = commands.refused + self.link.refused
+        return (
+            outbox.sent, commands.received, refused, outbox.waiting, outbox.backlog, outbox.dropped, self.link.connects,
+        )  # fmt: skip
+
+    @property
+    def problem(self) -> str:
+        """What is wrong at present; empty: nothing."""
+        problem = self.link.problem
+        if problem and self.outbox.backlog:
+            lost = f", {self.outbox.dropped} dropped" if self.outbox.dropped else ""
+            return f"{problem}; {self.outbox.backlog} changes are kept{lost}"
+        return problem
+
+    def wake(self) -> None:
+        """Have :meth:`turn` return soon; any thread may."""
+        os.eventfd_write(self._wakeup, 1)
+
+    # ---- a turn ------------------------------------------------------------------------------------------------------
+
+    def turn(self) -> None:
+        """Wait until there is something to do, at most about ``TURN_S``, and do it."""
+        for key, events in self._selector.select(self._patience_s()):
+            key.data(events)
+        self._link_turn()
+        self._follow()
+        self.steps.look(self._feeds.values())
+        for feed in list(self._more):
+            self._look(feed)
+        self.outbox.flush()
+        self._link_turn()
+
+    def _patience_s(self) -> float:
+        if self._more:
+            return 0.0
+        due_s = [TURN_S, self.link.turn()]
+        for feed in self._feeds.values():
+            due_ns = None if feed.held else feed.settle()
+            if due_ns is not None:
+                due_s.append(max(0.0, (due_ns - feed.block.now_ns()) / 1e9))
+        self.outbox.flush()
+        return min(due_s)
+
+    def _link_turn(self) -> None:
+        link = self.link
+        link.turn()
+        if link.lost is not None:
+            lost, link.lost = link.lost, None
+            self.outbox.lose(lost)
+        if link.problem and not link.up:
+            self.outbox.keeping = True
+        if link.came_up:
+            link.came_up = False
+            self.outbox.keeping = True
+            self._greet()
+
+    def _greet(self) -> None:
+        """A connection was made: take commands, tell that we are there, what was kept, and how everything is now."""
+        self.link.subscribe(filters(self.prefix, self._feeds.values()))
+        self.link.send(Message(self._status, ONLINE, 1, True))
+        for feed in self._feeds.values():
+            feed.show()
+
+    def _look(self, feed: Feed) -> None:
+        self._more.discard(feed)
+        if feed.look():
+            self._more.add(feed)
+        feed.inlet.look()
+
+    def _heard(self, feed: Feed, relay: Relay, _events: int) -> None:
+        relay.heard()
+        self._more.add(feed)
+
+    # ---- sources that come and go ------------------------------------------------------------------------------------
+
+    def _follow(self) -> None:
+        """Take up what a reload has changed; for big layouts that takes seconds, in which others go on."""
+        if self._reading is not None and self._reading.done():
+            reading, self._reading = self._reading, None
+            self._adopt(reading.result())
+            if self.link.up:
+                self._greet()
+        for feed in [feed for feed in self._feeds.values() if feed.over]:
+            self._leave(feed)
+        if self._reading is None and self._segment.generation != self._generation:
+            self._reading = self._reader.submit(self._read)
+            self._reading.add_done_callback(lambda _: self.wake())
+
+    def _read(self) -> list[Feed]:
+        self._generation = self._segment.generation  # before looking: what changes meanwhile is read the next time
+        self._segment.refresh()
+        known = {feed.block.section for feed in self._feeds.values()}
+        return [
+            Feed(block, self._rules, self.prefix, self.outbox, self._writer)
+            for block in self._segment.blocks.values()
+            if block.section not in known
+        ]
+
+    def _adopt(self, feeds: Iterable[Feed]) -> None:
+        for feed in feeds:
+            if (before := self._feeds.get(feed.block.source)) is not None:
+                self._leave(before, feed)
+            self._feeds[feed.block.source] = feed
+            block = feed.block
+            relay = Relay(block.ring, f"bell-{block.source}", min(TURN_NS, block.stale_ns))
+            self._relays[block.section] = relay
+            self._selector.register(relay.descriptor, selectors.EVENT_READ, partial(self._heard, feed, relay))
+
+    def _leave(self, feed: Feed, successor: Feed | None = None) -> None:
+        """What it has published and its successor does not is taken from the broker's memory."""
+        feed.inlet.look()
+        self._more.discard(feed)
+        stay = set() if successor is None else {channel.topic for channel in successor.all()}
+        self.outbox.forget(feed.all())
+        self.outbox.mark_all(Gone(channel.topic) for channel in feed.all() if channel.topic not in stay)
+        del self._feeds[feed.block.source]
+        relay = self._relays.pop(feed.block.section)
+        self._selector.unregister(relay.descriptor)
+        relay.stop()
+
+    # ---- the end -----------------------------------------------------------------------------------------------------
+
+    def close(self) -> None:
+        """Send what is there, say that we go, and go."""
+        self.steps.close()
+        until_s = time.monotonic() + LEAVE_S
+        self._drain(until_s, lambda: not self.outbox.busy)
+        for feed in self._feeds.values():
+            self.link.send(status(feed.status.topic, Quality.BAD, STOPPED))
+        self.link.send(Message(self._status, OFFLINE, 1, True))
+        self._drain(until_s, lambda: not self.link.in_flight)
+        self.link.close()
+        for relay in (*self._relays.values(), self._bell):
+            self._selector.unregister(relay.descriptor)
+            relay.stop()
+        for relay in (*self._relays.values(), self._bell):
+            relay.join()
+        self._reader.shutdown()
+        self._selector.close()
+        os.close(self._wakeup)
+
+    def _drain(self, until_s: float, done: Callable[[], bool]) -> None:
+        while self.link.up and not done() and (rest_s := until_s - time.monotonic()) > 0:
+            for key, events in self._selector.select(min(rest_s, TURN_S)):
+                key.data(events)
+            self.outbox.flush()
+            self.link.turn()

@@ -1,0 +1,184 @@
+"""What is published on one topic: its newest payload, made when its turn comes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final, NamedTuple, Protocol
+
+import msgspec
+
+from shmio.config import MqttTopic
+from shmio.layout.codec import Value, codec
+from shmio.layout.model import Register
+from shmio.layout.text import json_value, to_text
+from shmio.segment import Block, Frame, Quality
+from shmio.segment.view import holds_none, reading
+
+NUMBERS: Final = (int, float)
+
+
+class Message(NamedTuple):
+    """What goes to the broker. ``keep``: it is a change of a value, which is not lost while the broker is away."""
+
+    topic: str
+    payload: bytes
+    qos: int
+    retain: bool
+    keep: bool = False
+
+
+class Shown(NamedTuple):
+    """What a source shows at present: its newest frame, if it has one, and how good that is."""
+
+    frame: Frame | None
+    quality: Quality
+    reason: str
+
+
+class Showing(Protocol):
+    """Who follows a source."""
+
+    block: Block
+    shown: Shown
+
+
+class Channel(Protocol):
+    """A topic."""
+
+    topic: str
+
+    def message(self, *, late: bool = False) -> Message:
+        """As of now. ``late``: it will not be sent now, but when the broker is back."""
+
+
+class RegisterChannel:
+    """A register, or an array's element, by one of the two kinds of payload."""
+
+    def __init__(self, showing: Showing, register: Register, topic: str, rule: MqttTopic) -> None:
+        self.register = register
+        self.topic = topic
+        self.json = rule.payload == "json"
+        self.limited = rule.deadband > 0 or rule.max_rate_hz is not None
+        """Whether not each change is published."""
+        self._showing = showing
+        self._qos, self._retain, self._deadband = rule.qos, rule.retain, rule.deadband
+        self._pause_ns = round(1e9 / rule.max_rate_hz) if rule.max_rate_hz else 0
+        self._decode = codec(register, showing.block.layout.byte_order).decode
+        self._sent: Value = None
+        self.due_ns = 0
+        """By the source's clock: not before then."""
+
+    def moved(self, image: bytes) -> bool:
+        """Whether a change is large enough to be told."""
+        if not self._deadband:
+            return True
+        pairs = zip(_flat(self._decode(image)), _flat(self._sent), strict=False)
+        return self._sent is None or any(_apart(new, old, self._deadband) for new, old in pairs)
+
+    def message(self, *, late: bool = False) -> Message:
+        """As of now; empty while there is no good value, but as JSON, which says so."""
+        payload = self._json(late=late) if self.json else self._text()
+        return Message(self.topic, payload, self._qos, self._retain and not late, keep=True)
+
+    def _text(self) -> bytes:
+        frame, quality, _ = self._showing.shown
+        if frame is None or quality is Quality.BAD:
+            self._note(None)
+            return b""
+        value = self._decode(frame.image)
+        self._note(value)
+        return to_text(value, self.register).encode()
+
+    def _json(self, *, late: bool) -> bytes:
+        frame, quality, reason = self._showing.shown
+        found = reading(self._showing.block, self.register, frame)
+        if holds_none(found.value):
+            quality, reason = Quality.BAD, reason or found.reason
+        self._note(None if quality is Quality.BAD else found.value)
+        fields = {
+            "value": json_value(found.value, self.register.element),
+            "quality": str(quality),
+            "reason": reason,
+            "source_time": found.source_time,
+            "provenance": found.provenance,
+            "sequence": frame.number if frame else 0,
+        }
+        return msgspec.json.encode(fields | {"late": True} if late else fields)
+
+    def _note(self, value: Value) -> None:
+        if self.limited:
+            self._sent = value
+            self.due_ns = self._showing.block.now_ns() + self._pause_ns
+
+
+class FramesChannel:
+    """A block as a whole, by the bytes of its effective image."""
+
+    json = False
+
+    def __init__(self, showing: Showing, topic: str, rule: MqttTopic) -> None:
+        self.topic = topic
+        self.limited = rule.max_rate_hz is not None
+        self._showing = showing
+        self._qos, self._retain = rule.qos, rule.retain
+        self._pause_ns = round(1e9 / rule.max_rate_hz) if rule.max_rate_hz else 0
+        self.due_ns = 0
+
+    def moved(self, _image: bytes) -> bool:
+        """Every frame is one."""
+        return True
+
+    def message(self, *, late: bool = False) -> Message:
+        """As of now; empty while there is no good frame."""
+        frame, quality, _ = self._showing.shown
+        self.due_ns = self._showing.block.now_ns() + self._pause_ns
+        payload = b"" if frame is None or quality is Quality.BAD else frame.image
+        return Message(self.topic, payload, self._qos, self._retain and not late, keep=True)
+
+
+class StatusChannel:
+    """How a source fares, as JSON."""
+
+    def __init__(self, showing: Showing, topic: str) -> None:
+        self.topic = topic
+        self._showing = showing
+
+    def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  it is told again when the broker is back
+        """As of now."""
+        frame, quality, reason = self._showing.shown
+        return status(self.topic, quality, reason, frame)
+
+
+class Gone:
+    """What nothing is published on any more: what the broker remembers of it is deleted."""
+
+    def __init__(self, topic: str) -> None:
+        self.topic = topic
+
+    def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  see StatusChannel
+        """An empty one."""
+        return Message(self.topic, b"", 1, retain=True)
+
+
+def status(topic: str, quality: Quality, reason: str, frame: Frame | None = None) -> Message:
+    """What a source's status topic says."""
+    fields = {
+        "quality": str(quality),
+        "reason": reason,
+        "source_time": frame.source_ns / 1e9 if frame and frame.source_ns else None,
+        "cycle": frame.cycle if frame else None,
+    }
+    return Message(topic, msgspec.json.encode(fields), 1, retain=True)
+
+
+def _flat(value: Value) -> Iterator[Value]:
+    if isinstance(value, list):
+        for item in value:
+            yield from _flat(item)
+    else:
+        yield value
+
+
+def _apart(new: Value, old: Value, deadband: float) -> bool:
+    numbers = isinstance(new, NUMBERS) and isinstance(old, NUMBERS) and not isinstance(new, bool)
+    return new != old and not (numbers and abs(new - old) < deadband)  # type: ignore[operator]  # they are numbers

@@ -1,0 +1,123 @@
+"""What comes from the broker: values for registers, on their ``/in`` topics; and the answer to each."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Final
+
+import msgspec
+from paho.mqtt.client import MQTTMessage
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+
+from shmio.endpoints.mqtt.channel import Message
+from shmio.endpoints.mqtt.feed import Feed
+from shmio.endpoints.mqtt.rules import Rules
+from shmio.errors import CommandError, PathError, ValueRangeError
+from shmio.layout.model import Register
+from shmio.layout.text import MAX_TEXT, from_text
+from shmio.layout.topic import look_up, parse_topic
+from shmio.segment import DONE, EventKind
+
+REPLIES: Final = "shmio/results"
+"""Where clients may have results sent, below the prefix: a response topic elsewhere could make us write, or lie."""
+MAX_CORRELATION_BYTES: Final = 1024
+
+Answer = Callable[[Message, Properties | None], None]
+
+log = logging.getLogger("shmio.mqtt")
+
+
+def filters(prefix: str, feeds: Iterable[Feed]) -> list[str]:
+    """What to subscribe to: paths of each depth that a source has, and nothing that we publish ourselves."""
+    return [f"{prefix}/{feed.block.source}/{'+/' * depth}in" for feed in feeds for depth in feed.depths]
+
+
+class Commands:
+    """For the bridge's thread."""
+
+    def __init__(self, prefix: str, rules: Rules, feeds: Mapping[str, Feed], answer: Answer) -> None:
+        self.received = 0
+        self.refused = 0
+        """Those of which nothing was done: retained ones, and those that no source was sent."""
+        self._prefix, self._rules, self._feeds, self._answer = prefix, rules, feeds, answer
+
+    def take(self, message: MQTTMessage) -> None:
+        """Carry one out, as far as it is one."""
+        try:
+            topic = message.topic
+        except UnicodeDecodeError:
+            self.refused += 1
+            return
+        if not topic.startswith(f"{self._prefix}/") or not topic.endswith("/in"):
+            return
+        self.received += 1
+        if message.retain:  # it was there before we were: nobody knows how old it is
+            self.refused += 1
+            log.warning("%s: a retained command is not carried out; publish commands without the retain flag", topic)
+            return
+        tell = _Reply(self._prefix, topic, message, self._answer)
+        try:
+            feed, register = self._find(topic.removeprefix(f"{self._prefix}/"))
+            value = _value(bytes(message.payload), register, json=self._is_json(feed, register))
+            feed.inlet.send(register, value, tell)
+        except (CommandError, PathError, ValueRangeError) as error:
+            self.refused += 1
+            tell(EventKind.REJECTED, str(error))
+
+    def _find(self, text: str) -> tuple[Feed, Register]:
+        topic = parse_topic(text, self._feeds, None)
+        feed = self._feeds.get(topic.source)
+        if feed is None:
+            raise PathError(f"{topic.source}: no such source")
+        return feed, look_up(feed.block.layout, topic)
+
+    def _is_json(self, feed: Feed, register: Register) -> bool:
+        return self._rules.of(feed.block.source, register.path).payload == "json"
+
+
+class _Reply:
+    """Tells what became of one command, once."""
+
+    def __init__(self, prefix: str, topic: str, message: MQTTMessage, answer: Answer) -> None:
+        self._topic = f"{topic}/result"
+        self._qos = min(1, message.qos)
+        self._answer = answer
+        properties = vars(message.properties) if message.properties is not None else {}
+        self._correlation: bytes | None = properties.get("CorrelationData")
+        wanted = properties.get("ResponseTopic")
+        if isinstance(wanted, str) and wanted.startswith(f"{prefix}/{REPLIES}/") and not set("+#").intersection(wanted):
+            self._topic = wanted
+
+    def __call__(self, kind: EventKind, reason: str) -> None:
+        payload = msgspec.json.encode({"outcome": str(kind), "done": kind in DONE, "reason": reason})
+        properties = None
+        if self._correlation is not None and len(self._correlation) <= MAX_CORRELATION_BYTES:
+            properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+            properties.CorrelationData = self._correlation
+        self._answer(Message(self._topic, payload, self._qos, retain=False), properties)
+
+
+def _value(payload: bytes, register: Register, *, json: bool) -> Any:
+    """The value that a payload is; as JSON: a value, or an object with one. ValueRangeError."""
+    if len(payload) > MAX_TEXT:
+        raise ValueRangeError(f"{register.path}: the payload is longer than {MAX_TEXT} bytes")
+    try:
+        text = payload.decode()
+    except UnicodeDecodeError:
+        raise ValueRangeError(f"{register.path}: the payload is not UTF-8") from None
+    return from_text(_bare(text, register) if json else text, register)
+
+
+def _bare(text: str, register: Register) -> str:
+    """The text of a value as JSON, or of the ``value`` of an object; ValueRangeError."""
+    try:
+        value = msgspec.json.decode(text)
+        if isinstance(value, dict):
+            value = value["value"]
+    except (msgspec.DecodeError, KeyError, RecursionError):
+        raise ValueRangeError(
+            f'{register.path}: expected a value as JSON, or an object with one: {{"value": 1}}'
+        ) from None
+    return value if isinstance(value, str) else msgspec.json.encode(value).decode()

@@ -1,0 +1,164 @@
+"""Follows one block: one change scan for each frame marks the topics whose turn has come."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+from shmio.config import MqttTopic
+from shmio.endpoints.mqtt.channel import Channel, FramesChannel, RegisterChannel, Shown, StatusChannel
+from shmio.endpoints.mqtt.inlet import Inlet
+from shmio.endpoints.mqtt.outbox import Outbox
+from shmio.endpoints.mqtt.rules import Rules
+from shmio.layout.model import Layout, Register
+from shmio.layout.write import elements
+from shmio.segment import Block, Frame, Quality
+from shmio.segment.scan import ChangeScan
+
+NO_DATA: Final = Shown(None, Quality.BAD, "no data yet")
+TURN_FRAMES: Final = 8
+"""So many are taken before what else there is to do has its turn."""
+CATCH_UP_FRAMES: Final = 48
+"""Who is further behind than this goes on with the newest one: what he skips is conflated, not lost."""
+
+
+class Feed:
+    """One source: what it shows, and what of that the broker has not been told. For the bridge's thread."""
+
+    def __init__(self, block: Block, rules: Rules, prefix: str, outbox: Outbox, writer: int) -> None:
+        """``writer``: the command queue of this process. For a big layout this takes seconds."""
+        self.block = block
+        self.shown = NO_DATA
+        self.held = False
+        """Whether only steps show anything: it lives on the instance's clock, which is virtual."""
+        self.inlet = Inlet(block, writer)
+        base = f"{prefix}/{block.source}"
+        self.status = StatusChannel(self, f"{base}/status")
+        chosen = list(_chosen(block.layout, rules, block.source))
+        self.channels = [
+            RegisterChannel(self, register, f"{base}/{register.path}/out", rule) for register, rule in chosen
+        ]
+        frames = rules.frames(block.source)
+        self.frames = FramesChannel(self, f"{base}/frames", frames) if frames else None
+        self.depths = _depths(block.layout)
+        """Numbers of segments that paths in this source have."""
+        self._json = [channel for channel in self.channels if channel.json]
+        self._scan = ChangeScan([register for register, _ in chosen])
+        self._outbox = outbox
+        self._later: dict[RegisterChannel | FramesChannel, None] = {}
+        newest = block.latest()
+        self._cursor = block.cursor(after=newest.number - 1 if newest else 0)
+
+    @property
+    def over(self) -> bool:
+        """Whether a reload has ended the block, and all of it has been taken."""
+        return self.block.retired and not self._cursor.behind
+
+    def look(self) -> bool:
+        """Take frames that have come, a few at a time; whether there are more at once."""
+        if self.held:
+            return False
+        if self._cursor.behind > CATCH_UP_FRAMES:
+            self._cursor = self.block.cursor(after=self.block.ring.head() - 1)
+        for _ in range(TURN_FRAMES):
+            frame = self._cursor.poll()
+            if frame is None:
+                self._age()
+                return False
+            self.take(frame)
+            if self._outbox.busy:
+                self._outbox.flush()  # so that each frame's changes are told, as long as the broker takes them
+        return self._cursor.behind > 0
+
+    def step(self) -> None:
+        """Show what the step that is being delivered has changed, if the block is on the instance's clock."""
+        if self.held and (frame := self.block.latest()):
+            self._cursor = self.block.cursor(after=frame.number)
+            self.take(frame)
+
+    def take(self, frame: Frame) -> None:
+        """Show a frame."""
+        before = self.shown
+        quality, reason = self.block.assess(frame)
+        self.shown = Shown(frame, quality, reason)
+        if not self._requalify(before):
+            if quality is Quality.BAD:
+                return
+            old = before.frame
+            changed = self._scan.changed(old.image, frame.image) if old else range(len(self.channels))
+            for index in changed:
+                self._mark(self.channels[index])
+            if old and (old.effective is None) != (frame.effective is None):
+                self._outbox.mark_all(self._json)  # provenance may be another one
+            if self.frames:
+                self._mark(self.frames)
+        if self._later:
+            self.settle()
+
+    def _age(self) -> None:
+        """Turn bad with age."""
+        before = self.shown
+        if before.frame is not None and before.quality is not Quality.BAD:
+            self.shown = Shown(before.frame, *self.block.assess(before.frame))
+            self._requalify(before)
+
+    def _requalify(self, before: Shown) -> bool:
+        """Tell a change of quality: whether everything has been marked for that."""
+        now = self.shown
+        if (before.quality, before.reason) == (now.quality, now.reason) and before is not NO_DATA:
+            return False
+        self._outbox.mark(self.status)
+        if before is NO_DATA or (before.quality is Quality.BAD) != (now.quality is Quality.BAD):
+            self.mark_all()
+            return True
+        self._outbox.mark_all(self._json)
+        return False
+
+    def mark_all(self) -> None:
+        """Have everything told as it is now."""
+        self._later.clear()
+        self._outbox.mark_all(self.all())
+
+    def show(self) -> None:
+        """Have the broker be told, or be told again, how everything is."""
+        self._later.clear()
+        self._outbox.show(self.all())
+
+    def all(self) -> list[Channel]:
+        """All topics of this source."""
+        return [self.status, *self.channels, *([self.frames] if self.frames else [])]
+
+    def _mark(self, channel: RegisterChannel | FramesChannel) -> None:
+        if not channel.limited:
+            self._outbox.mark(channel)
+        elif channel in self._later or channel.due_ns > self.block.now_ns():
+            self._later[channel] = None
+        elif self.shown.frame and channel.moved(self.shown.frame.image):
+            self._outbox.mark(channel)
+
+    def settle(self) -> int | None:
+        """Mark what may be told again by now; when the next one may, by the source's clock. None: nothing waits."""
+        now_ns, frame = self.block.now_ns(), self.shown.frame
+        for channel in [channel for channel in self._later if channel.due_ns <= now_ns]:
+            del self._later[channel]
+            if frame and channel.moved(frame.image):
+                self._outbox.mark(channel)
+        return min((channel.due_ns for channel in self._later), default=None)
+
+
+def _chosen(layout: Layout, rules: Rules, source: str) -> Iterator[tuple[Register, MqttTopic]]:
+    """What is published of a block, each with its rule; arrays as a whole, or by their elements."""
+    for register in layout.registers:
+        rule = rules.of(source, register.path)
+        if not rule.publish:
+            continue
+        for part in elements(layout, register) if rule.elements and register.dims else (register,):
+            yield part, rule
+
+
+def _depths(layout: Layout) -> Sequence[int]:
+    depths = set()
+    for register in layout.registers:
+        depth = register.path.count("/") + 1
+        depths |= {depth, depth + len(register.dims)}
+    return sorted(depths)

@@ -1,0 +1,372 @@
+"""The connection to the broker: made anew whenever it is lost, with growing waits, and never waited for."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import random
+import selectors
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from functools import partial
+from typing import Any, Final, cast
+
+from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage, MQTTv5, MQTTv311
+from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
+from paho.mqtt.subscribeoptions import SubscribeOptions
+
+from shmio.endpoints.mqtt.channel import Message
+from shmio.endpoints.mqtt.failure import refusal, why
+from shmio.endpoints.mqtt.target import Dialling, Target
+from shmio.errors import ConfigError
+
+CONNECT_S: Final = 4.0
+"""For a connection, its TLS, and for the broker's answer to who we are; each."""
+FIRST_WAIT_S: Final = 0.25
+MOST_WAIT_S: Final = 15.0
+STABLE_S: Final = 5.0
+"""Who was connected so long has put his failures behind him."""
+MOST_IN_FLIGHT: Final = 1000
+"""Messages that the broker has not acknowledged."""
+MAX_PACKET_BYTES: Final = 1 << 21
+"""Of what a broker may send us, as far as it can be told so: with MQTT 5."""
+PACKETS: Final = 100
+"""So many are taken from the broker before what else there is to do has its turn."""
+
+log = logging.getLogger("shmio.mqtt")
+
+
+class Link:
+    """For the bridge's thread: it registers its socket with ``selector``, to have ``data`` called when it is ready."""
+
+    def __init__(
+        self,
+        dialling: Dialling,
+        selector: selectors.BaseSelector,
+        wake: Callable[[], object],
+        will: Message,
+    ) -> None:
+        """``wake``: has the thread turn the link; callable from any thread."""
+        self.up = False
+        self.came_up = False
+        """Set when a connection has been made; who has greeted it takes it back."""
+        self.lost: list[Message] | None = None
+        """Set when a connection is gone: what it has not taken for certain; who has kept that takes it back."""
+        self.problem = ""
+        """Why there is no connection, or what the broker refuses; empty: all is well."""
+        self.connects = 0
+        self.refused = 0
+        self._dialling, self._selector, self._wake, self._will = dialling, selector, wake, will
+        self.on_message: Callable[[MQTTMessage], None] = lambda _: None
+        """Called with each message that comes."""
+        self._client: Client | None = None
+        self._socket: socket.socket | None = None
+        self._writing = False
+        self._target: Target | None = None
+        self._made: queue.SimpleQueue[tuple[Client, str]] = queue.SimpleQueue()
+        self._protocol = MQTTv5
+        self._failures = 0
+        self._retry_s = 0.0
+        self._until_s: float | None = None
+        """When the broker must have answered."""
+        self._up_s = 0.0
+        self._misc_s = 0.0
+        self._in_flight: dict[int, Message] = {}
+        self._most_in_flight = MOST_IN_FLIGHT
+        self._most_bytes: int | None = None
+        self._most_qos, self._retains = 1, True
+
+    @property
+    def mqtt5(self) -> bool:
+        """Whether the broker speaks version 5."""
+        return self.up and self._protocol == MQTTv5
+
+    @property
+    def ready(self) -> bool:
+        """Whether it takes a message now, and does not only put it into its memory."""
+        return self.up and len(self._in_flight) < self._most_in_flight and not self._blocked()
+
+    @property
+    def in_flight(self) -> int:
+        """Messages that the broker has not acknowledged."""
+        return len(self._in_flight)
+
+    def _blocked(self) -> bool:
+        return self._client is not None and self._client.want_write()
+
+    # ---- a turn ------------------------------------------------------------------------------------------------------
+
+    def turn(self) -> float:
+        """Do what is due; in how many seconds there is more to do."""
+        now_s = time.monotonic()
+        with suppress(queue.Empty):
+            while True:
+                self._take(*self._made.get_nowait())
+        if self._client is None:
+            if now_s >= self._retry_s:
+                self._dial()
+            return max(0.0, self._retry_s - now_s) if self._client is None else CONNECT_S
+        if self._until_s is not None and now_s >= self._until_s:
+            self._end("it does not answer")
+        elif self.up and now_s >= self._misc_s:
+            self._misc_s = now_s + 1.0
+            self._client.loop_misc()
+        self._rearm()
+        return 1.0
+
+    def _dial(self) -> None:
+        try:
+            target = self._target = self._dialling.next()
+            client = self._make(target)
+        except (ConfigError, OSError) as error:
+            self._client = None
+            self._again(str(error))
+            return
+        self._client = client
+        self._until_s = None
+        threading.Thread(target=self._connect, args=(client, target), name="connect", daemon=True).start()
+
+    def _make(self, target: Target) -> Client:
+        """A client of its own for each attempt: what one has not got rid of is none of the next one's business."""
+        settings = self._dialling.settings
+        new = self._protocol == MQTTv5
+        client = Client(
+            CallbackAPIVersion.VERSION2,
+            self._dialling.client_id,
+            clean_session=None if new else not settings.session_expiry_s,
+            protocol=self._protocol,
+            transport=target.transport,
+            reconnect_on_failure=False,
+        )
+        client.connect_timeout = CONNECT_S
+        client.max_inflight_messages_set(0)  # we count them ourselves
+        if target.username is not None:
+            client.username_pw_set(target.username, target.password)
+        if target.context is not None:
+            client.tls_set_context(target.context)
+        client.will_set(self._will.topic, self._will.payload, self._will.qos, self._will.retain)
+        return client
+
+    def _connect(self, client: Client, target: Target) -> None:
+        """In a thread of its own: names, TCP and TLS take their time."""
+        settings = self._dialling.settings
+        options: dict[str, Any] = {}
+        if self._protocol == MQTTv5:
+            properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+            properties.SessionExpiryInterval = settings.session_expiry_s
+            properties.MaximumPacketSize = MAX_PACKET_BYTES
+            properties.ReceiveMaximum = PACKETS
+            options = {"properties": properties, "clean_start": not settings.session_expiry_s}
+        problem = ""
+        try:
+            client.connect(target.host, target.port, settings.keep_alive_s, **options)
+        except (OSError, ValueError) as error:  # ValueError: a name with an empty part
+            problem = why(error, target)
+        self._made.put((client, problem))
+        self._wake()
+
+    def _take(self, client: Client, problem: str) -> None:
+        """A connection was made, or was not."""
+        made = client.socket()
+        if client is not self._client:
+            _drop(client)
+        elif problem:
+            self._fail(problem)
+        elif made is None:
+            self._fail("it closes the connection at once")
+        else:
+            self._until_s = time.monotonic() + CONNECT_S
+            client.on_connect = self._connected  # not before: what connects is another thread
+            client.on_disconnect = self._disconnected
+            client.on_publish = self._acknowledged
+            client.on_message = lambda one, _data, message: self.on_message(message) if one is self._client else None
+            client.on_subscribe = self._subscribed
+            self._socket = cast("socket.socket", made)
+            self._writing = False
+            self._selector.register(made, selectors.EVENT_READ, self._serve)
+
+    def _serve(self, events: int) -> None:
+        """The socket is ready."""
+        client, made = self._client, self._socket
+        if client is None or made is None:
+            return
+        code = MQTTErrorCode.MQTT_ERR_SUCCESS
+        if events & selectors.EVENT_WRITE:
+            code = client.loop_write()
+        if events & selectors.EVENT_READ and not code:
+            code = client.loop_read(PACKETS)
+            pending = getattr(made, "pending", None)  # of TLS: what select does not see
+            while not code and pending is not None and self._socket is made and pending():
+                code = client.loop_read(PACKETS)
+        if code and client is self._client:
+            self._end(str(MQTTErrorCode(code).name).removeprefix("MQTT_ERR_").replace("_", " ").lower())
+        self._rearm()
+
+    def _rearm(self) -> None:
+        """Hear of room for what did not go out at once."""
+        if self._socket is not None and self._writing != self._blocked():
+            self._writing = not self._writing
+            events = selectors.EVENT_READ | (selectors.EVENT_WRITE if self._writing else 0)
+            self._selector.modify(self._socket, events, self._serve)
+
+    # ---- what the broker says ----------------------------------------------------------------------------------------
+
+    def _connected(
+        self, client: Client, _data: Any, _flags: ConnectFlags, code: ReasonCode, properties: Properties | None
+    ) -> None:
+        if client is not self._client:
+            return
+        if code.is_failure:
+            if self._protocol == MQTTv5 and str(code) == "Unsupported protocol version":
+                self._step_back()
+            else:
+                self._fail(refusal(code, self._dialling))
+            return
+        told = vars(properties) if properties is not None else {}
+        self._most_in_flight = min(MOST_IN_FLIGHT, told.get("ReceiveMaximum", MOST_IN_FLIGHT))
+        self._most_bytes = told.get("MaximumPacketSize")
+        self._most_qos, self._retains = min(1, told.get("MaximumQoS", 1)), bool(told.get("RetainAvailable", 1))
+        self._until_s, self._up_s = None, time.monotonic()
+        self._misc_s = self._up_s + 1.0
+        self.up = self.came_up = True
+        self.connects += 1
+        self.problem = ""
+        version = "5" if self._protocol == MQTTv5 else "3.1.1"
+        log.info("connected to broker %s, MQTT %s", self._target, version)
+
+    def _disconnected(
+        self, client: Client, _data: Any, flags: DisconnectFlags, code: ReasonCode, _properties: Properties | None
+    ) -> None:
+        if client is self._client:
+            told = flags.is_disconnect_packet_from_server
+            self._end(refusal(code, self._dialling) if told else "the connection was lost")
+
+    def _acknowledged(
+        self, client: Client, _data: Any, mid: int, code: ReasonCode, _properties: Properties | None
+    ) -> None:
+        if client is self._client and self._in_flight.pop(mid, None) is not None and code.is_failure:
+            self.refused += 1
+            if not self.problem:
+                log.warning("broker %s refuses messages: %s", self._target, code)
+            self.problem = f"broker {self._target} refuses messages: {code}"
+        elif self.up:
+            self.problem = ""
+
+    def _subscribed(
+        self, client: Client, _data: Any, _mid: int, codes: Sequence[ReasonCode], _properties: Properties | None
+    ) -> None:
+        if client is self._client and any(code.is_failure for code in codes):
+            log.warning("broker %s does not let us subscribe: no command can come: %s", self._target, codes[0])
+
+    # ---- its end -----------------------------------------------------------------------------------------------------
+
+    def _end(self, problem: str) -> None:
+        """There was a connection, or half of one."""
+        if self.up:
+            self.lost = list(self._in_flight.values())
+            if time.monotonic() - self._up_s >= STABLE_S:
+                self._failures = 0
+            self._protocol = MQTTv5
+            self._fail(problem)
+        elif self._protocol == MQTTv5 and self._until_s is not None:
+            self._step_back()  # some brokers that do not know version 5 say nothing
+        else:
+            self._fail(problem)
+
+    def _step_back(self) -> None:
+        """Try version 3.1.1, with the same broker, at once."""
+        self._close()
+        self._protocol = MQTTv311
+        self._dialling.repeat()
+        self._retry_s = 0.0
+        self._wake()
+
+    def _fail(self, problem: str) -> None:
+        self._close()
+        self._again(f"broker {self._target}: {problem}")
+        if self._protocol != MQTTv5:
+            self._protocol = MQTTv5
+
+    def _again(self, problem: str) -> None:
+        if problem != self.problem:
+            log.warning("%s", problem)
+        self.problem = problem
+        wait_s = min(MOST_WAIT_S, FIRST_WAIT_S * 2 ** min(self._failures // self._dialling.count, 16))
+        self._failures += 1
+        # Not all bridges of a plant at once, when their broker is back.
+        self._retry_s = time.monotonic() + wait_s * random.uniform(0.5, 1.5)  # noqa: S311  not a secret
+
+    def _close(self) -> None:
+        client, self._client = self._client, None
+        if self._socket is not None:
+            with suppress(KeyError, ValueError):
+                self._selector.unregister(self._socket)
+            self._socket = None
+        self.up, self.came_up, self._until_s = False, False, None
+        self._in_flight = {}
+        if client is not None:
+            _drop(client)
+
+    def drop(self, problem: str) -> None:
+        """Give a connection up that does not do what it should."""
+        self._end(problem)
+
+    # ---- what goes out -----------------------------------------------------------------------------------------------
+
+    def send(self, message: Message, properties: Properties | None = None) -> None:
+        """Send one, if there is a connection."""
+        client = self._client
+        if client is None or not self.up:
+            return
+        if self._most_bytes is not None and len(message.payload) + len(message.topic.encode()) + 64 > self._most_bytes:
+            self.refused += 1
+            self.problem = f"broker {self._target} takes {self._most_bytes} bytes at once: {message.topic} has more"
+            return
+        qos = min(message.qos, self._most_qos)
+        retain = message.retain and self._retains
+        info = client.publish(message.topic, message.payload, qos, retain, properties if self.mqtt5 else None)
+        if not qos:
+            return
+        if self._client is client:  # to publish may have found it dead
+            self._in_flight[info.mid] = message
+        elif self.lost is not None:
+            self.lost.append(message)
+
+    def owes(self, message: Message) -> bool:
+        """Whether this very message was sent, and the broker has not acknowledged it."""
+        return any(one is message for one in self._in_flight.values())
+
+    def subscribe(self, filters: Sequence[str]) -> None:
+        """Ask for what is sent to these; what was there before is not sent, or has its flag."""
+        client = self._client
+        if client is None or not filters:
+            return
+        if self._protocol == MQTTv5:
+            options = partial(SubscribeOptions, 1, noLocal=True, retainHandling=SubscribeOptions.RETAIN_DO_NOT_SEND)
+            client.subscribe([(one, options()) for one in filters])
+        else:
+            client.subscribe([(one, 1) for one in filters])
+
+    def close(self) -> None:
+        """Take leave; what was sent before is on its way."""
+        if self._client is not None:
+            self._client.on_disconnect = None
+            if self.up:
+                self._client.disconnect()
+        self._close()
+        self._retry_s = float("inf")
+
+
+def _drop(client: Client) -> None:
+    """Close its socket, whatever state it is in."""
+    client.on_disconnect = None
+    made = client.socket()
+    if made is not None:
+        with suppress(OSError):
+            made.close()

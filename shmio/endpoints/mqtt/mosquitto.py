@@ -1,0 +1,145 @@
+"""Eclipse Mosquitto as our own broker: its configuration, and the process itself."""
+
+from __future__ import annotations
+
+import getpass
+import logging
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from shmio.config import Address, Mqtt
+from shmio.config.accounts import read_accounts
+from shmio.endpoints.mqtt.place import SOCKET
+from shmio.errors import EndpointError
+
+PLACES: Final = ("/usr/local/sbin", "/usr/sbin", "/sbin")
+"""Beside the PATH: Debian has it where users do not look."""
+NONE: Final = (
+    'mqtt.broker: "mosquitto" is not on this machine; install it (Debian: apt install mosquitto), or write '
+    '"embedded", which uses a slower one without it'
+)
+START_S: Final = 10.0
+STOP_S: Final = 3.0
+MAX_PACKET_BYTES: Final = 1 << 21
+MAX_QUEUED_MESSAGES: Final = 100_000
+MAX_QUEUED_BYTES: Final = 64 << 20
+"""Of what waits for one client that reads slowly: what comes then is dropped, for it alone."""
+_STAMP: Final = re.compile(r"^\d+: ")
+
+log = logging.getLogger("shmio.mqtt")
+
+
+def find() -> str | None:
+    """Its path: as the environment says, or where it usually is; None: it is not on this machine, or not wanted."""
+    named = os.environ.get("SHMIO_MOSQUITTO")
+    if named is not None:
+        return shutil.which(named) if named else None
+    return shutil.which("mosquitto", path=os.pathsep.join([os.environ.get("PATH", os.defpath), *PLACES]))
+
+
+def configuration(settings: Mqtt, place: Path) -> str:
+    """Of a broker whose clients may all publish and subscribe; mosquitto.conf(5)."""
+    address = Address.parse(str(settings.listen))
+    lines = [
+        "per_listener_settings true",
+        f"user {getpass.getuser()}",  # only heeded when started by root: it stays who it is, to die with its parent
+        "persistence false",
+        "log_dest stderr",
+        *(f"log_type {kind}" for kind in ("error", "warning", "notice")),
+        f"max_packet_size {MAX_PACKET_BYTES}",
+        f"max_queued_messages {MAX_QUEUED_MESSAGES}",
+        f"max_queued_bytes {MAX_QUEUED_BYTES}",
+        "max_inflight_messages 1000",
+        f"listener 0 {place / SOCKET}",
+        "allow_anonymous true",
+        f"listener {address.port} {address.host}",
+    ]
+    if settings.password_file:
+        lines += ["allow_anonymous false", f"password_file {place / 'accounts'}"]
+    else:
+        lines.append("allow_anonymous true")
+    if tls := settings.tls:
+        lines += [f"certfile {tls.certificate}", f"keyfile {tls.key}"]
+        if tls.ca:
+            lines += [f"cafile {tls.ca}", "require_certificate true"]
+    return "".join(f"{line}\n" for line in lines)
+
+
+class Mosquitto:
+    """The process. For the main thread: it dies with the thread that starts it."""
+
+    def __init__(self, program: str, settings: Mqtt, place: Path) -> None:
+        """Start it. ConfigError: its accounts cannot be read."""
+        if settings.password_file:
+            accounts = read_accounts(settings.password_file)
+            _write(place / "accounts", "".join(f"{name}:{secret}\n" for name, secret in accounts.items()))
+        _write(place / "mosquitto.conf", configuration(settings, place))
+        self._socket = place / SOCKET
+        self._last = ""
+        command = [sys.executable, "-P", "-m", "shmio.endpoints.mqtt.tether", str(os.getpid()), program]
+        self._process = subprocess.Popen(
+            [*command, "-c", str(place / "mosquitto.conf")],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            encoding="utf-8",
+            errors="replace",
+        )
+        self._reader = threading.Thread(target=self._read, name="broker's log", daemon=True)
+        self._reader.start()
+
+    def await_start(self, beat: Callable[[], object]) -> None:
+        """Wait until it takes connections. EndpointError: it ends, or takes too long; says what it said last."""
+        until_s = time.monotonic() + START_S
+        while True:
+            self.check()
+            with socket.socket(socket.AF_UNIX) as probe:
+                try:
+                    probe.connect(str(self._socket))
+                except OSError:
+                    if time.monotonic() > until_s:
+                        raise EndpointError(f"mosquitto takes no connections: {self._last}") from None
+                else:
+                    return
+            beat()
+            time.sleep(0.02)
+
+    def check(self) -> None:
+        """EndpointError: it has ended."""
+        code = self._process.poll()
+        if code is not None:
+            self._reader.join(1.0)
+            raise EndpointError(f"mosquitto has ended: {self._last or f'exit status {code}'}")
+
+    def stop(self) -> None:
+        """End it."""
+        self._process.terminate()
+        try:
+            self._process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        self._reader.join(1.0)
+        if self._process.stderr is not None:
+            self._process.stderr.close()
+
+    def _read(self) -> None:
+        """Into our log."""
+        for line in self._process.stderr or ():
+            self._last = _STAMP.sub("", line.strip())
+            log.info("mosquitto: %s", self._last)
+
+
+def _write(file: Path, text: str) -> None:
+    fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    with open(fd, "w", encoding="utf-8") as stream:  # noqa: PTH123  a descriptor
+        stream.write(text)

@@ -1,0 +1,153 @@
+"""What the broker is still to be told: topics in the order of their first change, each with its newest value.
+
+While the broker is away each change is kept instead, in a bounded store, and sent before anything else when it is back.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from typing import Final, Protocol
+
+from paho.mqtt.properties import Properties
+
+from shmio.endpoints.mqtt.channel import Channel, Message
+
+OVERHEAD_BYTES: Final = 200
+"""Of one message in memory, about, beside its payload."""
+MOST_ANSWERS: Final = 1024
+"""Results of commands that wait; beyond that the oldest are dropped."""
+
+
+class Sender(Protocol):
+    """The connection to the broker."""
+
+    @property
+    def up(self) -> bool:
+        """Whether there is one."""
+
+    @property
+    def ready(self) -> bool:
+        """Whether it takes a message now, and does not only put it into its memory."""
+
+    def send(self, message: Message, properties: Properties | None = None) -> None:
+        """Send one."""
+
+
+class Outbox:
+    """For the bridge's thread."""
+
+    def __init__(self, link: Sender, backlog_bytes: int) -> None:
+        self._link = link
+        self._most = backlog_bytes
+        self._waiting: dict[Channel, None] = {}
+        self._answers: deque[tuple[Message, Properties | None]] = deque(maxlen=MOST_ANSWERS)
+        self._backlog: deque[Message] = deque()
+        self._backlog_bytes = 0
+        self.keeping = False
+        """Whether changes are kept while there is no connection: it has failed, or there has been one."""
+        self._settling = False
+        """Whether the broker is being told all that was kept, and then how everything is."""
+        self.sent = 0
+        self.dropped = 0
+
+    @property
+    def busy(self) -> bool:
+        """Whether anything is to be sent."""
+        return bool(self._waiting or self._backlog or self._answers)
+
+    @property
+    def waiting(self) -> int:
+        """Topics whose turn has not come."""
+        return len(self._waiting)
+
+    @property
+    def backlog(self) -> int:
+        """Changes that are kept."""
+        return len(self._backlog)
+
+    def mark(self, channel: Channel) -> None:
+        """Something about it is new. One that waits already keeps its place, and will be sent with what is new.
+
+        Until all that was kept has been sent, what is new is kept behind it, if there is room.
+        """
+        if self._link.up and not (self._settling and self._backlog_bytes < self._most):
+            self._waiting[channel] = None
+        elif self._settling or self.keeping:
+            message = channel.message(late=True)
+            if message.keep:
+                self._keep(message)
+            elif self._link.up:
+                self._waiting[channel] = None
+
+    def mark_all(self, channels: Iterable[Channel]) -> None:
+        """Something about all of them is new."""
+        for channel in channels:
+            self.mark(channel)
+
+    def show(self, channels: Iterable[Channel]) -> None:
+        """Have all of them sent as they are when their turn comes, after what was kept."""
+        if self._link.up:
+            self._waiting |= dict.fromkeys(channels)
+            self._settling = True
+
+    def answer(self, message: Message, properties: Properties | None) -> None:
+        """Send what became of a command, before values."""
+        if self._link.up:
+            self.dropped += len(self._answers) == MOST_ANSWERS
+            self._answers.append((message, properties))
+
+    def lose(self, unacknowledged: Iterable[Message]) -> None:
+        """The connection is gone: keep what it has not taken for certain, and what waited for it."""
+        for message in reversed(list(unacknowledged)):
+            if message.keep:
+                self._keep(message._replace(retain=False), first=True)
+        for channel in self._waiting:
+            message = channel.message(late=True)
+            if message.keep:
+                self._keep(message)
+        self._waiting.clear()
+        self._settling = False
+        self._answers.clear()
+
+    def forget(self, channels: Iterable[Channel]) -> None:
+        """A reload has ended what they tell of."""
+        for channel in channels:
+            self._waiting.pop(channel, None)
+
+    def flush(self) -> None:
+        """Send as long as the connection takes it: answers, then what was kept, then what is new."""
+        link = self._link
+        while self.busy and link.ready:
+            self.sent += 1
+            if self._answers:
+                link.send(*self._answers.popleft())
+            elif self._backlog:
+                message = self._backlog.popleft()
+                self._backlog_bytes -= _size(message)
+                link.send(message)
+            else:
+                channel = next(iter(self._waiting))
+                del self._waiting[channel]
+                link.send(channel.message())
+                self._settling = self._settling and bool(self._waiting)
+
+    def _keep(self, message: Message, *, first: bool = False) -> None:
+        """Keep a change; the oldest go when there is no room."""
+        size = _size(message)
+        if first:
+            if self._backlog_bytes + size > self._most:
+                self.dropped += 1
+                return
+            self._backlog.appendleft(message)
+            self._backlog_bytes += size
+            return
+        self._backlog.append(message)
+        self._backlog_bytes += size
+        while self._backlog_bytes > self._most:
+            self._backlog_bytes -= _size(self._backlog.popleft())
+            self.dropped += 1
+
+
+def _size(message: Message) -> int:
+    return OVERHEAD_BYTES + len(message.payload)

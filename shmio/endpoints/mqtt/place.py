@@ -1,0 +1,51 @@
+"""The folder of our own broker: beside the supervisor's socket, this user's alone."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Final
+
+from shmio.errors import EndpointError
+from shmio.segment import Segment
+
+SOCKET: Final = "broker.sock"
+
+
+def folder(segment: Segment) -> Path:
+    """Where it is; not made here."""
+    return Path(f"{segment.header.control.removesuffix('.sock')}.mqtt")
+
+
+def own_socket(segment: Segment) -> str:
+    """Where our own broker is reached by us alone."""
+    return str(folder(segment) / SOCKET)
+
+
+def prepare(place: Path) -> None:
+    """Make it, mode 0700, and empty it. EndpointError: it is something else, or somebody else's."""
+    try:
+        place.mkdir(mode=0o700, exist_ok=True)
+        fd = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            if os.fstat(fd).st_uid != os.getuid():
+                raise EndpointError(f"the broker's folder {place} belongs to another user")
+            os.fchmod(fd, 0o700)
+        finally:
+            os.close(fd)
+        clear(place)
+    except OSError as error:
+        raise EndpointError(f"the broker's folder {place}: {error.strerror}") from None
+
+
+def clear(place: Path) -> None:
+    """Remove what is in it."""
+    for entry in place.iterdir():
+        if not entry.is_dir():
+            entry.unlink(missing_ok=True)
+
+
+def remove(place: Path) -> None:
+    """Remove it."""
+    clear(place)
+    place.rmdir()

@@ -1,0 +1,90 @@
+"""Steps of virtual time: each waits until the broker has taken what it changed, and its marker."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterable
+from typing import Final
+
+import msgspec
+
+from shmio.endpoints.mqtt.channel import Message
+from shmio.endpoints.mqtt.feed import Feed
+from shmio.endpoints.mqtt.link import Link
+from shmio.endpoints.mqtt.outbox import Outbox
+from shmio.segment.clock import ClockPage, ClockState
+
+PATIENCE_S: Final = 3.0
+"""So long a broker has for a step; less than a step's own time-out."""
+
+log = logging.getLogger("shmio.mqtt")
+
+
+class Steps:
+    """For the bridge's thread."""
+
+    def __init__(self, clock: ClockPage, index: int, topic: str, link: Link, outbox: Outbox) -> None:
+        """``index``: of this process's slot."""
+        self._clock, self._index, self._topic, self._link, self._outbox = clock, index, topic, link, outbox
+        self._delivering: Marker | None = None
+        self._until_s = 0.0
+        self.done = clock.read().done
+        """The last step that was delivered."""
+        clock.deliver(index, self.done)  # from now on each step waits for it
+
+    def look(self, feeds: Iterable[Feed]) -> None:
+        """Begin to deliver a step that is done, or end it; what is held shows nothing but by steps."""
+        state = self._clock.read()
+        for feed in feeds:
+            feed.held = state.virtual and feed.block.attributes.stepped and feed.shown.frame is not None
+        if self._delivering is None:
+            if not state.virtual or state.done <= self.done:
+                return
+            self._begin(state, feeds)
+        if self._delivering is not None and self._over(self._delivering):
+            self.done, self._delivering = self._delivering.number, None
+            self._clock.deliver(self._index, self.done)
+
+    def _begin(self, state: ClockState, feeds: Iterable[Feed]) -> None:
+        for feed in feeds:
+            feed.inlet.look()
+            feed.step()
+        self._delivering = Marker(self._topic, state)
+        self._until_s = time.monotonic() + PATIENCE_S
+        self._outbox.mark(self._delivering)
+        self._outbox.flush()
+
+    def _over(self, marker: Marker) -> bool:
+        """Whether the broker has it; or is away, so that what changed is kept until it is back."""
+        if not self._link.up:
+            return True
+        if marker.sent is not None and not self._link.owes(marker.sent):
+            return True  # a broker acknowledges in the order in which it was sent (MQTT 5.0, section 4.6)
+        if time.monotonic() >= self._until_s:
+            log.warning("step %d: the broker does not take it", marker.number)
+            self._link.drop(f"it did not take step {marker.number} within {PATIENCE_S:g} s")
+            return True
+        return False
+
+    def close(self) -> None:
+        """No step waits for this process any more."""
+        self._clock.abstain(self._index)
+
+
+class Marker:
+    """Tells on its topic that a step is over."""
+
+    def __init__(self, topic: str, state: ClockState) -> None:
+        self.number = state.done
+        self.topic = topic
+        self.sent: Message | None = None
+        last = state.done == state.step  # or else nobody tells how far that one went
+        fields = {"step": state.done, "time_s": state.time_ns / 1e9 if last else None}
+        self._message = Message(topic, msgspec.json.encode(fields), 1, retain=False)
+
+    def message(self, *, late: bool = False) -> Message:
+        """With all that the step changed before it."""
+        if not late:
+            self.sent = self._message
+        return self._message

@@ -1,0 +1,116 @@
+"""A whole cell with a broker of its own, as clients of MQTT see it, and as its user does."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from shmio.config import Address
+from shmio.testing.cell import CONFIG, Cell, kill, until
+from shmio.testing.mosquitto import missing
+from shmio.testing.ports import reserved_port
+from tests.unit.endpoints.mqtt.harness import Listener, listening
+
+MQTT = """
+[mqtt]
+listen = "{broker}"
+prefix = "shmio/test"
+"""
+SOURCE = 'connector = "s7"\n'
+PROGRAMS = ["mosquitto", "embedded"]
+
+
+@pytest.fixture
+def broker() -> Iterator[Address]:
+    with reserved_port() as address:
+        yield address
+
+
+@contextmanager
+def running(make_cell: Callable[..., Cell], broker: Address, *, more: str = "") -> Iterator[Cell]:
+    config = CONFIG.replace(SOURCE, f'{SOURCE}writable = ["Outputs"]\n') + MQTT.replace("{broker}", str(broker)) + more
+    cell = make_cell(config=config)
+    cell.up()
+    yield cell
+
+
+@pytest.fixture(params=PROGRAMS)
+def program(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
+    """With mosquitto, and without."""
+    if request.param == "mosquitto":
+        if reason := missing():
+            pytest.skip(reason)
+    else:
+        monkeypatch.setenv("SHMIO_MOSQUITTO", "")
+    return str(request.param)
+
+
+def counts(listener: Listener, topic: str, count: int) -> None:
+    for _ in range(count):
+        listener.until(topic)
+
+
+def test_clients_see_and_drive_the_cell(make_cell: Callable[..., Cell], broker: Address, program: str) -> None:
+    with running(make_cell, broker, more=f'broker = "{program}"\n') as cell:
+        assert cell.status()["state"] == "running", cell.logs()
+        with listening(broker, protocol=4) as listener:  # type: ignore[arg-type]
+            counts(listener, "cell/Robot_800/Axs1_Pos/out", 10)
+            listener.publish("cell/Outputs/13/in", "1")
+            assert listener.json("cell/Outputs/13/in/result")["done"]
+            while not any(json.loads(value)[13] == 1 for value in listener.values("cell/Outputs/out")):
+                listener.message()
+            cell.down()
+            listener.until("status", b"offline")
+    assert not list(Path(os.environ.get("XDG_RUNTIME_DIR", "/tmp")).glob(f"shmio*/{cell.instance}*"))
+
+
+def test_a_killed_broker_comes_back_and_its_bridge_goes_on(
+    make_cell: Callable[..., Cell], broker: Address, program: str
+) -> None:
+    with running(make_cell, broker, more=f'broker = "{program}"\n') as cell:
+        before = cell.processes()
+        kill(before["broker"]["pid"])
+        until(lambda: cell.processes()["broker"]["restarts"] == 1, "the broker is started again")
+        until(lambda: cell.processes()["mqtt"]["counters"]["connects"] == 2, "the bridge is connected again")
+        until(lambda: cell.status()["state"] == "running", "all is well")
+        with listening(broker, protocol=4) as listener:  # type: ignore[arg-type]
+            counts(listener, "cell/Robot_800/Axs1_Pos/out", 3)
+        for name in ("mqtt", "grpc", "cell", "plc"):
+            assert cell.processes()[name]["pid"] == before[name]["pid"]
+
+
+def test_accounts_let_in_who_has_one(
+    make_cell: Callable[..., Cell], broker: Address, program: str, tmp_path: Path
+) -> None:
+    (tmp_path / "accounts").write_text("anna:secret\n")
+    (tmp_path / "accounts").chmod(0o600)
+    with running(make_cell, broker, more=f'broker = "{program}"\npassword_file = "accounts"\n'):
+        with listening(broker, protocol=4, username="anna", password="secret") as listener:  # type: ignore[arg-type]
+            counts(listener, "cell/Robot_800/Axs1_Pos/out", 3)
+        for account in ({}, {"username": "anna", "password": "guess"}):
+            assert refused(broker, **account)
+
+
+def refused(broker: Address, **account: str) -> bool:
+    """Whether the broker refuses a client, by MQTT 3.1.1's code for that."""
+    who = b"".join(len(text).to_bytes(2, "big") + text.encode() for text in ("me", *account.values()))
+    flags = 0xC2 if account else 2
+    variable = b"\0\x04MQTT\x04" + bytes([flags]) + b"\0\x3c" + who
+    with socket.create_connection((broker.host, broker.port), timeout=30) as client:
+        client.sendall(bytes([0x10, len(variable)]) + variable)
+        answer = client.recv(4)
+    return answer[:3] == b"\x20\x02\x00" and answer[3] in (4, 5)
+
+
+def test_a_port_that_is_taken_is_told_before_anything_starts(make_cell: Callable[..., Cell], broker: Address) -> None:
+    with socket.create_server((broker.host, broker.port)):
+        cell = make_cell(config=CONFIG + MQTT.replace("{broker}", str(broker)))
+        done = cell.supervisor("up", "--detach")
+    assert done.returncode == 1
+    assert f"broker: cannot listen on {broker}" in done.stderr

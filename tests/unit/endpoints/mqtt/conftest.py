@@ -1,0 +1,45 @@
+"""A segment, a broker, and who listens there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
+from shmio.testing.mosquitto import Mosquitto, missing
+from shmio.testing.ports import reserved_port
+from tests.unit.endpoints.harness import LAYOUT, STALE_NS, WRITABLE
+
+
+@pytest.fixture
+def segment(instance: str) -> Iterator[Segment]:
+    block = BlockSpec("cell", LAYOUT, 20_000_000, STALE_NS, 1 << 20, Attributes("test", WRITABLE))
+    processes = [ProcessSpec("cell", "source"), ProcessSpec("mqtt", "mqtt"), ProcessSpec("grpc", "grpc")]
+    with Segment.create(instance, [block], processes) as segment:
+        yield segment
+        segment.unlink()
+
+
+@pytest.fixture
+def make_broker(tmp_path: Path) -> Iterator[Callable[..., Mosquitto]]:
+    """Start a mosquitto of this test's own."""
+    if reason := missing():
+        pytest.skip(reason)
+    with ExitStack() as stack:
+
+        def make(*lines: str) -> Mosquitto:
+            address = stack.enter_context(reserved_port())
+            broker = Mosquitto(tmp_path, address, *lines)
+            stack.callback(broker.stop)
+            broker.start()
+            return broker
+
+        yield make
+
+
+@pytest.fixture
+def broker(make_broker: Callable[..., Mosquitto]) -> Mosquitto:
+    return make_broker()

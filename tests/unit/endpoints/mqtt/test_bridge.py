@@ -1,0 +1,185 @@
+"""The bridge against a real broker: what goes out."""
+
+from __future__ import annotations
+
+import json
+import struct
+import time
+
+import pytest
+
+from shmio.config import MqttTopic
+from shmio.segment import BlockWriter, ProcessSpec, Provenance, Quality, Segment
+from shmio.testing.mosquitto import Mosquitto
+from tests.unit.endpoints.harness import LAYOUT, image
+from tests.unit.endpoints.mqtt.harness import PREFIX, Listener, bridge, listening
+
+OUT = f"{PREFIX}/+/#"
+
+
+def test_what_changes_goes_out_and_nothing_else(segment: Segment, broker: Mosquitto) -> None:
+    writer = segment.writer("cell")
+    writer.publish(image(position=1.5, step=7), cycle=1)
+    with listening(broker.address) as listener:
+        with bridge(segment, broker.address):
+            assert listener.until("status") == b"online"
+            assert listener.until("cell/secret/out") == b"0"  # the last of all
+            writer.publish(image(position=2.5, step=7), cycle=2)
+            writer.publish(image(position=2.5, step=8, inputs=b"\1\2"), cycle=3)
+            assert listener.until("cell/step/out") == b"8"
+        listener.until("status", b"offline")
+    assert listener.values("cell/axis/position/out") == ["1.5", "2.5"]
+    assert listener.values("cell/inputs/out") == ["[0,0]", "[1,2]"]
+    assert listener.values("cell/running/out") == ["false"]
+
+
+def test_who_comes_later_finds_the_present_values(segment: Segment, broker: Mosquitto) -> None:
+    segment.writer("cell").publish(image(position=1.5), cycle=1)
+    with listening(broker.address) as first, bridge(segment, broker.address):
+        first.until("cell/secret/out")
+        with listening(broker.address) as listener:
+            assert listener.until("cell/axis/position/out") == b"1.5"
+            assert listener.heard
+
+
+def test_a_source_that_turns_bad_says_so_on_each_topic(segment: Segment, broker: Mosquitto) -> None:
+    """As text there is no value any more, also for who comes later; as JSON the last one is told to be bad."""
+    rules = [MqttTopic(match="cell/step", payload="json")]
+    writer = segment.writer("cell")
+    writer.publish(image(position=1.5, step=3), cycle=1)
+    with listening(broker.address) as listener, bridge(segment, broker.address, topic=rules):
+        good = listener.json("cell/status")
+        assert (good["quality"], good["cycle"]) == ("good", 1)
+        assert listener.until("cell/axis/position/out") == b"1.5"
+        value = listener.json("cell/step/out")
+        assert (value["value"], value["quality"], value["provenance"]) == (3, "good", "live")
+        writer.publish(image(position=1.5, step=3), cycle=2, quality=Quality.BAD, reason="cable out")
+        assert listener.json("cell/status") == {**good, "quality": "bad", "reason": "cable out", "cycle": 2} | {
+            "source_time": pytest.approx(good["source_time"], abs=60)
+        }
+        assert listener.until("cell/axis/position/out") == b""
+        bad = listener.json("cell/step/out")
+        assert (bad["value"], bad["quality"], bad["reason"]) == (3, "bad", "cable out")
+        listener.until("cell/secret/out")
+        with listening(broker.address, f"{PREFIX}/cell/axis/#", f"{PREFIX}/cell/status") as later:
+            assert later.message().topic == f"{PREFIX}/cell/status"  # the text's topic is empty
+        writer.publish(image(position=1.5, step=3), cycle=3)
+        assert listener.until("cell/axis/position/out") == b"1.5"
+        assert listener.json("cell/step/out")["quality"] == "good"
+
+
+def test_a_source_that_falls_silent_turns_bad(soon_stale: Segment, broker: Mosquitto) -> None:
+    soon_stale.processes.add(ProcessSpec("mqtt", "mqtt"))
+    writer = soon_stale.writer("cell")
+    writer.publish(image(position=1.5), cycle=1)
+    with listening(broker.address) as listener, bridge(soon_stale, broker.address):
+        while (told := listener.json("cell/status"))["quality"] != "bad":
+            pass
+        assert told["reason"].startswith("stale")
+        assert listener.until("cell/axis/position/out", b"") == b""
+
+
+def test_uncertain_values_are_shown_and_told(segment: Segment, broker: Mosquitto) -> None:
+    rules = [MqttTopic(match="cell/step", payload="json")]
+    writer = segment.writer("cell")
+    writer.publish(image(position=1.5), cycle=1)
+    with listening(broker.address) as listener, bridge(segment, broker.address, topic=rules):
+        listener.until("cell/secret/out")
+        writer.publish(image(position=2.5), cycle=2, quality=Quality.UNCERTAIN, reason="PLC in STOP")
+        assert listener.json("cell/status")["reason"] == "PLC in STOP"
+        assert listener.json("cell/step/out")["quality"] == "uncertain"
+        assert listener.until("cell/axis/position/out") == b"2.5"
+
+
+def test_injected_values_are_the_ones_shown(segment: Segment, broker: Mosquitto) -> None:
+    writer = segment.writer("cell")
+    writer.publish(image(position=1.5), cycle=1)
+    with listening(broker.address) as listener, bridge(segment, broker.address):
+        listener.until("cell/secret/out")
+        writer.publish(image(position=1.5), cycle=2, effective=image(position=9.5), provenance=Provenance.LIVE)
+        assert listener.until("cell/axis/position/out") == b"9.5"
+
+
+def test_rules_say_what_is_published_and_how(segment: Segment, broker: Mosquitto) -> None:
+    rules = [
+        MqttTopic(match="cell/axis/speed", publish=False),
+        MqttTopic(match="cell/inputs", elements=True),
+        MqttTopic(match=["cell/name", "cell/step"], retain=False, qos=0),
+        MqttTopic(match="cell", payload="frames"),
+    ]
+    writer = segment.writer("cell")
+    writer.publish(image(position=1.5, inputs=b"\3\4"), cycle=1)
+    with listening(broker.address) as listener, bridge(segment, broker.address, topic=rules):
+        frame = listener.until("cell/frames")
+        assert struct.unpack_from(">f", frame)[0] == 1.5
+        assert len(frame) == LAYOUT.size
+        topics = {topic for topic, _ in listener.heard}
+        assert f"{PREFIX}/cell/axis/speed/out" not in topics
+        assert f"{PREFIX}/cell/inputs/out" not in topics
+        assert listener.values("cell/inputs/0/out") == ["3"]
+        assert listener.values("cell/inputs/1/out") == ["4"]
+        with listening(broker.address) as later:
+            later.until("cell/status")
+            assert not later.values("cell/step/out")
+
+
+def wait_for(listener: Listener, topic: str, count: int) -> list[str]:
+    while len(values := listener.values(topic)) < count:
+        listener.message()
+    return values
+
+
+def test_changes_within_the_dead_band_are_not_told(segment: Segment, broker: Mosquitto) -> None:
+    writer = segment.writer("cell")
+    writer.publish(image(position=1.0), cycle=1)
+    rules = [MqttTopic(match="cell/axis/position", deadband=0.5)]
+    with listening(broker.address) as listener, bridge(segment, broker.address, topic=rules):
+        listener.until("cell/secret/out")
+        for cycle, position in enumerate((1.25, 1.25, 1.5, 1.75, 1.0), 2):
+            writer.publish(image(position=position, step=cycle), cycle=cycle)
+            listener.until("cell/step/out", str(cycle).encode())
+    assert listener.values("cell/axis/position/out") == ["1.0", "1.5", "1.0"]
+
+
+def test_a_rate_leaves_out_what_is_between_and_never_the_last(segment: Segment, broker: Mosquitto) -> None:
+    writer = segment.writer("cell")
+    writer.publish(image(position=0.0), cycle=1)
+    rules = [MqttTopic(match="cell/axis/position", max_rate_hz=5)]
+    with listening(broker.address) as listener, bridge(segment, broker.address, topic=rules):
+        listener.until("cell/secret/out")
+        begun_s = time.monotonic()
+        for cycle in range(2, 102):
+            writer.publish(image(position=cycle, step=cycle), cycle=cycle)
+            listener.until("cell/step/out")
+        assert listener.until("cell/axis/position/out", b"101.0")
+        passed_s = time.monotonic() - begun_s
+    assert len(listener.values("cell/axis/position/out")) <= 2 + passed_s * 5
+
+
+def test_text_that_is_none_and_names_that_need_encoding(segment: Segment, broker: Mosquitto) -> None:
+    """A STRING is its text; arrays are JSON; what JSON does not know is text in it."""
+    rules = [MqttTopic(match="cell/axis", payload="json")]
+    data = bytearray(image(position=float("nan"), running=True))
+    data[16:20] = bytes([8, 2]) + b"hi"
+    segment.writer("cell").publish(bytes(data), cycle=1)
+    with listening(broker.address) as listener, bridge(segment, broker.address, topic=rules):
+        listener.until("cell/secret/out")
+    assert json.loads(listener.values("cell/axis/position/out")[0])["value"] == "NaN"
+    assert listener.values("cell/name/out") == ["hi"]
+    assert listener.values("cell/running/out") == ["true"]
+
+
+def burst(writer: BlockWriter, cycles: range) -> None:
+    for cycle in cycles:
+        writer.publish(image(position=cycle, step=cycle), cycle=cycle)
+
+
+def test_more_frames_than_it_follows_end_with_the_last(segment: Segment, broker: Mosquitto) -> None:
+    writer = segment.writer("cell")
+    burst(writer, range(1, 3))
+    with listening(broker.address) as listener, bridge(segment, broker.address):
+        listener.until("cell/secret/out")
+        burst(writer, range(3, 3000))
+        listener.until("cell/step/out", b"2999")
+        steps = [int(value) for value in listener.values("cell/step/out")]
+    assert steps == sorted(set(steps))

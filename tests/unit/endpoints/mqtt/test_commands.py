@@ -1,0 +1,138 @@
+"""What comes in from a real broker: values for a source's device, and what became of each."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from shmio.config import MqttTopic
+from shmio.connectors.injections import Owner
+from shmio.segment import Segment
+from shmio.segment.processes import WRITERS
+from shmio.testing.mosquitto import Mosquitto
+from tests.unit.endpoints.mqtt.harness import PREFIX, Listener, bridge, listening
+from tests.unit.endpoints.plant import Plant
+
+
+@contextmanager
+def running(segment: Segment, broker: Mosquitto, **settings: Any) -> Iterator[tuple[Plant, Listener]]:
+    """A device, a bridge that is connected, and a client."""
+    plant = Plant(segment.writer("cell"))
+    plant.owners[WRITERS["mqtt"]] = Owner(WRITERS["mqtt"], 3)
+    plant.run()
+    try:
+        with listening(broker.address) as listener, bridge(segment, broker.address, **settings):
+            listener.until("cell/secret/out")
+            yield plant, listener
+    finally:
+        plant.stop()
+
+
+def test_a_value_reaches_the_device_and_its_end_comes_back(segment: Segment, broker: Mosquitto) -> None:
+    with running(segment, broker) as (_, listener):
+        listener.publish("cell/axis/position/in", "2.5", CorrelationData=b"mine")
+        listener.publish("cell/inputs/1/in", "7")
+        listener.publish("cell/bits/3/in", "true")
+        while True:
+            message = listener.message()
+            if message.topic == f"{PREFIX}/cell/axis/position/in/result":
+                break
+        assert json.loads(message.payload) == {"outcome": "written", "done": True, "reason": ""}
+        assert vars(message.properties)["CorrelationData"] == b"mine"
+        assert not message.retain
+        listener.until("cell/bits/3/in/result")
+        listener.shown("cell/bits/out", "[false,false,false,true,false,false,false,false,false,false]")
+        listener.shown("cell/axis/position/out", "2.5")
+        listener.shown("cell/inputs/out", "[0,7]")
+
+
+@pytest.mark.parametrize(
+    ("topic", "payload", "reason"),
+    [
+        ("cell/axis/position/in", b"fast", "REAL: expected a number"),
+        ("cell/axis/position/in", b"\xff\xfe", "not UTF-8"),
+        ("cell/step/in", b"99999", "INT"),
+        ("cell/secret/in", b"1", "not writable"),
+        ("cell/axis/nowhere/in", b"1", "no such register"),
+        ("cell/axis/in", b"1", "a structure"),
+        ("cell/inputs/9/in", b"1", "outside"),
+        ("cell/%zz/in", b"1", "hexadecimal"),
+        ("cell/bits/in", b"[" * 100_000, "JSON array"),
+        ("cell/name/in", b"x" * 2_000_000, "longer than"),
+    ],
+)
+def test_what_cannot_be_done_is_told_and_the_bridge_goes_on(
+    segment: Segment, broker: Mosquitto, topic: str, payload: bytes, reason: str
+) -> None:
+    with running(segment, broker) as (plant, listener):
+        listener.publish(topic, payload)
+        told = listener.json(f"{topic}/result")
+        assert (told["outcome"], told["done"]) == ("rejected", False)
+        assert reason in told["reason"]
+        assert not plant.written
+        listener.publish("cell/step/in", "5")
+        assert listener.json("cell/step/in/result")["done"]
+
+
+def test_the_devices_refusal_is_told(segment: Segment, broker: Mosquitto) -> None:
+    with running(segment, broker) as (plant, listener):
+        plant.refusal = "access denied"
+        listener.publish("cell/step/in", "5")
+        assert listener.json("cell/step/in/result") == {
+            "outcome": "refused", "done": False, "reason": "access denied",
+        }  # fmt: skip
+
+
+def test_a_command_that_was_there_before_is_not_carried_out(segment: Segment, broker: Mosquitto) -> None:
+    """Nobody knows how old it is. Its sender, if he is still there, publishes it again."""
+    with listening(broker.address, "none") as before:
+        before.publish("cell/step/in", "5", retain=True)
+    with running(segment, broker) as (plant, listener):
+        listener.publish("cell/axis/speed/in", "1.5")
+        listener.until("cell/axis/speed/in/result")
+        assert len(plant.written) == 1
+        listener.publish("cell/step/in", "6", retain=True)  # this one has only just come
+        assert listener.json("cell/step/in/result")["done"]
+
+
+def test_results_go_where_their_client_wants_them_below_the_prefix(segment: Segment, broker: Mosquitto) -> None:
+    with running(segment, broker) as (_, listener):
+        listener.publish("cell/step/in", "5", ResponseTopic=f"{PREFIX}/shmio/results/me")
+        assert listener.json("shmio/results/me")["done"]
+        for elsewhere in ("cell/step/in", f"{PREFIX}/cell/axis/speed/in", "$SYS/x", f"{PREFIX}/shmio/results/+"):
+            if "+" not in elsewhere:
+                listener.publish("cell/step/in", "5", ResponseTopic=elsewhere)
+                assert listener.json("cell/step/in/result")["done"]
+        listener.publish("cell/step/in", "6")
+        listener.until("cell/step/in/result")
+    assert not [topic for topic, payload in listener.heard if b"outcome" in payload and not topic.endswith(
+        ("cell/step/in/result", "shmio/results/me"))]  # fmt: skip
+
+
+def test_json_registers_take_a_value_or_an_object_with_one(segment: Segment, broker: Mosquitto) -> None:
+    rules = [MqttTopic(match="cell", payload="json")]
+    with running(segment, broker, topic=rules) as (_, listener):
+        for payload in ('{"value": 2.5, "quality": "good"}', "3.5", '{"value": "NaN"}'):
+            listener.publish("cell/axis/position/in", payload)
+            assert listener.json("cell/axis/position/in/result")["done"]
+        listener.publish("cell/name/in", '{"value": "hi"}')
+        assert listener.json("cell/name/in/result")["done"]
+        listener.publish("cell/bits/in", json.dumps({"value": [True] * 10}))
+        assert listener.json("cell/bits/in/result")["done"]
+        for payload in ('{"worth": 1}', "{", "[" * 10_000):
+            listener.publish("cell/axis/position/in", payload)
+            assert "as JSON" in listener.json("cell/axis/position/in/result")["reason"]
+
+
+def test_a_flood_of_commands_is_bounded_and_answered(segment: Segment, broker: Mosquitto) -> None:
+    with running(segment, broker) as (_, listener):
+        for number in range(5000):
+            listener.client.publish(f"{PREFIX}/cell/step/in", str(number % 1000), 0)
+        listener.publish("cell/axis/speed/in", "1.5")
+        listener.until("cell/axis/speed/in/result")
+        listener.publish("cell/axis/speed/in", "2.5")
+        assert listener.json("cell/axis/speed/in/result")["done"]

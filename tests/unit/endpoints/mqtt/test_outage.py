@@ -1,0 +1,233 @@
+"""A broker that goes away, and comes back: what changes meanwhile is kept, in order."""
+
+from __future__ import annotations
+
+import json
+import socket
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from shmio.config import Address, MqttTopic
+from shmio.segment import BlockWriter, Segment
+from shmio.testing.mosquitto import Mosquitto
+from shmio.testing.ports import reserved_port
+from shmio.testing.proxy import FaultProxy
+from tests.unit.endpoints.harness import image
+from tests.unit.endpoints.mqtt.harness import PREFIX, bridge, listening
+
+AWAY = "nothing listens there"
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tests do not wait for a bridge that has given up for a while."""
+    monkeypatch.setattr("shmio.endpoints.mqtt.link.FIRST_WAIT_S", 0.02)
+    monkeypatch.setattr("shmio.endpoints.mqtt.link.MOST_WAIT_S", 0.1)
+
+
+def test_changes_are_kept_while_the_broker_is_away(segment: Segment, broker: Mosquitto) -> None:
+    """They come in order, with their own times, marked as late; then everything as it is now."""
+    rules = [MqttTopic(match="cell/step", payload="json")]
+    writer = segment.writer("cell")
+    writer.publish(image(step=1), cycle=1)
+    with (
+        FaultProxy(broker.address, framing=None) as proxy,
+        listening(broker.address) as listener,
+        bridge(segment, proxy.address, topic=rules) as running,
+    ):
+        listener.until("cell/secret/out")
+        proxy.refuse()
+        listener.until("status", b"offline")  # its last will
+        running.until(lambda: AWAY in running.bridge.problem)
+        for step in range(2, 12):
+            writer.publish(image(step=step, position=step), cycle=step)
+        running.until(lambda: running.bridge.outbox.backlog >= 20)
+        assert "changes are kept" in running.bridge.problem
+        proxy.admit()
+        listener.until("status", b"online")
+        listener.until("cell/secret/out")
+        running.until(lambda: not running.bridge.problem)
+        assert running.bridge.outbox.dropped == 0
+    told = [json.loads(value) for value in listener.values("cell/step/out")]
+    assert [one["value"] for one in told] == [*range(1, 12), 11]
+    assert [one.get("late", False) for one in told] == [False, *[True] * 10, False]
+    times = [one["source_time"] for one in told]
+    assert times == sorted(times)
+    assert len(set(times)) == 11
+    assert listener.values("cell/axis/position/out")[1:] == [f"{step}.0" for step in [*range(2, 12), 11]]
+
+
+class Load:
+    """A source whose step counts up, a frame each."""
+
+    def __init__(self, writer: BlockWriter) -> None:
+        self.last = 0
+        self._writer = writer
+        writer.publish(image(), cycle=0)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while not self._stop.wait(0.01):
+            self.last += 1
+            self._writer.publish(image(step=self.last, position=self.last), cycle=self.last)
+
+    def stop(self) -> None:
+        self._stop.set()
+        self._thread.join()
+
+
+def test_a_connection_that_is_cut_again_and_again_loses_no_change(segment: Segment, broker: Mosquitto) -> None:
+    """Under load. What the broker may or may not have had comes once more; nothing comes before what was before it."""
+    with (
+        FaultProxy(broker.address, framing=None) as proxy,
+        listening(broker.address, f"{PREFIX}/cell/step/out") as listener,
+    ):
+        load = Load(segment.writer("cell"))
+        with bridge(segment, proxy.address) as running:
+            for _ in range(20):
+                for _ in range(25):
+                    listener.message()
+                connects = running.bridge.link.connects
+                proxy.cut(reset=True)
+                running.until(lambda count=connects: running.bridge.link.connects > count)
+            load.stop()
+            listener.until("cell/step/out", str(load.last).encode())
+            assert running.bridge.outbox.dropped == 0
+    first = list(dict.fromkeys(int(value) for value in listener.values("cell/step/out")))
+    assert first == list(range(first[0], load.last + 1))
+
+
+def test_a_broker_that_dies_again_and_again_is_found_again(segment: Segment, broker: Mosquitto) -> None:
+    load = Load(segment.writer("cell"))
+    try:
+        with bridge(segment, broker.address) as running:
+            for _ in range(20):
+                running.until(lambda: running.bridge.link.up)
+                broker.kill()
+                running.until(lambda: AWAY in running.bridge.problem)
+                broker.start()
+            load.stop()
+            running.until(lambda: running.bridge.link.up and not running.bridge.outbox.busy)
+            assert running.bridge.outbox.dropped == 0
+            with listening(broker.address, f"{PREFIX}/cell/step/out") as listener:
+                assert listener.until("cell/step/out") == str(load.last).encode()
+    finally:
+        load.stop()
+
+
+def test_more_than_may_be_kept_goes_oldest_first_and_is_counted(segment: Segment, broker: Mosquitto) -> None:
+    writer = segment.writer("cell")
+    writer.publish(image(step=1), cycle=1)
+    with bridge(segment, broker.address, backlog_mb=0.01) as running:
+        with listening(broker.address) as listener:
+            listener.until("cell/secret/out")
+        broker.kill()
+        running.until(lambda: AWAY in running.bridge.problem)
+        for step in range(2, 302):
+            writer.publish(image(step=step), cycle=step)
+            running.until(lambda s=step: running.bridge.outbox.backlog + running.bridge.outbox.dropped >= s - 1)
+        kept, dropped = running.bridge.outbox.backlog, running.bridge.outbox.dropped
+        assert kept + dropped >= 300
+        assert 0 < kept < 60
+        assert f"{dropped} dropped" in running.bridge.problem
+        broker.start()
+        running.until(lambda: not running.bridge.problem and not running.bridge.outbox.busy)
+        with listening(broker.address, f"{PREFIX}/cell/step/out") as listener:
+            assert listener.until("cell/step/out") == b"301"
+
+
+def test_a_second_broker_takes_the_place_of_the_first(segment: Segment, make_broker: Callable[..., Mosquitto]) -> None:
+    broker = make_broker()
+    segment.writer("cell").publish(image(step=1), cycle=1)
+    with reserved_port() as nobody, bridge(segment, [nobody, broker.address]) as running:
+        running.until(lambda: running.bridge.link.up)
+        with listening(broker.address) as listener:
+            listener.until("cell/step/out", b"1")
+
+
+def secret(folder: Path, text: str) -> str:
+    file = folder / "password"
+    file.write_text(text)
+    file.chmod(0o600)
+    return str(file)
+
+
+def test_a_wrong_password_is_told_and_the_right_one_heals(
+    segment: Segment, make_broker: Callable[..., Mosquitto], tmp_path: Path
+) -> None:
+    from shmio.config.accounts import hashed
+
+    (tmp_path / "accounts").write_text(f"cell:{hashed('right')}\n")
+    broker = make_broker("allow_anonymous false", f"password_file {tmp_path / 'accounts'}")
+    segment.writer("cell").publish(image(step=1), cycle=1)
+    file = secret(tmp_path, "wrong\n")
+    with bridge(segment, broker.address, username="cell", password_file=file) as running:
+        running.until(lambda: "mqtt.password_file" in running.bridge.problem)
+        assert "does not let us in" in running.bridge.problem
+        assert "right" not in running.bridge.problem
+        secret(tmp_path, "right\n")
+        running.until(lambda: running.bridge.link.up)
+        assert not running.bridge.problem
+        with listening(broker.address, username="cell", password="right") as listener:
+            listener.until("cell/step/out", b"1")
+
+
+class Answers:
+    """A broker that gives each who connects the same bytes, and closes."""
+
+    def __init__(self, answer: bytes) -> None:
+        self._answer = answer
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.address = Address("127.0.0.1", self._server.getsockname()[1])
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while True:
+            connection, _ = self._server.accept()
+            with connection:
+                if not connection.recv(1000):
+                    return
+                connection.sendall(self._answer)
+
+    def close(self) -> None:
+        with socket.create_connection((self.address.host, self.address.port)):
+            pass
+        self._thread.join()
+        self._server.close()
+
+
+@pytest.mark.parametrize(
+    ("answer", "told"),
+    [
+        (b"\x20\x03\x00\x97\x00", "it takes no more at present"),
+        (b"\x20\x03\x00\x89\x00", "it takes no more at present"),
+        (b"\x20\x03\x00\x85\x00", "it refuses: Client identifier not valid"),
+        (b"", "the connection was lost"),
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n", "the connection was lost"),
+        (b"\x20\xff\xff\xff\xff\xff\xff", "the connection was lost"),
+        (b"\x30\x05\x00\x09ab", "the connection was lost"),
+        (b"\x20\x02\x00\x05", "does not let us in"),
+    ],
+)
+def test_what_a_broker_says_is_told(segment: Segment, answer: bytes, told: str) -> None:
+    segment.writer("cell").publish(image(step=1), cycle=1)
+    answers = Answers(answer)
+    try:
+        with bridge(segment, answers.address) as running:
+            running.until(lambda: told in running.bridge.problem)
+    finally:
+        answers.close()
+
+
+def test_a_host_that_accepts_and_says_nothing_is_given_up(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shmio.endpoints.mqtt.link.CONNECT_S", 0.1)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = Address("127.0.0.1", silent.getsockname()[1])
+        with bridge(segment, address) as running:
+            running.until(lambda: "does not answer" in running.bridge.problem)
