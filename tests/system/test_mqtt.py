@@ -59,7 +59,7 @@ def counts(listener: Listener, topic: str, count: int) -> None:
 def test_clients_see_and_drive_the_cell(make_cell: Callable[..., Cell], broker: Address, program: str) -> None:
     with running(make_cell, broker, more=f'broker = "{program}"\n') as cell:
         assert cell.status()["state"] == "running", cell.logs()
-        with listening(broker, protocol=4) as listener:  # type: ignore[arg-type]
+        with listening(broker, protocol=4) as listener:
             counts(listener, "cell/Robot_800/Axs1_Pos/out", 10)
             listener.publish("cell/Outputs/13/in", "1")
             assert listener.json("cell/Outputs/13/in/result")["done"]
@@ -79,7 +79,7 @@ def test_a_killed_broker_comes_back_and_its_bridge_goes_on(
         until(lambda: cell.processes()["broker"]["restarts"] == 1, "the broker is started again")
         until(lambda: cell.processes()["mqtt"]["counters"]["connects"] == 2, "the bridge is connected again")
         until(lambda: cell.status()["state"] == "running", "all is well")
-        with listening(broker, protocol=4) as listener:  # type: ignore[arg-type]
+        with listening(broker, protocol=4) as listener:
             counts(listener, "cell/Robot_800/Axs1_Pos/out", 3)
         for name in ("mqtt", "grpc", "cell", "plc"):
             assert cell.processes()[name]["pid"] == before[name]["pid"]
@@ -91,7 +91,7 @@ def test_accounts_let_in_who_has_one(
     (tmp_path / "accounts").write_text("anna:secret\n")
     (tmp_path / "accounts").chmod(0o600)
     with running(make_cell, broker, more=f'broker = "{program}"\npassword_file = "accounts"\n'):
-        with listening(broker, protocol=4, username="anna", password="secret") as listener:  # type: ignore[arg-type]
+        with listening(broker, protocol=4, username="anna", password="secret") as listener:
             counts(listener, "cell/Robot_800/Axs1_Pos/out", 3)
         for account in ({}, {"username": "anna", "password": "guess"}):
             assert refused(broker, **account)
