@@ -29,6 +29,8 @@ class DumpBlock:
     layout_hash: str
     period_ns: int
     stale_ns: int
+    of: str = ""
+    """The hash of the whole layout, where only some of its registers were recorded."""
     frames: int = 0
     """How many were recorded; those that two files have are counted twice."""
     events: int = 0
@@ -104,7 +106,13 @@ def contents(part: Part, blocks: dict[tuple[str, int, str], DumpBlock]) -> Conte
                     part.found.damage.append(str(error))
                 continue
             blocks[key] = DumpBlock(
-                channel.source, channel.section, layout, channel.layout, channel.period_ns, channel.stale_ns
+                channel.source,
+                channel.section,
+                layout,
+                channel.layout,
+                channel.period_ns,
+                channel.stale_ns,
+                channel.of,
             )
         block = blocks[key]
         block.after.setdefault("frames" if channel.encoding == FRAME else "events", channel.after)

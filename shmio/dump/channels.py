@@ -34,6 +34,8 @@ class Channel:
     layout: str = ""
     period_ns: int = 0
     stale_ns: int = 0
+    of: str = ""
+    """The hash of the whole layout, where only some of its registers were recorded."""
 
 
 def describe(content: memoryview) -> Channel:
@@ -45,8 +47,9 @@ def describe(content: memoryview) -> Channel:
         period_ns, stale_ns = (int(about[name]) for name in ("period_ns", "stale_ns"))
         source, layout = about["source"], about["layout"]
         return Channel(
-            found.id, found.message_encoding, found.topic, source, block, section, after, layout, period_ns, stale_ns
-        )
+            found.id, found.message_encoding, found.topic, source, block, section, after, layout, period_ns, stale_ns,
+            about.get("of", ""),
+        )  # fmt: skip
     if found.message_encoding == PLAIN and found.topic in _OWN:
         return Channel(found.id, _OWN[found.topic], found.topic)
     return Channel(found.id, "", found.topic)  # another program's

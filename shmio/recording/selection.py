@@ -76,12 +76,12 @@ def _paths(pattern: str, source: str, layout: Layout, sources: Collection[str]) 
         topic = parse_topic(pattern, sources, next(iter(sources)) if len(sources) == 1 else None)
         if topic.source != source or topic.direction == "in":
             return set()
-        return {_whole(layout, register) for register in chosen(layout, topic.path or "**")}
+        return {whole_path(layout, register) for register in chosen(layout, topic.path or "**")}
     except PathError:
         return set()
 
 
-def _whole(layout: Layout, register: Register) -> str:
+def whole_path(layout: Layout, register: Register) -> str:
     """The path of a register, or of the array of which it is an element."""
     path = register.path
     while path not in layout.by_path:

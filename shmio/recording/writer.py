@@ -77,11 +77,11 @@ class Writer:
         self._mcap.add_attachment(changed_ns, now_ns, name, media_type, data)
 
     def open_block(
-        self, block: Block, number: int, after_frame: int, after_event: int, layout: Layout | None = None
+        self, block: Block, number: int, after_frame: int, after_event: int, layout: Layout | None = None, of: str = ""
     ) -> Channels:
         """Begin a block: the ``number``-th in this recording, behind these numbers. Its layout was attached before.
 
-        ``layout``: what is recorded of it, if that is not all.
+        ``layout``: what is recorded of it, if that is not all; ``of``: the hash of the whole, if that is another's.
         """
         layout = layout or block.layout
         self.flush()  # a channel's record is in the chunk of its block's first message, for readers without an index
@@ -93,8 +93,8 @@ class Writer:
             "period_ns": str(block.period_ns),
             "stale_ns": str(block.stale_ns),
         }
-        if layout.hash != block.layout.hash:
-            about["of"] = block.layout.hash.hex()
+        if of or layout.hash != block.layout.hash:
+            about["of"] = of or block.layout.hash.hex()
         frames, events = about | {"after": str(after_frame)}, about | {"after": str(after_event)}
         return Channels(
             self._mcap.register_channel(f"{block.source}/frames", FRAME, self._schema(FRAME, FRAME_SCHEMA), frames),

@@ -6,16 +6,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from shmio.dump.blocks import DumpBlock
-from shmio.dump.changes import register_bytes
 from shmio.dump.dump import Dump, Entry
 from shmio.dump.reader import Item
 from shmio.layout.model import Register
+from shmio.layout.write import covering
+from shmio.recording.selection import Part, whole_path
 from shmio.segment import Frame
-
-_Bytes = npt.NDArray[np.uint8]
 
 
 class Parts:
@@ -36,28 +34,17 @@ class Parts:
             return entry
         if entry.block not in self._parts:
             return None
-        block, mask = self._parts[entry.block]
+        block, part = self._parts[entry.block]
         item = entry.item
-        if isinstance(item, Frame):
-            effective = None if item.effective is None else _kept(item.effective, mask)
-            item = item._replace(raw=_kept(item.raw, mask), effective=effective)
-        return Entry(entry.time_ns, block, item)
+        return Entry(entry.time_ns, block, part.keep(item) if isinstance(item, Frame) else item)
 
 
-def _part(block: DumpBlock, registers: Sequence[Register]) -> tuple[DumpBlock, _Bytes]:
-    """The block with these registers alone, and a mask over its image."""
-    paths = {register.path for register in registers}
-    whole = [
-        register
-        for register in block.layout.registers
-        if register.path in paths or any(path.startswith(f"{register.path}/") for path in paths)
-    ]
-    layout = replace(block.layout, registers=tuple(whole))
-    mask = np.zeros(layout.size, np.uint8)
-    places, masks = register_bytes(whole)
-    np.bitwise_or.at(mask, places, masks)
-    return replace(block, layout=layout, layout_hash=layout.hash.hex()), mask
-
-
-def _kept(image: bytes, mask: _Bytes) -> bytes:
-    return (np.frombuffer(image, np.uint8) & mask).tobytes()
+def _part(block: DumpBlock, registers: Sequence[Register]) -> tuple[DumpBlock, Part]:
+    """The block with these registers alone, and what makes its frames."""
+    paths = {whole_path(block.layout, register) for register in registers}
+    whole = tuple(register for register in block.layout.registers if register.path in paths)
+    layout = replace(block.layout, registers=whole)
+    part = Part(layout, np.frombuffer(covering(whole, layout.size), np.uint8))
+    digest = layout.hash.hex()
+    of = "" if digest == block.layout_hash else block.of or block.layout_hash
+    return replace(block, layout=layout, layout_hash=digest, of=of), part

@@ -115,13 +115,14 @@ class Rewriter:
         """A frame says which event was before it, and the other way round: so it is known where both begin."""
         waiting, track.waiting = track.waiting, []
         first = waiting[-1].item
+        after = {what: block.after.get(what, 0) for what in ("frames", "events")}
         if isinstance(first, Frame):
             after = {"frames": first.number - 1, "events": first.event}
         elif isinstance(first, Event):
             after = {"frames": first.frame, "events": first.number - 1}
-        for entry in reversed(waiting[:-1]):
+        for entry in reversed(waiting):
             if isinstance(entry.item, Gap):
-                after[entry.item.what] = min(after[entry.item.what], entry.item.first - 1)
+                after[entry.item.what] = entry.item.first - 1
         track.last = dict(after)
         if self._whole:
             track.last = {what: min(number, block.after.get(what, number)) for what, number in after.items()}
@@ -131,7 +132,7 @@ class Rewriter:
             self._writer.attach(name, JSON, block.layout.to_json(), waiting[0].time_ns)
         track.number = len([one for one in self._tracks.values() if one.channels]) + 1
         track.channels = self._writer.open_block(
-            cast("Block", block), track.number, track.last["frames"], track.last["events"]
+            cast("Block", block), track.number, track.last["frames"], track.last["events"], of=block.of
         )
         for entry in waiting:
             self._of_block(block, entry)
@@ -151,6 +152,9 @@ class Rewriter:
 
     def finish(self) -> None:
         """Write index and footer."""
+        for block, track in self._tracks.items():
+            if track.waiting:  # nothing but gaps
+                self._begin(block, track)
         self._writer.finish()
 
 

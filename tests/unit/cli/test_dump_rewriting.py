@@ -82,6 +82,11 @@ def test_cut_by_source_and_register(tmp_path: Path, capsys: pytest.CaptureFixtur
             assert few.columns(path)[path[5:]].tolist() == all_of_it.columns(path)[path[5:]].tolist()
         for entry in few.frames("cell"):
             assert not any(entry.item.image[2:8])
+        assert few.blocks[0].of == all_of_it.blocks[0].layout_hash
+    assert main(["cut", "few.mem", "-o", "fewer.mem", "--only", "cell/row"]) == 0
+    assert main(["recover", "fewer.mem", "-o", "again.mem"]) == 0
+    with shmio.open_dump("again.mem") as fewer, shmio.open_dump(file) as all_of_it:
+        assert fewer.blocks[0].of == all_of_it.blocks[0].layout_hash, "of the whole, however often it was cut"
     assert main(["cut", str(file), "-o", "no.mem", "--only", "cell/nothing"]) == 1
     assert "no such register" in capsys.readouterr().err
 
@@ -106,6 +111,17 @@ def test_merge_of_files_of_different_sources(tmp_path: Path) -> None:
     found = contents(Path("all.mem"))
     assert len(found) == 300
     assert [time_ns for time_ns, _, _ in found] == sorted(time_ns for time_ns, _, _ in found)
+
+
+def test_a_block_of_which_nothing_but_gaps_is_there(tmp_path: Path) -> None:
+    with build(tmp_path / "a.mem") as work:
+        work.block("cell")
+        work.block("press", section=2)
+        work.frame(1, image(1))
+        work.gap(1, 7, "press")
+    assert main(["merge", "a.mem", "-o", "b.mem"]) == 0
+    whole(Path("b.mem"))
+    assert contents(Path("b.mem")) == contents(Path("a.mem"))
 
 
 def test_merge_of_what_does_not_belong_together(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
