@@ -108,7 +108,7 @@ def _part(worker: Worker) -> _Part:
 
 def _replay(worker: Worker, options: Any) -> _Part:
     """What plays a recording."""
-    from shmio.connectors.replay.beginning import begin, start_stamp  # noqa: PLC0415
+    from shmio.connectors.replay.beginning import begin  # noqa: PLC0415
     from shmio.connectors.replay.loop import ReplayLoop  # noqa: PLC0415  the other sources read no recordings
     from shmio.connectors.replay.source import Replay  # noqa: PLC0415
 
@@ -117,12 +117,12 @@ def _replay(worker: Worker, options: Any) -> _Part:
     if source.layout.hash != segment.blocks[worker.name].layout.hash:
         raise ConfigError(f"the recording of source {worker.name} has another layout by now: shmio-supervisor reload")
     block = segment.blocks[worker.name]
-    play = begin(source, block, segment.header.started_ns, segment.blocks.values())
+    beginning = begin(source, block, segment.header.started_ns, segment.blocks.values())
     clock = PageClock(segment.clock, worker.slot.index)
     loop = ReplayLoop(
         source,
-        segment.writer(worker.name, start_stamp(play, block)),
-        play,
+        segment.writer(worker.name, beginning.at),
+        beginning,
         clock,
         worker.config["writable"],
         owner_of=partial(_owner_of, segment),

@@ -129,8 +129,8 @@ def test_the_recording_of_a_replay_is_the_recording_and_its_streams_are_the_cell
         until(lambda: bool(replayed.v1 and replayed.v2 and replayed.native), "what is there at the beginning")
         refused = cell.run("shmio", "set", PLACE, "1")
         assert "refused" in refused.stdout + refused.stderr
-        attached.replay.play()
-        until(lambda: over(attached), "the end")
+        [playing] = attached.replay.play()
+        until(lambda: over(attached), "the end", PATIENCE_S + playing.length_s)
     replayed.close()
     second = dump(cell, first)
     found = cell.run("shmio-dump", "diff", "--ignore", "events", "--json", str(first), str(second))

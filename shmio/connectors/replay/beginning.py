@@ -3,14 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 from shmio.connectors.replay.source import Replay
 from shmio.errors import SegmentError
-from shmio.segment import Block, Stamp
+from shmio.segment import Block, Frame, Stamp
 from shmio.segment.playhead import Play, Playhead
 
 
-def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]) -> Play:
+class Beginning(NamedTuple):
+    """How a source plays from now on; ``last``: what the process before has published of the same recording last."""
+
+    play: Play
+    last: Frame | None
+
+    @property
+    def at(self) -> Stamp:
+        """When the process's start is told: with what comes next, however long it took."""
+        play, last = self
+        position_ns = play.begin_ns if last is None else last.publish_ns - play.base_ns
+        return stamp(play, position_ns, position_ns)
+
+
+def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]) -> Beginning:
     """Set the playhead of a block, unless it is. ``started_ns``: of the segment; ``blocks``: all there are.
 
     SegmentError: the block is none for a replay.
@@ -21,10 +36,10 @@ def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]
     with heads[0].held():  # sources that begin at the same time begin together
         own = block.playhead.read()
         if own is not None and _is_of(source, own):
-            return own
+            return Beginning(own, block.latest())
         play = _as_others(source, heads) or _as_configured(source, block, started_ns)
         block.playhead.write(play)
-        return play
+        return Beginning(play, None)
 
 
 def _is_of(source: Replay, play: Play) -> bool:
@@ -63,10 +78,3 @@ def stamp(play: Play, position_ns: int, clock_ns: int) -> Stamp:
     if not play.own_clock:
         clock_ns = play.due_ns(max(position_ns, play.position_ns))
     return Stamp(play.base_ns + position_ns, clock_ns)
-
-
-def start_stamp(play: Play, block: Block) -> Stamp:
-    """When the process's start is told: with what comes next, however long it took."""
-    last = block.latest()
-    position_ns = play.begin_ns if last is None else last.publish_ns - play.base_ns
-    return stamp(play, position_ns, position_ns)

@@ -11,7 +11,7 @@ from shmio.connectors.campaign import Blocks
 from shmio.connectors.desk import CommandDesk
 from shmio.connectors.injector import OwnerOf
 from shmio.connectors.output import Output
-from shmio.connectors.replay.beginning import stamp
+from shmio.connectors.replay.beginning import Beginning, stamp
 from shmio.connectors.replay.player import OVER, Player
 from shmio.connectors.replay.search import Search
 from shmio.connectors.replay.source import Replay
@@ -39,14 +39,14 @@ class ReplayLoop:
         self,
         source: Replay,
         writer: BlockWriter,
-        play: Play,
+        beginning: Beginning,
         clock: StepClock,
         writable: Iterable[str] = (),
         *,
         owner_of: OwnerOf = lambda _: None,
         blocks: Blocks | None = None,
     ) -> None:
-        """``play``: how it begins, as :func:`begin` has it."""
+        """``writer``: of whose block ``beginning`` tells."""
         block = writer.block
         if block.playhead is None:
             raise SegmentError(f"the block of source {block.source} has no playhead")
@@ -62,7 +62,7 @@ class ReplayLoop:
         )
         self._player = Player(source.tape, self._output, keep=source.keep)
         self._search: tuple[int, Search] | None = None
-        self._play = play
+        self._play, self._last = beginning
         self.counters = Counters()
 
     @property
@@ -85,13 +85,12 @@ class ReplayLoop:
 
     def _begin(self) -> None:
         """Go on from what the process before this one has published, if there was one."""
-        last = self._writer.block.latest()
-        state = self._page.read()
-        if last is None:
-            self._player.begin(self._play.at_ns(self._play.anchor_ns), self._stamp)
-        else:
-            last_ns = last.publish_ns - self._play.base_ns
-            self._player.resume(min(last_ns, self._play.at_ns(state.time_ns)))
+        play, last, clock_ns = self._play, self._last, self._page.read().time_ns
+        if last is not None:
+            self._player.resume(min(last.publish_ns - play.base_ns, play.at_ns(clock_ns)))
+        else:  # who joins others that play is where they are
+            joined = clock_ns - play.anchor_ns > LATE_NS
+            self._player.begin(play.at_ns(clock_ns if joined else play.anchor_ns), self._stamp)
         self.desk.open()
         self.counters.connects += 1
 

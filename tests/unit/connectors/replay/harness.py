@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from shmio.connectors.injections import Owner
-from shmio.connectors.replay.beginning import begin, start_stamp
+from shmio.connectors.replay.beginning import begin
 from shmio.connectors.replay.loop import ReplayLoop
 from shmio.connectors.replay.source import Replay
 from shmio.connectors.stepped import PageClock
@@ -121,12 +121,12 @@ class Playing:
         self._stack.callback(self.source.close)
         self.block = own.blocks[name]
         self.cursor, self.events = self.block.cursor(), self.block.events.cursor()
-        play = begin(self.source, self.block, own.header.started_ns, own.blocks.values())
+        beginning = begin(self.source, self.block, own.header.started_ns, own.blocks.values())
         self.clock = PageClock(own.clock, slot.index)
         self.loop = ReplayLoop(
             self.source,
-            own.writer(name, start_stamp(play, self.block)),
-            play,
+            own.writer(name, beginning.at),
+            beginning,
             self.clock,
             self.block.attributes.writable,
             owner_of=lambda writer: Owner(writer, os.getpid()),

@@ -245,6 +245,19 @@ def test_a_successor_goes_on_and_leaves_nothing_out(tmp_path: Path, instance: st
     assert counts(frames) == list(range(20))
 
 
+def test_another_recording_begins_anew_in_the_same_block(tmp_path: Path, instance: str) -> None:
+    files = [record(tmp_path / name, f"{instance}{name}") for name in "ab"]
+    with built(instance) as segment:
+        coordinator = Coordinator(segment)
+        with Playing(segment, files[0]) as cell:
+            coordinator.step(300 * MS)
+        with Playing(segment, files[1], start=0.1) as cell:
+            assert counts([cell.next()]) == [4], "what was there before the start"
+            coordinator.step(100 * MS)
+            assert counts(cell.frames()) == [5, 6, 7, 8, 9, 10]
+        coordinator.close()
+
+
 def test_age_is_the_recordings(tmp_path: Path, instance: str) -> None:
     """A slow replay does not go stale, and one that stands does not either."""
     file = record(tmp_path, instance)
