@@ -9,7 +9,8 @@ from typing import Any, Final, TypeVar
 
 from shmio.dump.blocks import DumpBlock
 from shmio.dump.differences import Difference, RegisterDifference, Side, SourceDifference
-from shmio.dump.dump import Dump, Entry
+from shmio.dump.dump import Dump
+from shmio.dump.entries import Entry
 from shmio.errors import PathError
 from shmio.layout.codec import Value, codec
 from shmio.layout.model import Register

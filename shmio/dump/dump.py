@@ -7,13 +7,14 @@ import os
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
-from typing import Final, Generic, NamedTuple, TypeVar
+from typing import Final
 
 from shmio.dump.batch import Batch
 from shmio.dump.blocks import Contents, DumpBlock, contents
 from shmio.dump.changes import Changes
 from shmio.dump.columns import Collector, Columns
 from shmio.dump.encoding import Gap
+from shmio.dump.entries import Entry, latest_of, messages_of
 from shmio.dump.names import Names
 from shmio.dump.part import MAX_NS, Damaged, Part
 from shmio.dump.reader import Item, Reader
@@ -25,16 +26,6 @@ from shmio.segment import Event, Frame
 MAX_FILES: Final = 512
 OVERLAP_NS: Final = 1_000_000_000
 """A recorder's file may begin so long before the one before it ends: a turn of the recorder, and more."""
-
-ItemT_co = TypeVar("ItemT_co", bound=Item, covariant=True)
-
-
-class Entry(NamedTuple, Generic[ItemT_co]):
-    """Something recorded. ``time_ns``: log time, UTC; ``block`` is None for what is of the instance, as a step."""
-
-    time_ns: int
-    block: DumpBlock | None
-    item: ItemT_co
 
 
 def open_dump(files: str | os.PathLike[str] | Iterable[str | os.PathLike[str]], damaged: Damaged | None = None) -> Dump:
@@ -169,14 +160,14 @@ class Dump:
     def latest(self, source: str | None = None, time_ns: int = MAX_NS) -> Entry[Frame] | None:
         """The last frame of a source not after a time: what stood then. PathError."""
         name = self._names.one(source)
+        found: Entry[Frame] | None = None
         for part, within in zip(reversed(self._parts), reversed(self._contents), strict=True):
-            if part.begin_ns > time_ns:
-                continue
-            for messages in part.messages_before(within.frames(name), time_ns):
-                for message in reversed(messages):
-                    if isinstance(message.item, Frame):
-                        return Entry(message.log_ns, within.blocks[message.channel.number], message.item)
-        return None
+            if part.begin_ns <= time_ns and (found is None or part.end_ns > found.time_ns):
+                other = latest_of(part, within, name, time_ns)
+                found = max((entry for entry in (found, other) if entry), key=lambda entry: entry.time_ns, default=None)
+            if found is not None and not self._overlap:
+                break
+        return found
 
     def next_event(self, source: str | None = None, after_ns: int = -1) -> Entry[Event] | None:
         """The first event of a source, or of any, after a time. PathError."""
@@ -254,7 +245,7 @@ class Dump:
     def _read(self, channels: Iterable[Collection[int]], from_ns: int, to_ns: int) -> Iterator[Entry[Item]]:
         parts = list(zip(self._parts, self._contents, channels, strict=True))
         streams = (
-            _messages(part, within, wanted, from_ns, to_ns)
+            messages_of(part, within, wanted, from_ns, to_ns)
             for part, within, wanted in parts
             if part.begin_ns <= to_ns and part.end_ns >= from_ns - OVERLAP_NS
         )
@@ -284,15 +275,3 @@ class Dump:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _messages(
-    part: Part, within: Contents, channels: Collection[int], from_ns: int, to_ns: int
-) -> Iterator[tuple[Contents, Entry[Item]]]:
-    for channel, log_ns, item in part.messages(channels, from_ns, to_ns):
-        block = (
-            within.numbered.get((item.source, item.block))
-            if isinstance(item, Gap)
-            else within.blocks.get(channel.number)
-        )
-        yield within, Entry(log_ns, block, item)

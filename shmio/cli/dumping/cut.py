@@ -10,7 +10,8 @@ from shmio.cli.dumping.moments import MAX_NS, parse_time
 from shmio.cli.dumping.parts import Parts
 from shmio.cli.dumping.rewriting import rewrite, verified
 from shmio.cli.run import say
-from shmio.dump.dump import Dump, Entry, open_dump
+from shmio.dump.dump import Dump, open_dump
+from shmio.dump.entries import Entry
 from shmio.dump.reader import Item
 from shmio.errors import RecordingError
 

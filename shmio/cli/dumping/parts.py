@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from shmio.dump.blocks import DumpBlock
-from shmio.dump.dump import Dump, Entry
+from shmio.dump.dump import Dump
+from shmio.dump.entries import Entry
 from shmio.dump.reader import Item
 from shmio.layout.model import Register
 from shmio.layout.write import covering

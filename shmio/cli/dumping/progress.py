@@ -6,7 +6,6 @@ import sys
 import time
 from contextlib import suppress
 
-from shmio.dump.records import BEAT_BYTES
 from shmio.logs import printable
 
 FIRST_S = 1.0
@@ -21,17 +20,11 @@ class Progress:
         self.total = 0
         """How much there is to do: bytes, or ns of a recording."""
         self._what = what
-        self._done = 0
         self._shown = False
         self._next_s = time.monotonic() + FIRST_S if sys.stderr.isatty() else float("inf")
 
-    def beat(self) -> None:
-        """Another BEAT_BYTES were read or unpacked."""
-        self.at(self._done + BEAT_BYTES)
-
     def at(self, done: int) -> None:
         """So much is done."""
-        self._done = done
         if time.monotonic() >= self._next_s:
             self._next_s = time.monotonic() + EACH_S
             share = f"{min(done / self.total, 1):4.0%}" if self.total else ""

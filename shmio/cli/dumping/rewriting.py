@@ -12,8 +12,9 @@ from shmio import __version__
 from shmio.cli.dumping.progress import Progress
 from shmio.cli.dumping.verify import lines, verify
 from shmio.dump.blocks import DumpBlock
-from shmio.dump.dump import Dump, Entry
+from shmio.dump.dump import Dump
 from shmio.dump.encoding import Gap, ProcessChange, Reason, StepMark
+from shmio.dump.entries import Entry
 from shmio.dump.reader import Item
 from shmio.errors import RecordingError
 from shmio.recording.output import Output

@@ -38,9 +38,9 @@ def execute(arguments: argparse.Namespace) -> int:
 
 def verify(file: Path) -> dict[str, Any]:
     """What a look at all of a file tells. OSError, RecordingError: it is no recording."""
-    with Progress(f"verifying {file}") as progress, Reader(file, beat=progress.beat) as reader:
-        progress.total = 2 * reader.records.size  # it is passed over once more for the checksum of all
-        found = check(reader)
+    with Progress(f"verifying {file}") as progress, Reader(file) as reader:
+        progress.total = reader.records.size
+        found = check(reader, progress.at)
         texts = [lost(damage) for damage in found.damage] + found.problems
         if found.count > len(texts):
             texts.append(f"and {found.count - len(texts)} more such places")

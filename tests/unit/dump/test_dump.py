@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 import shmio
 from shmio.dump.damage import Damage
@@ -13,7 +16,7 @@ from shmio.dump.encoding import Gap, Reason, StepMark
 from shmio.dump.part import Part
 from shmio.errors import MissingLibraryError, PathError, RecordingError
 from shmio.layout.model import Layout, Register
-from shmio.segment import Event, Frame
+from shmio.segment import Event, Frame, Quality
 from tests.unit.dump.build import PERIOD_NS, START_NS, build, image, plain, varied
 
 
@@ -267,6 +270,64 @@ def test_an_index_that_is_damaged_is_done_without(tmp_path: Path, back: int) -> 
     with shmio.open_dump(file, lambda *_: None) as dump:
         assert dump.columns("count")["count"].tolist() == list(range(1, 101))
         assert [e.item.number for e in dump.frames("cell", at(31), at(33))] == [31, 32, 33]
+
+
+def test_the_latest_of_files_that_run_beside_each_other(tmp_path: Path) -> None:
+    """The one that began later may have ended before."""
+    with shmio.open_dump([plain(tmp_path / "a.mem", 1, 400), plain(tmp_path / "b.mem", 100, 200)]) as dump:
+        for number in (50, 150, 200, 300, 400):
+            latest = dump.latest("cell", at(number))
+            assert latest is not None
+            assert latest.item.number == number
+
+
+KINDS: list[dict[str, Any]] = [
+    {},
+    {"reason": "so so", "quality": Quality.UNCERTAIN},
+    {"reason": "too long an answer", "quality": Quality.BAD},
+    {"effective": image(-1)},
+]
+
+
+@settings(max_examples=80, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    runs=st.lists(
+        st.tuples(
+            st.lists(st.tuples(st.integers(0, 2), st.integers(0, 3)), min_size=1, max_size=4), st.integers(1, 30)
+        ),
+        min_size=1,
+        max_size=6,
+    ),
+    chunk=st.integers(1, 200),
+)
+def test_whatever_the_order_of_messages_columns_have_what_frames_have(
+    tmp_path: Path, runs: list[tuple[list[tuple[int, int]], int]], chunk: int
+) -> None:
+    """Of patterns that repeat, and then others: what is alike is taken at once."""
+    sources = ["cell", "press", "saw"]
+    numbers = dict.fromkeys(sources, 0)
+    with build(tmp_path / "a.mem") as work:
+        for section, source in enumerate(sources):
+            work.block(source, section=section)
+        for count, (place, kind) in enumerate(turn for pattern, times in runs for turn in pattern * times):
+            source = sources[place]
+            numbers[source] += 1
+            work.frame(numbers[source], image(numbers[source]), source, **KINDS[kind])
+            if count % chunk == chunk - 1:
+                work.chunk()
+    with shmio.open_dump(tmp_path / "a.mem") as dump:
+        for source in dump.sources:
+            frames = [entry.item for entry in dump.frames(source)]
+            batches = [batch for _, batch in dump.batches(source)]
+            assert [number for batch in batches for number in batch.head["number"].tolist()] == [
+                f.number for f in frames
+            ]
+            assert [bytes(one) for batch in batches for one in batch.images] == [f.image for f in frames]
+            reasons = [reason for batch in batches for reason in batch.reasons or [""] * len(batch)]
+            assert reasons == [f.reason for f in frames]
+            raw = [bytes(one) for _, batch in dump.batches(source, raw=True) for one in batch.images]
+            assert raw == [f.raw for f in frames]
+            assert len(frames) == numbers[source]
 
 
 def test_tables_of_other_libraries(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,42 @@
+"""How far long work is, on a terminal and elsewhere."""
+
+from __future__ import annotations
+
+import io
+import sys
+import time
+
+import pytest
+
+from shmio.cli.dumping import progress
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_is_told_and_left_clean(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal, now_s = Terminal(), [0.0]
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(time, "monotonic", lambda: now_s[0])
+    with progress.Progress("reading a\x1bb") as work:
+        work.total = 200
+        work.at(10)
+        assert terminal.getvalue() == "", "what is soon done says nothing"
+        for now_s[0], done in ((1.5, 50), (1.6, 60), (2.0, 150), (3.0, 500)):
+            work.at(done)
+    shown = terminal.getvalue().split("\r")
+    assert [text.removesuffix("\x1b[K").split()[-1] for text in shown[1:-1]] == ["25%", "75%", "100%"]
+    assert "a\x1bb" not in terminal.getvalue()
+    assert shown[-1] == "\x1b[K"
+
+
+def test_a_file_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    file = io.StringIO()
+    monkeypatch.setattr(sys, "stderr", file)
+    monkeypatch.setattr(progress, "FIRST_S", -1.0)
+    with progress.Progress("reading") as work:
+        work.total = 2
+        work.at(1)
+    assert file.getvalue() == ""
