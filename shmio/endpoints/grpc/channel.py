@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sized
+from collections.abc import Callable, Collection, Sized
 from typing import NamedTuple, Protocol
 
 from shmio.endpoints.grpc.subject import Subject
@@ -62,3 +62,12 @@ class Table(NamedTuple):
     scan: ChangeScan
     apart: tuple[Channel, ...]
     """Those that the scan does not look at."""
+
+    @classmethod
+    def of(cls, channels: Collection[Channel], slots: int) -> Table:
+        """That of these; ``slots``: of places, of which some may be free."""
+        places: list[Channel | None] = [None] * slots
+        for channel in channels:
+            places[channel.slot] = channel
+        apart = tuple(channel for channel in channels if channel.changed)
+        return cls(tuple(places), ChangeScan.joined(channel.entries for channel in channels), apart)

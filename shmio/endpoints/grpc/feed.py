@@ -13,7 +13,6 @@ from shmio.endpoints.grpc.hold import Hold, Moment, Still
 from shmio.endpoints.grpc.inlet import Inlet
 from shmio.endpoints.grpc.subject import Subject
 from shmio.segment import Block, Event, Frame, Quality
-from shmio.segment.scan import ChangeScan
 
 log = logging.getLogger("shmio.grpc")
 
@@ -58,7 +57,7 @@ class Feed:
         self._channels: dict[Subject, Channel] = {}
         self._crowd = Crowd(self._refill)
         self._free: list[int] = []  # slots
-        self._table = Table((), ChangeScan([]), ())
+        self._table = Table.of((), 0)
         self._outdated = False
         self._owed: dict[Listener, Channel] = {}  # joined while there was no good value
         _ = block.layout.members("")  # builds what paths are looked up in, before the first client waits for it
@@ -98,9 +97,8 @@ class Feed:
             slot = self._free.pop() if self._free else len(self._channels)
             channel = self._channels[subject] = Channel(subject, slot)
             self._rebuild()
-        if listener not in channel.listeners:
-            channel.listeners[listener] = None
-            self._crowd.join(listener.stream)
+        channel.listeners[listener] = None
+        self._crowd.join(listener.stream)
         listener.since = 0
         self._owed[listener] = channel
         self._settle()
@@ -109,9 +107,8 @@ class Feed:
         """Leave; the last listener takes the channel with it."""
         self._owed.pop(listener, None)
         channel = self._channels[subject]
-        if listener in channel.listeners:
-            del channel.listeners[listener]
-            self._crowd.leave(listener.stream)
+        del channel.listeners[listener]
+        self._crowd.leave(listener.stream)
         if not channel.listeners:
             del self._channels[subject]
             self._free.append(channel.slot)
@@ -186,12 +183,7 @@ class Feed:
                     listener.since = 0  # it may have lost this very value
 
     def _rebuild(self) -> None:
-        slots: list[Channel | None] = [None] * (len(self._channels) + len(self._free))
-        for channel in self._channels.values():
-            slots[channel.slot] = channel
-        apart = tuple(channel for channel in self._channels.values() if channel.changed)
-        scan = ChangeScan.joined(channel.entries for channel in self._channels.values())
-        self._table = Table(tuple(slots), scan, apart)
+        self._table = Table.of(self._channels.values(), len(self._channels) + len(self._free))
         self._outdated = False
 
     # ---- what the source publishes -----------------------------------------------------------------------------

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
-from contextlib import asynccontextmanager, suppress
+from contextlib import asynccontextmanager
 from functools import partial
 from typing import Any, Final, TypeVar
 
@@ -17,16 +17,15 @@ from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.hold import Hold, Moment, Status
 from shmio.endpoints.grpc.marks import Marks
 from shmio.endpoints.grpc.outboxes import Outboxes
+from shmio.endpoints.grpc.player import Player
 from shmio.endpoints.grpc.publish import Publisher
-from shmio.errors import ShmioError, TimeError
+from shmio.errors import TimeError
 from shmio.segment import ProcessSlot, Segment
 from shmio.segment.clock import ClockState
 from shmio.segment.coordinator import Coordinator, Step, check_step
 
 REST_S: Final = 1.0
 """Time is given up when nobody has moved it for so long, so that others can."""
-LATE_S: Final = 0.5
-"""Who plays catches up with what it is late, up to this."""
 
 _Result = TypeVar("_Result")
 
@@ -70,10 +69,7 @@ class Stepper:
         self._alive = True
         self._watchers: list[Callable[[Status], None]] = []
         self._rest: asyncio.TimerHandle | None = None
-        self._play_dt_ns: int | None = None
-        self._rate = 1.0
-        self._player: asyncio.Task[None] | None = None
-        self._woken = asyncio.Event()  # the player is
+        self._player = Player(self._make, lambda: self._clock.read().step_size_ns)
         self._tasks: set[asyncio.Task[Any]] = set()
         self._page: Bell | None = None  # rings when it is written
         state = self._clock.read()
@@ -101,7 +97,7 @@ class Stepper:
     @property
     def alive(self) -> bool:
         """Whether time is being followed, and played if it should be."""
-        return self._page is not None and (self._player is None or not self._player.done())
+        return self._page is not None and self._player.alive
 
     def also(self, deliver: Callable[[Step], Awaitable[None]]) -> None:
         """Have each step delivered to others, too, before it is over."""
@@ -148,11 +144,11 @@ class Stepper:
         self.marks.stop()
         if self._rest is not None:
             self._rest.cancel()
-        tasks = [*self._tasks, *([self._player] if self._player is not None else [])]
+        tasks = list(self._tasks)
         for task in tasks:
             task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
-        if self._player is None:
+        await asyncio.gather(self._player.break_off(), *tasks, return_exceptions=True)
+        if not self._player.on:
             self._coordinator.close()
         self._driver.stop()
         page, self._page = self._page, None  # what was broken off may still give up time, and have it ring again
@@ -175,7 +171,7 @@ class Stepper:
         _check(dt_ns)
         if peer:
             await self._publisher.settle(peer)
-        if self._player is not None:
+        if self._player.on:
             raise TimeError("time is played at present: pause it before it can be stepped")
         return await self._make(dt_ns)
 
@@ -223,12 +219,12 @@ class Stepper:
         self._rest = self._loop.call_later(REST_S, self._give_up)
 
     def _give_up(self) -> None:
-        if self._owns and self._player is None and not self._turn.locked():
+        if self._owns and not self._player.on and not self._turn.locked():
             self._spawn(self._release())
 
     async def _release(self) -> None:
         async with self._turn:
-            if self._player is None:
+            if not self._player.on:
                 self._own(False)
                 self._coordinator.close()
 
@@ -237,37 +233,16 @@ class Stepper:
     async def _begin_play(self, dt_ns: int | None, rate: float) -> Status:
         _check(dt_ns)
         async with self._changing:
-            self._play_dt_ns, self._rate = dt_ns, rate
+            self._player.dt_ns, self._player.rate = dt_ns, rate
             await self._change(partial(self._coordinator.set_playing, True, rate))
-            if self._player is None:
-                self._player = self._loop.create_task(self._play())
+            self._player.begin()
         return self.status
 
     async def _end_play(self, end: bool) -> Status:
         async with self._changing:
-            player, self._player = self._player, None
-            self._woken.set()
-            if player is not None:
-                await player
+            await self._player.end()
             await self._change(partial(self._coordinator.set_playing, False), alive=not end)
         return self.status
-
-    async def _play(self) -> None:
-        due_s = self._loop.time()
-        reason = ""
-        self._woken.clear()
-        while self._player is asyncio.current_task():
-            try:
-                await self._make(self._play_dt_ns)
-                reason = ""
-            except ShmioError as error:
-                last, reason = reason, str(error)
-                if reason != last:
-                    log.warning("playing: %s", reason)
-            dt_s = (self._play_dt_ns or self._clock.read().step_size_ns) / 1e9
-            due_s = max(due_s + dt_s / self._rate, self._loop.time() - LATE_S)
-            with suppress(TimeoutError):  # others have their turn even if it is late
-                await asyncio.wait_for(self._woken.wait(), max(0.0, due_s - self._loop.time()))
 
     # ---- delivering ------------------------------------------------------------------------------------------------
 
@@ -308,7 +283,7 @@ class Stepper:
             self._tell(self._status(state))
 
     def _status(self, state: ClockState) -> Status:
-        dt_ns = (self._play_dt_ns if state.playing else None) or state.step_size_ns
+        dt_ns = (self._player.dt_ns if state.playing else None) or state.step_size_ns
         return Status(self._now().clock_ns, dt_ns, self._alive, state.playing)
 
     def _tell(self, status: Status) -> None:
