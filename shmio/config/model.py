@@ -188,6 +188,19 @@ class MqttTopic(Section):
         return [self.match] if isinstance(self.match, str) else self.match
 
 
+class Sparkplug(Section):
+    """``[mqtt.sparkplug]``: the instance as an edge node of Sparkplug B; ``node``: default the instance's name."""
+
+    group: Text
+    node: Text | None = None
+    match: Text | Texts = "**"
+
+    @property
+    def patterns(self) -> list[str]:
+        """Globs over paths that begin with their source: what is a metric."""
+        return [self.match] if isinstance(self.match, str) else self.match
+
+
 class Mqtt(Section):
     """``[mqtt]``: the bridge to a broker, and the broker itself unless it is ``external``."""
 
@@ -205,6 +218,7 @@ class Mqtt(Section):
     session_expiry_s: Annotated[int, Meta(ge=0, le=2**32 - 2)] = 0
     backlog_mb: Annotated[float, Meta(ge=0, le=65536)] = 16.0
     topic: list[MqttTopic] = []
+    sparkplug: Sparkplug | None = None
 
 
 class Trigger(Section):

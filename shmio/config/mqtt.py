@@ -23,6 +23,10 @@ def check_mqtt(config: Config) -> None:
         return
     if mqtt.prefix is not None:
         _check_prefix(mqtt.prefix)
+    if mqtt.sparkplug is not None:
+        for key, name in (("group", mqtt.sparkplug.group), ("node", mqtt.sparkplug.node or "node")):
+            if set("/+#").intersection(name):
+                raise ConfigError(f"mqtt.sparkplug.{key}: {name!r} is a part of a topic: it has no / + #")
     if mqtt.broker == "external":
         _check_external(mqtt)
     else:

@@ -15,6 +15,7 @@ from shmio.config import Address
 from shmio.testing.cell import CONFIG, Cell, kill, until
 from shmio.testing.mosquitto import missing
 from shmio.testing.ports import reserved_port
+from shmio.wire.sparkplug_b_pb2 import Metric, Payload
 from tests.unit.endpoints.mqtt.harness import Listener, listening
 
 MQTT = """
@@ -24,6 +25,7 @@ prefix = "shmio/test"
 """
 SOURCE = 'connector = "s7"\n'
 PROGRAMS = ["mosquitto", "embedded"]
+REBIRTH = Payload(metrics=[Metric(name="Node Control/Rebirth", boolean_value=True)]).SerializeToString()
 
 
 @pytest.fixture
@@ -83,6 +85,32 @@ def test_a_killed_broker_comes_back_and_its_bridge_goes_on(
             counts(listener, "cell/Robot_800/Axs1_Pos/out", 3)
         for name in ("mqtt", "grpc", "cell", "plc"):
             assert cell.processes()[name]["pid"] == before[name]["pid"]
+
+
+@pytest.mark.skipif(bool(missing()), reason=missing())
+def test_a_killed_edge_node_leaves_its_will_and_is_born_again(make_cell: Callable[..., Cell], broker: Address) -> None:
+    def told(listener: Listener, kind: str) -> Payload:
+        while (message := listener.message()).topic != f"spBv1.0/plant/{kind}":
+            pass
+        return Payload.FromString(bytes(message.payload))
+
+    def session(payload: Payload) -> int:
+        return next(metric.long_value for metric in payload.metrics if metric.name == "bdSeq")
+
+    more = '[[mqtt.topic]]\nmatch = "**"\npublish = false\n[mqtt.sparkplug]\ngroup = "plant"\nnode = "a50"\n'
+    with running(make_cell, broker, more=more) as cell, listening(broker, "spBv1.0/#") as listener:
+        names = {}
+        listener.client.publish("spBv1.0/plant/NCMD/a50", REBIRTH, 0)
+        first = session(told(listener, "NBIRTH/a50"))
+        for metric in told(listener, "DBIRTH/a50/cell").metrics:
+            names[metric.alias] = metric.name
+        assert "Robot_800/Axs1_Pos" in {names[metric.alias] for metric in told(listener, "DDATA/a50/cell").metrics}
+        kill(cell.processes()["mqtt"]["pid"])
+        assert session(told(listener, "NDEATH/a50")) == first
+        assert session(told(listener, "NBIRTH/a50")) != first
+        told(listener, "DBIRTH/a50/cell")
+        cell.down()
+        told(listener, "NDEATH/a50")
 
 
 def test_accounts_let_in_who_has_one(

@@ -165,21 +165,31 @@ def _odd(config: Config, layouts: dict[str, Layout]) -> list[str]:
 
 
 def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
-    """Rules of ``[[mqtt.topic]]`` that name nothing. ConfigError: a pattern that is none."""
-    for index, rule in enumerate(config.mqtt.topic if config.mqtt else ()):
-        key = f"mqtt.topic[{index}].match"
+    """Patterns of ``[mqtt]`` that name nothing. ConfigError: one that is none."""
+    for key, pattern, frames in _topics(config):
+        if frames:
+            if pattern not in layouts:
+                raise ConfigError(f"{key}: {pattern!r}: frames are those of a whole source, so name one")
+            continue
+        try:
+            glob = Glob(pattern)
+        except PathError as error:
+            raise ConfigError(f"{key}: {error}") from None
+        paths = (f"{source}/{register.path}" for source, layout in layouts.items() for register in layout.registers)
+        if not any(map(glob.matches, paths)):
+            yield f"{key}: {pattern!r} names no register; the path of one begins with its source"
+
+
+def _topics(config: Config) -> Iterator[tuple[str, str, bool]]:
+    """Each pattern with its key, and whether it is of frames."""
+    if config.mqtt is None:
+        return
+    for index, rule in enumerate(config.mqtt.topic):
         for pattern in rule.patterns:
-            if rule.payload == "frames":
-                if pattern not in layouts:
-                    raise ConfigError(f"{key}: {pattern!r}: frames are those of a whole source, so name one")
-                continue
-            try:
-                glob = Glob(pattern)
-            except PathError as error:
-                raise ConfigError(f"{key}: {error}") from None
-            paths = (f"{source}/{register.path}" for source, layout in layouts.items() for register in layout.registers)
-            if not any(map(glob.matches, paths)):
-                yield f"{key}: {pattern!r} names no register; the path of one begins with its source"
+            yield f"mqtt.topic[{index}].match", pattern, rule.payload == "frames"
+    if config.mqtt.sparkplug is not None:
+        for pattern in config.mqtt.sparkplug.patterns:
+            yield "mqtt.sparkplug.match", pattern, False
 
 
 def _near(pattern: str, layout: Layout) -> str:

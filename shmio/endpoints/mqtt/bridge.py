@@ -19,6 +19,8 @@ from shmio.endpoints.mqtt.link import Link
 from shmio.endpoints.mqtt.outbox import Outbox
 from shmio.endpoints.mqtt.place import own_socket
 from shmio.endpoints.mqtt.rules import Rules
+from shmio.endpoints.mqtt.sparkplug.device import Device
+from shmio.endpoints.mqtt.sparkplug.session import Session
 from shmio.endpoints.mqtt.steps import Steps
 from shmio.endpoints.mqtt.target import Dialling
 from shmio.segment import ProcessSlot, Quality, Segment
@@ -54,7 +56,7 @@ class Bridge:
             Dialling(settings, client_id, partial(own_socket, segment)),
             self._selector,
             self.wake,
-            Message(self._status, OFFLINE, 1, True),
+            lambda: Message(self._status, OFFLINE, 1, True),
         )
         self.outbox = Outbox(self.link, round(settings.backlog_mb * 1e6))
         self._commands = Commands(self.prefix, self._rules, self._feeds, self.outbox.answer)
@@ -62,7 +64,10 @@ class Bridge:
         self._more: set[Feed] = set()
         self._generation = -1
         self._reader = ThreadPoolExecutor(1, "reader")
-        self._reading: Future[list[Feed]] | None = None
+        self._sparkplug: Session | None = None
+        if settings.sparkplug is not None:
+            self._sparkplug = Session(settings, settings.sparkplug, segment, self._selector, self.wake)
+        self._reading: Future[list[tuple[Feed, Device | None]]] | None = None
         self._adopt(self._read())
         self.steps = Steps(segment.clock, slot.index, f"{self.prefix}/simlog/step", self.link, self.outbox)
         self._bell = Relay(segment.clock.slot_bell(slot.index), "bell-steps", TURN_NS)
@@ -73,9 +78,10 @@ class Bridge:
         """As the process table names them."""
         commands, outbox = self._commands, self.outbox
         refused = commands.refused + self.link.refused
-        return (
+        own = (
             outbox.sent, commands.received, refused, outbox.waiting, outbox.backlog, outbox.dropped, self.link.connects,
         )  # fmt: skip
+        return own if self._sparkplug is None else tuple(map(sum, zip(own, self._sparkplug.counters, strict=True)))
 
     @property
     def problem(self) -> str:
@@ -84,7 +90,7 @@ class Bridge:
         if problem and self.outbox.backlog:
             lost = f", {self.outbox.dropped} dropped" if self.outbox.dropped else ""
             return f"{problem}; {self.outbox.backlog} changes are kept{lost}"
-        return problem
+        return problem or ("" if self._sparkplug is None else self._sparkplug.problem)
 
     def wake(self) -> None:
         """Have :meth:`turn` return soon; any thread may."""
@@ -103,11 +109,15 @@ class Bridge:
             self._look(feed)
         self.outbox.flush()
         self._link_turn()
+        if self._sparkplug is not None:
+            self._sparkplug.turn()
 
     def _patience_s(self) -> float:
         if self._more:
             return 0.0
         due_s = [TURN_S, self.link.turn()]
+        if self._sparkplug is not None:
+            due_s.append(self._sparkplug.turn())
         for feed in self._feeds.values():
             due_ns = None if feed.held else feed.settle()
             if due_ns is not None:
@@ -160,21 +170,24 @@ class Bridge:
             self._reading = self._reader.submit(self._read)
             self._reading.add_done_callback(lambda _: self.wake())
 
-    def _read(self) -> list[Feed]:
+    def _read(self) -> list[tuple[Feed, Device | None]]:
         self._generation = self._segment.generation  # before looking: what changes meanwhile is read the next time
         self._segment.refresh()
         known = {feed.block.section for feed in self._feeds.values()}
-        return [
+        feeds = [
             Feed(block, self._rules, self.prefix, self.outbox, self._writer)
             for block in self._segment.blocks.values()
             if block.section not in known
         ]
+        return [(feed, None if self._sparkplug is None else self._sparkplug.device(feed)) for feed in feeds]
 
-    def _adopt(self, feeds: Iterable[Feed]) -> None:
-        for feed in feeds:
+    def _adopt(self, read: Iterable[tuple[Feed, Device | None]]) -> None:
+        for feed, device in read:
             if (before := self._feeds.get(feed.block.source)) is not None:
                 self._leave(before, feed)
             self._feeds[feed.block.source] = feed
+            if device is not None and self._sparkplug is not None:
+                self._sparkplug.adopt(device)
             block = feed.block
             relay = Relay(block.ring, f"bell-{block.source}", min(TURN_NS, block.stale_ns))
             self._relays[block.section] = relay
@@ -188,6 +201,8 @@ class Bridge:
         self.outbox.forget(feed.all())
         self.outbox.mark_all(Gone(channel.topic) for channel in feed.all() if channel.topic not in stay)
         del self._feeds[feed.block.source]
+        if self._sparkplug is not None:
+            self._sparkplug.leave(feed.block.source)
         relay = self._relays.pop(feed.block.section)
         self._selector.unregister(relay.descriptor)
         relay.stop()
@@ -204,6 +219,8 @@ class Bridge:
         self.link.send(Message(self._status, OFFLINE, 1, True))
         self._drain(until_s, lambda: not self.link.in_flight)
         self.link.close()
+        if self._sparkplug is not None:
+            self._sparkplug.close()
         for relay in (*self._relays.values(), self._bell):
             self._selector.unregister(relay.descriptor)
             relay.stop()

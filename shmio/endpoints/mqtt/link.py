@@ -38,6 +38,7 @@ MAX_PACKET_BYTES: Final = 1 << 21
 """Of what a broker may send us, as far as it can be told so: with MQTT 5."""
 PACKETS: Final = 100
 """So many are taken from the broker before what else there is to do has its turn."""
+WITH_WILL: Final = "Disconnect with will message"
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -50,9 +51,9 @@ class Link:
         dialling: Dialling,
         selector: selectors.BaseSelector,
         wake: Callable[[], object],
-        will: Message,
+        will: Callable[[], Message],
     ) -> None:
-        """``wake``: has the thread turn the link; callable from any thread."""
+        """``wake``: has the thread turn the link; callable from any thread. ``will``: asked for at each attempt."""
         self.up = False
         self.came_up = False
         """Set when a connection has been made; who has greeted it takes it back."""
@@ -150,7 +151,8 @@ class Link:
             client.username_pw_set(target.username, target.password)
         if target.context is not None:
             client.tls_set_context(target.context)
-        client.will_set(self._will.topic, self._will.payload, self._will.qos, self._will.retain)
+        will = self._will()
+        client.will_set(will.topic, will.payload, will.qos, will.retain)
         return client
 
     def _connect(self, client: Client, target: Target) -> None:
@@ -353,12 +355,13 @@ class Link:
         else:
             client.subscribe([(one, 1) for one in filters])
 
-    def close(self) -> None:
-        """Take leave; what was sent before is on its way."""
+    def close(self, *, will: bool = False) -> None:
+        """Take leave; what was sent before is on its way. ``will``: have the will published, as far as that can be."""
         if self._client is not None:
             self._client.on_disconnect = None
             if self.up:
-                self._client.disconnect()
+                reason = ReasonCode(PacketTypes.DISCONNECT, WITH_WILL) if will and self.mqtt5 else None
+                self._client.disconnect(reason)
         self._close()
         self._retry_s = float("inf")
 

@@ -1,0 +1,101 @@
+"""A source as a device of an edge node: what its frames bring."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from enum import Enum
+from typing import NamedTuple
+
+from shmio.endpoints.mqtt.feed import CATCH_UP_FRAMES, TURN_FRAMES
+from shmio.endpoints.mqtt.inlet import Inlet
+from shmio.endpoints.mqtt.sparkplug.metrics import Metric, parts_of
+from shmio.endpoints.mqtt.sparkplug.node import Sample
+from shmio.layout.codec import codec
+from shmio.layout.glob import Glob
+from shmio.layout.model import Register
+from shmio.segment import Block, Frame, Quality
+from shmio.segment.scan import ChangeScan
+
+
+class Kind(Enum):
+    """What has happened to a device."""
+
+    BIRTH = "birth"
+    DATA = "data"
+    DEATH = "death"
+
+
+class News(NamedTuple):
+    """What a frame, or its age, has brought. ``at``: numbers of the metrics that are new."""
+
+    kind: Kind
+    at: Sequence[int] = ()
+
+
+class Device:
+    """Follows one block, for the bridge's thread. For a big layout to make one takes seconds."""
+
+    def __init__(self, block: Block, inlet: Inlet, globs: Sequence[Glob]) -> None:
+        """``inlet``: where commands go. ``globs``: over paths with the source, of what is a metric."""
+        self.block = block
+        self.inlet = inlet
+        registers = [
+            one for one in block.layout.registers if any(g.matches(f"{block.source}/{one.path}") for g in globs)
+        ]
+        self.parts: tuple[Register, ...] = tuple(parts_of(block.layout, registers))
+        self.alive = False
+        """Whether the source has good values, or doubtful ones."""
+        self._metrics: Sequence[Metric] = ()
+        self._scan = ChangeScan(self.parts)
+        self._decoders = [codec(part, block.layout.byte_order).decode for part in self.parts]
+        self._frame: Frame | None = None
+        self._quality, self._reason = Quality.BAD, ""
+        newest = block.latest()
+        self._cursor = block.cursor(after=newest.number - 1 if newest else 0)
+
+    def named(self, metrics: Sequence[Metric]) -> None:
+        """The metrics of its parts, in their order."""
+        self._metrics = metrics
+
+    def look(self) -> Iterator[News]:
+        """What has come; a few frames at a time."""
+        if self._cursor.behind > CATCH_UP_FRAMES:
+            self._cursor = self.block.cursor(after=self.block.ring.head() - 1)
+        for _ in range(TURN_FRAMES):
+            frame = self._cursor.poll()
+            if frame is None:
+                frame = self._frame  # it may have become too old
+            if frame is not None and (news := self._take(frame)) is not None:
+                yield news
+            if frame is self._frame and not self._cursor.behind:
+                return
+
+    @property
+    def behind(self) -> int:
+        """Frames that wait."""
+        return self._cursor.behind
+
+    def samples(self, at: Sequence[int] | None = None) -> list[Sample]:
+        """Metrics as they are now, all or these."""
+        frame = self._frame
+        if frame is None:
+            return []
+        at_ms = frame.source_ns // 1_000_000
+        return [
+            Sample(self._metrics[one], self._decoders[one](frame.image), at_ms, self._quality, self._reason)
+            for one in (range(len(self.parts)) if at is None else at)
+        ]
+
+    def _take(self, frame: Frame) -> News | None:
+        old, before = self._frame, (self._quality, self._reason)
+        self._frame = frame
+        self._quality, self._reason = self.block.assess(frame)
+        alive, self.alive = self.alive, self._quality is not Quality.BAD
+        if not self.alive:
+            return News(Kind.DEATH) if alive else None
+        if not alive or old is None:
+            return News(Kind.BIRTH)
+        if before != (self._quality, self._reason):
+            return News(Kind.DATA, range(len(self.parts)))
+        changed = self._scan.changed(old.image, frame.image)
+        return News(Kind.DATA, changed) if changed else None

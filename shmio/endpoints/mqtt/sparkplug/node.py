@@ -1,0 +1,184 @@
+"""An edge node of Sparkplug B: what it publishes and in which order, and what it is told. No I/O.
+
+Sources are its devices. A device is born when its source is good for the first time, dies when that turns bad, and is
+born again. (Eclipse Sparkplug Specification 3.0.0, 5 and 6.4.)
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from itertools import count
+from typing import Any, Final, NamedTuple
+
+from google.protobuf.message import DecodeError
+
+from shmio.endpoints.mqtt.channel import Message
+from shmio.endpoints.mqtt.sparkplug.metrics import BOOLEAN, INT64, Metric, tell_quality
+from shmio.errors import PathError, ValueRangeError
+from shmio.layout.model import Register
+from shmio.segment import Quality
+from shmio.wire import sparkplug_b_pb2 as wire
+
+NAMESPACE: Final = "spBv1.0"
+REBIRTH: Final = "Node Control/Rebirth"
+MAX_METRICS: Final = 4096
+"""Of one command."""
+_SEQUENCE: Final = 256
+
+
+class Sample(NamedTuple):
+    """A value of one metric. ``at_ms``: when the source had it, ms since 1970."""
+
+    metric: Metric
+    value: Any
+    at_ms: int
+    quality: Quality = Quality.GOOD
+    reason: str = ""
+
+
+class Command(NamedTuple):
+    """What a host application wants. ``rebirth``: the node is to be born again; else ``values`` by path of a device."""
+
+    rebirth: bool = False
+    device: str = ""
+    values: Mapping[str, Any] = {}
+
+
+class EdgeNode:
+    """One node, through all its sessions; one thread."""
+
+    def __init__(self, group: str, node: str, now_ms: Callable[[], int] = lambda: time.time_ns() // 1_000_000) -> None:
+        self._group, self._node = group, node
+        self._now_ms = now_ms
+        self._sequence = 0
+        # Not from 0 after each restart: a late will of the process before must not be taken for this one's.
+        self._session = now_ms() // 1000 % _SEQUENCE
+        self._born: set[str] = set()
+        self.metrics: dict[str, dict[str, Metric]] = {}
+        """Of each device, by name, in the order in which they were given."""
+        self._by_alias: dict[int, Metric] = {}
+
+    def define(self, devices: Mapping[str, Iterable[Register]]) -> None:
+        """What the devices have, by name; what is born has to be born again."""
+        aliases = count(1)
+        self.metrics = {
+            device: {register.path: Metric(register, next(aliases)) for register in registers}
+            for device, registers in devices.items()
+        }
+        self._by_alias = {metric.alias: metric for found in self.metrics.values() for metric in found.values()}
+        self._born.clear()
+
+    @property
+    def commands(self) -> list[str]:
+        """Topics to subscribe to before anything is published, with QoS 1."""
+        return [self._topic("NCMD"), self._topic("DCMD", "+")]
+
+    def will(self) -> Message:
+        """Begin a new session: what its connection is to leave as its will."""
+        self._session = (self._session + 1) % _SEQUENCE
+        self._born.clear()
+        return self.death()
+
+    def death(self) -> Message:
+        """What is published before the node disconnects by itself."""
+        payload = wire.Payload(timestamp=self._now_ms())
+        self._tell_session(payload)
+        return Message(self._topic("NDEATH"), payload.SerializeToString(), 1, retain=False)
+
+    def birth(self) -> Message:
+        """What is published first in a session, and when it is asked for; births of the devices come next."""
+        self._born.clear()
+        self._sequence = 0
+        payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
+        self._tell_session(payload)
+        payload.metrics.add(name=REBIRTH, timestamp=self._now_ms(), datatype=BOOLEAN, boolean_value=False)
+        return self._message(payload, "NBIRTH")
+
+    def device_birth(self, device: str, samples: Iterable[Sample]) -> Message:
+        """The birth of a device with all its metrics; of those without a sample the value is null."""
+        self._born.add(device)
+        payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
+        given = {sample.metric.name: sample for sample in samples}
+        for name, metric in self.metrics[device].items():
+            sample = given.get(name) or Sample(metric, None, payload.timestamp, Quality.BAD, "there is no value")
+            found = payload.metrics.add(name=name, alias=metric.alias, datatype=metric.datatype)
+            self._fill(found, sample)
+        return self._message(payload, "DBIRTH", device)
+
+    def data(self, device: str, samples: Iterable[Sample], *, historical: bool = False) -> Message:
+        """Values that changed. ``historical``: they are sent late, and are not those of now."""
+        payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
+        for sample in samples:
+            found = payload.metrics.add(alias=sample.metric.alias)
+            if historical:
+                found.is_historical = True
+            self._fill(found, sample)
+        return self._message(payload, "DDATA", device)
+
+    def device_death(self, device: str) -> Message:
+        """A device is not to be trusted any more."""
+        self._born.discard(device)
+        payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
+        return self._message(payload, "DDEATH", device)
+
+    def lives(self, device: str) -> bool:
+        """Whether a device was born in this session, and has not died."""
+        return device in self._born
+
+    def command(self, topic: str, data: bytes) -> Command:
+        """What a message on one of the topics of :attr:`commands` says.
+
+        ValueRangeError: it is no payload of Sparkplug B, or has values that are none of their metrics; PathError:
+        there is no such device or metric.
+        """
+        try:
+            payload = wire.Payload.FromString(data)
+        except DecodeError:
+            raise ValueRangeError(f"{topic}: this is no payload of Sparkplug B") from None
+        if len(payload.metrics) > MAX_METRICS:
+            raise ValueRangeError(f"{topic}: {len(payload.metrics)} metrics, {MAX_METRICS} are the most")
+        if topic == self._topic("NCMD"):
+            asked = any(metric.name == REBIRTH and metric.boolean_value for metric in payload.metrics)
+            if not asked:
+                raise PathError(f"{topic}: the node takes {REBIRTH} = true, and nothing else")
+            return Command(rebirth=True)
+        device = topic.rpartition("/")[2]
+        if device not in self.metrics or topic != self._topic("DCMD", device):
+            raise PathError(f"{topic}: there is no such device; there are: {', '.join(self.metrics)}")
+        values: dict[str, Any] = {}
+        for found in payload.metrics:
+            metric = self._metric(device, found)
+            if metric.name in values:
+                raise ValueRangeError(f"{metric.name}: given twice")
+            values[metric.name] = metric.take(found)
+        if not values:
+            raise ValueRangeError(f"{topic}: there is no metric in it")
+        return Command(device=device, values=values)
+
+    def _metric(self, device: str, found: wire.Metric) -> Metric:
+        """By its name or its alias; PathError."""
+        metrics = self.metrics[device]
+        metric = metrics.get(found.name) if found.HasField("name") else self._by_alias.get(found.alias)
+        if metric is None or metrics.get(metric.name) is not metric:
+            what = repr(found.name[:100]) if found.HasField("name") else f"alias {found.alias}"
+            raise PathError(f"{device}: there is no metric {what}")
+        return metric
+
+    def _fill(self, found: wire.Metric, sample: Sample) -> None:
+        found.timestamp = sample.at_ms
+        sample.metric.put(found, sample.value)
+        tell_quality(found, sample.quality, sample.reason)
+
+    def _tell_session(self, payload: wire.Payload) -> None:
+        payload.metrics.add(name="bdSeq", timestamp=self._now_ms(), datatype=INT64, long_value=self._session)
+
+    def _message(self, payload: wire.Payload, kind: str, device: str = "") -> Message:
+        return Message(self._topic(kind, device), payload.SerializeToString(), 0, retain=False)
+
+    def _next(self) -> int:
+        number, self._sequence = self._sequence, (self._sequence + 1) % _SEQUENCE
+        return number
+
+    def _topic(self, kind: str, device: str = "") -> str:
+        return "/".join((NAMESPACE, self._group, kind, self._node, *((device,) if device else ())))

@@ -1,0 +1,208 @@
+"""An instance as an edge node of Sparkplug B.
+
+By a connection of its own: a connection has one will, and the bridge's says something else.
+"""
+
+from __future__ import annotations
+
+import logging
+import selectors
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import msgspec
+from paho.mqtt.client import MQTTMessage
+
+from shmio.config import Mqtt, Sparkplug
+from shmio.endpoints.mqtt.channel import Message
+from shmio.endpoints.mqtt.feed import Feed
+from shmio.endpoints.mqtt.link import Link
+from shmio.endpoints.mqtt.place import own_socket
+from shmio.endpoints.mqtt.sparkplug.backlog import Backlog
+from shmio.endpoints.mqtt.sparkplug.device import Device, Kind
+from shmio.endpoints.mqtt.sparkplug.node import EdgeNode
+from shmio.endpoints.mqtt.target import Dialling
+from shmio.errors import CommandError, PathError, ValueRangeError
+from shmio.layout.glob import Glob
+from shmio.segment import DONE, EventKind, Segment
+
+log = logging.getLogger("shmio.mqtt")
+
+
+class Session:
+    """For the bridge's thread: :meth:`turn` in each of its turns.
+
+    What changes while the broker takes nothing more is merged; while it is away it is kept, and sent as historical.
+    """
+
+    def __init__(
+        self,
+        settings: Mqtt,
+        sparkplug: Sparkplug,
+        segment: Segment,
+        selector: selectors.BaseSelector,
+        wake: Callable[[], object],
+    ) -> None:
+        """``selector``, ``wake``: as of :class:`Link`. PathError: a pattern is none."""
+        self.node = EdgeNode(sparkplug.group, sparkplug.node or segment.instance)
+        client_id = f"{settings.client_id or f'shmio-{segment.instance}'}-sparkplug"
+        # A session begins with its births: the broker is to keep nothing of one before (5.4).
+        clean = msgspec.structs.replace(settings, session_expiry_s=0)
+        dialling = Dialling(clean, client_id, partial(own_socket, segment))
+        self.link = Link(dialling, selector, wake, self.node.will)
+        self.link.on_message = self._command
+        self._globs = [Glob(pattern) for pattern in sparkplug.patterns]
+        self._devices: dict[str, Device] = {}
+        self._waiting: dict[str, dict[int, None]] = {}
+        self._backlog = Backlog(round(settings.backlog_mb * 1e6))
+        self._keeping = False
+        self._defined = False
+        """Whether the node is told of all devices that there are."""
+        self._sent = self._received = self._refused = 0
+
+    @property
+    def counters(self) -> tuple[int, ...]:
+        """As those of the bridge."""
+        waiting = sum(map(len, self._waiting.values()))
+        refused, connects = self._refused + self.link.refused, self.link.connects
+        return self._sent, self._received, refused, waiting, self._backlog.count, self._backlog.dropped, connects
+
+    @property
+    def problem(self) -> str:
+        """What is wrong at present; empty: nothing."""
+        return f"Sparkplug: {self.link.problem}" if self.link.problem else ""
+
+    def device(self, feed: Feed) -> Device:
+        """What a source is to be; any thread may make it."""
+        return Device(feed.block, feed.inlet, self._globs)
+
+    def adopt(self, device: Device) -> None:
+        """There is one more."""
+        self._devices[device.block.source] = device
+        self._defined = False
+
+    def leave(self, source: str) -> None:
+        """There is one less."""
+        del self._devices[source]
+        self._defined = False
+
+    def _define(self) -> None:
+        """Tell the node what there is; if it is born already, it is born anew."""
+        self._defined = True
+        self.node.define({name: device.parts for name, device in self._devices.items()})
+        for name, device in self._devices.items():
+            device.named(list(self.node.metrics[name].values()))
+        self._waiting = {name: {} for name in self._devices}
+        self._backlog.clear()  # what is in it has other aliases
+        if self.link.up and not self.link.came_up:
+            self._birth()
+
+    def turn(self) -> float:
+        """Do what is due; in how many seconds there is more."""
+        if not self._defined:
+            self._define()
+        rest_s = self.link.turn()
+        self.link.lost = None
+        if self.link.problem and not self.link.up:
+            self._keeping = True
+        if self.link.came_up:
+            self.link.came_up, self._keeping = False, True
+            self.link.subscribe(self.node.commands)
+            self._birth()
+        for name, device in self._devices.items():
+            for news in device.look():
+                self._tell(name, device, news.kind, news.at)
+        self._flush()
+        return 0.0 if any(device.behind for device in self._devices.values()) else rest_s
+
+    def close(self) -> None:
+        """Say that the node dies, and go."""
+        if self.link.up:
+            self.link.send(self.node.death())
+        self.link.close(will=True)
+
+    # ---- what goes out -----------------------------------------------------------------------------------------------
+
+    def _birth(self) -> None:
+        self._send(self.node.birth())
+        for name, device in self._devices.items():
+            if device.alive:
+                self._send(self.node.device_birth(name, device.samples()))
+            self._waiting[name].clear()
+
+    def _tell(self, name: str, device: Device, kind: Kind, at: Sequence[int]) -> None:
+        if not self.link.up:
+            if self._keeping and kind is not Kind.DEATH:
+                self._backlog.keep(name, device.samples(None if kind is Kind.BIRTH else at))
+            return
+        if kind is Kind.DATA:
+            self._waiting[name] |= dict.fromkeys(at)
+            self._flush_device(name, device)  # so that each frame's changes are told, as long as the broker takes them
+            return
+        self._waiting[name].clear()
+        if kind is Kind.BIRTH:
+            self._send(self.node.device_birth(name, device.samples()))
+        elif self.node.lives(name):
+            self._send(self.node.device_death(name))
+
+    def _flush(self) -> None:
+        for name, device in self._devices.items():
+            self._flush_device(name, device)
+
+    def _flush_device(self, name: str, device: Device) -> None:
+        """What was kept first, then what has changed; before its birth nobody knows its metrics."""
+        link, waiting = self.link, self._waiting[name]
+        if not self.node.lives(name):
+            return
+        while link.ready and (samples := self._backlog.take(name)):
+            self._send(self.node.data(name, samples, historical=True))
+        if waiting and link.ready:
+            self._send(self.node.data(name, device.samples(list(waiting))))
+            waiting.clear()
+
+    def _send(self, message: Message) -> None:
+        self._sent += 1
+        self.link.send(message)
+
+    # ---- what comes --------------------------------------------------------------------------------------------------
+
+    def _command(self, message: MQTTMessage) -> None:
+        try:
+            topic = message.topic
+        except UnicodeDecodeError:
+            self._refused += 1
+            return
+        self._received += 1
+        if message.retain:  # it was there before we were
+            self._refused += 1
+            return
+        try:
+            command = self.node.command(topic, bytes(message.payload))
+        except (PathError, ValueRangeError) as error:
+            self._refuse(str(error))
+            return
+        if command.rebirth:
+            self._birth()
+            return
+        device = self._devices[command.device]
+        for path, value in command.values.items():
+            register = self.node.metrics[command.device][path].register
+            try:
+                device.inlet.send(register, value, _Outcome(f"{command.device}/{path}"))
+            except (CommandError, ValueRangeError) as error:
+                self._refuse(str(error))
+
+    def _refuse(self, why: str) -> None:
+        self._refused += 1
+        log.warning("Sparkplug command: %s", why)
+
+
+class _Outcome:
+    """Sparkplug has no answer to a command but the value that comes: what was not done is in the log."""
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+
+    def __call__(self, kind: EventKind, reason: str) -> None:
+        if kind not in DONE:
+            log.warning("Sparkplug command: %s: %s: %s", self._path, kind, reason)

@@ -1,0 +1,194 @@
+"""An instance as an edge node, at a real broker, as a host application sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import pytest
+
+from shmio.config import Address, Sparkplug
+from shmio.connectors.injections import Owner
+from shmio.segment import Quality, Segment
+from shmio.segment.processes import WRITERS
+from shmio.testing.mosquitto import Mosquitto
+from shmio.testing.proxy import FaultProxy
+from shmio.wire import sparkplug_b_pb2 as wire
+from tests.unit.endpoints.harness import image
+from tests.unit.endpoints.mqtt.harness import Listener, Running, bridge
+from tests.unit.endpoints.plant import Plant
+
+NODE = "spBv1.0/plant/{}/a50"
+PLANT = Sparkplug(group="plant", node="a50")
+
+
+class Heard(NamedTuple):
+    """A message: NBIRTH, DDATA and so on, and its metrics by name."""
+
+    kind: str
+    payload: wire.Payload
+    metrics: dict[str, wire.Metric]
+
+
+class Host:
+    """A host application: it knows metrics by the aliases of their births."""
+
+    def __init__(self, listener: Listener) -> None:
+        self._listener = listener
+        self._names: dict[int, str] = {}
+        self.seqs: list[int] = []
+
+    def next(self) -> Heard:
+        """The next message of the node."""
+        message = self._listener.message()
+        assert not message.retain
+        kind = message.topic.split("/")[2]
+        payload = wire.Payload.FromString(bytes(message.payload))
+        if kind in ("NCMD", "DCMD"):  # our own
+            return self.next()
+        assert payload.HasField("seq") == (kind != "NDEATH")
+        if kind == "NBIRTH":
+            self._names, self.seqs = {}, []
+        if kind in ("NBIRTH", "DBIRTH"):
+            self._names |= {metric.alias: metric.name for metric in payload.metrics if metric.HasField("alias")}
+        if kind != "NDEATH":
+            self.seqs.append(payload.seq)
+            assert self.seqs == [number % 256 for number in range(len(self.seqs))]
+        return Heard(kind, payload, {one.name or self._names[one.alias]: one for one in payload.metrics})
+
+    def until(self, kind: str) -> Heard:
+        """The next message of a kind."""
+        while (found := self.next()).kind != kind:
+            pass
+        return found
+
+    def command(self, kind: str, *metrics: wire.Metric, device: str = "") -> None:
+        """Send one."""
+        topic = NODE.format(kind) + (f"/{device}" if device else "")
+        data = wire.Payload(timestamp=1, metrics=metrics).SerializeToString()
+        self._listener.client.publish(topic, data, 0).wait_for_publish(30)
+
+
+@contextmanager
+def hosting(address: Address) -> Iterator[Host]:
+    listener = Listener(address, "spBv1.0/#")
+    try:
+        yield Host(listener)
+    finally:
+        listener.close()
+
+
+@contextmanager
+def node(segment: Segment, address: Address, **settings: Any) -> Iterator[Running]:
+    with bridge(segment, address, **({"sparkplug": PLANT} | settings)) as running:
+        yield running
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shmio.endpoints.mqtt.link.FIRST_WAIT_S", 0.02)
+    monkeypatch.setattr("shmio.endpoints.mqtt.link.MOST_WAIT_S", 0.1)
+
+
+def bd_seq(heard: Heard) -> int:
+    return heard.metrics["bdSeq"].long_value
+
+
+def test_a_node_is_born_tells_what_changes_and_dies(segment: Segment, broker: Mosquitto) -> None:
+    writer = segment.writer("cell")
+    writer.publish(image(position=1.5, step=7), cycle=1)
+    with hosting(broker.address) as host:
+        with node(segment, broker.address):
+            birth = host.next()
+            assert birth.kind == "NBIRTH"
+            device = host.next()
+            assert device.kind == "DBIRTH"
+            assert device.metrics["axis/position"].float_value == 1.5
+            assert device.metrics["step"].int_value == 7
+            assert not device.metrics["step"].HasField("properties")
+            writer.publish(image(position=2.5, step=7), cycle=2)
+            data = host.next()
+            assert (data.kind, set(data.metrics)) == ("DDATA", {"axis/position"})
+            assert data.metrics["axis/position"].float_value == 2.5
+            assert not data.metrics["axis/position"].HasField("name")
+            assert not data.metrics["axis/position"].is_historical
+        death = host.until("NDEATH")
+        assert bd_seq(death) == bd_seq(birth)
+
+
+def test_a_source_that_is_bad_is_a_device_that_is_dead(segment: Segment, broker: Mosquitto) -> None:
+    writer = segment.writer("cell")
+    writer.publish(image(), cycle=1, quality=Quality.BAD, reason="cable out")
+    with hosting(broker.address) as host, node(segment, broker.address):
+        assert host.next().kind == "NBIRTH"
+        writer.publish(image(position=1.5), cycle=2)
+        assert host.next().kind == "DBIRTH"
+        writer.publish(image(position=1.5), cycle=3, quality=Quality.UNCERTAIN, reason="PLC in STOP")
+        doubtful = host.next().metrics["axis/position"].properties
+        assert [doubtful.values[0].int_value, doubtful.values[1].string_value] == [500, "PLC in STOP"]
+        writer.publish(image(position=1.5), cycle=4, quality=Quality.BAD, reason="cable out")
+        assert host.next().kind == "DDEATH"
+        writer.publish(image(position=2.5), cycle=5)
+        again = host.next()
+        assert (again.kind, again.metrics["axis/position"].float_value) == ("DBIRTH", 2.5)
+
+
+def test_a_node_is_born_again_when_it_is_asked_to(segment: Segment, broker: Mosquitto) -> None:
+    segment.writer("cell").publish(image(position=1.5), cycle=1)
+    with hosting(broker.address) as host, node(segment, broker.address):
+        first = host.next()
+        host.until("DBIRTH")
+        host.command("NCMD", wire.Metric(name="Node Control/Rebirth", boolean_value=True))
+        again = host.next()
+        assert (again.kind, bd_seq(again)) == ("NBIRTH", bd_seq(first))
+        assert host.next().kind == "DBIRTH"
+
+
+def test_commands_reach_the_device_and_garbage_nothing(segment: Segment, broker: Mosquitto) -> None:
+    plant = Plant(segment.writer("cell"))
+    plant.owners[WRITERS["mqtt"]] = Owner(WRITERS["mqtt"], 3)
+    plant.run()
+    try:
+        with hosting(broker.address) as host, node(segment, broker.address) as running:
+            alias = host.until("DBIRTH").metrics["axis/position"].alias
+            for metric in (
+                wire.Metric(name="axis/nowhere", float_value=1),
+                wire.Metric(name="secret", int_value=1),
+                wire.Metric(name="axis/position", string_value="fast"),
+                wire.Metric(alias=alias, float_value=2.5),
+            ):
+                host.command("DCMD", metric, device="cell")
+            while (changed := host.until("DDATA").metrics.get("axis/position")) is None:
+                pass
+            assert changed.float_value == 2.5
+            running.until(lambda: running.bridge.counters[1:3] == (4, 3))
+    finally:
+        plant.stop()
+
+
+def test_what_changed_while_the_broker_was_away_comes_as_history(segment: Segment, broker: Mosquitto) -> None:
+    writer = segment.writer("cell")
+    writer.publish(image(step=1), cycle=1)
+    with (
+        FaultProxy(broker.address, framing=None) as proxy,
+        hosting(broker.address) as host,
+        node(segment, proxy.address) as running,
+    ):
+        first = host.until("NBIRTH")
+        host.until("DBIRTH")
+        proxy.refuse()
+        assert bd_seq(host.until("NDEATH")) == bd_seq(first), "its last will"
+        running.until(lambda: "Sparkplug" in running.bridge.problem or "nothing listens" in running.bridge.problem)
+        for step in range(2, 12):
+            writer.publish(image(step=step), cycle=step)
+        running.until(lambda: running.bridge.counters[4] >= 20)  # as topics, and as metrics
+        proxy.admit()
+        again = host.until("NBIRTH")
+        assert bd_seq(again) != bd_seq(first)
+        assert host.next().metrics["step"].int_value == 11
+        told = [host.next() for _ in range(10)]
+        assert [one.metrics["step"].int_value for one in told] == list(range(2, 12))
+        assert all(one.metrics["step"].is_historical for one in told)
+        times_ms = [one.metrics["step"].timestamp for one in told]
+        assert times_ms == sorted(times_ms)

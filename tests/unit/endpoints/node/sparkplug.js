@@ -1,0 +1,22 @@
+// Decodes and encodes payloads of Sparkplug B by another implementation, Eclipse Tahu's.
+// Usage: node sparkplug.js < LINES, each {decode: base64} or {encode: payload}; prints a list with an answer to each.
+"use strict";
+const { decodePayload, encodePayload } = require("sparkplug-payload").get("spBv1.0");
+
+// A Long as a number. The library gives one of Int64 as unsigned where its Long is not the protobuf library's own.
+function plain(metric) {
+  const long = metric.value;
+  if (typeof long !== "object" || long === null || !("low" in long)) return metric;
+  return { ...metric, value: Number((metric.type === "Int64" ? long.toSigned() : long.toUnsigned()).toString()) };
+}
+
+const lines = require("fs").readFileSync(0, "utf8").split("\n").filter(Boolean);
+const answers = lines.map((line) => {
+  const asked = JSON.parse(line);
+  if (asked.decode !== undefined) {
+    const { seq, metrics } = decodePayload(Buffer.from(asked.decode, "base64"));
+    return { seq: Number(seq), metrics: metrics.map(plain) };
+  }
+  return Buffer.from(encodePayload(asked.encode)).toString("base64");
+});
+process.stdout.write(JSON.stringify(answers));
