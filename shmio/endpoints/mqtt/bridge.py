@@ -61,6 +61,7 @@ class Bridge:
         self.outbox = Outbox(self.link, round(settings.backlog_mb * 1e6))
         self._commands = Commands(self.prefix, self._rules, self._feeds, self.outbox.answer)
         self.link.on_message = self._commands.take
+        self.link.on_lost = self.outbox.lose
         self._more: set[Feed] = set()
         self._generation = -1
         self._reader = ThreadPoolExecutor(1, "reader")
@@ -128,9 +129,6 @@ class Bridge:
     def _link_turn(self) -> None:
         link = self.link
         link.turn()
-        if link.lost is not None:
-            lost, link.lost = link.lost, None
-            self.outbox.lose(lost)
         if link.problem and not link.up:
             self.outbox.keeping = True
         if link.came_up:

@@ -40,6 +40,9 @@ PACKETS: Final = 100
 """So many are taken from the broker before what else there is to do has its turn."""
 WITH_WILL: Final = "Disconnect with will message"
 
+_BEING_SENT: Final = 0
+"""A number that no message has."""
+
 log = logging.getLogger("shmio.mqtt")
 
 
@@ -57,8 +60,8 @@ class Link:
         self.up = False
         self.came_up = False
         """Set when a connection has been made; who has greeted it takes it back."""
-        self.lost: list[Message] | None = None
-        """Set when a connection is gone: what it has not taken for certain; who has kept that takes it back."""
+        self.on_lost: Callable[[list[Message]], None] = lambda _: None
+        """Called when a connection is gone, with what it has not taken for certain."""
         self.problem = ""
         """Why there is no connection, or what the broker refuses; empty: all is well."""
         self.connects = 0
@@ -271,11 +274,12 @@ class Link:
     def _end(self, problem: str) -> None:
         """There was a connection, or half of one."""
         if self.up:
-            self.lost = list(self._in_flight.values())
+            lost = list(self._in_flight.values())
             if time.monotonic() - self._up_s >= STABLE_S:
                 self._failures = 0
             self._protocol = MQTTv5
             self._fail(problem)
+            self.on_lost(lost)
         elif self._protocol == MQTTv5 and self._until_s is not None:
             self._step_back()  # some brokers that do not know version 5 say nothing
         else:
@@ -332,13 +336,11 @@ class Link:
             return
         qos = min(message.qos, self._most_qos)
         retain = message.retain and self._retains
+        if qos:
+            self._in_flight[_BEING_SENT] = message  # to send it may find the connection gone
         info = client.publish(message.topic, message.payload, qos, retain, properties if self.mqtt5 else None)
-        if not qos:
-            return
-        if self._client is client:  # to publish may have found it dead
+        if self._in_flight.pop(_BEING_SENT, None) is not None:
             self._in_flight[info.mid] = message
-        elif self.lost is not None:
-            self.lost.append(message)
 
     def owes(self, message: Message) -> bool:
         """Whether this very message was sent, and the broker has not acknowledged it."""
