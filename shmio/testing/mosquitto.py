@@ -29,7 +29,7 @@ class Mosquitto:
         self.address = address
         self._file = folder / "mosquitto.conf"
         self._process: subprocess.Popen[bytes] | None = None
-        head = (f"listener {address.port} {address.host}", "user root", "log_dest stderr", "log_type all")
+        head = (f"listener {address.port} {address.host}", "user root", "log_dest stderr", "log_type notice")
         self._file.write_text("\n".join((*head, *(lines or ("allow_anonymous true",)), "")))
 
     @property

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from shmio.testing.mosquitto import missing
+
 ROOT = Path(__file__).parents[2]
 RATIO = r"(?: +(\d+\.\d+) times as fast)?$"
 ROW = re.compile(r"^(\S.*?) +(\d+) +(\d+)" + RATIO, re.MULTILINE)
@@ -112,6 +114,14 @@ def test_streams_are_measured_beside_a_bare_server() -> None:
     latencies = re.findall(r"^version [12], (?:1|50) subscribers +(\d+\.\d+)", found, re.MULTILINE)
     assert len(latencies) == 4
     assert all(float(latency) > 0 for latency in latencies)
+
+
+@pytest.mark.skipif(bool(missing()), reason=missing())
+def test_mqtt_is_measured_beside_a_bare_publisher() -> None:
+    found = printed("mqtt")
+    rates = re.findall(r"^(shmio's bridge|paho, bare) +([1-9]\d*) +([1-9]\d*)", found, re.MULTILINE)
+    assert [name for name, *_ in rates] == ["shmio's bridge", "paho, bare"] * 2
+    assert len(re.findall(r"^QoS [01] +\d+\.\d+ +\d+\.\d+ +\d+\.\d+ +\d+\.\d+$", found, re.MULTILINE)) == 2
 
 
 def test_one_client_of_our_own_service_is_measured() -> None:

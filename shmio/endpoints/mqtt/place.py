@@ -9,7 +9,8 @@ from typing import Final
 from shmio.errors import EndpointError
 from shmio.segment import Segment
 
-SOCKET: Final = "broker.sock"
+SOCKET: Final = "s"
+"""Short: the path of a UNIX socket is."""
 
 
 def folder(segment: Segment) -> Path:

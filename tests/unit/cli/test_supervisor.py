@@ -231,7 +231,7 @@ def test_check_tells_what_the_instance_takes(example: Edit, instance: str, capsy
     example('name = "a50"', f'name = "{instance}"')
     assert main(["check"]) == 0
     output = capsys.readouterr().out
-    assert f"supervisor.toml: instance {instance}, 4 processes" in output
+    assert f"supervisor.toml: instance {instance}, 6 processes" in output
     assert "source cell at 127.0.0.1:1102: DB201, 22 registers, 2180 bytes; ring of 512 frames, 10.2 s" in output
     assert re.search(rf"segment shmio-{instance}: \d\.\d\d MB", output)
     assert output.endswith("no faults found\n")

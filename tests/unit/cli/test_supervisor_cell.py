@@ -45,7 +45,8 @@ class Cell:
         self.run("init", status=0)
         file = folder / "supervisor.toml"
         text = file.read_text().replace('"a50"  ', f'"{instance}"').replace("1102", str(free_port()))
-        file.write_text(text.replace("127.0.0.1:8089", "127.0.0.1:0").replace("127.0.0.1:8090", "127.0.0.1:0"))
+        text = text.replace("127.0.0.1:8089", "127.0.0.1:0").replace("127.0.0.1:8090", "127.0.0.1:0")
+        file.write_text(text.replace("1883", str(free_port())))
 
     def command(self, *arguments: str) -> list[str]:
         return [sys.executable, "-m", "shmio.cli.supervisor", *arguments]
@@ -94,6 +95,8 @@ def test_a_day_in_the_life_of_the_cell(cell: Cell) -> None:
         ("plc", "emulator", "running"),
         ("cell", "source", "running"),
         ("grpc", "grpc", "running"),
+        ("broker", "mqtt", "running"),
+        ("mqtt", "mqtt", "running"),
         ("recorder", "recorder", "running"),
     ]
     assert status["processes"][1]["quality"] == "good"
@@ -117,7 +120,7 @@ def test_a_day_in_the_life_of_the_cell(cell: Cell) -> None:
 
     assert cell.run("restart", "cell", status=0).stdout == "cell runs again\n"
     assert cell.of("cell").pid != pids["cell"]
-    assert "there are: plc, cell, grpc, recorder" in cell.run("restart", "nobody", status=1).stderr
+    assert "there are: plc, cell, grpc, broker, mqtt, recorder" in cell.run("restart", "nobody", status=1).stderr
     file = cell.folder / "supervisor.toml"
     moved = file.rename(cell.folder / "elsewhere.toml")
     assert cell.run("logs", "--instance", cell.instance, "cell", status=0).stdout
