@@ -7,16 +7,13 @@ from shmio.config.model import (
     Emulator,
     Grpc,
     Instance,
-    Mqtt,
-    MqttTls,
-    MqttTopic,
     Recorder,
     Source,
-    Sparkplug,
     Tls,
     Token,
     Trigger,
 )
+from shmio.config.mqttmodel import Mqtt, MqttTls, MqttTopic, Sparkplug
 from shmio.config.read import RESERVED_SOURCES, load
 
 __all__ = [

@@ -5,32 +5,27 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from msgspec import Meta, Struct, field
+from msgspec import Meta, field
+
+from shmio.config.mqttmodel import Mqtt
+from shmio.config.section import Section, Text, Texts
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}\Z"
 NAME_RULE = "at most 40 letters, digits and _ . -, the first a letter or a digit"
 Name = Annotated[str, Meta(pattern=NAME_PATTERN)]
 Milliseconds = Annotated[float, Meta(gt=0, le=3_600_000)]
-Text = Annotated[str, Meta(min_length=1)]
-Texts = Annotated[list[Text], Meta(min_length=1)]
 DbNumber = Annotated[int, Meta(ge=1, le=65535)]
 Seconds = Annotated[float, Meta(ge=0, le=1e9)]
 Operand = bool | int | float | str | list[Any]
 ClockName = Literal["wall", "stepped"]
 ReplayedInjections = Literal["keep", "leave out"]
 DistributionName = Literal["uniform", "gaussian"]
-BrokerName = Literal["embedded", "mosquitto", "external"]
-PayloadName = Literal["text", "json", "frames"]
 OperationName = Literal["set", "offset", "scale", "clamp", "noise", "random", "freeze", "delay", "drop", "flip"]
 RealtimePriority = Annotated[int, Meta(ge=1, le=99)]
 """Of SCHED_FIFO, sched(7)."""
 
 ROLES = ("read", "write", "inject", "control")
 """What a client of the gRPC endpoint may be allowed."""
-
-
-class Section(Struct, forbid_unknown_fields=True, kw_only=True):
-    """A table of the file: unknown keys are refused."""
 
 
 class Instance(Section):
@@ -157,68 +152,6 @@ class Grpc(Section):
             for index, text in enumerate(self.listen)
         }
         return found | {f"grpc.address[{index}].listen": address for index, address in enumerate(self.address)}
-
-
-class MqttTls(Section):
-    """``[mqtt.tls]``: PEM files. ``ca``: whose certificates are trusted, of an external broker the host's if not given.
-
-    ``certificate`` and ``key``: what an external broker is shown, or what our own one shows its clients.
-    """
-
-    ca: Text | None = None
-    certificate: Text | None = None
-    key: Text | None = None
-
-
-class MqttTopic(Section):
-    """``[[mqtt.topic]]``: how the registers that ``match`` names are published; of several rules the first counts."""
-
-    match: Text | Texts
-    publish: bool = True
-    payload: PayloadName = "text"
-    qos: Annotated[int, Meta(ge=0, le=1)] = 1
-    retain: bool = True
-    deadband: Annotated[float, Meta(ge=0, le=1e300)] = 0.0
-    max_rate_hz: Annotated[float, Meta(gt=0, le=1e6)] | None = None
-    elements: bool = False
-
-    @property
-    def patterns(self) -> list[str]:
-        """Globs over paths that begin with their source."""
-        return [self.match] if isinstance(self.match, str) else self.match
-
-
-class Sparkplug(Section):
-    """``[mqtt.sparkplug]``: the instance as an edge node of Sparkplug B; ``node``: default the instance's name."""
-
-    group: Text
-    node: Text | None = None
-    match: Text | Texts = "**"
-
-    @property
-    def patterns(self) -> list[str]:
-        """Globs over paths that begin with their source: what is a metric."""
-        return [self.match] if isinstance(self.match, str) else self.match
-
-
-class Mqtt(Section):
-    """``[mqtt]``: the bridge to a broker, and the broker itself unless it is ``external``."""
-
-    broker: BrokerName = "embedded"
-    listen: Text | None = None
-    host: Text | Texts | None = None
-    port: Annotated[int, Meta(ge=1, le=65535)] | None = None
-    prefix: Text | None = None
-    insecure: bool = False
-    tls: MqttTls | None = None
-    username: Text | None = None
-    password_file: Text | None = None
-    client_id: Annotated[str, Meta(min_length=1, max_length=128)] | None = None
-    keep_alive_s: Annotated[int, Meta(ge=5, le=3600)] = 30
-    session_expiry_s: Annotated[int, Meta(ge=0, le=2**32 - 2)] = 0
-    backlog_mb: Annotated[float, Meta(ge=0, le=65536)] = 16.0
-    topic: list[MqttTopic] = []
-    sparkplug: Sparkplug | None = None
 
 
 class Trigger(Section):

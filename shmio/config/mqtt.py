@@ -6,7 +6,8 @@ import re
 from typing import Final
 
 from shmio.config.address import Address
-from shmio.config.model import Config, Mqtt
+from shmio.config.model import Config
+from shmio.config.mqttmodel import Mqtt
 from shmio.errors import ConfigError
 
 PORT: Final = 1883

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ssl
 
-from shmio.config.model import MqttTls
+from shmio.config.mqttmodel import MqttTls
 from shmio.errors import ConfigError
 
 

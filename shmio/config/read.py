@@ -20,20 +20,17 @@ from shmio.config.model import (
     Grpc,
     Instance,
     Listening,
-    Mqtt,
-    MqttTls,
-    MqttTopic,
     Recorder,
     Replay,
-    Section,
     Source,
-    Sparkplug,
     Tls,
     Token,
     Trigger,
 )
 from shmio.config.mqtt import check_mqtt, resolve_mqtt
+from shmio.config.mqttmodel import Mqtt, MqttTls, MqttTopic, Sparkplug
 from shmio.config.properties import read_properties
+from shmio.config.section import Section
 from shmio.config.wording import explain, explain_toml, named
 from shmio.errors import ConfigError
 

@@ -12,13 +12,12 @@ from msgspec import ValidationError
 from shmio.config.model import (
     NAME_PATTERN,
     NAME_RULE,
-    BrokerName,
     ClockName,
     DistributionName,
     OperationName,
-    PayloadName,
     ReplayedInjections,
 )
+from shmio.config.mqttmodel import BrokerName, PayloadName
 
 MAX_LINE = 80
 _PLACE = re.compile(r"\(at line (\d+), column (\d+)\)\Z")
