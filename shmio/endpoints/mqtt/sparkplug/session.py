@@ -102,7 +102,6 @@ class Session:
         if not self._defined:
             self._define()
         rest_s = self.link.turn()
-        self.link.lost = None
         if self.link.problem and not self.link.up:
             self._keeping = True
         if self.link.came_up:
