@@ -112,7 +112,7 @@ class Dump:
     @property
     def damage(self) -> list[str]:
         """What was found damaged when the files were opened: a few texts."""
-        return [text for part in self._parts for text in part.found.damage]
+        return list(dict.fromkeys(text for part in self._parts for text in part.found.damage))
 
     # ---- one by one --------------------------------------------------------------------------------------------------
 

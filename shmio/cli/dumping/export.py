@@ -52,6 +52,8 @@ def execute(arguments: argparse.Namespace) -> int:
         from_ns = parse_time("--from", arguments.begin, dump.begin_ns, 0)
         to_ns = parse_time("--to", arguments.end, dump.begin_ns, MAX_NS)
         chosen = _chosen(dump, arguments)
+        if not chosen:
+            raise RecordingError(f"{dump.files[0]}: nothing is recorded in it")
         sources = list(dict.fromkeys(block.source for block in chosen))
         if arguments.format == "mcap":
             progress.total = dump.end_ns - dump.begin_ns

@@ -60,6 +60,7 @@ def _describe(reader: Reader, found: Survey) -> dict[str, Any]:
         "host": about.get("host", ""),
         "version": about.get("version", ""),
         "recorder": about.get("recorder", ""),
+        "made_by": about.get("made_by"),
         "started": iso(int(started_ns)) if started_ns.isdecimal() and len(started_ns) < 20 else None,
         "from": iso(first_ns) if tracks else None,
         "to": iso(last_ns) if tracks else None,
@@ -125,6 +126,8 @@ def _lines(found: dict[str, Any]) -> list[str]:
     rate = f", {found['bytes_per_minute'] / 1e6:.2f} MB/min" if found["bytes_per_minute"] else ""
     ended = "closed" if found["closed"] else f"not closed ({found['end']}): still being written, or cut off"
     by = f"recorded by {found['recorder']}, shmio {found['version']}, on {found['host']}"
+    if found["made_by"]:
+        by += f"; made of it by {found['made_by']}"
     lines = [
         f"{found['file']}: {size}, {ended}",
         f"  instance {found['instance']}, mode {found['mode']}, started {found['started']}; {by}",

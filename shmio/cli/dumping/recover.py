@@ -27,7 +27,7 @@ def execute(arguments: argparse.Namespace) -> int:
 
     with open_dump(file, damaged) as dump:
         if not dump.blocks:
-            raise RecordingError(f"{file}: {'; '.join(dump.damage) or 'nothing is recorded in it'}")
+            raise RecordingError(dump.damage[0] if dump.damage else f"{file}: nothing is recorded in it")
         layouts = [text for text in dump.damage if "layout" in text]
         records = dump.readers[0].records
         end = "" if records.closed else records.damage

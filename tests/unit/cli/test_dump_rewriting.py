@@ -61,6 +61,8 @@ def test_cut_by_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     low, high = START_NS + 16 * PERIOD_NS, START_NS + 40 * PERIOD_NS
     assert contents(part) == [entry for entry in contents(file) if low <= entry[0] <= high]
     assert part.stat().st_mode & 0o777 == 0o600
+    assert main(["info", "part.mem"]) == 0
+    assert "made of it by shmio-dump cut" in capsys.readouterr().out
     assert main(["cut", str(file), "-o", "part.mem"]) == 1
     assert capsys.readouterr().err == "part.mem is there already: nothing is ever overwritten\n"
     assert main(["cut", str(file), "-o", "none.mem", "--from", "100"]) == 1
@@ -183,6 +185,10 @@ def test_recover_of_a_file_cut_off_at_every_byte_of_its_last_chunk(
 
 
 def test_recover_of_what_is_no_recording(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with build(Path("x.mem")):
+        pass
+    assert main(["recover", "x.mem"]) == 1
+    assert capsys.readouterr().err == "x.mem: nothing is recorded in it\n"
     for content, message in ((b"", "is empty"), (b"nothing", "is no recording"), (MAGIC, "no recording of shmio")):
         Path("x.mem").write_bytes(content)
         assert main(["recover", "x.mem"]) == 1
