@@ -202,9 +202,10 @@ directory = "again"
             lambda: all(one["quality"] == "good" for one in cell.processes().values() if one["kind"] == "source"),
             "good",
         )
-        before = cell.processes()["cell"]["pid"]
-        kill(before)
-        until(lambda: cell.processes()["cell"]["pid"] not in (before, None), "another process")
+        block = attached.block("cell")
+        before = block.incarnation
+        kill(cell.processes()["cell"]["pid"])
+        until(lambda: block.incarnation > before, "another process")
         until(lambda: attached.read(POSITION).quality.name == "GOOD", "good again")
         with attached.inject(POSITION) as shadow:
             shadow.set({POSITION: 123.0})
@@ -218,11 +219,12 @@ directory = "again"
     cell.down()
     [again] = (cell.folder / "again").iterdir()
     with shmio.open_dump(again) as found:
-        cycles = [entry.item.cycle for entry in found.frames("cell") if entry.item.effective is None]
+        cycles = [entry.item.cycle for entry in found.frames("cell")]
     with shmio.open_dump(file) as found:
         known = [entry.item.cycle for entry in found.frames("cell")]
     lost = [(one, two) for one, two in pairwise(cycles) if two - one not in (0, 1) and two > one]
-    assert all(two - one == known[known.index(one) + 1] - one for one, two in lost), "the kill has lost nothing"
+    if "frames were left out" not in cell.logs():  # a host that took 10 s for the new process
+        assert all(two == known[known.index(one) + 1] for one, two in lost), "the kill has lost nothing"
 
 
 @pytest.mark.parametrize(
