@@ -86,6 +86,16 @@ def test_a_benchmark_compares(benchmark: str, row: re.Pattern[str], tables: dict
     assert all((ratio == "") == (name == ours) for name, *_, ratio in found if name in (ours, *list(tables)[1:2]))
 
 
+def test_recording_is_measured() -> None:
+    found = printed("recording")
+    sizes = re.findall(
+        r"^(?:emulated cell|with noise|at rest) +(\d\.\d+) +(\d\.\d+) +(\d\.\d+) +7$", found, re.MULTILINE
+    )
+    assert len(sizes) == 3
+    assert all(0 < float(ours) < float(raw) / 10 for raw, _, ours in sizes)
+    assert len(re.findall(r"^(?:50|1000) Hz +\d+\.\d+ +\d+\.\d+ +\d+\.\d+ +\d+$", found, re.MULTILINE)) == 2
+
+
 def test_reading_recordings_is_measured() -> None:
     found = printed("dump_read")
     for contender in ("shmio columns", "shmio, frame by frame", "mcap library and struct"):

@@ -1,0 +1,211 @@
+"""Recording: size of a minute, and what it costs the host.
+
+Sizes are of a minute at 50 Hz as a recorder chunks it, of three kinds of data: the emulated A50 cell, whose axes move
+by sines; the same with noise on all 20 REALs, as analog inputs have it; and the cell at rest. Beside it the same frames
+without compression, and what the mcap library writes by its defaults. CPU is that of a recorder's process beside a
+source that publishes by the clock.
+"""
+
+from __future__ import annotations
+
+import json
+import random
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, cast
+
+import mcap.writer
+from common import CpuTime, begin, db201, table
+
+from shmio.dump.encoding import FRAME, encode_frame
+from shmio.emulators.a50 import A50
+from shmio.layout.model import Layout
+from shmio.recording.output import Output, create
+from shmio.recording.recorder import CHUNK_S
+from shmio.recording.writer import Writer
+from shmio.segment import Block, BlockSpec, BlockWriter, Frame, ProcessSpec, Provenance, Quality, Segment
+from shmio.segment.processes import Activity
+
+HZ = 50
+START_NS = 1_700_000_000_000_000_000
+JITTER_NS = 60_000
+SEED_MB = 7.0
+"""A minute of the seed's dumps."""
+
+Image = Callable[[int], bytes]
+"""The block at a cycle."""
+
+
+# -- data --------------------------------------------------------------------------------------------------------------
+
+
+def cell(layout: Layout, *, noise: float = 0.0, moving: bool = True) -> Image:
+    """The A50 cell; ``noise``: standard deviation of what is added to each REAL."""
+    program, chance = A50(layout), random.Random(1)
+    image = bytearray(layout.size)
+    axes = [register.offset for register in layout.registers if register.type == "REAL"]
+
+    def at(cycle: int) -> bytes:
+        program.step(cycle / HZ if moving else 0.0, image)
+        for offset in axes if noise else ():
+            (value,) = struct.unpack_from(">f", image, offset)
+            struct.pack_into(">f", image, offset, value + chance.gauss(0, noise))
+        return bytes(image)
+
+    return at
+
+
+def frames(image: Image, count: int) -> Iterator[Frame]:
+    """As a source publishes them, which wakes a little late each time."""
+    chance = random.Random(2)
+    for cycle in range(1, count + 1):
+        clock_ns = cycle * 10**9 // HZ + int(chance.expovariate(1 / JITTER_NS))
+        yield Frame(
+            cycle, cycle, 10**12 + clock_ns, clock_ns, START_NS + clock_ns - 400_000, 1, Quality.GOOD, Provenance.LIVE,
+            0, 380 + chance.randrange(60), "", image(cycle), None,
+        )  # fmt: skip
+
+
+# -- sizes -------------------------------------------------------------------------------------------------------------
+
+
+class _Block:
+    """What a writer asks of a block."""
+
+    source, section, period_ns, stale_ns = "cell", 1, 10**9 // HZ, 10**9
+
+    def __init__(self, layout: Layout) -> None:
+        self.layout = layout
+
+
+def ours(folder: Path, layout: Layout, some: Sequence[Frame]) -> int:
+    """As a recorder writes it, index and layout and all."""
+    path, fd = create(folder, "bench")
+    output = Output(path, fd, limit_bytes=1 << 30)
+    writer = Writer(output, {"instance": "bench"})
+    writer.attach(f"layouts/{layout.hash.hex()}.json", "application/json", layout.to_json(), START_NS)
+    channels = writer.open_block(cast("Block", _Block(layout)), 1, 0, 0)
+    for frame in some:
+        writer.frame(channels, frame, START_NS + frame.clock_ns)
+        if frame.number % round(CHUNK_S * HZ) == 0:
+            writer.flush()
+    writer.finish()
+    if not output.close(60):
+        raise SystemExit(output.problem)
+    return path.stat().st_size
+
+
+def library(folder: Path, some: Sequence[Frame], **options: object) -> int:
+    """The mcap library by its defaults: chunks of 1 MiB, zstd."""
+    file = folder / "library.mcap"
+    with file.open("wb") as stream:
+        writer = mcap.writer.Writer(cast("IO[bytes]", stream), **options)  # type: ignore[arg-type]
+        writer.start()
+        channel = writer.register_channel("cell/frames", FRAME, writer.register_schema(FRAME, "", b""))
+        for frame in some:
+            log_ns = START_NS + frame.clock_ns
+            writer.add_message(channel, log_ns, encode_frame(frame), log_ns)
+        writer.finish()
+    return file.stat().st_size
+
+
+def sizes(minutes: int) -> None:
+    """Print MB a minute."""
+    layout = db201()
+    data = {
+        "emulated cell": cell(layout),
+        "with noise": cell(layout, noise=0.01),
+        "at rest": cell(layout, moving=False),
+    }
+    rows = []
+    for name, image in data.items():
+        some = list(frames(image, minutes * 60 * HZ))
+        with tempfile.TemporaryDirectory() as folder:
+            contenders = [
+                sum(len(encode_frame(frame)) for frame in some),
+                library(Path(folder), some),
+                ours(Path(folder), layout, some),
+            ]
+        rows.append([name, *(f"{size / minutes / 1e6:.3f}" for size in contenders), f"{SEED_MB:g}"])
+    table([f"MB a minute at {HZ} Hz", "raw frames", "mcap defaults", "shmio", "the seed"], rows)
+
+
+# -- CPU ---------------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def recorder(segment: Segment, folder: Path) -> Iterator[int]:
+    """The recorder's process; its pid."""
+    description = {
+        "instance": segment.instance,
+        "epoch": segment.header.epoch,
+        "name": "recorder",
+        "kind": "recorder",
+        "log_file": str(folder / "recorder.log"),
+        "config": {"directory": str(folder / "dumps"), "config_file": str(folder / "supervisor.toml")},
+    }
+    process = subprocess.Popen([sys.executable, "-m", "shmio.recording"], stdin=subprocess.PIPE, text=True)
+    try:
+        assert process.stdin is not None
+        process.stdin.write(json.dumps(description))
+        process.stdin.close()
+        report = segment.processes.find("recorder")
+        while report.report.pid != process.pid or report.report.activity is not Activity.RUNNING:
+            time.sleep(0.05)
+        time.sleep(1)
+        yield process.pid
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def publish(writer: BlockWriter, image: Image, hertz: int, duration_s: float) -> None:
+    """By the clock."""
+    images = [image(cycle) for cycle in range(HZ * 4)]
+    begun_s = time.monotonic()
+    for cycle in range(round(duration_s * hertz)):
+        time.sleep(max(0.0, begun_s + cycle / hertz - time.monotonic()))
+        writer.publish(images[cycle % len(images)], cycle=cycle, source_ns=time.time_ns())
+
+
+def cpu(duration_s: float) -> None:
+    """Print what a recorder takes of a core."""
+    layout = db201()
+    rows = []
+    for hertz in (50, 1000):
+        blocks = [BlockSpec("cell", layout, 10**9 // hertz, 10**9, 64 << 20)]
+        processes = [ProcessSpec("cell", "source"), ProcessSpec("recorder", "recorder")]
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            Segment.create(f"bench-recording-{hertz}", blocks, processes) as segment,
+        ):
+            try:
+                with recorder(segment, Path(folder)) as pid:
+                    writer = segment.writer("cell")
+                    before, begun_s = CpuTime.of(pid), time.monotonic()
+                    publish(writer, cell(layout, noise=0.01), hertz, duration_s)
+                    used, taken_s = CpuTime.of(pid).since(before), time.monotonic() - begun_s
+                    counters = segment.processes.find("recorder").counters
+                parts = [used.user_s, used.system_s, used.user_s + used.system_s]
+                rows.append(
+                    [f"{hertz} Hz", *(f"{100 * part / taken_s:.2f}" for part in parts), str(counters["missed"])]
+                )
+            finally:
+                segment.unlink()
+    table(["recorder, % of a core", "user", "system", "sum", "missed"], rows)
+
+
+def main() -> None:
+    quick = begin("Recording: a minute's size, and CPU")
+    sizes(1 if quick else 10)
+    cpu(2.0 if quick else 30.0)
+
+
+if __name__ == "__main__":
+    main()
