@@ -25,9 +25,9 @@ SEED = 20
 
 @pytest.fixture
 def segment(instance: str) -> Iterator[Segment]:
-    """With a ring of minutes."""
+    """With a ring that is made for a far faster source, and so lasts minutes."""
     processes = [ProcessSpec("cell", "source"), ProcessSpec("recorder", "recorder")]
-    with Segment.create(instance, [BlockSpec("cell", LAYOUT, 20_000_000, 10**9, 1 << 27)], processes) as segment:
+    with Segment.create(instance, [BlockSpec("cell", LAYOUT, 500_000, 10**9, 1 << 27)], processes) as segment:
         yield segment
         segment.unlink()
 
@@ -54,11 +54,11 @@ def test_a_kill_at_any_moment_costs_nothing_and_leaves_whole_files(segment: Segm
     try:
         for _ in range(KILLS):
             with Process(segment, tmp_path) as process:
-                until(lambda: ready(process), "that it records")
+                until(lambda: ready(process), "that it records", 60)
                 over.wait(chance.choice([0.0, chance.uniform(0, 0.1), chance.uniform(0, 1.2)]))
                 kill(process.popen.pid)
         with Process(segment, tmp_path) as process:
-            until(lambda: ready(process), "that it records")
+            until(lambda: ready(process), "that it records", 60)
             folder = process.folder
             until(lambda: all(closed(file) for file in folder.iterdir() if file != process.file), "all of them closed")
             over.set()
