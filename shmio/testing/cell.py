@@ -17,7 +17,7 @@ from shmio.config import Address
 from shmio.segment.status import read_status
 
 BIN = Path(sys.executable).parent
-PATIENCE_S = 30.0
+PATIENCE_S = 120.0
 
 CONFIG = """
 [instance]
