@@ -16,7 +16,19 @@ def client_context(tls: MqttTls) -> ssl.SSLContext:
         _trust(context, tls.ca)
     if tls.certificate is not None:
         _show(context, tls)
+    context.sslsocket_class = _Socket
     return context
+
+
+class _Socket(ssl.SSLSocket):
+    """Is closed when no TLS comes about; who makes it then has no other way to."""
+
+    def do_handshake(self, block: bool = False) -> None:
+        try:
+            super().do_handshake(block)
+        except OSError:
+            self.close()
+            raise
 
 
 def server_context(tls: MqttTls) -> ssl.SSLContext:

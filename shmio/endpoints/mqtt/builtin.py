@@ -99,9 +99,10 @@ async def serve(worker: Worker, settings: Mqtt, place: Path) -> None:
     address = Address.parse(str(settings.listen))
     context = server_context(settings.tls) if settings.tls else None
     connections = _Connections(broker)
+    servers: list[asyncio.Server] = []
     try:
-        own = await asyncio.start_unix_server(connections.take_bridge, place / SOCKET)
-        served = await _listen(connections, address, context)
+        servers.append(await asyncio.start_unix_server(connections.take_bridge, place / SOCKET))
+        servers.append(await _listen(connections, address, context))
         worker.running()
         stopping = asyncio.Event()
         loop = asyncio.get_running_loop()
@@ -112,9 +113,9 @@ async def serve(worker: Worker, settings: Mqtt, place: Path) -> None:
                 await asyncio.wait_for(stopping.wait(), BEAT_S)
             except TimeoutError:
                 continue
-        for server in (own, served):
-            server.close()
     finally:
+        for server in servers:
+            server.close()
         await broker.shutdown()
 
 
