@@ -27,12 +27,12 @@ def snippets() -> list[tuple[str, str]]:
 
 
 def test_the_programs_are_found() -> None:
-    assert [page for page, _ in snippets()] == ["docs/how-to/analyse-a-recording.md"] * 2 + [
+    assert [page for page, _ in snippets()] == ["docs/how-to/analyse-a-recording.md"] * 3 + [
         "docs/reference/python-api.md"
     ]
 
 
-@pytest.mark.parametrize(("page", "program"), snippets(), ids=["change", "columns", "all"])
+@pytest.mark.parametrize(("page", "program"), snippets(), ids=["change", "columns", "pandas", "all"])
 def test_a_program_of_the_manual(page: str, program: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if "to_pandas" in program:
         pytest.importorskip("pandas")
