@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable
 from contextlib import closing
 from typing import Final
@@ -13,7 +14,7 @@ from shmio.segment.clock import ClockPage
 from shmio.segment.coordinator import Coordinator, Step
 
 BRIEF_NS: Final = 500_000
-"""So long the event loop stands still for a source that answers at once: to be told by a thread takes about as long."""
+"""So long the event loop stands still for sources that answer at once: to be told by a thread takes about as long."""
 
 
 class Driver:
@@ -27,6 +28,7 @@ class Driver:
 
     async def step(self, dt_ns: int | None) -> Step:
         """Errors as of :meth:`Coordinator.step`; one that is cancelled is broken off."""
+        still_ns = time.monotonic_ns() + BRIEF_NS
         with closing(self._coordinator.stepping(dt_ns)) as stepping:
             while True:
                 try:
@@ -34,7 +36,8 @@ class Driver:
                 except StopIteration as over:
                     step: Step = over.value
                     return step
-                await self._stay(wait)
+                if not _brief(wait, still_ns - time.monotonic_ns()):
+                    await self._stay(wait)
 
     def stop(self) -> None:
         """Wait for nobody any more."""
@@ -44,8 +47,6 @@ class Driver:
 
     async def _stay(self, wait: Wait) -> None:
         """Until its bell rings, which it does now and then in any case."""
-        if wait.block is not None and wait.block.ring.wait(wait.seen, min(BRIEF_NS, wait.rest_ns)) != wait.seen:
-            return
         rung = asyncio.get_running_loop().create_future()
 
         def ring() -> None:
@@ -67,3 +68,10 @@ class Driver:
         bell = self._delivered = self._delivered or Bell(self._clock.delivered_bell, "delivered")
         bell.listeners[ring] = None
         return lambda: bell.listeners.pop(ring)
+
+
+def _brief(wait: Wait, rest_ns: int) -> bool:
+    """Wait in the event loop's own thread, at most so long; whether the block's bell has rung."""
+    if wait.block is None or rest_ns <= 0:
+        return False
+    return wait.block.ring.wait(wait.seen, min(rest_ns, wait.rest_ns)) != wait.seen
