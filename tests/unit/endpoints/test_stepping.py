@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import threading
 from typing import Any
 
 import grpc
@@ -662,29 +661,3 @@ def test_what_is_bad_after_a_step_is_not_shown_and_all_of_it_when_it_is_good_aga
         assert await message(stream) == ("SIMLOG://step", 3.0)
 
     simulate(instance, test, "sim", "b")
-
-
-def test_sources_that_tell_much_before_they_answer_hold_up_no_stream(instance: str) -> None:
-    async def test(served: Endpoint, models: Models) -> None:
-        models["sim"].mute = True
-        stepping = asyncio.create_task(step(served))
-        while not served.segment.clock.read().stepping:  # noqa: ASYNC110  the endpoint's doing
-            await asyncio.sleep(0)
-        over = threading.Event()
-
-        def tell() -> None:
-            while not over.is_set():
-                models["sim"].publish(0)
-
-        telling = threading.Thread(target=tell)
-        telling.start()
-        try:
-            for _ in range(5):
-                await served.health("source.sim")
-        finally:
-            over.set()
-            telling.join()
-        models["sim"].answer()
-        assert await stepping == 0
-
-    simulate(instance, test)
