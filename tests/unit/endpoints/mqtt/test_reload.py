@@ -1,0 +1,70 @@
+"""An instance that is reloaded: sources come, go and change; the broker remembers nothing that is no more."""
+
+from __future__ import annotations
+
+from shmio.layout.model import Layout, Register
+from shmio.segment import Attributes, BlockSpec, Segment
+from shmio.testing.mosquitto import Mosquitto
+from tests.unit.endpoints.harness import STALE_NS, WRITABLE, image
+from tests.unit.endpoints.mqtt.harness import PREFIX, bridge, listening
+
+SMALLER = Layout(
+    "DB1",
+    1,
+    8,
+    False,
+    (Register("axis/position", "REAL", (), 0, None, 4, 1), Register("step", "INT", (), 4, None, 2, 1)),
+)
+
+
+def test_a_source_that_changes_goes_on_and_what_it_no_longer_has_is_forgotten(
+    segment: Segment, broker: Mosquitto
+) -> None:
+    segment.writer("cell").publish(image(position=1.5, step=3), cycle=1)
+    with Segment.open(segment.instance, writable=True) as opened, listening(broker.address) as listener:
+        with bridge(opened, broker.address):
+            listener.until("cell/secret/out", b"0")
+            spec = BlockSpec("cell", SMALLER, 10_000_000, STALE_NS, 1 << 20, Attributes("test", WRITABLE))
+            other = BlockSpec("other", SMALLER, 10_000_000, STALE_NS, 1 << 20, Attributes("test", ()))
+            segment.change(retire=["cell"], add=[spec, other])
+            segment.writer("cell").publish(b"\x40\x00\x00\x00\x00\x09\x00\x00", cycle=2)
+            segment.writer("other").publish(b"\x40\x00\x00\x00\x00\x0a\x00\x00", cycle=2)
+            listener.shown("cell/step/out", "9")
+            listener.shown("other/step/out", "10")
+            listener.shown("cell/secret/out", "")
+        with listening(broker.address, f"{PREFIX}/#") as later:
+            later.publish("end", "")
+            later.until("end")
+            kept = {topic.removeprefix(f"{PREFIX}/") for topic, payload in later.heard if payload}
+    registers = {f"{source}/{name}/out" for source in ("cell", "other") for name in ("axis/position", "step")}
+    assert kept == registers | {"status", "cell/status", "other/status"}
+
+
+def test_a_source_that_is_removed_is_forgotten(segment: Segment, broker: Mosquitto) -> None:
+    segment.writer("cell").publish(image(step=3), cycle=1)
+    with Segment.open(segment.instance, writable=True) as opened, listening(broker.address) as listener:
+        with bridge(opened, broker.address) as running:
+            listener.until("cell/secret/out", b"0")
+            segment.change(retire=["cell"], add=[])
+            listener.shown("cell/secret/out", "")
+            running.until(lambda: not running.bridge.outbox.busy and not running.bridge.link.in_flight)
+        with listening(broker.address, f"{PREFIX}/#") as later:
+            later.publish("end", "")
+            later.until("end")
+            assert {topic for topic, payload in later.heard if payload} == {f"{PREFIX}/status"}
+
+
+def test_commands_reach_a_source_that_has_come(segment: Segment, broker: Mosquitto) -> None:
+    segment.writer("cell").publish(image(step=3), cycle=1)
+    spec = BlockSpec("other", SMALLER, 10_000_000, STALE_NS, 1 << 20, Attributes("test", ()))
+    with (
+        Segment.open(segment.instance, writable=True) as opened,
+        listening(broker.address) as listener,
+        bridge(opened, broker.address),
+    ):
+        listener.until("cell/secret/out", b"0")
+        segment.change(retire=[], add=[spec])
+        segment.writer("other").publish(bytes(8), cycle=1)
+        listener.shown("other/step/out", "0")
+        listener.publish("other/step/in", "1")
+        assert "not writable" in listener.json("other/step/in/result")["reason"]
