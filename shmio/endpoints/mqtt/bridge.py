@@ -114,7 +114,7 @@ class Bridge:
             self._sparkplug.turn()
 
     def _patience_s(self) -> float:
-        if self._more:
+        if self._more or self.outbox.able:
             return 0.0
         due_s = [TURN_S, self.link.turn()]
         if self._sparkplug is not None:
@@ -124,7 +124,7 @@ class Bridge:
             if due_ns is not None:
                 due_s.append(max(0.0, (due_ns - feed.block.now_ns()) / 1e9))
         self.outbox.flush()
-        return min(due_s)
+        return 0.0 if self.outbox.able else min(due_s)
 
     def _link_turn(self) -> None:
         link = self.link

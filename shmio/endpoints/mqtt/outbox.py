@@ -15,6 +15,8 @@ from shmio.endpoints.mqtt.channel import Channel, Message
 
 OVERHEAD_BYTES: Final = 200
 """Of one message in memory, about, beside its payload."""
+TURN_MESSAGES: Final = 500
+"""So many are sent before what else there is to do has its turn."""
 MOST_ANSWERS: Final = 1024
 """Results of commands that wait; beyond that the oldest are dropped."""
 
@@ -55,6 +57,11 @@ class Outbox:
     def busy(self) -> bool:
         """Whether anything is to be sent."""
         return bool(self._waiting or self._backlog or self._answers)
+
+    @property
+    def able(self) -> bool:
+        """Whether :meth:`flush` would send something now."""
+        return self.busy and self._link.ready
 
     @property
     def waiting(self) -> int:
@@ -116,9 +123,11 @@ class Outbox:
             self._waiting.pop(channel, None)
 
     def flush(self) -> None:
-        """Send as long as the connection takes it: answers, then what was kept, then what is new."""
+        """Send as long as the connection takes it: answers, then what was kept, then what is new; so many at once."""
         link = self._link
-        while self.busy and link.ready:
+        for _ in range(TURN_MESSAGES):
+            if not self.able:
+                return
             self.sent += 1
             if self._answers:
                 link.send(*self._answers.popleft())

@@ -1,0 +1,142 @@
+"""What waits for the broker: order, conflation, and the bounded store for when it is away. No broker."""
+
+from __future__ import annotations
+
+from paho.mqtt.properties import Properties
+
+from shmio.endpoints.mqtt.channel import Message
+from shmio.endpoints.mqtt.outbox import MOST_ANSWERS, OVERHEAD_BYTES, TURN_MESSAGES, Outbox
+
+
+class Link:
+    """Takes ``room`` messages."""
+
+    def __init__(self) -> None:
+        self.up = True
+        self.room = 1_000_000
+        self.sent: list[str] = []
+
+    @property
+    def ready(self) -> bool:
+        return self.up and self.room > 0
+
+    def send(self, message: Message, properties: Properties | None = None) -> None:
+        self.room -= 1
+        self.sent.append(f"{message.topic}{message.payload.decode()}{'' if message.retain else '!'}")
+
+
+class Counter:
+    """A topic whose payload is how it stands when it is asked."""
+
+    def __init__(self, topic: str, *, keep: bool = True) -> None:
+        self.topic = topic
+        self.value = 0
+        self._keep = keep
+
+    def message(self, *, late: bool = False) -> Message:
+        return Message(self.topic, str(self.value).encode(), 1, retain=not late, keep=self._keep)
+
+
+def test_a_topic_that_waits_keeps_its_place_and_has_its_newest_value() -> None:
+    link = Link()
+    outbox, a, b = Outbox(link, 10_000), Counter("a"), Counter("b")
+    link.room = 0
+    for channel in (a, b, a):
+        channel.value += 1
+        outbox.mark(channel)
+    outbox.flush()
+    assert (link.sent, outbox.waiting) == ([], 2)
+    link.room = 10
+    outbox.flush()
+    assert link.sent == ["a2", "b1"]
+
+
+def test_no_turn_is_longer_than_others_can_wait() -> None:
+    link = Link()
+    outbox = Outbox(link, 0)
+    outbox.mark_all(Counter(str(number)) for number in range(2 * TURN_MESSAGES + 1))
+    outbox.flush()
+    assert len(link.sent) == TURN_MESSAGES
+    assert outbox.able
+    outbox.flush()
+    outbox.flush()
+    assert len(link.sent) == 2 * TURN_MESSAGES + 1
+    assert not outbox.able
+
+
+def test_nothing_is_kept_before_there_was_anything_to_wait_for() -> None:
+    link = Link()
+    link.up = False
+    outbox = Outbox(link, 10_000)
+    outbox.mark(Counter("a"))
+    assert not outbox.busy
+
+
+def test_what_was_lost_and_what_waited_comes_before_what_is_new() -> None:
+    link = Link()
+    outbox, a, b, status = Outbox(link, 10_000), Counter("a"), Counter("b"), Counter("s", keep=False)
+    outbox.keeping = True
+    link.room = 0
+    b.value = 3
+    outbox.mark_all([b, status])
+    link.up = False
+    outbox.lose([Message("a", b"1", 1, retain=True, keep=True), Message("s", b"1", 1, retain=True)])
+    for a.value in (2, 3):
+        outbox.mark(a)
+    link.up, link.room = True, 100
+    outbox.show([a, b, status])
+    a.value = 4
+    outbox.mark(a)  # while what was kept is still on its way
+    outbox.flush()
+    assert link.sent == ["a1!", "b3!", "a2!", "a3!", "a4!", "a4", "b3", "s0"]
+    a.value = 5
+    outbox.mark(a)
+    outbox.flush()
+    assert link.sent[-1] == "a5"
+
+
+def test_the_oldest_go_when_there_is_no_room() -> None:
+    link = Link()
+    link.up = False
+    outbox, a = Outbox(link, 3 * (OVERHEAD_BYTES + 1)), Counter("a")
+    outbox.keeping = True
+    for a.value in range(1, 8):
+        outbox.mark(a)
+    assert (outbox.backlog, outbox.dropped) == (3, 4)
+    outbox.lose([Message("a", b"0", 1, retain=True, keep=True)])  # older than all of them
+    assert (outbox.backlog, outbox.dropped) == (3, 5)
+    link.up = True
+    outbox.show([a])
+    outbox.flush()
+    assert link.sent == ["a5!", "a6!", "a7!", "a7"]
+
+
+def test_a_store_that_is_full_when_the_broker_is_back_makes_place_for_the_newest_value() -> None:
+    """What comes then is conflated, not dropped."""
+    link = Link()
+    link.up = False
+    outbox, a = Outbox(link, OVERHEAD_BYTES + 1), Counter("a")
+    outbox.keeping = True
+    a.value = 1
+    outbox.mark(a)
+    link.up = True
+    outbox.show([a])
+    for a.value in (2, 3):
+        outbox.mark(a)
+    outbox.flush()
+    assert (link.sent, outbox.dropped) == (["a1!", "a3"], 0)
+
+
+def test_results_come_first_and_are_bounded() -> None:
+    link = Link()
+    outbox = Outbox(link, 0)
+    link.room = 0
+    outbox.mark(Counter("a"))
+    for number in range(MOST_ANSWERS + 2):
+        outbox.answer(Message("r", str(number).encode(), 0, retain=True), None)
+    assert outbox.dropped == 2
+    link.room = 1_000_000
+    while outbox.able:
+        outbox.flush()
+    assert link.sent[0] == "r2"
+    assert link.sent[-1] == "a0"
