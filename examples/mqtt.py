@@ -24,7 +24,7 @@ def main() -> int:
     parser.add_argument("paths", nargs="*", metavar="PATH")
     parser.add_argument("--write", metavar="PATH=VALUE")
     parser.add_argument("--count", type=int, default=0, help="end after so many messages")
-    arguments = parser.parse_args()
+    arguments = parser.parse_intermixed_args()
     host, _, port = arguments.broker.rpartition(":")
     prefix, (path, _, value) = arguments.prefix, (arguments.write or "").partition("=")
     topics = [f"{prefix}/{path}/out" for path in arguments.paths] + ([f"{prefix}/{path}/in/result"] if path else [])
