@@ -5,17 +5,15 @@ from __future__ import annotations
 import base64
 import hashlib
 import hmac
-import os
 import secrets
-import stat
 from typing import Final
 
+from shmio.config.secretfile import read_secret
 from shmio.errors import ConfigError
 
 MAX_BYTES: Final = 1 << 20
 ROUNDS: Final = 101
 """Of mosquitto's own hashes, as its versions up to 2.0 make them; passwords come once a connection."""
-_OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 KEY: Final = "mqtt.password_file"
 
 
@@ -93,19 +91,7 @@ def _bytes(text: str) -> bytes:
 
 def _read(name: str) -> str:
     key = f"{KEY}: {name}"
-    try:
-        fd = os.open(name, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # which a pipe without a writer would block
-    except OSError as error:
-        raise ConfigError(f"{key}: {error.strerror}") from None
-    try:
-        mode = os.fstat(fd).st_mode
-        if not stat.S_ISREG(mode):
-            raise ConfigError(f"{key}: not a file")
-        if mode & _OTHERS:
-            raise ConfigError(f"{key}: mode {stat.S_IMODE(mode):04o} lets others in: chmod 600, and new passwords")
-        data = os.read(fd, MAX_BYTES + 1)
-    finally:
-        os.close(fd)
+    data = read_secret(key, name, MAX_BYTES + 1, instead="new passwords")
     if len(data) > MAX_BYTES:
         raise ConfigError(f"{key}: larger than {MAX_BYTES} bytes")
     try:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ssl
 
 from shmio.config.mqttmodel import MqttTls
+from shmio.config.pem import detail, load_authority, load_pair
 from shmio.errors import ConfigError
 
 
@@ -13,7 +14,7 @@ def client_context(tls: MqttTls) -> ssl.SSLContext:
     context = ssl.create_default_context()
     if tls.ca is not None:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-        _trust(context, tls.ca)
+        load_authority(context, tls.ca, "mqtt.tls.ca")
     if tls.certificate is not None:
         _show(context, tls)
     context.sslsocket_class = _Socket
@@ -36,18 +37,9 @@ def server_context(tls: MqttTls) -> ssl.SSLContext:
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     _show(context, tls)
     if tls.ca is not None:
-        _trust(context, tls.ca)
+        load_authority(context, tls.ca, "mqtt.tls.ca")
         context.verify_mode = ssl.CERT_REQUIRED
     return context
-
-
-def _trust(context: ssl.SSLContext, name: str) -> None:
-    try:
-        context.load_verify_locations(name)
-    except ssl.SSLError as error:
-        raise ConfigError(f"mqtt.tls.ca: {name}: no usable PEM certificate{_detail(error)}") from None
-    except OSError as error:
-        raise ConfigError(f"mqtt.tls.ca: {name}: {error.strerror}") from None
 
 
 def _show(context: ssl.SSLContext, tls: MqttTls) -> None:
@@ -59,20 +51,6 @@ def _show(context: ssl.SSLContext, tls: MqttTls) -> None:
         except OSError as error:
             raise ConfigError(f"mqtt.tls.{field}: {name}: {error.strerror}") from None
     try:
-        context.load_cert_chain(certificate, key, password=_refuse_to_ask)
-    except _EncryptedError:
-        raise ConfigError(f"mqtt.tls.key: {key}: needs a passphrase; give one that needs none") from None
+        load_pair(context, certificate, key, "mqtt.tls")
     except ssl.SSLError as error:
-        raise ConfigError(f"mqtt.tls: {certificate} and {key} are no certificate and its key{_detail(error)}") from None
-
-
-def _detail(error: ssl.SSLError) -> str:
-    return f" ({error.reason})" if error.reason else ""
-
-
-class _EncryptedError(Exception):
-    pass
-
-
-def _refuse_to_ask() -> str:
-    raise _EncryptedError
+        raise ConfigError(f"mqtt.tls: {certificate} and {key} are no certificate and its key{detail(error)}") from None

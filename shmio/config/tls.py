@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from shmio.config.model import Tls
+from shmio.config.pem import detail, load_authority, load_pair
 from shmio.errors import ConfigError
 
 
@@ -26,16 +27,14 @@ def read_tls(tls: Tls) -> TlsFiles:
         client_ca=_read("client_ca", tls.client_ca) if tls.client_ca else None,
     )
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    _try_certificates("certificate", tls.certificate, context)
+    load_authority(context, tls.certificate, "grpc.tls.certificate")
     if tls.client_ca:
-        _try_certificates("client_ca", tls.client_ca, context)
+        load_authority(context, tls.client_ca, "grpc.tls.client_ca")
     try:
-        context.load_cert_chain(tls.certificate, tls.key, password=_refuse_to_ask)
-    except _EncryptedError:
-        raise ConfigError(f"grpc.tls.key: {tls.key}: needs a passphrase; give one that needs none") from None
+        load_pair(context, tls.certificate, tls.key, "grpc.tls")
     except ssl.SSLError as error:
         other = error.reason == "KEY_VALUES_MISMATCH"
-        why = "not the key of grpc.tls.certificate" if other else f"no usable PEM private key{_detail(error)}"
+        why = "not the key of grpc.tls.certificate" if other else f"no usable PEM private key{detail(error)}"
         raise ConfigError(f"grpc.tls.key: {tls.key}: {why}") from None
     return found
 
@@ -45,22 +44,3 @@ def _read(key: str, name: str) -> bytes:
         return Path(name).read_bytes()
     except OSError as error:
         raise ConfigError(f"grpc.tls.{key}: {name}: {error.strerror}") from None
-
-
-def _try_certificates(key: str, name: str, context: ssl.SSLContext) -> None:
-    try:
-        context.load_verify_locations(name)
-    except ssl.SSLError as error:
-        raise ConfigError(f"grpc.tls.{key}: {name}: no usable PEM certificate{_detail(error)}") from None
-
-
-def _detail(error: ssl.SSLError) -> str:
-    return f" ({error.reason})" if error.reason else ""
-
-
-class _EncryptedError(Exception):
-    pass
-
-
-def _refuse_to_ask() -> str:
-    raise _EncryptedError

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import stat
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from shmio.config.model import Token
+from shmio.config.secretfile import read_secret
 from shmio.errors import ConfigError
 
 MIN_LENGTH: Final = 20
 MAX_LENGTH: Final = 1024
-_OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 
 
 class Secret(NamedTuple):
@@ -43,19 +41,7 @@ def digest(token: bytes) -> bytes:
 
 def _read(key: str, name: str) -> bytes:
     key = f"{key}.token_file: {name}"
-    try:
-        fd = os.open(name, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # which a pipe without a writer would block
-    except OSError as error:
-        raise ConfigError(f"{key}: {error.strerror}") from None
-    try:
-        mode = os.fstat(fd).st_mode
-        if not stat.S_ISREG(mode):
-            raise ConfigError(f"{key}: not a file")
-        if mode & _OTHERS:
-            raise ConfigError(f"{key}: mode {stat.S_IMODE(mode):04o} lets others in: chmod 600, and a new token")
-        text = os.read(fd, MAX_LENGTH + 3).rstrip(b"\r\n")
-    finally:
-        os.close(fd)
+    text = read_secret(key, name, MAX_LENGTH + 3, instead="a new token").rstrip(b"\r\n")
     if not MIN_LENGTH <= len(text) <= MAX_LENGTH or not all(0x21 <= byte <= 0x7E for byte in text):
         raise ConfigError(
             f"{key}: expected one token of {MIN_LENGTH} to {MAX_LENGTH} letters, digits and signs, and nothing else: "
