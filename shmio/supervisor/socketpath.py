@@ -10,8 +10,7 @@ from typing import Final
 
 from shmio.errors import ControlError
 
-MAX_PATH_BYTES: Final = 105
-"""sun_path holds 108 with the final zero, unix(7); what our own broker has beside it is two longer."""
+MAX_PATH_BYTES: Final = 107  # sun_path holds 108 with the final zero, unix(7)
 
 
 def socket_path(instance: str) -> str:

@@ -10,12 +10,12 @@ from shmio.errors import EndpointError
 from shmio.segment import Segment
 
 SOCKET: Final = "s"
-"""Short: the path of a UNIX socket is."""
+"""So short that its path is no longer than that of the supervisor's socket, which fits where such may be."""
 
 
 def folder(segment: Segment) -> Path:
     """Where it is; not made here."""
-    return Path(f"{segment.header.control.removesuffix('.sock')}.mqtt")
+    return Path(f"{segment.header.control.removesuffix('.sock')}.mq")
 
 
 def own_socket(segment: Segment) -> str:

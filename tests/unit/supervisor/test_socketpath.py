@@ -44,5 +44,5 @@ def test_a_path_that_is_too_long_is_passed_over(tmp_path: Path, monkeypatch: pyt
 
 
 def test_no_folder_at_all_is_an_error_that_says_why() -> None:
-    with pytest.raises(ControlError, match="longer than 105 bytes"):
+    with pytest.raises(ControlError, match="longer than 107 bytes"):
         socket_path("a" * 120)
