@@ -218,6 +218,8 @@ def decode_gap(data: bytes) -> Gap:
     gap = msgspec.json.decode(data, type=Gap)
     if gap.what not in ("frames", "events") or not 0 < gap.first <= gap.last or gap.count != gap.last - gap.first + 1:
         raise ValueError("a gap contradicts itself")
+    if min(gap.after_ns, gap.before_ns) < 0:
+        raise ValueError("a gap contradicts all clocks")
     return gap
 
 

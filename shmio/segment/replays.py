@@ -149,6 +149,10 @@ class Replays:
         if wanted.change:
             names = [self._register(wanted.change)[0]]
         meant = {_recording(plays[source]) for source in names or plays}
+        if wanted.event and len(meant) > 1:  # whose positions have nothing to do with each other
+            raise CommandError(
+                f"several recordings are played: name one of the sources of the one that is meant ({', '.join(plays)})"
+            )
         return {source: play for source, play in plays.items() if _recording(play) in meant}
 
     def _register(self, path: str) -> tuple[str, str]:

@@ -33,10 +33,10 @@ def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]
     heads = [other.playhead for other in blocks if other.playhead is not None]
     if block.playhead is None or not heads:
         raise SegmentError(f"the block of source {block.source} has no playhead")
+    own = block.playhead.read()
+    if own is not None and _is_of(source, own):  # without the lock: who holds it may wait for this process
+        return Beginning(own, block.latest())
     with heads[0].held():  # sources that begin at the same time begin together
-        own = block.playhead.read()
-        if own is not None and _is_of(source, own):
-            return Beginning(own, block.latest())
         play = _as_others(source, heads) or _as_configured(source, block, started_ns)
         block.playhead.write(play)
         return Beginning(play, None)

@@ -72,6 +72,12 @@ class Player:
             self._publish(entry, stamp)
         self.go(None if entry is None else position_ns)
 
+    def again(self, position_ns: int, stale_ns: int, stamp: StampOf) -> None:
+        """Go on at the begin of a loop; where nothing comes soon, what stood at its end stands no longer."""
+        if self._tape.newest(position_ns + stale_ns) is None:
+            self.end(NOTHING, stamp(position_ns, position_ns))
+        self.go(position_ns)
+
     def resume(self, position_ns: int) -> None:
         """Go on behind a position, up to which the process before this one has published."""
         self.go(position_ns + 1)

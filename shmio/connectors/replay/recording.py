@@ -19,6 +19,10 @@ Moment = float | str
 MAX_NS: Final = 1 << 61
 """No time is beyond this: some 70 years."""
 
+MIN_PERIOD_NS: Final = 100_000
+MAX_PERIOD_NS: Final = 3_600_000_000_000
+"""A source's cycle, as a configuration may have it."""
+
 log = logging.getLogger("shmio.source")
 
 
@@ -66,7 +70,11 @@ class Recording:
             max(last.time_ns + last.block.period_ns for last in lasts if last and last.block) - self.utc_ns,
         )
         """From the first frame to a period behind the last one."""
-        if max(self.utc_ns, *map(abs, self.whole)) > MAX_NS:
+        even = all(
+            MIN_PERIOD_NS <= block.period_ns <= MAX_PERIOD_NS and block.period_ns <= block.stale_ns <= MAX_NS
+            for block in self._dump.blocks
+        )
+        if not even or max(self.utc_ns, *map(abs, self.whole)) > MAX_NS:
             raise RecordingError(f"{self._file} has times that make no sense: it cannot be played")
 
     def _damaged(self, file: Path, damage: Damage) -> None:

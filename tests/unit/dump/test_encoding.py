@@ -53,7 +53,15 @@ def test_a_gap() -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"count": 4}, {"first": 10, "count": 0}, {"what": "trees"}, {"first": 0, "count": 10}]
+    "change",
+    [
+        {"count": 4},
+        {"first": 10, "count": 0},
+        {"what": "trees"},
+        {"first": 0, "count": 10},
+        {"after_ns": -(1 << 63)},
+        {"before_ns": -1},
+    ],
 )
 def test_a_gap_that_contradicts_itself(change: dict[str, object]) -> None:
     fields = {"source": "c", "block": 1, "what": "frames", "first": 5, "last": 9, "count": 5, "reason": "overtaken"}
