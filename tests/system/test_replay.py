@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -15,24 +16,39 @@ import pytest
 
 import shmio
 from shmio.client import connect
+from shmio.config import Address
 from shmio.errors import RemoteError
 from shmio.testing.cell import PATIENCE_S, Cell, kill, until
+from shmio.testing.ports import reserved_port
 from shmio.wire import simlog_v1_pb2 as v1
 from shmio.wire import simlog_v2_pb2 as v2
 from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub as V1Stub
 from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as V2Stub
 from tests.system.armed import ARMED
+from tests.unit.endpoints.mqtt.harness import PREFIX, listening
 
 RECORDED = ARMED + '\n[recorder]\ndirectory = "dumps"\n'
+MQTT = """
+[mqtt]
+listen = "{broker}"
+prefix = "shmio/test"
+[[mqtt.topic]]
+match = "cell/Robot_800/Axs1_Pos"
+payload = "json"
+"""
+FRAMES = int(os.environ.get("SHMIO_REPLAY_FRAMES", "150"))
+"""How long a cell is recorded, and replayed: 50 a second."""
 POSITION = "cell/Robot_800/Axs1_Pos"
 PLACE = "cell/Outputs/100"
 
 
 class Streams:
-    """What clients of all interfaces get, each read by a thread, until the instance ends."""
+    """What clients of all interfaces get until the instance ends."""
 
-    def __init__(self, cell: Cell) -> None:
+    def __init__(self, cell: Cell, broker: Address) -> None:
         self._stack = ExitStack()
+        self._listener = self._stack.enter_context(listening(broker, f"{PREFIX}/{POSITION}/out", f"{PREFIX}/status"))
+        self.mqtt: list[tuple[Any, ...]] = []
         self.v1: list[bytes] = []
         self.v2: list[bytes] = []
         self.native: list[tuple[Any, ...]] = []
@@ -58,6 +74,10 @@ class Streams:
         for thread in self._threads:
             thread.join(PATIENCE_S)
             assert not thread.is_alive()
+        while (message := self._listener.message()).payload != b"offline":
+            if message.topic.endswith("/out"):
+                told = json.loads(message.payload)
+                self.mqtt.append((told["value"], told["quality"], told["reason"], told["source_time"]))
         self._stack.close()
 
 
@@ -101,14 +121,20 @@ def over(attached: shmio.Attachment) -> bool:
     return all(one.over for one in attached.replay.status())
 
 
-@pytest.mark.timeout(240)
+@pytest.fixture
+def broker() -> Iterator[Address]:
+    with reserved_port() as address:
+        yield address
+
+
+@pytest.mark.timeout(240 + FRAMES // 10)
 def test_the_recording_of_a_replay_is_the_recording_and_its_streams_are_the_cells(
-    make_cell: Callable[..., Cell],
+    make_cell: Callable[..., Cell], broker: Address
 ) -> None:
-    cell = make_cell(config=RECORDED)
+    cell = make_cell(config=RECORDED + MQTT.replace("{broker}", str(broker)))
     cell.up()
     until(lambda: good(cell), "good quality")
-    live = Streams(cell)
+    live = Streams(cell, broker)
     written(cell, 5)
     with shmio.attach(cell.instance, writable=True) as attached:
         with attached.inject("cell/Robot_800/Axs2_Pos") as shadow:
@@ -118,14 +144,17 @@ def test_the_recording_of_a_replay_is_the_recording_and_its_streams_are_the_cell
         with attached.inject(f"{PLACE}/in"):
             done = cell.run("shmio", "set", PLACE, "9")
             assert done.stdout == f"{PLACE}  taken\n"
-    until(lambda: len(live.native) > 150, "frames")
+    while len(live.native) < FRAMES:
+        reached = min(FRAMES, len(live.native) + 500)
+        until(lambda reached=reached: len(live.native) >= reached, "frames")
+        written(cell, len(live.native) % 100)
     cell.down()
     live.close()
     first = dump(cell)
     with replaying(cell, first, "--paused", "--record") as attached:
         assert cell.status()["mode"] == "replay"
-        assert sorted(cell.processes()) == ["cell", "grpc", "recorder"]
-        replayed = Streams(cell)
+        assert sorted(cell.processes()) == ["broker", "cell", "grpc", "mqtt", "recorder"]
+        replayed = Streams(cell, broker)
         until(lambda: bool(replayed.v1 and replayed.v2 and replayed.native), "what is there at the beginning")
         refused = cell.run("shmio", "set", PLACE, "1")
         assert "refused" in refused.stdout + refused.stderr
@@ -136,10 +165,10 @@ def test_the_recording_of_a_replay_is_the_recording_and_its_streams_are_the_cell
     found = cell.run("shmio-dump", "diff", "--ignore", "events", "--json", str(first), str(second))
     assert found.returncode == 0, found.stdout
     [told] = json.loads(found.stdout)["sources"]
-    assert told["frames"]["compared"] > 150
+    assert told["frames"]["compared"] >= FRAMES
     assert told["timing_ms"]["max"] == 0, "each at its time, to the ns"
     same_events(cell, first, second)
-    for name in ("v1", "v2", "native"):
+    for name in ("v1", "v2", "native", "mqtt"):
         assert_continues(name, getattr(live, name), getattr(replayed, name))
 
 
