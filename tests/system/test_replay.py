@@ -69,6 +69,10 @@ class Streams:
         for thread in self._threads:
             thread.start()
 
+    def await_frames(self, count: int) -> None:
+        """Until shmio.v1 has brought so many."""
+        until(lambda: len(self.native) >= count, f"{count} frames")
+
     def close(self) -> None:
         """When the instance has ended, so that the streams have."""
         for thread in self._threads:
@@ -145,8 +149,7 @@ def test_the_recording_of_a_replay_is_the_recording_and_its_streams_are_the_cell
             done = cell.run("shmio", "set", PLACE, "9")
             assert done.stdout == f"{PLACE}  taken\n"
     while len(live.native) < FRAMES:
-        reached = min(FRAMES, len(live.native) + 500)
-        until(lambda reached=reached: len(live.native) >= reached, "frames")
+        live.await_frames(min(FRAMES, len(live.native) + 500))
         written(cell, len(live.native) % 100)
     cell.down()
     live.close()
