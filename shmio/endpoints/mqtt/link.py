@@ -74,6 +74,9 @@ class Link:
         self._writing = False
         self._target: Target | None = None
         self._made: queue.SimpleQueue[tuple[Client, str]] = queue.SimpleQueue()
+        self._handing = threading.Lock()
+        self._over = False
+        """Whether nobody takes a connection any more."""
         self._protocol = MQTTv5
         self._failures = 0
         self._retry_s = 0.0
@@ -173,8 +176,12 @@ class Link:
             client.connect(target.host, target.port, settings.keep_alive_s, **options)
         except (OSError, ValueError) as error:  # ValueError: a name with an empty part
             problem = why(error, target)
-        self._made.put((client, problem))
-        self._wake()
+        with self._handing:
+            if not self._over:
+                self._made.put((client, problem))
+                self._wake()
+                return
+        _drop(client)
 
     def _take(self, client: Client, problem: str) -> None:
         """A connection was made, or was not."""
@@ -366,6 +373,11 @@ class Link:
                 self._client.disconnect(reason)
         self._close()
         self._retry_s = float("inf")
+        with self._handing:  # who still connects closes what he makes, and wakes nobody
+            self._over = True
+        with suppress(queue.Empty):
+            while True:
+                _drop(self._made.get_nowait()[0])
 
 
 def _drop(client: Client) -> None:
