@@ -23,6 +23,8 @@ from shmio.segment import DONE, EventKind
 REPLIES: Final = "shmio/results"
 """Where clients may have results sent, below the prefix: a response topic elsewhere could make us write, or lie."""
 MAX_CORRELATION_BYTES: Final = 1024
+MAX_TOPIC_BYTES: Final = 65535 - len("/result")
+"""Of a command: a topic is no longer than 65535 bytes (MQTT 5.0, section 1.5.4), and its result has one, too."""
 
 Answer = Callable[[Message, Properties | None], None]
 
@@ -53,6 +55,9 @@ class Commands:
         if not topic.startswith(f"{self._prefix}/") or not topic.endswith("/in"):
             return
         self.received += 1
+        if len(topic.encode()) > MAX_TOPIC_BYTES:
+            self.refused += 1
+            return
         if message.retain:  # it was there before we were: nobody knows how old it is
             self.refused += 1
             log.warning("%s: a retained command is not carried out; publish commands without the retain flag", topic)

@@ -78,6 +78,16 @@ def test_what_cannot_be_done_is_told_and_the_bridge_goes_on(
         assert listener.json("cell/step/in/result")["done"]
 
 
+def test_a_topic_that_leaves_no_room_for_a_result_is_passed_over(segment: Segment, broker: Mosquitto) -> None:
+    with running(segment, broker) as (plant, listener):
+        longest = 65535 - len(f"{PREFIX}/cell//in")
+        listener.publish(f"cell/{'x' * longest}/in", "1")
+        shorter = f"cell/{'x' * (longest - len('/result'))}/in"
+        listener.publish(shorter, "1")
+        assert "a path is at most" in listener.json(f"{shorter}/result")["reason"]
+        assert not plant.written
+
+
 def test_the_devices_refusal_is_told(segment: Segment, broker: Mosquitto) -> None:
     with running(segment, broker) as (plant, listener):
         plant.refusal = "access denied"
