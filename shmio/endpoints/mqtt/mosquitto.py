@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import getpass
 import logging
 import os
 import re
@@ -51,7 +50,7 @@ def configuration(settings: Mqtt, place: Path) -> str:
     address = Address.parse(str(settings.listen))
     lines = [
         "per_listener_settings true",
-        f"user {getpass.getuser()}",  # only heeded when started by root: it stays who it is, to die with its parent
+        "user root",  # only heeded when started by root: it stays who it is, to die with its parent
         "persistence false",
         "log_dest stderr",
         *(f"log_type {kind}" for kind in ("error", "warning", "notice")),

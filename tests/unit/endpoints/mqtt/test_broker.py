@@ -230,7 +230,8 @@ def test_a_mosquitto_that_is_insisted_on_and_not_there_is_told(
         pass
 
 
-def test_what_mosquitto_is_told(tmp_path: Path) -> None:
+def test_what_mosquitto_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LOGNAME", "nobody")  # as some ways to become root leave it
     tls = MqttTls(ca="/c/ca.pem", certificate="/c/c.pem", key="/c/k.pem")
     text = mosquitto.configuration(Mqtt(listen="[::1]:1883", password_file="/c/a", tls=tls), tmp_path)
     lines = text.splitlines()
@@ -245,3 +246,4 @@ def test_what_mosquitto_is_told(tmp_path: Path) -> None:
         "require_certificate true",
     ]
     assert "persistence false" in lines[:own]
+    assert "user root" in lines[:own]
