@@ -8,8 +8,10 @@ from typing import Final
 from shmio.endpoints.mqtt.outbox import OVERHEAD_BYTES
 from shmio.endpoints.mqtt.sparkplug.node import Sample
 
-SAMPLE_BYTES: Final = 120
-"""Of one in memory, about."""
+SAMPLE_BYTES: Final = 96
+"""Of one in memory, about, beside its value."""
+ELEMENT_BYTES: Final = 32
+"""Of a number in memory, with its place in a list."""
 
 
 class Backlog:
@@ -22,15 +24,16 @@ class Backlog:
         """Those that had no room any more."""
         self._most = most_bytes
         self._bytes = 0
-        self._kept: dict[str, deque[list[Sample]]] = {}
+        self._kept: dict[str, deque[tuple[int, list[Sample]]]] = {}
+        self._number = 0
 
     def keep(self, device: str, samples: list[Sample]) -> None:
-        """Keep what one frame brought; the oldest of the same device go when there is no room."""
-        kept = self._kept.setdefault(device, deque())
-        kept.append(samples)
+        """Keep what one frame brought; the oldest, of whatever device, go when there is no room."""
+        self._number += 1
+        self._kept.setdefault(device, deque()).append((self._number, samples))
         self._add(samples, 1)
-        while self._bytes > self._most and kept:
-            oldest = kept.popleft()
+        while self._bytes > self._most:
+            _, oldest = min((kept for kept in self._kept.values() if kept), key=lambda kept: kept[0][0]).popleft()
             self._add(oldest, -1)
             self.dropped += len(oldest)
 
@@ -39,7 +42,7 @@ class Backlog:
         kept = self._kept.get(device)
         if not kept:
             return []
-        samples = kept.popleft()
+        _, samples = kept.popleft()
         self._add(samples, -1)
         return samples
 
@@ -51,4 +54,9 @@ class Backlog:
 
     def _add(self, samples: list[Sample], sign: int) -> None:
         self.count += sign * len(samples)
-        self._bytes += sign * (OVERHEAD_BYTES + SAMPLE_BYTES * len(samples))
+        self._bytes += sign * (OVERHEAD_BYTES + sum(map(_size, samples)))
+
+
+def _size(sample: Sample) -> int:
+    register = sample.metric.register
+    return SAMPLE_BYTES + max(ELEMENT_BYTES * register.count, register.size)

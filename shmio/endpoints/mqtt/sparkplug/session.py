@@ -9,6 +9,7 @@ import logging
 import selectors
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Final
 
 import msgspec
 from paho.mqtt.client import MQTTMessage
@@ -25,6 +26,9 @@ from shmio.endpoints.mqtt.target import Dialling
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.glob import Glob
 from shmio.segment import DONE, EventKind, Segment
+
+TURN_SAMPLES: Final = 2000
+"""So many of those that were kept are sent before what else there is to do has its turn."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -56,6 +60,10 @@ class Session:
         self._waiting: dict[str, dict[int, None]] = {}
         self._backlog = Backlog(round(settings.backlog_mb * 1e6))
         self._keeping = False
+        self._room = 0
+        """How many that were kept may be sent in this turn."""
+        self._asked = False
+        """Whether a host wants the births again. However often it says so: once a turn, when the broker takes them."""
         self._defined = False
         """Whether the node is told of all devices that there are."""
         self._sent = self._received = self._refused = 0
@@ -108,11 +116,15 @@ class Session:
             self.link.came_up, self._keeping = False, True
             self.link.subscribe(self.node.commands)
             self._birth()
+        elif self._asked and self.link.ready:
+            self._birth()
+        self._room = TURN_SAMPLES
         for name, device in self._devices.items():
             for news in device.look():
                 self._tell(name, device, news.kind, news.at)
         self._flush()
-        return 0.0 if any(device.behind for device in self._devices.values()) else rest_s
+        more = self._room <= 0 or any(device.behind for device in self._devices.values())
+        return 0.0 if more else rest_s
 
     def close(self) -> None:
         """Say that the node dies, and go."""
@@ -123,6 +135,7 @@ class Session:
     # ---- what goes out -----------------------------------------------------------------------------------------------
 
     def _birth(self) -> None:
+        self._asked = False
         self._send(self.node.birth())
         for name, device in self._devices.items():
             if device.alive:
@@ -149,15 +162,16 @@ class Session:
             self._flush_device(name, device)
 
     def _flush_device(self, name: str, device: Device) -> None:
-        """What was kept first, then what has changed; before its birth nobody knows its metrics."""
+        """What has changed, then what was kept, as history; before its birth nobody knows its metrics."""
         link, waiting = self.link, self._waiting[name]
         if not self.node.lives(name):
             return
-        while link.ready and (samples := self._backlog.take(name)):
-            self._send(self.node.data(name, samples, historical=True))
         if waiting and link.ready:
             self._send(self.node.data(name, device.samples(list(waiting))))
             waiting.clear()
+        while self._room > 0 and link.ready and (samples := self._backlog.take(name)):
+            self._room -= len(samples)
+            self._send(self.node.data(name, samples, historical=True))
 
     def _send(self, message: Message) -> None:
         self._sent += 1
@@ -181,7 +195,7 @@ class Session:
             self._refuse(str(error))
             return
         if command.rebirth:
-            self._birth()
+            self._asked = True
             return
         device = self._devices[command.device]
         for path, value in command.values.items():

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import pytest
 
-from shmio.config import Address, Sparkplug
+from shmio.config import Address, Mqtt, MqttTopic, Sparkplug
 from shmio.connectors.injections import Owner
+from shmio.endpoints.mqtt.bridge import Bridge
 from shmio.segment import Quality, Segment
 from shmio.segment.processes import WRITERS
 from shmio.testing.mosquitto import Mosquitto
 from shmio.testing.proxy import FaultProxy
 from shmio.wire import sparkplug_b_pb2 as wire
 from tests.unit.endpoints.harness import image
-from tests.unit.endpoints.mqtt.harness import Listener, Running, bridge
+from tests.unit.endpoints.mqtt.harness import TIMEOUT_S, Listener, Running, bridge
 from tests.unit.endpoints.plant import Plant
 
 NODE = "spBv1.0/plant/{}/a50"
@@ -192,3 +194,62 @@ def test_what_changed_while_the_broker_was_away_comes_as_history(segment: Segmen
         assert all(one.metrics["step"].is_historical for one in told)
         times_ms = [one.metrics["step"].timestamp for one in told]
         assert times_ms == sorted(times_ms)
+
+
+def test_a_flood_of_requests_for_births_is_answered_by_few(segment: Segment, broker: Mosquitto) -> None:
+    """Each may be megabytes, and who asks need not read them."""
+    segment.writer("cell").publish(image(step=1), cycle=1)
+    with FaultProxy(broker.address, framing=None) as proxy, hosting(broker.address) as host:
+        with node(segment, proxy.address):
+            host.until("DBIRTH")
+            proxy.freeze()
+            for _ in range(100):
+                host.command("NCMD", wire.Metric(name="Node Control/Rebirth", boolean_value=True))
+            proxy.thaw()
+            host.until("DBIRTH")
+        births = 1
+        while (kind := host.next().kind) != "NDEATH":
+            births += kind == "NBIRTH"
+    assert births < 50
+
+
+def test_what_was_kept_is_sent_a_little_at_a_time(
+    segment: Segment, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a large backlog would hold up commands and the heartbeat."""
+    monkeypatch.setattr("shmio.endpoints.mqtt.sparkplug.session.TURN_SAMPLES", 2)
+    writer, slot = segment.writer("cell"), segment.processes.find("mqtt")
+    writer.publish(image(step=1), cycle=1)
+    nothing = [MqttTopic(match="**", publish=False)]
+    assert slot.take()
+    bridge = Bridge(segment, slot, Mqtt(broker="external", host=str(broker.address), topic=nothing, sparkplug=PLANT))
+
+    def turn(until: Callable[[], bool]) -> None:
+        deadline_s = time.monotonic() + TIMEOUT_S
+        while not until():
+            bridge.turn()
+            assert time.monotonic() < deadline_s
+
+    def kept() -> int:
+        return bridge.counters[4]
+
+    try:
+        turn(lambda: bridge.counters[6] == 2)
+        broker.kill()
+        turn(lambda: bool(bridge.problem))
+        for step in range(2, 42):
+            writer.publish(image(step=step), cycle=step)
+        turn(lambda: kept() >= 40)
+        broker.start()
+        before, most = kept(), 0
+
+        def less() -> bool:
+            nonlocal before, most
+            most, before = max(most, before - kept()), kept()
+            return not before
+
+        turn(less)
+        assert most <= 4  # a turn looks twice
+        assert bridge.counters[5] == 0
+    finally:
+        bridge.close()

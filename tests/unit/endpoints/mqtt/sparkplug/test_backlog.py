@@ -1,0 +1,37 @@
+"""What is kept of devices: within its bound, whatever their values are, and the oldest goes first."""
+
+from __future__ import annotations
+
+import sys
+
+from shmio.endpoints.mqtt.sparkplug.backlog import Backlog
+from shmio.endpoints.mqtt.sparkplug.metrics import Metric
+from shmio.endpoints.mqtt.sparkplug.node import Sample
+from shmio.layout.model import Register
+
+NUMBER = Metric(Register("number", "REAL", (), 0, None, 4, 1), 1)
+ROW = Metric(Register("row", "REAL", ((0, 999),), 0, None, 4000, 1000), 2)
+MOST_BYTES = 100_000
+
+
+def test_arrays_count_as_large_as_they_are() -> None:
+    backlog = Backlog(MOST_BYTES)
+    kept = []
+    for at_ms in range(100):
+        sample = Sample(ROW, [at_ms + element / 7 for element in range(1000)], at_ms)
+        kept.append(sys.getsizeof(sample.value) + sum(map(sys.getsizeof, sample.value)))
+        backlog.keep("cell", [sample])
+    assert 0 < sum(kept[: backlog.count]) <= MOST_BYTES
+    assert backlog.count + backlog.dropped == 100
+
+
+def test_the_oldest_goes_of_whatever_device_it_is() -> None:
+    backlog = Backlog(MOST_BYTES)
+    for at_ms in range(1000):
+        backlog.keep("first", [Sample(NUMBER, 0.5, at_ms)])
+    full = backlog.count
+    for at_ms in range(1000, 1000 + full // 2):
+        backlog.keep("second", [Sample(NUMBER, 0.5, at_ms)])
+    assert backlog.count == full
+    assert backlog.take("second")[0].at_ms == 1000
+    assert backlog.take("first")[0].at_ms == 1000 - full + full // 2
