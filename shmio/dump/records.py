@@ -83,8 +83,10 @@ class Records:
                 raise RecordingError(f"{file} is no regular file")
             if own and found.st_uid != os.geteuid():
                 raise RecordingError(f"{file} is another user's, of id {found.st_uid}")
+            if stat.S_ISDIR(found.st_mode):
+                raise RecordingError(f"{file} is a folder; name the recordings in it: {file}/*.mem")
             self.size = found.st_size
-            start = os.pread(self._fd, len(MAGIC), 0)
+            start = self._pread(len(MAGIC), 0)
         except (OSError, RecordingError):
             os.close(self._fd)
             raise
@@ -158,7 +160,11 @@ class Records:
 
     def _pread(self, size: int, at: int) -> bytes:
         self._worked(size)
-        return os.pread(self._fd, size, at)
+        try:
+            return os.pread(self._fd, size, at)
+        except OSError as error:
+            error.filename = str(self.file)  # the call knows no name
+            raise
 
     def _worked(self, size: int) -> None:
         self._worked_bytes += size

@@ -161,7 +161,10 @@ class Rewriter:
 
 @contextmanager
 def new_file(path: Path) -> Iterator[IO[bytes]]:
-    """A file of this user alone that was not there before; removed again unless all goes well. RecordingError."""
+    """A file of this user alone that was not there before; removed again unless all goes well.
+
+    RecordingError: it is there. OSError, with the file's name: as by a full disk.
+    """
     try:
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     except FileExistsError:
@@ -171,9 +174,11 @@ def new_file(path: Path) -> Iterator[IO[bytes]]:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
-    except BaseException:
+    except BaseException as error:
         with suppress(OSError):
             path.unlink()
+        if isinstance(error, OSError) and error.filename is None:
+            error.filename = str(path)
         raise
 
 
