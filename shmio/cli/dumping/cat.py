@@ -6,9 +6,10 @@ import argparse
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from pathlib import Path
 
 from shmio.cli.dumping.complaints import Complaints
-from shmio.cli.dumping.moments import MAX_NS, local, parse_time
+from shmio.cli.dumping.moments import MAX_NS, parse_time, span
 from shmio.cli.dumping.printers import Csv, JsonLines, Printer, Table, View
 from shmio.dump.channels import Channel
 from shmio.dump.encoding import EVENT, FRAME, GAP, PROCESS, STEP, ProcessChange, StepMark
@@ -40,7 +41,11 @@ def execute(arguments: argparse.Namespace) -> int:
         from_ns = parse_time("--from", arguments.begin, start_ns, 0)
         to_ns = parse_time("--to", arguments.end, start_ns, MAX_NS)
         channels = [track.channel for track in found.tracks.values()]
-        views = _views(reader, channels, arguments.patterns, complaints)
+        try:
+            views = _views(reader, channels, arguments.patterns, complaints)
+        except PathError:
+            _one_file(arguments.patterns)
+            raise
         sources = {view.source for view in views.values()} if arguments.patterns else {c.source for c in channels}
         printer: Printer = PRINTERS[arguments.form](list(views.values()))
         wanted = {c.number for c in channels if c.number in views or (c.encoding == EVENT and c.source in sources)}
@@ -71,7 +76,7 @@ def _nothing(found: Survey) -> str:
     if not tracks:
         return "nothing is recorded in it"
     first_ns, last_ns = min(track.first_ns for track in tracks), max(track.last_ns for track in tracks)
-    return f"nothing of what was asked for is in it then; it goes from {local(first_ns)} to {local(last_ns)}"
+    return f"nothing of what was asked for is in it then; it goes {span(first_ns, last_ns)}"
 
 
 def _views(
@@ -109,6 +114,13 @@ def _views(
         if not some:
             raise problem
     return {number: View(*blocks[number], list(registers.values())) for number, registers in chosen.items()}
+
+
+def _one_file(patterns: Sequence[str]) -> None:
+    """PathError for a pattern that is a file, as the shell's ``*.mem`` makes them, with what to do."""
+    for pattern in patterns:
+        if Path(pattern).is_file():
+            raise PathError(f"{pattern} is a file, and cat prints one: shmio-dump merge FILE… -o NEW makes one of them")
 
 
 def _lines(message: Message, views: dict[int, View], sources: set[str], printer: Printer) -> Iterator[str]:

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Iterator
 
 from shmio.cli.dumping.complaints import Complaints
-from shmio.cli.dumping.moments import MAX_NS, parse_time
+from shmio.cli.dumping.moments import MAX_NS, parse_time, span
 from shmio.cli.dumping.parts import Parts
 from shmio.cli.dumping.rewriting import rewrite, verified
 from shmio.cli.run import say
@@ -48,4 +48,4 @@ def _entries(
         elif (part := parts.of(entry)) is not None:
             yield part
     if not anything:
-        raise RecordingError(f"nothing of {dump.files[0]} is in that time")
+        raise RecordingError(f"nothing of {dump.files[0]} is in that time; it goes {span(dump.begin_ns, dump.end_ns)}")

@@ -10,7 +10,7 @@ from typing import IO, Protocol
 
 from shmio.cli.dumping.complaints import Complaints
 from shmio.cli.dumping.csvfile import CsvTable
-from shmio.cli.dumping.moments import MAX_NS, parse_time
+from shmio.cli.dumping.moments import MAX_NS, parse_time, span
 from shmio.cli.dumping.parquet import ParquetTable
 from shmio.cli.dumping.progress import Progress
 from shmio.cli.dumping.rewriting import new_file
@@ -71,7 +71,9 @@ def execute(arguments: argparse.Namespace) -> int:
                     progress.at(place * (dump.end_ns - dump.begin_ns) + past)
             files = tables.close()
         if not files:
-            raise RecordingError(f"no frames of {dump.files[0]} are in that time")
+            raise RecordingError(
+                f"no frames of {dump.files[0]} are in that time; it goes {span(dump.begin_ns, dump.end_ns)}"
+            )
     for path, rows in files:
         say(f"{path}: {rows} rows")
     return int(complaints.any)

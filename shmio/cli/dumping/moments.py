@@ -39,6 +39,11 @@ def local(time_ns: int) -> str:
     return _datetime(time_ns).astimezone().isoformat(" ", timespec="milliseconds")[:23]
 
 
+def span(first_ns: int, last_ns: int) -> str:
+    """From when to when, for people."""
+    return f"from {local(first_ns)} to {local(last_ns)}"
+
+
 def lost(damage: Damage) -> str:
     """Where something is lost, in time and in the file, and why."""
     begin = f"after {local(damage.after_ns)}" if damage.after_ns else "from the beginning"

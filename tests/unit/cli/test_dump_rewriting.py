@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import random
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -66,7 +69,7 @@ def test_cut_by_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert main(["cut", str(file), "-o", "part.mem"]) == 1
     assert capsys.readouterr().err == "part.mem is there already: nothing is ever overwritten\n"
     assert main(["cut", str(file), "-o", "none.mem", "--from", "100"]) == 1
-    assert "is in that time" in capsys.readouterr().err
+    assert re.fullmatch(r"nothing of \S+ is in that time; it goes from .* to .*\n", capsys.readouterr().err)
     assert not Path("none.mem").exists()
 
 
@@ -225,3 +228,22 @@ def test_a_flipped_bit_anywhere_is_told_and_costs_one_chunk_at_most(
         if len(kept) < len(before) - largest:
             assert place < 6000, f"byte {place}: {len(frames)} and {len(kept)}"  # an attachment: a block's layout
         new.unlink()
+
+
+@pytest.mark.parametrize(
+    ("verb", "output"),
+    [("cut", "new.mem"), ("merge", "new.mem"), ("recover", "new.mem"), ("export", "new.mcap"), ("export", "tables")],
+)
+def test_a_full_disk_is_told_with_the_file_and_leaves_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], verb: str, output: str
+) -> None:
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    file, new = varied(tmp_path / "a.mem"), tmp_path / output
+    monkeypatch.setattr(os, "fsync", full)
+    options = ["--format", "mcap" if new.suffix else "csv", "--source", "cell"] if verb == "export" else []
+    assert main([verb, str(file), "-o", str(new), *options]) == 1
+    path = new if new.suffix else new / "cell.csv"
+    assert capsys.readouterr().err == f"{path}: No space left on device\n"
+    assert not path.exists()
