@@ -26,6 +26,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if rest:  # argparse leaves patterns that come after an option
         arguments.patterns = [*arguments.patterns, *rest]
 
+    around = arguments.verb == "record" and (arguments.before_s, arguments.after_s) != (None, None)
+    if around and arguments.when is None:
+        parser.error("--before and --after are for --when: without a condition all is recorded, from now on")
+
     def command() -> int:
         verb = importlib.import_module(f"shmio.cli.dumping.{arguments.verb}")
         status: int = verb.execute(arguments)
@@ -57,7 +61,7 @@ def _parser() -> argparse.ArgumentParser:
     record.add_argument("--when", metavar="CONDITION", help="only what happens around the times when this is true")
     for option, what in (("--before", "before it is true"), ("--after", "after it was true last")):
         record.add_argument(
-            option, dest=f"{option[2:]}_s", type=_seconds, default=10.0, metavar="SECONDS",
+            option, dest=f"{option[2:]}_s", type=_amount, metavar="SECONDS",
             help=f"with --when: so much {what} (default 10)",
         )  # fmt: skip
 

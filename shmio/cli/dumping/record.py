@@ -36,7 +36,7 @@ def execute(arguments: argparse.Namespace) -> int:
     with Segment.open(instance_name(arguments)) as segment, told_to_stop() as stopping:
         sources = arguments.sources
         selection = Selection(sources, arguments.registers or ())
-        for missing in selection.nothing(segment.blocks):
+        for missing in selection.nothing({name: block.layout for name, block in segment.blocks.items()}):
             raise PathError(missing)
         tap = Tap(segment, Start(first=False), selection)
         work = _work(arguments, tap, _attachments(segment))
@@ -60,7 +60,8 @@ def _work(arguments: argparse.Namespace, tap: Tap, attachments: Attachments) -> 
     settings = Settings(directory=str(arguments.directory), rotate_min=0, rotate_mb=0)
     if arguments.when is None:
         return Series(tap, settings, BY, attachments)
-    trigger = Trigger(arguments.when, arguments.before_s, arguments.after_s)
+    seconds = {name: value for name in ("before_s", "after_s") if (value := getattr(arguments, name)) is not None}
+    trigger = Trigger(arguments.when, **seconds)
     return Triggered(tap, settings, trigger, BY, attachments)
 
 

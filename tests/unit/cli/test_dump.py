@@ -204,6 +204,20 @@ def test_a_path_that_names_nothing_is_refused(file: str, said: Output) -> None:
     assert said()[1] == ["count: there are 2 sources, and 'count' is none of them: write cell/… or press/…"]
 
 
+def test_cat_of_several_files_says_how(file: str, said: Output) -> None:
+    assert main(["cat", file, file]) == 1
+    assert said() == (
+        [],
+        [f"{file} is a file, and cat prints one: shmio-dump merge FILE… -o NEW makes one of them"],
+    )
+
+
+@pytest.mark.parametrize("verb", ["info", "cat", "verify", "recover"])
+def test_a_folder_is_no_recording(verb: str, tmp_path: Path, said: Output) -> None:
+    assert main([verb, str(tmp_path)]) == 1
+    assert said() == ([], [f"{tmp_path} is a folder; name the recordings in it: {tmp_path}/*.mem"])
+
+
 def test_a_recording_that_was_not_closed_is_read_and_that_is_told(file: str, said: Output) -> None:
     data = Path(file).read_bytes()
     Path("cut.mem").write_bytes(data[:-600])
@@ -421,6 +435,13 @@ def test_what_cannot_be_recorded_is_told(segment: Segment, arguments: list[str],
 def test_nothing_runs(said: Output) -> None:
     assert main(["record", "--instance", "test-none"]) == 1
     assert "no instance 'test-none' is running" in said()[1][0]
+
+
+@pytest.mark.parametrize("option", ["--before", "--after"])
+def test_seconds_around_a_condition_need_one(option: str, said: Output) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main(["record", option, "3"])
+    assert "--before and --after are for --when" in said()[1][-1]
 
 
 @pytest.mark.parametrize("seconds", ["0", "-1", "nan", "x", "inf"])
