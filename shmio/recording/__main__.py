@@ -36,7 +36,7 @@ def run(worker: Worker) -> None:
     elsewhere = _elsewhere(worker.before, directory)
     start = Start(known, reason=Reason.ELSEWHERE if elsewhere else Reason.NOT_RUNNING)
     selection = Selection(settings.sources or None, settings.registers)
-    for missing in selection.nothing(segment.blocks):
+    for missing in selection.nothing({name: block.layout for name, block in segment.blocks.items()}):
         worker.log.warning("recorder.registers: %s", missing)
     tap, attachments = Tap(segment, start, selection), ConfigFiles(Path(worker.config["config_file"]))
     series: Series | Triggered

@@ -55,17 +55,17 @@ class Selection:
         mask = np.frombuffer(covering(registers, block.layout.size), np.uint8)
         return Part(replace(block.layout, registers=registers), mask) if registers else None
 
-    def nothing(self, blocks: Mapping[str, Block]) -> list[str]:
-        """What of it names nothing at present: sources that are not there, patterns without registers."""
+    def nothing(self, layouts: Mapping[str, Layout]) -> list[str]:
+        """What of it names nothing: sources that are not there, patterns without registers. ``layouts``: by source."""
         missing = [
-            f"no source {source!r}; there are: {', '.join(blocks)}"
+            f"no source {source!r}; there are: {', '.join(layouts)}"
             for source in self._sources or ()
-            if source not in blocks
+            if source not in layouts
         ]
         missing += [
             f"{pattern}: no register has such a path"
             for pattern in self._registers
-            if not any(_paths(pattern, source, block.layout, blocks) for source, block in blocks.items())
+            if not any(_paths(pattern, source, layout, layouts) for source, layout in layouts.items())
         ]
         return missing
 

@@ -21,6 +21,7 @@ from shmio.layout.glob import Glob
 from shmio.layout.image import complaints
 from shmio.layout.model import Layout
 from shmio.layout.topic import find, near
+from shmio.recording.selection import Selection
 from shmio.supervisor.plan import Plan, make_plan
 
 EMULATOR_KINDS = ("s7",)
@@ -68,6 +69,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
             *notices,
             *_odd(config, layouts),
             *_odd_topics(config, layouts),
+            *_odd_recorder(config, layouts),
             *_not_served(config, layouts, emulated),
             *_unread(emulated),
         ]
@@ -178,6 +180,13 @@ def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
         paths = (f"{source}/{register.path}" for source, layout in layouts.items() for register in layout.registers)
         if not any(map(glob.matches, paths)):
             yield f"{key}: {pattern!r} names no register; the path of one begins with its source"
+
+
+def _odd_recorder(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
+    """Patterns of ``recorder.registers`` that name nothing."""
+    if config.recorder is not None:
+        for text in Selection(registers=config.recorder.registers).nothing(layouts):
+            yield f"recorder.registers: {text}"
 
 
 def _topics(config: Config) -> Iterator[tuple[str, str, bool]]:

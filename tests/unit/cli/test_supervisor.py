@@ -355,6 +355,20 @@ def test_a_writable_that_names_nothing_is_odd(
     assert ("usable, with 1 warning\n" in output) is odd
 
 
+@pytest.mark.parametrize(
+    ("pattern", "odd"),
+    [("cell/Robot_9/**", True), ("cel/Inputs", True), ("cell/Robot_*/Axs1_Pos", False), ("cell/Inputs/5", False)],
+)
+def test_recorded_registers_that_name_nothing_are_odd(
+    example: Edit, pattern: str, odd: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example('directory = "dumps"', f'directory = "dumps"\nregisters = ["{pattern}"]')
+    assert main(["check"]) == 0
+    output = capsys.readouterr().out
+    assert (f"warning: recorder.registers: {pattern}: no register has such a path" in output) is odd
+    assert ("usable, with 1 warning\n" in output) is odd
+
+
 @pytest.mark.parametrize("key", ["dbNumber = 7", 'block = "db7"'])
 def test_a_block_is_chosen_by_its_number_or_name(example: Edit, key: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path("two.db").write_text(Path("db201.db").read_text() + block("DB7", "Int"))
