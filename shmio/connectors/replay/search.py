@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 
 from shmio.connectors.replay.tape import Entry, Tape
 from shmio.errors import PathError
-from shmio.layout.topic import find
+from shmio.layout.topic import find, shorten
 from shmio.layout.write import bits_of
 from shmio.segment import Event, EventKind, Frame
 from shmio.segment.playhead import Find, Found
@@ -38,7 +38,7 @@ class Search:
 def _happened(name: str) -> Callable[[Entry], bool]:
     kinds = {str(kind): kind for kind in EventKind}
     if name not in kinds:
-        raise PathError(f"there is no kind of event {name!r}; there are: {', '.join(kinds)}")
+        raise PathError(f"event {shorten(name, 16)!r} is none of {', '.join(kinds)}")
     return lambda entry: isinstance(entry.item, Event) and entry.item.kind == kinds[name]
 
 
