@@ -50,6 +50,9 @@ class Outbox:
         """Whether changes are kept while there is no connection: it has failed, or there has been one."""
         self._settling = False
         """Whether the broker is being told all that was kept, and then how everything is."""
+        self._room = 0
+        """Bytes up to which changes are kept meanwhile: fewer the more was sent, for else a broker that takes less
+        than there is would be told of the past for ever."""
         self.sent = 0
         self.dropped = 0
 
@@ -78,13 +81,13 @@ class Outbox:
 
         Until all that was kept has been sent, what is new is kept behind it, if there is room.
         """
-        if self._link.up and not (self._settling and self._backlog_bytes < self._most):
+        if self._link.up and not (self._settling and self._backlog_bytes < self._room):
             self._waiting[channel] = None
         elif self._settling or self.keeping:
             message = channel.message(late=True)
             if message.keep:
                 self._keep(message)
-            elif self._link.up:
+            if self._link.up:  # what is kept is not retained; it may have been shown already
                 self._waiting[channel] = None
 
     def mark_all(self, channels: Iterable[Channel]) -> None:
@@ -96,7 +99,8 @@ class Outbox:
         """Have all of them sent as they are when their turn comes, after what was kept."""
         if self._link.up:
             self._waiting |= dict.fromkeys(channels)
-            self._settling = True
+            if not self._settling:
+                self._settling, self._room = True, self._most
 
     def answer(self, message: Message, properties: Properties | None) -> None:
         """Send what became of a command, before values."""
@@ -134,6 +138,7 @@ class Outbox:
             elif self._backlog:
                 message = self._backlog.popleft()
                 self._backlog_bytes -= _size(message)
+                self._room -= _size(message) // 2
                 link.send(message)
             else:
                 channel = next(iter(self._waiting))

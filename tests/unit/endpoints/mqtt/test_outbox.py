@@ -140,3 +140,39 @@ def test_results_come_first_and_are_bounded() -> None:
         outbox.flush()
     assert link.sent[0] == "r2"
     assert link.sent[-1] == "a0"
+
+
+def test_a_broker_that_takes_less_than_there_is_comes_back_to_the_present() -> None:
+    """Else what changes while the past is told would be put behind it for ever."""
+    link = Link()
+    link.up = False
+    outbox, topics = Outbox(link, 10_000), [Counter(name) for name in "abc"]
+    outbox.keeping = True
+    outbox.mark_all(topics)
+    link.up, link.room = True, 0
+    outbox.show(topics)
+    for number in range(1000):
+        for topic in topics:
+            topic.value = number
+            outbox.mark(topic)
+        link.room = 1
+        outbox.flush()
+    assert outbox.backlog == 0
+    assert not any(one.endswith("!") for one in link.sent[-3:])
+    assert outbox.dropped == 0
+
+
+def test_what_changes_after_it_was_shown_is_shown_again() -> None:
+    """What is kept is sent without the retain flag: the broker would go on telling the value before."""
+    link = Link()
+    outbox, a, b = Outbox(link, 10_000), Counter("a"), Counter("b")
+    link.room = 1
+    outbox.show([a, b])
+    outbox.flush()
+    a.value = 7
+    outbox.mark(a)
+    link.room = 10
+    outbox.flush()
+    assert link.sent[0] == "a0"
+    assert "a7" in link.sent
+    assert "b0" in link.sent
