@@ -52,6 +52,7 @@ class Bridge:
         self._status = f"{self.prefix}/status"
         self._feeds: dict[str, Feed] = {}
         self._relays: dict[int, Relay] = {}
+        self._gone: dict[str, Gone] = {}
         self.link = Link(
             Dialling(settings, client_id, partial(own_socket, segment)),
             self._selector,
@@ -142,6 +143,7 @@ class Bridge:
         self.link.send(Message(self._status, ONLINE, 1, True))
         for feed in self._feeds.values():
             feed.show()
+        self.outbox.show(self._gone.values())
 
     def _look(self, feed: Feed) -> None:
         self._more.discard(feed)
@@ -184,6 +186,8 @@ class Bridge:
             if (before := self._feeds.get(feed.block.source)) is not None:
                 self._leave(before, feed)
             self._feeds[feed.block.source] = feed
+            for channel in feed.all():
+                self._gone.pop(channel.topic, None)
             if device is not None and self._sparkplug is not None:
                 self._sparkplug.adopt(device)
             block = feed.block
@@ -197,7 +201,9 @@ class Bridge:
         self._more.discard(feed)
         stay = set() if successor is None else {channel.topic for channel in successor.all()}
         self.outbox.forget(feed.all())
-        self.outbox.mark_all(Gone(channel.topic) for channel in feed.all() if channel.topic not in stay)
+        gone = {channel.topic: Gone(channel.topic) for channel in feed.all() if channel.topic not in stay}
+        self._gone |= gone  # told again with each connection: the broker may be away
+        self.outbox.mark_all(gone.values())
         del self._feeds[feed.block.source]
         if self._sparkplug is not None:
             self._sparkplug.leave(feed.block.source)

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import threading
+
+import pytest
+
 from shmio.layout.model import Layout, Register
 from shmio.segment import Attributes, BlockSpec, Segment
 from shmio.testing.mosquitto import Mosquitto
+from shmio.testing.proxy import FaultProxy
 from tests.unit.endpoints.harness import STALE_NS, WRITABLE, image
 from tests.unit.endpoints.mqtt.harness import PREFIX, bridge, listening
 
@@ -52,6 +57,27 @@ def test_a_source_that_is_removed_is_forgotten(segment: Segment, broker: Mosquit
             later.publish("end", "")
             later.until("end")
             assert {topic for topic, payload in later.heard if payload} == {f"{PREFIX}/status"}
+
+
+def test_what_is_removed_while_the_broker_is_away_is_forgotten_when_it_is_back(
+    segment: Segment, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shmio.endpoints.mqtt.link.MOST_WAIT_S", 0.1)
+    segment.writer("cell").publish(image(step=3), cycle=1)
+    with (
+        Segment.open(segment.instance, writable=True) as opened,
+        FaultProxy(broker.address, framing=None) as proxy,
+        listening(broker.address) as listener,
+        bridge(opened, proxy.address) as running,
+    ):
+        listener.until("cell/secret/out", b"0")
+        proxy.refuse()
+        running.until(lambda: bool(running.bridge.problem))
+        segment.change(retire=["cell"], add=[])
+        running.until(lambda: all(thread.name != "bell-cell" for thread in threading.enumerate()))
+        proxy.admit()
+        for topic in ("cell/status", "cell/secret/out"):
+            listener.until(topic, b"")
 
 
 def test_commands_reach_a_source_that_has_come(segment: Segment, broker: Mosquitto) -> None:
