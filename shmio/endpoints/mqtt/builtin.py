@@ -49,6 +49,16 @@ class Accounts(BaseAuthPlugin):  # type: ignore[misc]  # the library's classes h
         return secret is not None and await asyncio.to_thread(matches, password, secret)
 
 
+class _Broker(Broker):  # type: ignore[misc]
+    """Sends a client what is retained for its own subscriptions alone; aMQTT sends who connects that of everybody's."""
+
+    async def _publish_retained_messages_for_subscription(
+        self, subscription: tuple[str, int], session: Session
+    ) -> None:
+        if any(whose.client_id == session.client_id for whose, _ in self._subscriptions.get(subscription[0], ())):
+            await super()._publish_retained_messages_for_subscription(subscription, session)
+
+
 class _Reader(StreamReaderAdapter):  # type: ignore[misc]
     """Takes no packet that is too large. ``begun``: what was read before."""
 
@@ -89,7 +99,7 @@ async def serve(worker: Worker, settings: Mqtt, place: Path) -> None:
     accounts = read_accounts(settings.password_file) if settings.password_file else None
     logging.getLogger("amqtt").setLevel(logging.ERROR)
     logging.getLogger("transitions").setLevel(logging.ERROR)
-    broker = Broker(
+    broker = _Broker(
         {
             "listeners": {_LISTENER: {"type": "external"}},
             "plugins": {f"{__name__}.{Accounts.__name__}": {}},

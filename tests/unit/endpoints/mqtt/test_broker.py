@@ -122,6 +122,19 @@ def test_clients_see_what_the_bridge_publishes(segment: Segment, address: Addres
     assert not folder(segment).exists()
 
 
+def test_a_client_hears_only_what_it_has_subscribed_to(segment: Segment, address: Address, program: str) -> None:
+    with (
+        serving(segment, address, program),
+        bridged(segment),
+        listening(address, protocol=MQTTv311) as everything,
+    ):
+        assert everything.until("cell/step/out") == b"7"
+        with listening(address, f"{PREFIX}/mine", protocol=MQTTv311) as listener:
+            listener.publish("mine", "last")
+            listener.until("mine")
+            assert listener.heard == [(f"{PREFIX}/mine", b"last")]
+
+
 def test_a_retained_command_is_not_carried_out_by_either_version(
     segment: Segment, address: Address, program: str
 ) -> None:
