@@ -21,7 +21,7 @@ ANSWER_S: Final = 5.0
 """So long an answer is waited for that needs no search."""
 SEARCH_S: Final = 600.0
 TURN_NS: Final = 500_000_000
-"""How often it is looked whether who is to answer still lives."""
+"""How often it is looked whether who asks still wants to know."""
 
 
 class Playing(msgspec.Struct, frozen=True):
@@ -105,11 +105,11 @@ class Replays:
         """The same with the next event of a kind, such as ``accepted`` or ``noted``, of any source."""
         return self.change(Wanted(event=kind, jump=jump))
 
-    def change(self, wanted: Wanted) -> list[Playing]:
-        """Do what is wanted; how all play then.
+    def change(self, wanted: Wanted, given_up: Callable[[], bool] = lambda: False) -> list[Playing]:
+        """Do what is wanted; how all play then. ``given_up`` is asked now and then while a recording is searched.
 
         ValueRangeError: a speed or a time; PathError: a source or a register; CommandError: there is no replay, or it
-        refuses, or does not answer.
+        refuses, or does not answer, or it was given up.
         """
         if not self._segment.shared.writable:
             raise CommandError("this attachment only reads: attach with writable=True")
@@ -118,7 +118,7 @@ class Replays:
         plays = self._chosen(wanted)
         with self._held(plays) as heads:
             if wanted.change or wanted.event:
-                self._go_to(wanted, heads)
+                self._go_to(wanted, heads, given_up)
             else:
                 self._move(heads, lambda play, clock_ns: _moved(play, wanted, clock_ns))
         return self.status()
@@ -176,7 +176,7 @@ class Replays:
 
     # ---- what ------------------------------------------------------------------------------------------------------
 
-    def _go_to(self, wanted: Wanted, heads: Mapping[str, Playhead]) -> None:
+    def _go_to(self, wanted: Wanted, heads: Mapping[str, Playhead], given_up: Callable[[], bool]) -> None:
         """Have them stand, look ahead, and go on to what was found."""
         self._move(heads, lambda _, clock_ns: Move(clock_ns, paused=True))
         searched = dict(heads)
@@ -184,10 +184,10 @@ class Replays:
         if wanted.change:
             source, path = self._register(wanted.change)
             searched = {source: heads[source]}
-        now_ns = self._segment.clock.present_ns()
+        now_ns = self._segment.clock.read().time_ns
         after_ns = {source: play.at_ns(now_ns) for source, play in self._plays().items()}
         answers = self._ask(
-            searched, {source: Find(after_ns[source], path, wanted.event) for source in searched}, SEARCH_S
+            searched, {source: Find(after_ns[source], path, wanted.event) for source in searched}, SEARCH_S, given_up
         )
         positions_ns = [found.position_ns for found in answers.values() if found.position_ns is not None]
         if not positions_ns:
@@ -200,7 +200,7 @@ class Replays:
 
     def _move(self, heads: Mapping[str, Playhead], move: Callable[[Play, int], Move]) -> None:
         """Move all from one moment on."""
-        clock_ns = self._segment.clock.present_ns()
+        clock_ns = self._segment.clock.read().time_ns  # behind a step that is under way: until then nobody answers
         asks: dict[str, Ask] = {}
         for source, head in heads.items():
             play = head.read()
@@ -210,16 +210,25 @@ class Replays:
             if found.error:
                 raise CommandError(f"{source}: {found.error}")
 
-    def _ask(self, heads: Mapping[str, Playhead], asks: Mapping[str, Ask], patience_s: float) -> dict[str, Found]:
+    def _ask(
+        self,
+        heads: Mapping[str, Playhead],
+        asks: Mapping[str, Ask],
+        patience_s: float,
+        given_up: Callable[[], bool] = lambda: False,
+    ) -> dict[str, Found]:
         """Ask all at once; their answers."""
         numbers = {source: heads[source].ask(ask) for source, ask in asks.items()}
         for slot in self._segment.processes:
             if slot.name in asks:
                 self._segment.clock.slot_bell(slot.index).ring()
         until_ns = time.monotonic_ns() + round(patience_s * 1e9)
-        return {source: self._answer(source, heads[source], number, until_ns) for source, number in numbers.items()}
+        return {
+            source: self._answer(source, heads[source], number, until_ns, given_up)
+            for source, number in numbers.items()
+        }
 
-    def _answer(self, source: str, head: Playhead, number: int, until_ns: int) -> Found:
+    def _answer(self, source: str, head: Playhead, number: int, until_ns: int, given_up: Callable[[], bool]) -> Found:
         ring = self._segment.blocks[source].ring
         while True:
             seen = ring.doorbell()
@@ -229,6 +238,8 @@ class Replays:
             rest_ns = until_ns - time.monotonic_ns()
             if rest_ns <= 0:
                 raise CommandError(f"source {source} does not answer: {self._state(source)}")
+            if given_up():
+                raise CommandError(f"source {source} has not answered: it was given up")
             ring.wait(seen, min(rest_ns, TURN_NS))
 
     def _state(self, source: str) -> str:

@@ -7,21 +7,24 @@ from typing import NamedTuple
 
 from shmio.connectors.replay.source import Replay
 from shmio.errors import SegmentError
-from shmio.segment import Block, Frame, Stamp
+from shmio.segment import NO_WRITER, Block, Stamp
 from shmio.segment.playhead import Play, Playhead
 
 
 class Beginning(NamedTuple):
-    """How a source plays from now on; ``last``: what the process before has published of the same recording last."""
+    """How a source plays from now on; ``done_ns``: the position up to which the process before has published it.
+
+    None: there was none that played the same recording.
+    """
 
     play: Play
-    last: Frame | None
+    done_ns: int | None
 
     @property
     def at(self) -> Stamp:
         """When the process's start is told: with what comes next, however long it took."""
-        play, last = self
-        position_ns = play.begin_ns if last is None else last.publish_ns - play.base_ns
+        play, done_ns = self
+        position_ns = play.begin_ns if done_ns is None else done_ns
         return stamp(play, position_ns, position_ns)
 
 
@@ -35,11 +38,21 @@ def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]
         raise SegmentError(f"the block of source {block.source} has no playhead")
     own = block.playhead.read()
     if own is not None and _is_of(source, own):  # without the lock: who holds it may wait for this process
-        return Beginning(own, block.latest())
+        return Beginning(own, _done_ns(block, own))
     with heads[0].held():  # sources that begin at the same time begin together
         play = _as_others(source, heads) or _as_configured(source, block, started_ns)
         block.playhead.write(play)
         return Beginning(play, None)
+
+
+def _done_ns(block: Block, play: Play) -> int | None:
+    """The position of the last frame, or of what was told behind it."""
+    last = block.latest()
+    if last is None:
+        return None
+    told = block.events.read(block.events.head())
+    behind = told is not None and told.frame == last.number and told.writer == NO_WRITER
+    return max(last.publish_ns, told.publish_ns if told is not None and behind else 0) - play.base_ns
 
 
 def _is_of(source: Replay, play: Play) -> bool:

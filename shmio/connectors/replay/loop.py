@@ -62,7 +62,7 @@ class ReplayLoop:
         )
         self._player = Player(source.tape, self._output, keep=source.keep)
         self._search: tuple[int, Search] | None = None
-        self._play, self._last = beginning
+        self._play, self._done_ns = beginning
         self.counters = Counters()
 
     @property
@@ -85,9 +85,9 @@ class ReplayLoop:
 
     def _begin(self) -> None:
         """Go on from what the process before this one has published, if there was one."""
-        play, last, clock_ns = self._play, self._last, self._page.read().time_ns
-        if last is not None:
-            self._player.resume(min(last.publish_ns - play.base_ns, play.at_ns(clock_ns)))
+        play, clock_ns = self._play, self._page.read().time_ns
+        if self._done_ns is not None:
+            self._player.resume(min(self._done_ns, play.at_ns(clock_ns)))
         else:  # who joins others that play is where they are
             joined = clock_ns - play.anchor_ns > LATE_NS
             self._player.begin(play.at_ns(clock_ns if joined else play.anchor_ns), self._stamp)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from typing import Any, Final
 
 import grpc
@@ -31,21 +32,28 @@ class Moves:
         return {"Replay": grpc.unary_unary_rpc_method_handler(self.replay, request, response)}
 
     async def replay(self, request: wire.ReplayRequest, context: Context) -> wire.ReplayResponse:
-        """Move the replays; one call after the other.
+        """Move the replays; one call after the other. A search ends with its call.
 
         INVALID_ARGUMENT: a speed or a time; NOT_FOUND: a source or a register; FAILED_PRECONDITION: nothing is played,
         what is looked for is not there, or a source does not answer.
         """
         try:
             wanted = _wanted(request)
-            async with self._turn:
-                if wanted == Wanted(sources=wanted.sources):
-                    found = await asyncio.to_thread(self._replays.status)
-                else:
-                    found = await asyncio.to_thread(self._replays.change, wanted)
+            if wanted == Wanted(sources=wanted.sources):
+                found = await asyncio.to_thread(self._replays.status)
+            else:
+                found = await self._change(wanted)
         except ShmioError as error:
             await refuse(context, error)
         return wire.ReplayResponse(sources=map(_playing, found))
+
+    async def _change(self, wanted: Wanted) -> list[Playing]:
+        over = threading.Event()
+        async with self._turn:
+            try:
+                return await asyncio.to_thread(self._replays.change, wanted, over.is_set)
+            finally:
+                over.set()  # its thread goes on when the call is cancelled
 
 
 def _wanted(request: wire.ReplayRequest) -> Wanted:

@@ -2,23 +2,30 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, cast
 
 import pytest
 
-from shmio.connectors.replay.player import NOTHING
+from shmio.connectors.replay.player import NOTHING, Player
+from shmio.connectors.replay.search import Search
 from shmio.connectors.replay.source import Replay
+from shmio.connectors.replay.tape import Entry, Tape
 from shmio.dump.encoding import Gap, Reason
 from shmio.errors import CommandError, ConfigError
 from shmio.segment import EventKind, Quality, Record, Segment
 from shmio.segment.attach import attach
 from shmio.segment.coordinator import Coordinator
+from shmio.segment.playhead import Move
+from shmio.segment.replays import Wanted
 from tests.unit.connectors.replay.harness import (
     BEGIN_NS,
     LAYOUT,
     MS,
+    PATIENCE_S,
     PERIOD_NS,
     Playing,
     S,
@@ -31,6 +38,8 @@ from tests.unit.connectors.replay.harness import (
 from tests.unit.dump.build import START_NS, Build
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from shmio.segment import Block
 
 
@@ -115,3 +124,96 @@ def test_a_gap_at_a_time_that_makes_no_sense_harms_nothing(tmp_path: Path, insta
         coordinator.step(S)
         assert counts(playing.frames())[:2] == [1, 3]
         coordinator.close()
+
+
+def test_a_successor_tells_no_event_again(tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with recorded(tmp_path, instance) as [cell]:
+        for number in range(10):
+            cell.frame(BEGIN_NS + number * PERIOD_NS, image(number))
+            cell.event(BEGIN_NS + number * PERIOD_NS + MS, Record(EventKind.NOTED, str(number)))
+    [file] = tmp_path.glob("*.mem")
+    monkeypatch.setattr(Player, "end", lambda *_: None)  # one that is killed publishes no last frame
+    with built(instance) as segment, attach(instance, writable=True) as attachment:
+        events = segment.blocks["cell"].events.cursor()
+        with Playing(segment, file):
+            attachment.replay.to_event("noted")
+            attachment.step(1.0)
+        with Playing(segment, file):
+            attachment.replay.play()
+            attachment.step(0.05)
+        told = [event for event in iter(events.poll, None) if event.kind == EventKind.NOTED]
+    assert [event.text for event in told] == ["0", "1", "2"]
+
+
+def test_what_a_process_that_was_held_up_leaves_out_is_not_read(
+    tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else it would be later still when it has come to the end of that."""
+    with recorded(tmp_path, instance) as [cell]:
+        for number in range(2000):
+            cell.frame(BEGIN_NS + number * PERIOD_NS, image(number))
+            if number % 100 == 0:
+                cell.take()
+    [file] = tmp_path.glob("*.mem")
+    read = []
+    entries = Tape.entries
+
+    def counted(tape: Tape, from_ns: int | None) -> Iterator[Entry]:
+        for entry in entries(tape, from_ns):
+            read.append(entry)
+            yield entry
+
+    monkeypatch.setattr(Tape, "entries", counted)
+    with built(instance, stepped=False) as segment, Playing(segment, file, paused=True) as playing:
+        playing.next()
+        head = playing.block.playhead
+        assert head is not None
+        now_ns = segment.clock.present_ns()
+        with head.held():
+            head.ask(Move(now_ns - 30 * S, paused=False, speed=1.0))
+        segment.clock.slot_bell(0).ring()
+        assert counts([playing.next()])[0] >= 1500
+        assert len(read) < 200
+    assert playing.loop.counters.overruns >= 1400
+
+
+def test_what_is_asked_for_within_a_step_is_done_behind_it(tmp_path: Path, instance: str) -> None:
+    file = record(tmp_path, instance)
+    with (
+        built(instance) as segment,
+        Playing(segment, file) as playing,
+        attach(instance, writable=True) as attachment,
+    ):
+        head = segment.blocks["cell"].playhead
+        assert head is not None
+        coordinator = Coordinator(segment)
+        stepping = coordinator.stepping(100 * MS)
+        next(stepping)
+        playing.until(lambda: (play := head.read()) is not None and play.step == 1)
+        asking = threading.Thread(target=attachment.replay.pause)
+        asking.start()
+        until_s = time.monotonic() + PATIENCE_S
+        while head.asks(0) is None and time.monotonic() < until_s:
+            pass
+        for _ in stepping:
+            pass
+        asking.join()
+        coordinator.close()
+        [status] = attachment.replay.status()
+        assert (status.paused, status.position_s) == (True, 0.1)
+
+
+def test_a_search_can_be_given_up(tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = record(tmp_path, instance)
+    monkeypatch.setattr(Search, "go_on", lambda _: None)  # one that takes for ever
+    with built(instance, stepped=False) as segment, Playing(segment, file), attach(instance, writable=True) as attached:
+        asked = []
+
+        def given_up() -> bool:
+            asked.append(True)
+            return len(asked) > 1
+
+        with pytest.raises(CommandError, match="source cell has not answered: it was given up"):
+            attached.replay.change(Wanted(event="noted"), given_up)
+        [status] = attached.replay.seek(0.1)
+        assert status.position_s == 0.1, "another request takes its place"

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
 
 from shmio.client import connect, connect_aio
+from shmio.connectors.replay.search import Search
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
-from tests.unit.connectors.replay.harness import PERIOD_NS, Playing, built, record
+from tests.unit.connectors.replay.harness import PATIENCE_S, PERIOD_NS, Playing, built, record
 from tests.unit.endpoints.harness import Endpoint, serve
 
 Test = Callable[[Endpoint, Playing], Awaitable[None]]
@@ -60,6 +62,25 @@ def test_what_cannot_be_is_refused(tmp_path: Path, instance: str, wish: object, 
                 cell.replay(**wish)  # type: ignore[arg-type]
 
         await asyncio.to_thread(call)
+
+    replay(tmp_path, instance, test)
+
+
+def test_a_search_holds_up_nobody_and_ends_with_its_call(
+    tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun = threading.Event()
+    monkeypatch.setattr(Search, "go_on", lambda _: begun.set())  # one that takes for ever
+
+    async def test(served: Endpoint, _: Playing) -> None:
+        async with connect_aio(f"127.0.0.1:{served.port}") as cell:
+            search = asyncio.create_task(cell.replay(event="noted"))
+            assert await asyncio.to_thread(begun.wait, PATIENCE_S)
+            [status] = await cell.replay()
+            assert status.paused
+            search.cancel()
+            [status] = await cell.replay(seek=0.1)
+            assert status.position_s == 0.1
 
     replay(tmp_path, instance, test)
 
