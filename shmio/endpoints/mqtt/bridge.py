@@ -6,7 +6,7 @@ import logging
 import os
 import selectors
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Final
@@ -70,7 +70,7 @@ class Bridge:
         if settings.sparkplug is not None:
             self._sparkplug = Session(settings, settings.sparkplug, segment, self._selector, self.wake)
         self._reading: Future[list[tuple[Feed, Device | None]]] | None = None
-        self._adopt(self._read())
+        self._adopt(self._read(()))
         self.steps = Steps(segment.clock, slot.index, f"{self.prefix}/simlog/step", self.link, self.outbox)
         self._bell = Relay(segment.clock.slot_bell(slot.index), "bell-steps", TURN_NS)
         self._selector.register(self._bell.descriptor, selectors.EVENT_READ, lambda _: self._bell.heard())
@@ -167,13 +167,17 @@ class Bridge:
         for feed in [feed for feed in self._feeds.values() if feed.over]:
             self._leave(feed)
         if self._reading is None and self._segment.generation != self._generation:
-            self._reading = self._reader.submit(self._read)
+            self._reading = self._reader.submit(self._read, self._known)
             self._reading.add_done_callback(lambda _: self.wake())
 
-    def _read(self) -> list[tuple[Feed, Device | None]]:
+    @property
+    def _known(self) -> set[int]:
+        """Sections of the blocks that are followed."""
+        return {feed.block.section for feed in self._feeds.values()}
+
+    def _read(self, known: Container[int]) -> list[tuple[Feed, Device | None]]:
         self._generation = self._segment.generation  # before looking: what changes meanwhile is read the next time
         self._segment.refresh()
-        known = {feed.block.section for feed in self._feeds.values()}
         feeds = [
             Feed(block, self._rules, self.prefix, self.outbox, self._writer)
             for block in self._segment.blocks.values()

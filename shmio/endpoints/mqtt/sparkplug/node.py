@@ -23,6 +23,7 @@ from shmio.wire import sparkplug_b_pb2 as wire
 NAMESPACE: Final = "spBv1.0"
 REBIRTH: Final = "Node Control/Rebirth"
 MAX_METRICS: Final = 4096
+MAX_BYTES: Final = 1 << 20
 """Of one command."""
 _SEQUENCE: Final = 256
 
@@ -132,6 +133,8 @@ class EdgeNode:
         ValueRangeError: it is no payload of Sparkplug B, or has values that are none of their metrics; PathError:
         there is no such device or metric.
         """
+        if len(data) > MAX_BYTES:  # before it is taken apart: each metric is an object
+            raise ValueRangeError(f"{topic}: the payload is longer than {MAX_BYTES} bytes")
         try:
             payload = wire.Payload.FromString(data)
         except DecodeError:

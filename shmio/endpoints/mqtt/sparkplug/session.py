@@ -55,6 +55,7 @@ class Session:
         dialling = Dialling(clean, client_id, partial(own_socket, segment))
         self.link = Link(dialling, selector, wake, self.node.will)
         self.link.on_message = self._command
+        self.link.on_lost = self._lose
         self._globs = [Glob(pattern) for pattern in sparkplug.patterns]
         self._devices: dict[str, Device] = {}
         self._waiting: dict[str, dict[int, None]] = {}
@@ -156,6 +157,14 @@ class Session:
             self._send(self.node.device_birth(name, device.samples()))
         elif self.node.lives(name):
             self._send(self.node.device_death(name))
+
+    def _lose(self, _unacknowledged: Sequence[Message]) -> None:
+        """The connection is gone: keep what waited for it."""
+        for name, device in self._devices.items():
+            waiting = self._waiting[name]
+            if waiting and device.alive:
+                self._backlog.keep(name, device.samples(list(waiting)))
+            waiting.clear()
 
     def _flush(self) -> None:
         for name, device in self._devices.items():

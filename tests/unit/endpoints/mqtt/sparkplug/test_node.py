@@ -215,6 +215,8 @@ def test_a_command_has_something_once_and_not_too_much_of_it() -> None:
     for metrics, message in (([], "no metric in it"), ([one, one], "given twice"), ([one] * (MAX_METRICS + 1), "most")):
         with pytest.raises(ValueRangeError, match=message):
             edge.command(topic, wire.Payload(metrics=metrics).SerializeToString())
+    with pytest.raises(ValueRangeError, match="longer than 1048576 bytes"):
+        edge.command(topic, bytes((1 << 20) + 1))
     with pytest.raises(PathError, match="nothing else"):
         edge.command("spBv1.0/plant/NCMD/a50", wire.Payload(metrics=[one]).SerializeToString())
 
