@@ -12,6 +12,7 @@ from shmio.connectors.replay.tape import Tape
 from shmio.dump.damage import Damage
 from shmio.dump.dump import open_dump
 from shmio.errors import RecordingError
+from shmio.segment.header import MAX_PROCESSES
 
 Moment = float | str
 """Seconds from a recording's begin, or a date and time."""
@@ -59,6 +60,11 @@ class Recording:
         self.utc_ns = int(started)
         """UTC of position 0: when the instance started that was recorded."""
         names = self._dump.sources
+        if len(names) > MAX_PROCESSES:
+            raise RecordingError(
+                f"{self._file} has {len(names)} sources, an instance at most {MAX_PROCESSES}: shmio-dump cut --source "
+                "takes some of them into a file of their own"
+            )
         firsts = {name: next(self._dump.frames(name), None) for name in names}
         self.sources = [name for name in names if firsts[name] is not None]
         """Names of those that have frames."""

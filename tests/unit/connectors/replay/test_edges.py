@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, cast
 import pytest
 
 from shmio.connectors.replay.player import NOTHING, Player
+from shmio.connectors.replay.recording import Recording
 from shmio.connectors.replay.search import Search
 from shmio.connectors.replay.source import Replay
 from shmio.connectors.replay.tape import Entry, Tape
 from shmio.dump.encoding import Gap, Reason
-from shmio.errors import CommandError, ConfigError
+from shmio.errors import CommandError, ConfigError, RecordingError
 from shmio.segment import EventKind, Quality, Record, Segment
 from shmio.segment.attach import attach
 from shmio.segment.coordinator import Coordinator
@@ -217,3 +218,15 @@ def test_a_search_can_be_given_up(tmp_path: Path, instance: str, monkeypatch: py
             attached.replay.change(Wanted(event="noted"), given_up)
         [status] = attached.replay.seek(0.1)
         assert status.position_s == 0.1, "another request takes its place"
+
+
+def test_a_recording_of_more_sources_than_an_instance_may_have_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "many.mem"
+    work = Build(file)
+    for number in range(257):
+        work.block(f"s{number}", LAYOUT, number + 1)
+        work.frame(1, image(1), f"s{number}")
+    work.writer.finish()
+    assert work.output.close(30)
+    with pytest.raises(RecordingError, match=r"has 257 sources, an instance at most 256: shmio-dump cut"):
+        Recording([file])
