@@ -171,9 +171,14 @@ def test_a_block_without_a_number_is_played_and_read(cell: Cell) -> None:
     cell.run("down", status=0)
 
 
+def moved(text: str) -> str:
+    """The configuration with emulator and broker on other ports."""
+    return re.sub(r'listen = "127\.0\.0\.1:\d+"', lambda _: f'listen = "127.0.0.1:{free_port()}"', text)
+
+
 def test_a_device_that_is_not_there_is_told_but_does_not_hold_up_the_start(cell: Cell) -> None:
     file = cell.folder / "supervisor.toml"
-    file.write_text(file.read_text().replace('listen = "127.0.0.1:', f'listen = "127.0.0.1:{free_port()}" #'))
+    file.write_text(moved(file.read_text()))
     assert "warning: source cell is bad: " in cell.run("up", "--detach", status=0).stderr
     assert cell.status()["state"] == "degraded"
     cell.run("down", status=0)
@@ -252,8 +257,7 @@ def test_what_another_instance_has_is_said_to_be_its(cell: Cell) -> None:
     serve_on(cell, f"127.0.0.1:{free_port()}")
     cell.run("up", "--detach", status=0)
     text = (cell.folder / "supervisor.toml").read_text().replace(f'"{cell.instance}"', f'"{cell.instance}-2"')
-    elsewhere = text.replace('listen = "127.0.0.1:', 'listen = "127.0.0.1:0" #')
-    (cell.folder / "second.toml").write_text(elsewhere.replace("listen = [", 'listen = ["127.0.0.1:0"] #'))
+    (cell.folder / "second.toml").write_text(moved(text).replace("listen = [", 'listen = ["127.0.0.1:0"] #'))
     refused = cell.run("up", "-c", "second.toml", status=1).stderr
     assert refused.startswith(f"instance.log_dir: instance {cell.instance!r} writes its logs to ")
     text = text.replace(f'"{cell.instance}-2"', f'"{cell.instance}-2"\nlog_dir = "logs-2"')
@@ -266,7 +270,7 @@ def test_what_another_instance_has_is_said_to_be_its(cell: Cell) -> None:
             f"{cell.of(name).pid}, listens there; choose another port, or stop that instance: shmio-supervisor down "
             f"--instance {cell.instance}\n"
         )
-        text = text.replace('listen = "127.0.0.1:', f'listen = "127.0.0.1:{free_port()}" #')
+        text = moved(text)
     cell.run("down", status=0)
 
 

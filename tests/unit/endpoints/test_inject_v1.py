@@ -233,7 +233,11 @@ def test_what_cannot_be_is_refused_by_name(
         found, text = await refusal(inject(served, target, shadow).read())
         assert (found, reason in text) == (status, True), text
         assert standing(served) == []
-        assert served.service.counters[0] == 0
+
+        async def closed() -> bool:
+            return served.service.counters[0] == 0
+
+        await served.until(closed)
 
     with_plant(segment, test)
 
