@@ -48,6 +48,8 @@ class Listener:
     def close(self) -> None:
         self.client.disconnect()
         self.client.loop_stop()
+        # Only the end of the client closes the pair of sockets of its thread: in a cycle, that has no order.
+        self.client.on_connect = self.client.on_message = None
 
     def message(self) -> MQTTMessage:
         """The next one."""
