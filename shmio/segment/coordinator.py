@@ -164,13 +164,6 @@ class Coordinator:
             raise TimeError(f"step {step.number}: {problem}")
         return step
 
-    def delivered(self, slot: ProcessSlot, step: int) -> None:
-        """Tell that the process in this slot, which is the caller's, has delivered a step and its marker.
-
-        From the first call on each step waits for it, whoever coordinates, as long as it lives.
-        """
-        self._segment.clock.deliver(slot.index, step)
-
     def close(self) -> None:
         """Give time up to whoever takes it over next; until then it stands."""
         with self._turn:

@@ -90,7 +90,7 @@ async def _serve(worker: Worker) -> None:
             reading = None
         if not (feeds.alive and services.stepper.alive and server.alive):
             raise RuntimeError("something ended that should not have; the endpoint starts anew")
-        services.stepper.look()
+        services.stepper.timeline.look()
         streams, dropped, published, refused = services.counters
         worker.report((streams, feeds.messages + services.updates, dropped, published, refused))
         try:

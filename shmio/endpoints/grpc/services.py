@@ -49,7 +49,7 @@ class Services:
         self._services = (
             self._native,
             SimlogV1(topics, self._publisher, self._outboxes, self._shadows, self.stepper),
-            SimlogV2(topics, self._publisher, self._outboxes, self._shadows, self.stepper.marks),
+            SimlogV2(topics, self._publisher, self._outboxes, self._shadows, self.stepper.timeline.marks),
             SimServer(self.stepper, self._outboxes),
         )
 

@@ -148,7 +148,7 @@ class SimlogV1:
     async def _follow(self, mark: Mark, context: Context) -> AsyncIterator[bytes]:
         """Stream a topic of time."""
         with self._outboxes.opened() as outbox, ExitStack() as listening:
-            listening.callback(self._stepper.marks.listen(mark, _marked, StateLane(outbox)))
+            listening.callback(self._stepper.timeline.marks.listen(mark, _marked, StateLane(outbox)))
             outbox.on_failure = listening.close
             await context.send_initial_metadata(())
             while (message := await outbox.pop()) is not None:

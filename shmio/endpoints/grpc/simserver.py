@@ -36,7 +36,7 @@ class SimServer:
         self._stepper = stepper
         self._outboxes = outboxes
         self._lanes: dict[StateLane, None] = {}  # of those who follow the status
-        stepper.watch(self._tell)
+        stepper.timeline.watch(self._tell)
 
     def handlers(self) -> grpc.GenericRpcHandler:
         """The service's calls, for a server."""
@@ -60,7 +60,7 @@ class SimServer:
             step = await self._stepper.step(_ns(request.deltaTime), context.peer())
         except ShmioError as error:
             await context.abort(_STATUS.get(type(error), grpc.StatusCode.INTERNAL), str(error))
-        return _wire(self._stepper.status._replace(clock_ns=step.time_ns, dt_ns=step.dt_ns))
+        return _wire(self._stepper.timeline.status._replace(clock_ns=step.time_ns, dt_ns=step.dt_ns))
 
     async def start(self, request: wire.StartRequest, context: Context) -> wire.SimStatus:
         """Step in real time from now on; errors as of :meth:`step`."""

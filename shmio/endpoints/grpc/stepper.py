@@ -1,27 +1,25 @@
-"""The instance's time for all services: stepping and playing, and heeding those who do it elsewhere."""
+"""The instance's time moved for clients of all services: stepping and playing."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 from typing import Any, Final, TypeVar
 
 from shmio.endpoints.grpc.audience import Audience
-from shmio.endpoints.grpc.bells import Bell, Bells
-from shmio.endpoints.grpc.delivery import Delivery, before
+from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.driver import Driver
 from shmio.endpoints.grpc.feed import Feed
-from shmio.endpoints.grpc.hold import Hold, Moment, Status
-from shmio.endpoints.grpc.marks import Marks
+from shmio.endpoints.grpc.hold import Hold, Status
 from shmio.endpoints.grpc.outboxes import Outboxes
 from shmio.endpoints.grpc.player import Player
 from shmio.endpoints.grpc.publish import Publisher
+from shmio.endpoints.grpc.timeline import Timeline
 from shmio.errors import TimeError
 from shmio.segment import ProcessSlot, Segment
-from shmio.segment.clock import ClockState
 from shmio.segment.coordinator import Coordinator, Step, check_step
 
 REST_S: Final = 1.0
@@ -33,10 +31,7 @@ log = logging.getLogger("shmio.grpc")
 
 
 class Stepper:
-    """Moves time for clients, one at a time, and has each step delivered, whichever process makes it.
-
-    For the event loop's thread.
-    """
+    """Moves time for clients, one at a time. For the event loop's thread."""
 
     def __init__(
         self,
@@ -49,15 +44,8 @@ class Stepper:
         publisher: Publisher,
         audience: Audience,
     ) -> None:
-        """``slot``: this process's in the table. ``audience``: while there is none, no step waits for it."""
-        self.marks = Marks(hold, self._now, lambda: self._clock.read().step_size_ns / 1e9)
-        """Tells steps and time."""
+        """Arguments as of :class:`Timeline`."""
         self._segment = segment
-        self._clock = segment.clock
-        self._slot = slot
-        self.hold = hold
-        """Whether time is virtual, and what was delivered."""
-        self._delivery = Delivery(hold, feeds, outboxes)
         self._publisher = publisher
         self._loop = asyncio.get_running_loop()
         self._coordinator = Coordinator(segment)
@@ -66,28 +54,16 @@ class Stepper:
         self._owns = False
         self._changing = asyncio.Lock()  # one begins to play, or ends
         self._moving: asyncio.Task[Any] | None = None
-        self._alive = True
-        self._watchers: list[Callable[[Status], None]] = []
         self._rest: asyncio.TimerHandle | None = None
-        self._player = Player(self._make, lambda: self._clock.read().step_size_ns)
+        self._player = Player(self._make, lambda: segment.clock.read().step_size_ns)
         self._tasks: set[asyncio.Task[Any]] = set()
-        self._page: Bell | None = None  # rings when it is written
-        state = self._clock.read()
-        if state.virtual:
-            self._delivery.begin(Moment(state.done, state.present_ns))
-        self._told = self._status(state)[1:]
-        self._delivered = state.done
-        self._audience = audience
-        self._awaited = False  # whether steps wait for this process
-        audience.changed = self._attend
-        hold.look = self.look
-        self._attend()
+        self.timeline = Timeline(segment, slot, hold, feeds, outboxes, audience, lambda: self._player.dt_ns)
+        """How time stands, whoever moves it."""
 
     async def start(self, predecessor: int = 0) -> None:
         """Begin to follow time; go on playing if the process before this one, by its pid, did when it died."""
-        self._page = Bell(self._clock.bell, "clock")
-        self._page.listeners[self.look] = None
-        state = self._clock.told()
+        self.timeline.start()
+        state = self._segment.clock.told()
         if state.playing and state.owner == predecessor:  # what another program that died has played stands
             try:
                 await self.play(state.dt_ns or None, state.rate)
@@ -97,21 +73,7 @@ class Stepper:
     @property
     def alive(self) -> bool:
         """Whether time is being followed, and played if it should be."""
-        return self._page is not None and self._player.alive
-
-    def also(self, deliver: Callable[[Step], Awaitable[None]]) -> None:
-        """Have each step delivered to others, too, before it is over."""
-        self._delivery.others.append(deliver)
-
-    def watch(self, watcher: Callable[[Status], None]) -> None:
-        """Have it told of each step and of each change."""
-        self._watchers.append(watcher)
-
-    @property
-    def status(self) -> Status:
-        """How time stands."""
-        self.look()
-        return self._status(self._clock.read())
+        return self.timeline.alive and self._player.alive
 
     async def set_step_size(self, dt_ns: int) -> None:
         """How far a step goes that does not say it itself; takes time over. ValueRangeError, TimeError."""
@@ -141,7 +103,6 @@ class Stepper:
 
     async def stop(self) -> None:
         """Move nothing more. A successor goes on with what is played."""
-        self.marks.stop()
         if self._rest is not None:
             self._rest.cancel()
         tasks = list(self._tasks)
@@ -151,10 +112,7 @@ class Stepper:
         if not self._player.on:
             self._coordinator.close()
         self._driver.stop()
-        page, self._page = self._page, None  # what was broken off may still give up time, and have it ring again
-        if page is not None:
-            page.stop()
-            page.join()
+        await self.timeline.stop()
 
     # ---- moving time ---------------------------------------------------------------------------------------------
 
@@ -179,39 +137,36 @@ class Stepper:
         """Make a step, and deliver it."""
         async with self._moved():
             step = await self._driver.step(dt_ns)
-            self._alive = True
-            await self._deliver(step)
+            await self.timeline.deliver(step)
             return step
 
-    async def _change(self, call: Callable[[], None], *, alive: bool = True) -> None:
+    async def _change(self, call: Callable[[], None], *, end: bool = False) -> None:
         """Have the coordinator change how time is moved."""
         async with self._moved():
             call()
-            self._alive = alive
+            self.timeline.ended = end
 
     @asynccontextmanager
     async def _moved(self) -> AsyncIterator[None]:
         """Time is ours, and nobody else's turn."""
         async with self._turn:
-            self._moving = asyncio.current_task()
+            self._moving, self.timeline.steered = asyncio.current_task(), True
             try:
                 if self._segment.outdated:
                     await asyncio.to_thread(self._segment.refresh)
                 if not self._owns:
                     self._coordinator.take_over()
                     self._own(True)
-                    self.look()
+                    self.timeline.look()
                 yield
             finally:
-                self._moving = None
-                self.look()
+                self._moving, self.timeline.steered = None, False
+                self.timeline.look()
                 self._set_rest()
 
     def _own(self, owns: bool) -> None:
-        """Nobody but the owner writes the page."""
         self._owns = owns
-        if self._page is not None:
-            (self._page.mute if owns else self._page.unmute)()
+        self.timeline.own(owns)
 
     def _set_rest(self) -> None:
         if self._rest is not None:
@@ -236,63 +191,13 @@ class Stepper:
             self._player.dt_ns, self._player.rate = dt_ns, rate
             await self._change(partial(self._coordinator.set_playing, True, rate))
             self._player.begin()
-        return self.status
+        return self.timeline.status
 
     async def _end_play(self, end: bool) -> Status:
         async with self._changing:
             await self._player.end()
-            await self._change(partial(self._coordinator.set_playing, False), alive=not end)
-        return self.status
-
-    # ---- delivering ------------------------------------------------------------------------------------------------
-
-    async def _deliver(self, step: Step) -> None:
-        if await self._delivery.deliver(step, partial(self._mark, step)):
-            self._delivered = step.number
-            if self._awaited:
-                self._coordinator.delivered(self._slot, step.number)
-
-    def _mark(self, step: Step) -> None:
-        self._alive = True
-        self.marks.tell()
-        self._tell(Status(step.time_ns, step.dt_ns, True, self._clock.read().playing))
-
-    def _attend(self) -> None:
-        """Have steps wait for this process from now on, or no longer."""
-        if self._audience:
-            self.look()  # it is shown what is over by now, and waited for from the next step on
-            self._awaited = True
-            self._coordinator.delivered(self._slot, self._delivered)
-        else:
-            self._awaited = False
-            self._clock.abstain(self._slot.index)
-
-    def look(self) -> None:
-        """Heed what the page says by now; also called now and then, for the death of who plays rings no bell."""
-        state = self._clock.read()
-        if state.virtual and not self.hold.on:
-            self._delivery.begin(before(state))
-        if state.done > self.hold.moment.number and not self._moving:
-            step = Step(state.done, state.present_ns, state.dt_ns)
-            if self._awaited or self._delivery.busy:
-                self._spawn(self._deliver(step))
-            else:
-                self._delivered = step.number
-                self._delivery.pass_over(step, partial(self._mark, step))
-        elif self._status(state)[1:] != self._told:
-            self._tell(self._status(state))
-
-    def _status(self, state: ClockState) -> Status:
-        dt_ns = (self._player.dt_ns if state.playing else None) or state.step_size_ns
-        return Status(self._now().clock_ns, dt_ns, self._alive, state.playing)
-
-    def _tell(self, status: Status) -> None:
-        self._told = self._status(self._clock.read())[1:]
-        for watcher in self._watchers:
-            watcher(status)
-
-    def _now(self) -> Moment:
-        return self.hold.moment if self.hold.on else Moment(0, self._clock.read().time_ns)
+            await self._change(partial(self._coordinator.set_playing, False), end=end)
+        return self.timeline.status
 
 
 def _check(dt_ns: int | None) -> None:

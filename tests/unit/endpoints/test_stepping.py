@@ -306,7 +306,7 @@ def test_a_step_waits_for_the_endpoint_only_while_it_has_streams(instance: str) 
             stream.cancel()
             await served.until(left)
             local.step()
-            assert served.service.stepper.status.clock_ns == 5 * 50_000_000
+            assert served.service.stepper.timeline.status.clock_ns == 5 * 50_000_000
             local.close()
 
     simulate(instance, test)
@@ -505,7 +505,7 @@ def test_the_death_of_a_program_that_plays_is_told(instance: str) -> None:
         with Segment.open(instance, writable=True) as dying:  # without giving time up
             Coordinator(dying).set_playing(True)
             assert (await asyncio.wait_for(statuses.read(), TIMEOUT_S)).playing
-        served.service.stepper.look()
+        served.service.stepper.timeline.look()
         assert not (await asyncio.wait_for(statuses.read(), TIMEOUT_S)).playing
         assert await step(served) == 0, "it is anybody's again"
 

@@ -337,10 +337,9 @@ def test_a_step_waits_for_the_others_that_deliver(instance: str) -> None:
     with built(instance) as segment, Segment.open(instance, writable=True) as other:
         slot = other.processes.find("grpc")
         coordinator = Coordinator(segment, hard_s=60)
-        endpoint = Coordinator(other)
         assert slot.take()
         assert coordinator.step().number == 1, "it has not said that it delivers"
-        endpoint.delivered(slot, endpoint.read().done)
+        other.clock.deliver(slot.index, other.clock.read().done)
         done: list[int] = []
 
         def deliver() -> None:
@@ -349,7 +348,7 @@ def test_a_step_waits_for_the_others_that_deliver(instance: str) -> None:
                 seen = clock.bell.value()
                 if clock.read().done == 2:
                     done.append(2)
-                    endpoint.delivered(slot, 2)
+                    clock.deliver(slot.index, 2)
                 else:
                     clock.bell.wait(seen)
 

@@ -29,7 +29,7 @@ class Clocks:
         self._segment = segment
         self._stepper = stepper
         self._watchers: set[asyncio.Event] = set()
-        stepper.watch(self._tell)
+        stepper.timeline.watch(self._tell)
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
         """Its calls, by name."""

@@ -55,9 +55,9 @@ class NativeService:
         self._selections = Selections(topics)
         self._bells = bells
         self._clocks = Clocks(segment, stepper)
-        self._hold = stepper.hold
+        self._hold = stepper.timeline.hold
         self._audience = audience
-        stepper.also(self._deliver)
+        stepper.timeline.also(self._deliver)
         self._orders = Orders(topics, feeds, self._selections, self._bells)
         self._simulations = Simulations(feeds, segment)
         self._moves = Moves(segment)

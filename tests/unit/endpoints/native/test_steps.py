@@ -38,7 +38,7 @@ def test_so_many_steps_are_done_and_all_streams_have_each_of_them(instance: str)
             seen = []
             async for step in cell.steps(40, 0.02):
                 seen.append(step)
-                assert served.service.stepper.hold.moment.number >= step.step
+                assert served.service.stepper.timeline.hold.moment.number >= step.step
             assert seen == done(*range(1, 41), dt_ms=20)
             assert (await cell.clock()).step == 40
         assert [await stream.values() for _ in range(40)] == [{"count": number} for number in range(1, 41)]
