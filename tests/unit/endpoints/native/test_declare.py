@@ -13,6 +13,7 @@ import pytest
 from shmio.client import Client, Happening, connect, connect_aio
 from shmio.errors import CommandError, ValueRangeError
 from shmio.segment import EventKind, Segment
+from shmio.segment.view import View
 from shmio.wire import shmio_v1_pb2 as wire
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, refusal
 from tests.unit.endpoints.native.harness import stub
@@ -61,6 +62,25 @@ def test_every_operation_is_laid_as_it_was_declared(segment: Segment) -> None:
                 if (happened := next(campaign)).what == "injected":
                     injected.remove(happened.number)
         assert cell.injections() == []
+
+    with_client(segment, test)
+
+
+def test_what_the_source_delivered_is_read_beneath_it(segment: Segment) -> None:
+    def test(cell: Client, device: Plant, served: Endpoint) -> None:
+        struct.pack_into(">f", device.memory, 0, 1.5)
+        with cell.declare([OFFSET]):
+            seen(cell, "cell/axis/position", 4.0)
+            update = cell.read("cell/axis/*", originals=True).of("cell/axis/position")
+            assert (update["axis/position"], update.original("axis/position")) == (4.0, 1.5)
+            with cell.subscribe("cell", frames=True) as frames:
+                both = next(frames)
+            assert [struct.unpack_from(">f", image) for image in (both.image, both.raw)] == [(4.0,), (1.5,)]
+            block = served.segment.blocks["cell"]
+            frame = block.latest()
+            assert frame is not None
+            view = View(block, frame)
+            assert (view["axis/position"], view.original("axis/position")) == (4.0, 1.5)
 
     with_client(segment, test)
 
