@@ -11,7 +11,7 @@ from shmio.cli.cell import Cell
 from shmio.cli.interrupt import told_to_stop
 from shmio.cli.run import at_least, dumps
 from shmio.cli.supervise.status import clock_line
-from shmio.errors import ValueRangeError
+from shmio.errors import CommandError, ValueRangeError
 from shmio.segment.coordinator import MAX_RATE, MAX_STEP_NS, MIN_STEP_NS, check_step
 from shmio.segment.status import clock_status
 
@@ -22,8 +22,8 @@ LOOK_S = 0.2
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the verb's own arguments."""
     parser.add_argument("--dt-ms", type=_dt_ms, metavar="N", help="by how much (default: the step size, 50)")
-    parser.add_argument("--count", type=at_least(1), default=1, metavar="N", help="so many steps (default: 1)")
     how = parser.add_mutually_exclusive_group()
+    how.add_argument("--count", type=at_least(1), default=1, metavar="N", help="so many steps (default: 1)")
     how.add_argument(
         "--play",
         type=_rate,
@@ -36,8 +36,10 @@ def arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
-    """Step, play or pause, and tell the time then. TimeError, ValueRangeError."""
+    """Step, play or pause, and tell the time then. TimeError, ValueRangeError, CommandError."""
     dt_s = None if options.dt_ms is None else options.dt_ms / 1000
+    if options.pause and dt_s is not None:
+        raise CommandError("--pause does no step: leave out --dt-ms")
     if options.play is not None:
         _play(cell, options.play, dt_s)
     elif options.pause:
@@ -45,7 +47,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
     else:
         cell.step(dt_s, options.count)
     clock = clock_status(cell.clock)
-    print(dumps(msgspec.to_builtins(clock)) if options.json else clock_line(clock))
+    print(dumps(msgspec.to_builtins(clock)) if options.json else clock_line(clock, options.dt_ms))
     return 0
 
 

@@ -49,7 +49,7 @@ class SupervisorStatus(msgspec.Struct):
 
 
 class ClockStatus(msgspec.Struct):
-    """The instance's clock. ``mode``: wall or virtual.
+    """The instance's clock. ``mode``: wall or virtual. ``step``: number of the last one that all have finished.
 
     ``note``: whom a step waits for, why the last one failed, or that it moved nothing.
     """
@@ -135,7 +135,7 @@ def status_of(segment: Segment, remedy: str, asking: str = "") -> InstanceStatus
 def clock_status(state: ClockState) -> ClockStatus:
     """What the clock page says, in the units of a reader."""
     return ClockStatus(
-        str(state.mode), state.present_ns / 1e9, state.step, state.step_size_ns / 1e6, state.playing, state.rate,
+        str(state.mode), state.present_ns / 1e9, state.done, state.step_size_ns / 1e6, state.playing, state.rate,
         state.note,
     )  # fmt: skip
 

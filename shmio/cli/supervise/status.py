@@ -48,11 +48,13 @@ def _table(status: InstanceStatus) -> list[str]:
     return lines
 
 
-def clock_line(clock: ClockStatus) -> str:
-    """Virtual time in one line."""
+def clock_line(clock: ClockStatus, dt_ms: float | None = None) -> str:
+    """Virtual time in one line. ``dt_ms``: by how much its steps were told to move it; None: by the step size."""
+    size = f"{clock.step_size_ms:g} ms"
+    step = f"{clock.step}, steps of {size}" if dt_ms is None else f"{clock.step} of {dt_ms:g} ms, step size {size}"
     how = f", playing at {clock.rate:g} times real time" if clock.playing else ""
     note = f"; {clock.note}" if clock.note else ""
-    return f"virtual time {clock.time_s:.3f} s, step {clock.step}, steps of {clock.step_size_ms:g} ms{how}{note}"
+    return f"virtual time {clock.time_s:.3f} s, step {step}{how}{note}"
 
 
 def _row(process: ProcessStatus) -> tuple[str, ...]:
