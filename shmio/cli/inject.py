@@ -33,10 +33,11 @@ def arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=_seed, metavar="N", help="of those of the file that have none")
     parser.add_argument("--from-now", action="store_true", help="times in the file count from now, not from the start")
     parser.add_argument("--list", action="store_true", help="what is injected at present, as without any PATH")
-    parser.add_argument("--for", dest="for_s", type=seconds, metavar="S", help="lift after so many seconds")
+    how_long = parser.add_mutually_exclusive_group()
+    how_long.add_argument("--for", dest="for_s", type=seconds, metavar="S", help="lift after so many seconds")
     parser.add_argument("--priority", type=int, default=0, metavar="N", help="the highest is outermost (default: 0)")
     parser.add_argument("--name", default="", help="what it is called in the list")
-    parser.add_argument("--keep", action="store_true", help="leave it there, until it is lifted by its number")
+    how_long.add_argument("--keep", action="store_true", help="leave it there, until it is lifted by its number")
     parser.add_argument("--lift", metavar="NUMBER", type=int, help="lift one, whoever laid it")
     parser.add_argument("--lift-all", action="store_true", help="lift all of them, of all sources")
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 TIMEOUT_S: Final = 2.0
 MIN_PERIODS: Final = 3
 """A command may wait for its source so long, or so many cycles if that is longer, unless told otherwise."""
+_MODELS: Final = frozenset({"simulation", "remote"})  # connectors whose sources have registers that nobody writes
 PATIENCE_S: Final = 1.0
 """What is added for the device's answer to arrive."""
 
@@ -219,9 +220,10 @@ class Commander:
         source = self.block.source
         register = find(self.block.layout, path)
         if not self.is_writable(register):
-            raise CommandError(
-                f"{source}/{path} is not writable; the configuration has to name it in the source's `writable`"
-            )
+            remedy = "the configuration has to name it in the source's `writable`"
+            if self.block.attributes.connector in _MODELS:
+                remedy += ", unless its model computes it: nobody writes that, and shmio inject shows another value"
+            raise CommandError(f"{source}/{path} is not writable; {remedy}")
         return register
 
     def _next(self, ticket: Ticket) -> Event | None:

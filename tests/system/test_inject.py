@@ -106,6 +106,13 @@ def test_a_killed_client_leaves_no_shadow_and_a_killed_source_keeps_it(cell: Cel
         until(lambda: get(cell, POSITION)["value"] != 55.5, "lifted")
 
 
+def test_one_is_kept_or_lifted_after_a_time(cell: Cell) -> None:
+    both = cell.run("shmio", "inject", "--for", "1", "--keep", POSITION, "11")
+    assert (both.returncode, both.stdout) == (2, "")
+    assert "argument --keep: not allowed with argument --for" in both.stderr
+    assert cell.run("shmio", "inject").stdout == ""
+
+
 def test_a_kept_one_stays_until_it_is_lifted(cell: Cell) -> None:
     kept = cell.run("shmio", "inject", "--keep", POSITION, "11")
     assert kept.returncode == 0, kept.stderr

@@ -212,6 +212,47 @@ def test_a_model_that_raises_fails_the_step_with_its_line(line: Cell) -> None:
     assert get(line, "belt/position") == [pytest.approx(position + 0.1)]
 
 
+def test_a_step_that_has_failed_is_told_alike_on_the_host_and_by_grpc(line: Cell) -> None:
+    ways: tuple[tuple[str, ...], ...] = (), ("--host", str(line.grpc))
+    number = line.status()["clock"]["step"]
+    line.run("shmio", "set", "belt/speed", "-1")
+    failed = [line.run("shmio", "step", "--count", "2", *way) for way in ways]
+    assert [(done.returncode, done.stdout) for done in failed] == [(1, "")] * 2
+    first, second = (done.stderr.partition(": ") for done in failed)
+    assert (first[0], second[0], first[2]) == (f"step {number + 1}", f"step {number + 2}", second[2])
+    on_host, by_grpc = (step(line, "--pause", *way) for way in ways)
+    assert on_host == by_grpc
+    assert on_host["step"] == number, "the last that all have finished"
+    assert on_host["note"].startswith(f"step {number + 2} failed: belt: ")
+
+
+def test_how_far_a_step_goes_is_told_as_it_was_asked_for(line: Cell) -> None:
+    told = line.run("shmio", "step", "--dt-ms", "20", "--count", "2").stdout
+    assert re.fullmatch(r"virtual time [0-9.]+ s, step [0-9]+ of 20 ms, step size 50 ms\n", told), told
+    refused = line.run("shmio", "step", "--pause", "--dt-ms", "20")
+    assert (refused.returncode, refused.stderr) == (1, "--pause does no step: leave out --dt-ms\n")
+    refused = line.run("shmio", "step", "--play", "--count", "2")
+    assert (refused.returncode, "--count: not allowed with argument --play" in refused.stderr) == (2, True)
+
+
+@pytest.mark.parametrize("remote", [False, True])
+def test_what_a_model_computes_is_not_set_and_the_remedy_works(line: Cell, remote: bool) -> None:
+    way = ("--host", str(line.grpc)) if remote else ()
+    unlisted = line.run("shmio", "set", *way, "belt/position", "7").stderr
+    assert unlisted.startswith("belt/position is not writable; ")
+    assert unlisted.endswith("unless its model computes it: nobody writes that, and shmio inject shows another value\n")
+    listed = line.run("shmio", "set", *way, "gate/closed", "true").stderr
+    assert listed == (
+        "gate/closed: the source refused it: the model computes closed: it is an output, which nobody writes; "
+        "shmio inject shows others\n"
+    )
+    laid = line.run("shmio", "inject", *way, "--keep", "belt/position", "-7")
+    assert laid.returncode == 0, laid.stderr
+    assert get(line, "belt/position") == [-7.0]
+    assert line.run("shmio", "inject", *way, "--lift-all").returncode == 0
+    assert get(line, "belt/position") != [-7.0]
+
+
 def test_a_model_that_is_killed_within_a_step_fails_it_and_goes_on_with_the_next(line: Cell) -> None:
     with Attachment(Segment.open(line.instance, writable=True)) as cell:
         [position], number = get(line, "belt/position"), cell.clock.step + 1

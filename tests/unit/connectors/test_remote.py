@@ -151,7 +151,8 @@ def test_a_model_elsewhere_computes_its_outputs_and_nothing_else(instance: str) 
         assert struct.unpack(">III", latest(segment, "sim").raw) == (9, 7, 0)
         (outcome,) = commander.write({"sum": 7})
         assert outcome.kind is EventKind.REFUSED
-        assert outcome.text == "the model computes sum: it is an output, which nobody writes"
+        told = "the model computes sum: it is an output, which nobody writes; shmio inject shows others"
+        assert outcome.text == told
         assert [(ask.step, ask.time_ns, ask.dt_ns) for ask in model.asks] == [
             (1, 20 * MS, 20 * MS),
             (2, 50 * MS, 30 * MS),
