@@ -7,6 +7,7 @@ from typing import Final
 
 from shmio.config import MqttTopic
 from shmio.endpoints.mqtt.channel import Channel, FramesChannel, RegisterChannel, Shown, StatusChannel
+from shmio.endpoints.mqtt.frames import Frames
 from shmio.endpoints.mqtt.inlet import Inlet
 from shmio.endpoints.mqtt.outbox import Outbox
 from shmio.endpoints.mqtt.rules import Rules
@@ -16,10 +17,6 @@ from shmio.segment import Block, Frame, Quality
 from shmio.segment.scan import ChangeScan
 
 NO_DATA: Final = Shown(None, Quality.BAD, "no data yet")
-TURN_FRAMES: Final = 8
-"""So many are taken before what else there is to do has its turn."""
-CATCH_UP_FRAMES: Final = 48
-"""Who is further behind than this goes on with the newest one: what he skips is conflated, not lost."""
 
 
 class Feed:
@@ -46,34 +43,30 @@ class Feed:
         self._scan = ChangeScan([register for register, _ in chosen])
         self._outbox = outbox
         self._later: dict[RegisterChannel | FramesChannel, None] = {}
-        newest = block.latest()
-        self._cursor = block.cursor(after=newest.number - 1 if newest else 0)
+        self._coming = Frames(block)
 
     @property
     def over(self) -> bool:
         """Whether a reload has ended the block, and all of it has been taken."""
-        return self.block.retired and not self._cursor.behind
+        return self.block.retired and not self._coming.behind
 
     def look(self) -> bool:
         """Take frames that have come, a few at a time; whether there are more at once."""
         if self.held:
             return False
-        if self._cursor.behind > CATCH_UP_FRAMES:
-            self._cursor = self.block.cursor(after=self.block.ring.head() - 1)
-        for _ in range(TURN_FRAMES):
-            frame = self._cursor.poll()
-            if frame is None:
-                self._age()
-                return False
+        for frame in self._coming.come():
             self.take(frame)
             if self._outbox.busy:
                 self._outbox.flush()  # so that each frame's changes are told, as long as the broker takes them
-        return self._cursor.behind > 0
+        if self._coming.behind:
+            return True
+        self._age()
+        return False
 
     def step(self) -> None:
         """Show what the step that is being delivered has changed, if the block is on the instance's clock."""
         if self.held and (frame := self.block.latest()):
-            self._cursor = self.block.cursor(after=frame.number)
+            self._coming.go_on_after(frame.number)
             self.take(frame)
 
     def take(self, frame: Frame) -> None:

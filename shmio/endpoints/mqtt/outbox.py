@@ -12,6 +12,7 @@ from typing import Final, Protocol
 from paho.mqtt.properties import Properties
 
 from shmio.endpoints.mqtt.channel import Channel, Message
+from shmio.endpoints.mqtt.store import Store
 
 OVERHEAD_BYTES: Final = 200
 """Of one message in memory, about, beside its payload."""
@@ -42,10 +43,9 @@ class Outbox:
     def __init__(self, link: Sender, backlog_bytes: int) -> None:
         self._link = link
         self._most = backlog_bytes
+        self._kept: Store[Message] = Store(backlog_bytes)
         self._waiting: dict[Channel, None] = {}
         self._answers: deque[tuple[Message, Properties | None]] = deque(maxlen=MOST_ANSWERS)
-        self._backlog: deque[Message] = deque()
-        self._backlog_bytes = 0
         self.keeping = False
         """Whether changes are kept while there is no connection: it has failed, or there has been one."""
         self._settling = False
@@ -54,12 +54,12 @@ class Outbox:
         """Bytes up to which changes are kept meanwhile: fewer the more was sent, for else a broker that takes less
         than there is would be told of the past for ever."""
         self.sent = 0
-        self.dropped = 0
+        self._unanswered = 0
 
     @property
     def busy(self) -> bool:
         """Whether anything is to be sent."""
-        return bool(self._waiting or self._backlog or self._answers)
+        return bool(self._waiting or self._kept.count or self._answers)
 
     @property
     def able(self) -> bool:
@@ -74,19 +74,24 @@ class Outbox:
     @property
     def backlog(self) -> int:
         """Changes that are kept."""
-        return len(self._backlog)
+        return self._kept.count
+
+    @property
+    def dropped(self) -> int:
+        """Changes that had no room, and answers."""
+        return self._kept.dropped + self._unanswered
 
     def mark(self, channel: Channel) -> None:
         """Something about it is new. One that waits already keeps its place, and will be sent with what is new.
 
         Until all that was kept has been sent, what is new is kept behind it, if there is room.
         """
-        if self._link.up and not (self._settling and self._backlog_bytes < self._room):
+        if self._link.up and not (self._settling and self._kept.bytes < self._room):
             self._waiting[channel] = None
         elif self._settling or self.keeping:
             message = channel.message(late=True)
             if message.keep:
-                self._keep(message)
+                self._kept.put(message, _size(message))
             if self._link.up:  # what is kept is not retained; it may have been shown already
                 self._waiting[channel] = None
 
@@ -105,18 +110,18 @@ class Outbox:
     def answer(self, message: Message, properties: Properties | None) -> None:
         """Send what became of a command, before values."""
         if self._link.up:
-            self.dropped += len(self._answers) == MOST_ANSWERS
+            self._unanswered += len(self._answers) == MOST_ANSWERS
             self._answers.append((message, properties))
 
     def lose(self, unacknowledged: Iterable[Message]) -> None:
         """The connection is gone: keep what it has not taken for certain, and what waited for it."""
         for message in reversed(list(unacknowledged)):
             if message.keep:
-                self._keep(message._replace(retain=False), first=True)
+                self._kept.put_back(message._replace(retain=False), _size(message))
         for channel in self._waiting:
             message = channel.message(late=True)
             if message.keep:
-                self._keep(message)
+                self._kept.put(message, _size(message))
         self._waiting.clear()
         self._settling = False
         self._answers.clear()
@@ -135,9 +140,7 @@ class Outbox:
             self.sent += 1
             if self._answers:
                 link.send(*self._answers.popleft())
-            elif self._backlog:
-                message = self._backlog.popleft()
-                self._backlog_bytes -= _size(message)
+            elif (message := self._kept.pop()) is not None:
                 self._room -= _size(message) // 2
                 link.send(message)
             else:
@@ -145,22 +148,6 @@ class Outbox:
                 del self._waiting[channel]
                 link.send(channel.message())
                 self._settling = self._settling and bool(self._waiting)
-
-    def _keep(self, message: Message, *, first: bool = False) -> None:
-        """Keep a change; the oldest go when there is no room."""
-        size = _size(message)
-        if first:
-            if self._backlog_bytes + size > self._most:
-                self.dropped += 1
-                return
-            self._backlog.appendleft(message)
-            self._backlog_bytes += size
-            return
-        self._backlog.append(message)
-        self._backlog_bytes += size
-        while self._backlog_bytes > self._most:
-            self._backlog_bytes -= _size(self._backlog.popleft())
-            self.dropped += 1
 
 
 def _size(message: Message) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from enum import Enum
 from typing import NamedTuple
 
-from shmio.endpoints.mqtt.feed import CATCH_UP_FRAMES, TURN_FRAMES
+from shmio.endpoints.mqtt.frames import Frames
 from shmio.endpoints.mqtt.inlet import Inlet
 from shmio.endpoints.mqtt.sparkplug.metrics import Metric, parts_of
 from shmio.endpoints.mqtt.sparkplug.node import Sample
@@ -50,8 +50,7 @@ class Device:
         self._decoders = [codec(part, block.layout.byte_order).decode for part in self.parts]
         self._frame: Frame | None = None
         self._quality, self._reason = Quality.BAD, ""
-        newest = block.latest()
-        self._cursor = block.cursor(after=newest.number - 1 if newest else 0)
+        self._coming = Frames(block)
 
     def named(self, metrics: Sequence[Metric]) -> None:
         """The metrics of its parts, in their order."""
@@ -59,21 +58,17 @@ class Device:
 
     def look(self) -> Iterator[News]:
         """What has come; a few frames at a time."""
-        if self._cursor.behind > CATCH_UP_FRAMES:
-            self._cursor = self.block.cursor(after=self.block.ring.head() - 1)
-        for _ in range(TURN_FRAMES):
-            frame = self._cursor.poll()
-            if frame is None:
-                frame = self._frame  # it may have become too old
-            if frame is not None and (news := self._take(frame)) is not None:
+        for frame in self._coming.come():
+            if (news := self._take(frame)) is not None:
                 yield news
-            if frame is self._frame and not self._cursor.behind:
-                return
+        last = self._frame
+        if last is not None and not self.behind and (news := self._take(last)) is not None:  # with age
+            yield news
 
     @property
     def behind(self) -> int:
         """Frames that wait."""
-        return self._cursor.behind
+        return self._coming.behind
 
     def samples(self, at: Sequence[int] | None = None) -> list[Sample]:
         """Metrics as they are now, all or these."""

@@ -87,7 +87,7 @@ def test_a_connection_that_is_cut_again_and_again_loses_no_change(
 ) -> None:
     """Under load. What the broker may or may not have had comes once more; nothing comes before what was before it."""
     # A busy host is not to be taken for a broker that is too slow, for which changes are conflated.
-    monkeypatch.setattr("shmio.endpoints.mqtt.feed.CATCH_UP_FRAMES", 500)
+    monkeypatch.setattr("shmio.endpoints.mqtt.frames.CATCH_UP_FRAMES", 500)
     broker = make_broker("allow_anonymous true", "max_inflight_messages 10000")
     with (
         FaultProxy(broker.address, framing=None) as proxy,

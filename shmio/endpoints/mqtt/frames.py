@@ -1,0 +1,41 @@
+"""The frames of one block for who tells a broker of them: in order, a few at a time, and never far behind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from shmio.segment import Block, Frame
+
+TURN_FRAMES: Final = 8
+"""So many are taken before what else there is to do has its turn."""
+CATCH_UP_FRAMES: Final = 48
+"""Who is further behind than this goes on with the newest one: what he skips is conflated, not lost."""
+
+
+class Frames:
+    """Begins with the newest one that there is. For one thread."""
+
+    def __init__(self, block: Block) -> None:
+        self._block = block
+        newest = block.latest()
+        self._cursor = block.cursor(after=newest.number - 1 if newest else 0)
+
+    @property
+    def behind(self) -> int:
+        """How many wait."""
+        return self._cursor.behind
+
+    def come(self) -> Iterator[Frame]:
+        """Those that have come; at most a few."""
+        if self._cursor.behind > CATCH_UP_FRAMES:
+            self.go_on_after(self._block.ring.head() - 1)
+        for _ in range(TURN_FRAMES):
+            frame = self._cursor.poll()
+            if frame is None:
+                return
+            yield frame
+
+    def go_on_after(self, number: int) -> None:
+        """The next one is the one behind this."""
+        self._cursor = self._block.cursor(after=number)
