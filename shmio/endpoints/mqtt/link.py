@@ -3,41 +3,32 @@
 from __future__ import annotations
 
 import logging
-import queue
 import random
 import selectors
 import socket
-import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import Any, Final, cast
+from typing import Any, Final
 
 from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage, MQTTv5, MQTTv311
-from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
+from paho.mqtt.enums import MQTTErrorCode
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
+from shmio.endpoints.mqtt.attempt import CONNECT_S, PACKETS, Attempt, hang_up
 from shmio.endpoints.mqtt.channel import Message
-from shmio.endpoints.mqtt.failure import refusal, why
+from shmio.endpoints.mqtt.failure import refusal
+from shmio.endpoints.mqtt.limits import Limits
 from shmio.endpoints.mqtt.target import Dialling, Target
-from shmio.errors import ConfigError
 
-CONNECT_S: Final = 4.0
-"""For a connection, its TLS, and for the broker's answer to who we are; each."""
 FIRST_WAIT_S: Final = 0.25
 MOST_WAIT_S: Final = 15.0
 STABLE_S: Final = 5.0
 """Who was connected so long has put his failures behind him."""
-MOST_IN_FLIGHT: Final = 1000
-"""Messages that the broker has not acknowledged."""
-MAX_PACKET_BYTES: Final = 1 << 21
-"""Of what a broker may send us, as far as it can be told so: with MQTT 5."""
-PACKETS: Final = 100
-"""So many are taken from the broker before what else there is to do has its turn."""
 WITH_WILL: Final = "Disconnect with will message"
 
 _BEING_SENT: Final = 0
@@ -73,10 +64,7 @@ class Link:
         self._socket: socket.socket | None = None
         self._writing = False
         self._target: Target | None = None
-        self._made: queue.SimpleQueue[tuple[Client, str]] = queue.SimpleQueue()
-        self._handing = threading.Lock()
-        self._over = False
-        """Whether nobody takes a connection any more."""
+        self._attempt: Attempt | None = None
         self._protocol = MQTTv5
         self._failures = 0
         self._retry_s = 0.0
@@ -85,9 +73,7 @@ class Link:
         self._up_s = 0.0
         self._misc_s = 0.0
         self._in_flight: dict[int, Message] = {}
-        self._most_in_flight = MOST_IN_FLIGHT
-        self._most_bytes: int | None = None
-        self._most_qos, self._retains = 1, True
+        self._limits = Limits()
 
     @property
     def mqtt5(self) -> bool:
@@ -97,7 +83,7 @@ class Link:
     @property
     def ready(self) -> bool:
         """Whether it takes a message now, and does not only put it into its memory."""
-        return self.up and len(self._in_flight) < self._most_in_flight and not self._blocked()
+        return self.up and len(self._in_flight) < self._limits.in_flight and not self._blocked()
 
     @property
     def in_flight(self) -> int:
@@ -112,96 +98,38 @@ class Link:
     def turn(self) -> float:
         """Do what is due; in how many seconds there is more to do."""
         now_s = time.monotonic()
-        with suppress(queue.Empty):
-            while True:
-                self._take(*self._made.get_nowait())
+        if self._attempt is not None and self._attempt.over:
+            self._take(self._attempt)
+        if self._attempt is None and self._client is None:
+            if now_s < self._retry_s:
+                return self._retry_s - now_s
+            self._attempt = Attempt(self._dialling, self._protocol, self._will(), self._wake)
+            self._target = self._attempt.target
         if self._client is None:
-            if now_s >= self._retry_s:
-                self._dial()
-            return max(0.0, self._retry_s - now_s) if self._client is None else CONNECT_S
+            return CONNECT_S
         if self._until_s is not None and now_s >= self._until_s:
-            self._end("it does not answer")
+            self.drop("it does not answer")
         elif self.up and now_s >= self._misc_s:
             self._misc_s = now_s + 1.0
             self._client.loop_misc()
         self._rearm()
         return 1.0
 
-    def _dial(self) -> None:
-        try:
-            target = self._target = self._dialling.next()
-            client = self._make(target)
-        except (ConfigError, OSError) as error:
-            self._client = None
-            self._again(str(error))
-            return
-        self._client = client
-        self._until_s = None
-        threading.Thread(target=self._connect, args=(client, target), name="connect", daemon=True).start()
-
-    def _make(self, target: Target) -> Client:
-        """A client of its own for each attempt: what one has not got rid of is none of the next one's business."""
-        settings = self._dialling.settings
-        new = self._protocol == MQTTv5
-        client = Client(
-            CallbackAPIVersion.VERSION2,
-            self._dialling.client_id,
-            clean_session=None if new else not settings.session_expiry_s,
-            protocol=self._protocol,
-            transport=target.transport,
-            reconnect_on_failure=False,
-        )
-        client.connect_timeout = CONNECT_S
-        client.max_inflight_messages_set(0)  # we count them ourselves
-        if target.username is not None:
-            client.username_pw_set(target.username, target.password)
-        if target.context is not None:
-            client.tls_set_context(target.context)
-        will = self._will()
-        client.will_set(will.topic, will.payload, will.qos, will.retain)
-        return client
-
-    def _connect(self, client: Client, target: Target) -> None:
-        """In a thread of its own: names, TCP and TLS take their time."""
-        settings = self._dialling.settings
-        options: dict[str, Any] = {}
-        if self._protocol == MQTTv5:
-            properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
-            properties.SessionExpiryInterval = settings.session_expiry_s
-            properties.MaximumPacketSize = MAX_PACKET_BYTES
-            properties.ReceiveMaximum = PACKETS
-            options = {"properties": properties, "clean_start": not settings.session_expiry_s}
-        problem = ""
-        try:
-            client.connect(target.host, target.port, settings.keep_alive_s, **options)
-        except (OSError, ValueError) as error:  # ValueError: a name with an empty part
-            problem = why(error, target)
-        with self._handing:
-            if not self._over:
-                self._made.put((client, problem))
-                self._wake()
-                return
-        _drop(client)
-
-    def _take(self, client: Client, problem: str) -> None:
+    def _take(self, attempt: Attempt) -> None:
         """A connection was made, or was not."""
-        made = client.socket()
-        if client is not self._client:
-            _drop(client)
-        elif problem:
-            self._fail(problem)
-        elif made is None:
-            self._fail("it closes the connection at once")
-        else:
-            self._until_s = time.monotonic() + CONNECT_S
-            client.on_connect = self._connected  # not before: what connects is another thread
-            client.on_disconnect = self._disconnected
-            client.on_publish = self._acknowledged
-            client.on_message = lambda one, _data, message: self.on_message(message) if one is self._client else None
-            client.on_subscribe = self._subscribed
-            self._socket = cast("socket.socket", made)
-            self._writing = False
-            self._selector.register(made, selectors.EVENT_READ, self._serve)
+        self._attempt = None
+        client, made = attempt.client, attempt.socket
+        if client is None or made is None:
+            self._fail(attempt.problem)
+            return
+        self._until_s = time.monotonic() + CONNECT_S
+        client.on_connect = self._connected
+        client.on_disconnect = self._disconnected
+        client.on_publish = self._acknowledged
+        client.on_message = lambda one, _data, message: self.on_message(message) if one is self._client else None
+        client.on_subscribe = self._subscribed
+        self._client, self._socket, self._writing = client, made, False
+        self._selector.register(made, selectors.EVENT_READ, self._serve)
 
     def _serve(self, events: int) -> None:
         """The socket is ready."""
@@ -217,7 +145,7 @@ class Link:
             while not code and pending is not None and self._socket is made and pending():
                 code = client.loop_read(PACKETS)
         if code and client is self._client:
-            self._end(str(MQTTErrorCode(code).name).removeprefix("MQTT_ERR_").replace("_", " ").lower())
+            self.drop(str(MQTTErrorCode(code).name).removeprefix("MQTT_ERR_").replace("_", " ").lower())
         self._rearm()
 
     def _rearm(self) -> None:
@@ -238,12 +166,9 @@ class Link:
             if self._protocol == MQTTv5 and str(code) == "Unsupported protocol version":
                 self._step_back()
             else:
-                self._fail(refusal(code, self._dialling))
+                self._fail(f"broker {self._target}: {refusal(code, self._dialling)}")
             return
-        told = vars(properties) if properties is not None else {}
-        self._most_in_flight = min(MOST_IN_FLIGHT, told.get("ReceiveMaximum", MOST_IN_FLIGHT))
-        self._most_bytes = told.get("MaximumPacketSize")
-        self._most_qos, self._retains = min(1, told.get("MaximumQoS", 1)), bool(told.get("RetainAvailable", 1))
+        self._limits = Limits.told(properties)
         self._until_s, self._up_s = None, time.monotonic()
         self._misc_s = self._up_s + 1.0
         self.up = self.came_up = True
@@ -257,7 +182,7 @@ class Link:
     ) -> None:
         if client is self._client:
             told = flags.is_disconnect_packet_from_server
-            self._end(refusal(code, self._dialling) if told else "the connection was lost")
+            self.drop(refusal(code, self._dialling) if told else "the connection was lost")
 
     def _acknowledged(
         self, client: Client, _data: Any, mid: int, code: ReasonCode, _properties: Properties | None
@@ -278,13 +203,13 @@ class Link:
 
     # ---- its end -----------------------------------------------------------------------------------------------------
 
-    def _end(self, problem: str) -> None:
-        """There was a connection, or half of one."""
+    def drop(self, problem: str) -> None:
+        """Give a connection up, or half of one, that does not do what it should."""
+        problem = f"broker {self._target}: {problem}"
         if self.up:
             lost = list(self._in_flight.values())
             if time.monotonic() - self._up_s >= STABLE_S:
                 self._failures = 0
-            self._protocol = MQTTv5
             self._fail(problem)
             self.on_lost(lost)
         elif self._protocol == MQTTv5 and self._until_s is not None:
@@ -302,11 +227,7 @@ class Link:
 
     def _fail(self, problem: str) -> None:
         self._close()
-        self._again(f"broker {self._target}: {problem}")
-        if self._protocol != MQTTv5:
-            self._protocol = MQTTv5
-
-    def _again(self, problem: str) -> None:
+        self._protocol = MQTTv5
         if problem != self.problem:
             log.warning("%s", problem)
         self.problem = problem
@@ -324,11 +245,7 @@ class Link:
         self.up, self.came_up, self._until_s = False, False, None
         self._in_flight = {}
         if client is not None:
-            _drop(client)
-
-    def drop(self, problem: str) -> None:
-        """Give a connection up that does not do what it should."""
-        self._end(problem)
+            hang_up(client)
 
     # ---- what goes out -----------------------------------------------------------------------------------------------
 
@@ -337,12 +254,12 @@ class Link:
         client = self._client
         if client is None or not self.up:
             return
-        if self._most_bytes is not None and len(message.payload) + len(message.topic.encode()) + 64 > self._most_bytes:
+        limits = self._limits
+        if not limits.fit(message):
             self.refused += 1
-            self.problem = f"broker {self._target} takes {self._most_bytes} bytes at once: {message.topic} has more"
+            self.problem = f"broker {self._target} takes {limits.packet_bytes} bytes at once: {message.topic} has more"
             return
-        qos = min(message.qos, self._most_qos)
-        retain = message.retain and self._retains
+        qos, retain = min(message.qos, limits.qos), message.retain and limits.retain
         if qos:
             self._in_flight[_BEING_SENT] = message  # to send it may find the connection gone
         info = client.publish(message.topic, message.payload, qos, retain, properties if self.mqtt5 else None)
@@ -373,17 +290,6 @@ class Link:
                 self._client.disconnect(reason)
         self._close()
         self._retry_s = float("inf")
-        with self._handing:  # who still connects closes what he makes, and wakes nobody
-            self._over = True
-        with suppress(queue.Empty):
-            while True:
-                _drop(self._made.get_nowait()[0])
-
-
-def _drop(client: Client) -> None:
-    """Close its socket, whatever state it is in."""
-    client.on_disconnect = None
-    made = client.socket()
-    if made is not None:
-        with suppress(OSError):
-            made.close()
+        if self._attempt is not None:
+            self._attempt.abandon()
+            self._attempt = None

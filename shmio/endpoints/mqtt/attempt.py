@@ -1,0 +1,118 @@
+"""One attempt to connect, in a thread of its own: files, names, TCP and TLS take their time."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, Final, cast
+
+from paho.mqtt.client import Client, MQTTv5
+from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+
+from shmio.config.accounts import read_password
+from shmio.config.mqtttls import client_context
+from shmio.endpoints.mqtt.channel import Message
+from shmio.endpoints.mqtt.failure import why
+from shmio.endpoints.mqtt.target import Dialling
+from shmio.errors import ConfigError
+
+CONNECT_S: Final = 4.0
+"""For a connection, its TLS, and for the broker's answer to who we are; each."""
+MAX_PACKET_BYTES: Final = 1 << 21
+"""Of what a broker may send us, as far as it can be told so: with MQTT 5."""
+PACKETS: Final = 100
+"""So many are taken from the broker before what else there is to do has its turn."""
+
+
+class Attempt:
+    """Begins at once, with the broker whose turn it is."""
+
+    def __init__(
+        self, dialling: Dialling, protocol: MQTTProtocolVersion, will: Message, wake: Callable[[], object]
+    ) -> None:
+        """``wake``: called by its thread when it is over, if anybody wants it then."""
+        self.target = dialling.next()
+        self.over = False
+        """Whether ``client``, ``socket`` and ``problem`` are what has come of it."""
+        self.client: Client | None = None
+        self.socket: socket.socket | None = None
+        """A connection, on which nothing was read yet."""
+        self.problem = ""
+        """Why there is none."""
+        self._dialling, self._protocol, self._will, self._wake = dialling, protocol, will, wake
+        self._handing = threading.Lock()
+        self._unwanted = False
+        threading.Thread(target=self._run, name="connect", daemon=True).start()
+
+    def abandon(self) -> None:
+        """Nobody wants it any more: what it makes is closed, and nobody is woken."""
+        with self._handing:
+            self._unwanted = True
+        if self.over:
+            self._close()
+
+    def _run(self) -> None:
+        try:
+            self._connect()
+        except ConfigError as error:
+            self.problem = str(error)
+        except (OSError, ValueError) as error:  # ValueError: a name with an empty part
+            self.problem = f"broker {self.target}: {why(error, self.target)}"
+        if self.problem:
+            self._close()
+        with self._handing:
+            if not self._unwanted:
+                self.over = True
+                self._wake()
+                return
+        self._close()
+
+    def _connect(self) -> None:
+        """ConfigError: a file that is needed for it will not do."""
+        settings, target, new = self._dialling.settings, self.target, self._protocol == MQTTv5
+        # A client of its own for each attempt: what one has not got rid of is none of the next one's business.
+        client = self.client = Client(
+            CallbackAPIVersion.VERSION2,
+            self._dialling.client_id,
+            clean_session=None if new else not settings.session_expiry_s,
+            protocol=self._protocol,
+            transport=target.transport,
+            reconnect_on_failure=False,
+        )
+        client.connect_timeout = CONNECT_S
+        client.max_inflight_messages_set(0)  # we count them ourselves
+        client.will_set(self._will.topic, self._will.payload, self._will.qos, self._will.retain)
+        if settings.broker == "external":
+            if settings.username is not None:
+                password = read_password(settings.password_file) if settings.password_file else None
+                client.username_pw_set(settings.username, password)
+            if settings.tls is not None:
+                client.tls_set_context(client_context(settings.tls))
+        options: dict[str, Any] = {}
+        if new:
+            properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+            properties.SessionExpiryInterval = settings.session_expiry_s
+            properties.MaximumPacketSize = MAX_PACKET_BYTES
+            properties.ReceiveMaximum = PACKETS
+            options = {"properties": properties, "clean_start": not settings.session_expiry_s}
+        client.connect(target.host, target.port, settings.keep_alive_s, **options)
+        self.socket = cast("socket.socket | None", client.socket())
+        if self.socket is None:
+            self.problem = f"broker {target}: it closes the connection at once"
+
+    def _close(self) -> None:
+        if self.client is not None:
+            hang_up(self.client)
+
+
+def hang_up(client: Client) -> None:
+    """Close its socket, whatever state it is in."""
+    client.on_disconnect = None
+    made = client.socket()
+    if made is not None:
+        with suppress(OSError):
+            made.close()

@@ -1,0 +1,39 @@
+"""What a broker takes, as it says when it lets us in (MQTT 5.0, section 3.2.2.3); one of version 3.1.1 says nothing."""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+from paho.mqtt.properties import Properties
+
+from shmio.endpoints.mqtt.channel import Message
+
+MOST_IN_FLIGHT: Final = 1000
+"""Messages that the broker has not acknowledged."""
+HEAD_BYTES: Final = 64
+"""Of a packet, beside topic and payload, at most."""
+
+
+class Limits(NamedTuple):
+    """``in_flight``: messages without an acknowledgement; ``packet_bytes``: None for any."""
+
+    in_flight: int = MOST_IN_FLIGHT
+    packet_bytes: int | None = None
+    qos: int = 1
+    retain: bool = True
+
+    @classmethod
+    def told(cls, properties: Properties | None) -> Limits:
+        """Those of a CONNACK."""
+        told = vars(properties) if properties is not None else {}
+        return cls(
+            min(MOST_IN_FLIGHT, told.get("ReceiveMaximum", MOST_IN_FLIGHT)),
+            told.get("MaximumPacketSize"),
+            min(1, told.get("MaximumQoS", 1)),
+            bool(told.get("RetainAvailable", 1)),
+        )
+
+    def fit(self, message: Message) -> bool:
+        """Whether it is not too large."""
+        size = HEAD_BYTES + len(message.topic.encode()) + len(message.payload)
+        return self.packet_bytes is None or size <= self.packet_bytes
