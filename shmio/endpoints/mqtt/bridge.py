@@ -6,7 +6,7 @@ import logging
 import os
 import selectors
 import time
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Container, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Final
@@ -64,6 +64,8 @@ class Bridge:
         self.link.on_message = self._commands.take
         self.link.on_lost = self.outbox.lose
         self._more: set[Feed] = set()
+        self._rest_s = 0.0
+        """So long there is nothing to do but what comes."""
         self._generation = -1
         self._reader = ThreadPoolExecutor(1, "reader")
         self._sparkplug: Session | None = None
@@ -102,40 +104,38 @@ class Bridge:
 
     def turn(self) -> None:
         """Wait until there is something to do, at most about ``TURN_S``, and do it."""
-        for key, events in self._selector.select(self._patience_s()):
+        for key, events in self._selector.select(self._rest_s):
             key.data(events)
         self._link_turn()
         self._follow()
         self.steps.look(self._feeds.values())
         for feed in list(self._more):
             self._look(feed)
+        due_s = [TURN_S, *self._settle()]
         self.outbox.flush()
-        self._link_turn()
-        if self._sparkplug is not None:
-            self._sparkplug.turn()
-
-    def _patience_s(self) -> float:
-        if self._more or self.outbox.able:
-            return 0.0
-        due_s = [TURN_S, self.link.turn()]
+        due_s.append(self._link_turn())
         if self._sparkplug is not None:
             due_s.append(self._sparkplug.turn())
+        self._rest_s = 0.0 if self._more or self.outbox.able else min(due_s)
+
+    def _settle(self) -> Iterator[float]:
+        """Have told what may be told again by now; in how many seconds there is more of each source."""
         for feed in self._feeds.values():
             due_ns = None if feed.held else feed.settle()
             if due_ns is not None:
-                due_s.append(max(0.0, (due_ns - feed.block.now_ns()) / 1e9))
-        self.outbox.flush()
-        return 0.0 if self.outbox.able else min(due_s)
+                yield max(0.0, (due_ns - feed.block.now_ns()) / 1e9)
 
-    def _link_turn(self) -> None:
+    def _link_turn(self) -> float:
+        """In how many seconds it has to be turned again."""
         link = self.link
-        link.turn()
+        rest_s = link.turn()
         if link.problem and not link.up:
             self.outbox.keeping = True
         if link.came_up:
             link.came_up = False
             self.outbox.keeping = True
             self._greet()
+        return rest_s
 
     def _greet(self) -> None:
         """A connection was made: take commands, tell that we are there, what was kept, and how everything is now."""

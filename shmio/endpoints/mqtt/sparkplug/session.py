@@ -110,7 +110,6 @@ class Session:
         """Do what is due; in how many seconds there is more."""
         if not self._defined:
             self._define()
-        rest_s = self.link.turn()
         if self.link.problem and not self.link.up:
             self._keeping = True
         if self.link.came_up:
@@ -124,7 +123,8 @@ class Session:
             for news in device.look():
                 self._tell(name, device, news.kind, news.at)
         self._flush()
-        more = self._room <= 0 or any(device.behind for device in self._devices.values())
+        rest_s = self.link.turn()  # behind what it was given, to hear when it takes the rest
+        more = self._room <= 0 or self.link.came_up or any(device.behind for device in self._devices.values())
         return 0.0 if more else rest_s
 
     def close(self) -> None:
