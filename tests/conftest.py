@@ -15,6 +15,8 @@ import pytest
 from hypothesis import settings
 from xdist.scheduler import LoadScopeScheduling
 
+from shmio.testing.mosquitto import missing
+
 # Tests interrupt themselves and others; who runs in the background, or beside others, begins with SIGINT ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -129,3 +131,14 @@ def instance() -> Iterator[str]:
 def shared_instance() -> Iterator[str]:
     """The same for an instance that several tests of a module use."""
     yield from _named()
+
+
+@pytest.fixture(params=["mosquitto", "embedded"])
+def program(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """What our own broker is asked to be: with mosquitto on the machine, and without."""
+    if request.param == "mosquitto":
+        if reason := missing():
+            pytest.skip(reason)
+    else:
+        monkeypatch.setenv("SHMIO_MOSQUITTO", "")
+    return str(request.param)

@@ -24,7 +24,6 @@ listen = "{broker}"
 prefix = "shmio/test"
 """
 SOURCE = 'connector = "s7"\n'
-PROGRAMS = ["mosquitto", "embedded"]
 REBIRTH = Payload(metrics=[Metric(name="Node Control/Rebirth", boolean_value=True)]).SerializeToString()
 
 
@@ -40,17 +39,6 @@ def running(make_cell: Callable[..., Cell], broker: Address, *, more: str = "") 
     cell = make_cell(config=config)
     cell.up()
     yield cell
-
-
-@pytest.fixture(params=PROGRAMS)
-def program(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
-    """With mosquitto, and without."""
-    if request.param == "mosquitto":
-        if reason := missing():
-            pytest.skip(reason)
-    else:
-        monkeypatch.setenv("SHMIO_MOSQUITTO", "")
-    return str(request.param)
 
 
 def counts(listener: Listener, topic: str, count: int) -> None:

@@ -21,7 +21,6 @@ from shmio.endpoints.mqtt import broker, mosquitto
 from shmio.endpoints.mqtt.place import folder
 from shmio.errors import ConfigError, EndpointError
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
-from shmio.testing.mosquitto import missing
 from shmio.testing.ports import reserved_port
 from tests.unit.endpoints.harness import LAYOUT, STALE_NS, WRITABLE, image
 from tests.unit.endpoints.mqtt.harness import PREFIX, TIMEOUT_S, Running, bridge, listening
@@ -41,17 +40,6 @@ def segment(instance: str, tmp_path: Path) -> Iterator[Segment]:
 def address() -> Iterator[Address]:
     with reserved_port() as address:
         yield address
-
-
-@pytest.fixture(params=["mosquitto", "embedded"])
-def program(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """With mosquitto, and without."""
-    if request.param == "mosquitto":
-        if reason := missing():
-            pytest.skip(reason)
-    else:
-        monkeypatch.setenv("SHMIO_MOSQUITTO", "")
-    return str(request.param)
 
 
 class Process:
