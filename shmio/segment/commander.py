@@ -28,6 +28,9 @@ MIN_PERIODS: Final = 3
 _MODELS: Final = frozenset({"simulation", "remote"})  # connectors whose sources have registers that nobody writes
 PATIENCE_S: Final = 1.0
 """What is added for the device's answer to arrive."""
+RESTARTED: Final = "the source was restarted meanwhile; it is not known whether the value was written"
+REPLACED: Final = "the source was changed or removed by a reload; it is not known whether the value was written"
+SILENT: Final = "the source gave no answer in time; it is not known whether the value was written"
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,9 +250,9 @@ class Commander:
 
     def _silence(self, ticket: Ticket) -> str:
         if self.block.retired:
-            return "the source was changed or removed by a reload; it is not known whether the value was written"
+            return REPLACED
         if self.block.incarnation != ticket.incarnation:
-            return "the source was restarted meanwhile; it is not known whether the value was written"
+            return RESTARTED
         if ticket.events.missed:
             return f"{ticket.events.missed} events were missed, the answer may be among them"
-        return "the source gave no answer in time; it is not known whether the value was written"
+        return SILENT

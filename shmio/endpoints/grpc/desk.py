@@ -9,8 +9,8 @@ from typing import Any, Final, Unpack
 
 from shmio.config import Declaration
 from shmio.endpoints.grpc.followers import Follower
-from shmio.endpoints.grpc.inlet import RETIRED, Inlet
-from shmio.endpoints.grpc.pending import Done, End
+from shmio.endpoints.grpc.inlet import Inlet
+from shmio.endpoints.pending import RETIRED, Done, End
 from shmio.errors import CommandError
 from shmio.layout.write import Write
 from shmio.segment import EventKind

@@ -12,11 +12,10 @@ from shmio.endpoints.grpc.beneath import Beneath
 from shmio.endpoints.grpc.echo import Listener
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.followers import Follower
-from shmio.endpoints.grpc.inlet import RETIRED
 from shmio.endpoints.grpc.outbox import EventLane, Finish, Outbox, StateLane
-from shmio.endpoints.grpc.pending import Done, End, worst
 from shmio.endpoints.grpc.shape import Shape
 from shmio.endpoints.grpc.subject import Encode, Source, Subject
+from shmio.endpoints.pending import RETIRED, Done, End, worst
 from shmio.errors import CommandError, PathError
 from shmio.layout.topic import Topic, find
 from shmio.layout.write import covering, encode

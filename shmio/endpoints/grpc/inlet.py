@@ -6,7 +6,7 @@ import asyncio
 import time
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Final, Unpack
+from typing import Unpack
 
 import msgspec
 
@@ -15,19 +15,14 @@ from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.ear import Ear
 from shmio.endpoints.grpc.echo import Echo
 from shmio.endpoints.grpc.followers import Follower, Followers
-from shmio.endpoints.grpc.pending import Cost, Done, Pending
+from shmio.endpoints.pending import MAX_OPEN, RETIRED, Cost, Done, Pendings
 from shmio.errors import CommandError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
 from shmio.layout.write import Write, merge
 from shmio.segment import Block, Event, EventKind
-from shmio.segment.commander import PATIENCE_S, Commander, Ticket
+from shmio.segment.commander import Commander, Ticket
 from shmio.segment.commands import Laid
-
-MAX_OPEN: Final = 512
-"""Events that may be outstanding: a quarter of the ring, so that none is overwritten before it is read."""
-
-RETIRED: Final = "the source was changed or removed by a reload"
 
 
 class Inlet:
@@ -48,14 +43,11 @@ class Inlet:
         self.stamp = stamp
         self.echo = Echo(block, stamp)
         self.followers = Followers()
-        self._writer = writer
         self._loop = asyncio.get_running_loop()
         self._commander = Commander(block, writer)
         self._prepared = False
         self._preparing = asyncio.Lock()
-        self._pending: dict[int, Pending] = {}
-        self._untaken_bytes = 0  # of records that may still lie in the queue
-        self._open_events = 0
+        self._pending = Pendings(writer)
         self._silent = False
         self._turn = asyncio.Lock()  # who waits for room is served in order
         self._freed: asyncio.Future[None] | None = None
@@ -180,12 +172,7 @@ class Inlet:
         *,
         until_accepted: bool = False,
     ) -> None:
-        self._pending[ticket.number] = Pending(
-            ticket.incarnation, ticket.until_ns, cost, len(ticket.paths), done, accepted, until_accepted,
-            open_events=cost.events,
-        )  # fmt: skip
-        self._untaken_bytes += cost.record_bytes
-        self._open_events += cost.events
+        self._pending.add(ticket, cost, done, accepted, until_accepted=until_accepted)
         if self._timer is None:
             self._set_timer()
 
@@ -200,8 +187,9 @@ class Inlet:
         return Cost.of([find(self.block.layout, path).size for path in values])
 
     def _has_room(self, cost: Cost) -> bool:
-        fits = self._untaken_bytes + cost.record_bytes <= self.block.commands.capacity
-        return self._silent or not self._pending or (fits and self._open_events + cost.events <= MAX_OPEN)
+        pending = self._pending
+        fits = pending.untaken_bytes + cost.record_bytes <= self.block.commands.capacity
+        return self._silent or not pending or (fits and pending.open_events + cost.events <= MAX_OPEN)
 
     # ---- what the source says --------------------------------------------------------------------------------
 
@@ -211,20 +199,10 @@ class Inlet:
                 listener.deliver(message)
         for item in self.followers.gather(event):
             self.followers.tell(item)
-        if event.kind == EventKind.STARTED:
-            self._restarted(event)
-        elif event.writer == self._writer and (pending := self._pending.get(event.command)):
+        if self._pending.hear(event):
             self._silent = False
-            self._hear(event, pending)
-
-    def _hear(self, event: Event, pending: Pending) -> None:
-        if not pending.taken:
-            self._untaken_bytes -= pending.cost.record_bytes
-        if pending.open_events:
-            pending.open_events -= 1
-            self._open_events -= 1
-        if pending.hear(event):
-            self._end(event.command)
+            if event.kind == EventKind.STARTED:
+                self._set_timer()
 
     def _missed(self, count: int) -> None:
         """Ends of commands may be among it, too: these are not waited for longer than it takes to come."""
@@ -233,37 +211,13 @@ class Inlet:
         self.followers.skip()
         self.echo.fail(reason)
         self.followers.fail(reason)
-        self._hurry(list(self._pending.values()))
-
-    def _restarted(self, event: Event) -> None:
-        """A successor rejects what its predecessor had not taken; of what it had taken nobody knows."""
-        self._silent = False
-        before = [
-            (number, pending) for number, pending in self._pending.items() if pending.incarnation != event.incarnation
-        ]
-        for number, pending in before:
-            if pending.taken:
-                self._end(number, "the source was restarted meanwhile; it is not known whether the value was written")
-        self._hurry([pending for _, pending in before if not pending.taken])
-
-    def _hurry(self, some: Sequence[Pending]) -> None:
-        soon_ns = time.monotonic_ns() + round(PATIENCE_S * 1e9)
-        for pending in some:
-            pending.until_ns = min(pending.until_ns, soon_ns)
+        self._pending.hurry()
         self._set_timer()
 
     def _retired(self) -> None:
-        for number in list(self._pending):
-            self._end(number, RETIRED)
+        self._pending.end(RETIRED)
         self.followers.end(RETIRED)
         self._free()
-
-    def _end(self, number: int, missing: str = "") -> None:
-        pending = self._pending.pop(number)
-        self._open_events -= pending.open_events
-        if not pending.taken:
-            self._untaken_bytes -= pending.cost.record_bytes
-        pending.finish(missing)
 
     def _free(self) -> None:
         if self._freed is not None and not self._freed.done():
@@ -275,16 +229,12 @@ class Inlet:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        if self._pending:
-            first_ns = min(pending.until_ns for pending in self._pending.values())
-            self._timer = self._loop.call_later(max(0.0, (first_ns - time.monotonic_ns()) / 1e9), self._expire)
+        due_ns = self._pending.due_ns
+        if due_ns is not None:
+            self._timer = self._loop.call_later(max(0.0, (due_ns - time.monotonic_ns()) / 1e9), self._expire)
 
     def _expire(self) -> None:
         self._timer = None
-        now_ns = time.monotonic_ns()
-        for number, pending in list(self._pending.items()):
-            if pending.until_ns <= now_ns:
-                self._silent |= not pending.taken
-                self._end(number, "the source gave no answer in time; it is not known whether the value was written")
+        self._silent |= self._pending.expire()
         self._free()
         self._set_timer()

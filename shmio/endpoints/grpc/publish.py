@@ -12,11 +12,11 @@ from google.protobuf.empty_pb2 import Empty
 from google.protobuf.message import DecodeError
 
 from shmio.endpoints.grpc.arrivals import Arrivals
-from shmio.endpoints.grpc.pending import Done, End, worst
 from shmio.endpoints.grpc.refusals import Refusals
 from shmio.endpoints.grpc.shadows import Shadows, Way
 from shmio.endpoints.grpc.shape import Shape, shape
 from shmio.endpoints.grpc.topics import Topics
+from shmio.endpoints.pending import Done, End, in_words, worst
 from shmio.errors import CommandError, ShmioError, ValueRangeError
 from shmio.layout.topic import shorten
 from shmio.segment import DONE, EventKind
@@ -180,15 +180,15 @@ class Publisher:
                 answer.set_result((EventKind.ACCEPTED, ""))
 
         def ended(ends: Sequence[End]) -> None:
-            kind, reason = worst(ends)
-            if kind in DONE:
+            end = worst(ends)
+            if end[0] in DONE:
                 self.published += 1
                 accepted()  # which nobody said, if an injection took all of it
             elif answer.done():
-                self._refusals.add(reason, request.path, peer)
+                self._refusals.add(in_words(end), request.path, peer)
             else:
                 self._refusals.count += 1
-                answer.set_result((kind, reason))
+                answer.set_result((end[0], in_words(end)))
 
         try:
             await self._way(request).send(ended, accepted)
@@ -230,9 +230,9 @@ class Publisher:
         return task
 
     def _ended(self, value: _Value, path: str, peer: str, ends: Sequence[End]) -> None:
-        kind, reason = worst(ends)
-        if kind in DONE:
+        end = worst(ends)
+        if end[0] in DONE:
             self.published += 1
         else:
-            self._refusals.add(reason, path, peer)
+            self._refusals.add(in_words(end), path, peer)
         value.end()

@@ -14,9 +14,9 @@ from typing import Final, NamedTuple
 
 from shmio.endpoints.grpc.connections import Peer, connected, peer_of
 from shmio.endpoints.grpc.injection import Injection
-from shmio.endpoints.grpc.inlet import RETIRED
 from shmio.endpoints.grpc.shape import Shape
 from shmio.endpoints.grpc.topics import Mark, Topics
+from shmio.endpoints.pending import RETIRED
 from shmio.errors import ConflictError, EndpointError, ValueRangeError
 from shmio.layout.topic import Topic, encode_segment, shorten
 

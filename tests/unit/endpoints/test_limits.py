@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from shmio.client import calls
-from shmio.endpoints.grpc import inlet, load, outbox, server, subscribers, values
+from shmio.endpoints import pending
+from shmio.endpoints.grpc import load, outbox, server, subscribers, values
 from shmio.endpoints.grpc.gate import Limits
 
 PAGE = Path(__file__).parents[3] / "docs/reference/grpc-access.md"
@@ -37,7 +38,7 @@ SILENT_MS = sum(value for name, value in server.OPTIONS if name.startswith("grpc
         ("characters of a subscriber's name or uuid", subscribers.MAX_NAME),
         ("elements of a value of version 2, or of one `Read`", values.MAX_ELEMENTS),
         ("registers of a value of version 2, or of one `Read`", values.MAX_MEMBERS),
-        ("events of a source under way for what clients write", inlet.MAX_OPEN),
+        ("events of a source under way for what clients write", pending.MAX_OPEN),
         ("a client whose host is silent", SILENT_MS // 1000),
     ],
 )

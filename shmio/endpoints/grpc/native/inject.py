@@ -18,11 +18,11 @@ from shmio.endpoints.grpc.native.values import assigned, outcome, packed
 from shmio.endpoints.grpc.native.views import VALUES, head
 from shmio.endpoints.grpc.native.waiting import Waiting
 from shmio.endpoints.grpc.native.written import head_of
-from shmio.endpoints.grpc.pending import End
 from shmio.endpoints.grpc.topics import Topics
+from shmio.endpoints.pending import End, worst
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.layout.write import Write, covering
-from shmio.segment import DONE, Direction, EventKind, Frame
+from shmio.segment import Direction, EventKind, Frame
 from shmio.segment.commands import MAX_NAME_BYTES
 from shmio.segment.diverted import Diverted, apply
 from shmio.wire import shmio_v1_pb2 as wire
@@ -173,7 +173,7 @@ class Injection(Follower):
             self._answer(shadow, (EventKind.REJECTED, str(error)))
             return
         if shadow.sequence:
-            self._answer(shadow, _worst(ends))
+            self._answer(shadow, worst(ends))
 
     def _answer(self, shadow: wire.Shadow, end: End) -> None:
         answer = wire.Answer(sequence=shadow.sequence, outcome=outcome(*end))
@@ -267,8 +267,3 @@ def _check(lay: wire.Lay) -> None:
         raise ValueRangeError(f"lifetime_ms: at most {MAX_LIFETIME_MS}, a day")
     if lay.keep and lay.lifetime_ms:
         raise ValueRangeError("keep and lifetime_ms: what is kept stays until somebody lifts it")
-
-
-def _worst(ends: Sequence[End]) -> End:
-    """One end for all, for neighbours went as one: the first that is not what was wanted."""
-    return next((end for end in ends if end[0] not in DONE), ends[0])
