@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from enum import StrEnum
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 import msgspec
 
@@ -38,6 +38,8 @@ _EVENT: Final = struct.Struct("<QQQqqqQQIIIIIIHBBHH")
 _QUALITIES: Final = (*Quality, Quality.BAD)  # what is none is not to be trusted
 _PROVENANCES: Final = tuple(Provenance)
 _EFFECTIVE: Final = 1  # flag: an effective image follows the raw one
+
+T = TypeVar("T")
 
 FRAME_SCHEMA: Final = b"""Little-endian. u64 number, u64 cycle, i64 publish (ns, CLOCK_MONOTONIC), i64 clock (ns since \
 the instance's start), i64 source (ns UTC), u64 event (last one before), u32 incarnation, u8 quality (0 bad, \
@@ -206,16 +208,20 @@ def decode_event(data: bytes) -> Event:
     )  # fmt: skip
 
 
-def encode_gap(gap: Gap) -> bytes:
-    """A gap as JSON."""
-    return msgspec.json.encode(gap)
+def encode_json(item: Gap | StepMark | ProcessChange) -> bytes:
+    """A gap, a step's end or a change of a process as JSON."""
+    return msgspec.json.encode(item)
+
+
+def _decode_json(data: bytes, kind: type[T], name: str) -> T:
+    if len(data) > MAX_JSON_BYTES:
+        raise ValueError(f"{name} of {len(data)} bytes")
+    return msgspec.json.decode(data, type=kind)
 
 
 def decode_gap(data: bytes) -> Gap:
     """The gap of a message; ValueError."""
-    if len(data) > MAX_JSON_BYTES:
-        raise ValueError(f"a gap of {len(data)} bytes")
-    gap = msgspec.json.decode(data, type=Gap)
+    gap = _decode_json(data, Gap, "a gap")
     if gap.what not in ("frames", "events") or not 0 < gap.first <= gap.last or gap.count != gap.last - gap.first + 1:
         raise ValueError("a gap contradicts itself")
     if min(gap.after_ns, gap.before_ns) < 0:
@@ -223,31 +229,17 @@ def decode_gap(data: bytes) -> Gap:
     return gap
 
 
-def encode_step(mark: StepMark) -> bytes:
-    """A step's end as JSON."""
-    return msgspec.json.encode(mark)
-
-
 def decode_step(data: bytes) -> StepMark:
     """The step's end of a message; ValueError."""
-    if len(data) > MAX_JSON_BYTES:
-        raise ValueError(f"a step of {len(data)} bytes")
-    mark = msgspec.json.decode(data, type=StepMark)
+    mark = _decode_json(data, StepMark, "a step")
     if min(mark.step, mark.time_ns, mark.dt_ns) < 0:
         raise ValueError("a step is negative")
     return mark
 
 
-def encode_process(change: ProcessChange) -> bytes:
-    """A change of a process as JSON."""
-    return msgspec.json.encode(change)
-
-
 def decode_process(data: bytes) -> ProcessChange:
     """The change of a process of a message; ValueError."""
-    if len(data) > MAX_JSON_BYTES:
-        raise ValueError(f"a change of a process of {len(data)} bytes")
-    return msgspec.json.decode(data, type=ProcessChange)
+    return _decode_json(data, ProcessChange, "a change of a process")
 
 
 def encode_place(place: Place) -> str:

@@ -9,6 +9,7 @@ from typing import IO, Final, cast
 import mcap.writer
 
 from shmio import __version__
+from shmio.dump.blocks import DumpBlock
 from shmio.dump.encoding import (
     ABOUT,
     EVENT,
@@ -30,10 +31,8 @@ from shmio.dump.encoding import (
     StepMark,
     encode_event,
     encode_frame,
-    encode_gap,
+    encode_json,
     encode_place,
-    encode_process,
-    encode_step,
 )
 from shmio.layout.model import Layout
 from shmio.recording.output import Output
@@ -55,10 +54,10 @@ class Channels:
 
 
 class Writer:
-    """Writes one recording to an :class:`Output`; one thread. Nothing here waits for the disk."""
+    """Writes one recording; one thread. With an :class:`Output` nothing here waits for the disk."""
 
-    def __init__(self, output: Output, about: Mapping[str, str]) -> None:
-        """``about``: what the reader is told of the instance."""
+    def __init__(self, output: Output | IO[bytes], about: Mapping[str, str]) -> None:
+        """``output``: or any other file. ``about``: what the reader is told of the instance."""
         self._output = output
         self._mcap = mcap.writer.Writer(cast("IO[bytes]", output), chunk_size=CHUNK_BYTES, enable_data_crcs=True)
         self._mcap.start(PROFILE, f"shmio {__version__}")
@@ -77,7 +76,13 @@ class Writer:
         self._mcap.add_attachment(changed_ns, now_ns, name, media_type, data)
 
     def open_block(
-        self, block: Block, number: int, after_frame: int, after_event: int, layout: Layout | None = None, of: str = ""
+        self,
+        block: Block | DumpBlock,
+        number: int,
+        after_frame: int,
+        after_event: int,
+        layout: Layout | None = None,
+        of: str = "",
     ) -> Channels:
         """Begin a block: the ``number``-th in this recording, behind these numbers. Its layout was attached before.
 
@@ -118,17 +123,17 @@ class Writer:
 
     def gap(self, gap: Gap, log_ns: int) -> None:
         """Tell what was missed; it comes before what follows it."""
-        self._mcap.add_message(self._channel(GAPS_TOPIC, "shmio.gap.v1", GAP_SCHEMA), log_ns, encode_gap(gap), log_ns)
+        self._mcap.add_message(self._channel(GAPS_TOPIC, "shmio.gap.v1", GAP_SCHEMA), log_ns, encode_json(gap), log_ns)
 
     def step(self, mark: StepMark, log_ns: int) -> None:
         """Tell that a step is done; it comes after all its frames."""
         channel = self._channel(STEPS_TOPIC, "shmio.step.v1", STEP_SCHEMA)
-        self._mcap.add_message(channel, log_ns, encode_step(mark), log_ns, mark.step & 0xFFFFFFFF)
+        self._mcap.add_message(channel, log_ns, encode_json(mark), log_ns, mark.step & 0xFFFFFFFF)
 
     def process(self, change: ProcessChange, log_ns: int) -> None:
         """Tell what has happened to a process."""
         channel = self._channel(PROCESSES_TOPIC, "shmio.process.v1", PROCESS_SCHEMA)
-        self._mcap.add_message(channel, log_ns, encode_process(change), log_ns)
+        self._mcap.add_message(channel, log_ns, encode_json(change), log_ns)
 
     def _channel(self, topic: str, schema: str, text: bytes) -> int:
         """A channel of the instance's own, described in the chunk of its first message."""

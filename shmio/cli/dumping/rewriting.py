@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Final, cast
+from typing import IO, Final
 
 from shmio import __version__
 from shmio.cli.dumping.progress import Progress
@@ -17,30 +17,13 @@ from shmio.dump.encoding import Gap, ProcessChange, Reason, StepMark
 from shmio.dump.entries import Entry
 from shmio.dump.reader import Item
 from shmio.errors import RecordingError
-from shmio.recording.output import Output
 from shmio.recording.writer import JSON, TEXT, TOML, Channels, Writer
-from shmio.segment import Block, Event, Frame
+from shmio.segment import Event, Frame
 
 MAX_ATTACHMENT_BYTES: Final = 16 << 20
 FLUSH_BYTES: Final = 4 << 20
 
 _TYPES: Final = {".json": JSON, ".toml": TOML}
-
-
-class _File:
-    """What the writer writes to: a file that no one has yet."""
-
-    def __init__(self, stream: IO[bytes]) -> None:
-        self._stream = stream
-
-    def write(self, data: bytes | memoryview) -> int:
-        return self._stream.write(data)
-
-    def tell(self) -> int:
-        return self._stream.tell()
-
-    def flush(self) -> None:
-        self._stream.flush()
 
 
 class _Track:
@@ -62,7 +45,7 @@ class Rewriter:
         """``made`` says by what; ``whole`` as of :func:`rewrite`."""
         self._whole = whole
         about = {**dump.about, "made_by": made, "made_version": __version__}
-        self._writer = Writer(cast("Output", _File(stream)), about)
+        self._writer = Writer(stream, about)
         self._dump = dump
         self._tracks: dict[DumpBlock, _Track] = {}
         self._layouts: set[bytes] = set()
@@ -133,7 +116,7 @@ class Rewriter:
             self._writer.attach(name, JSON, block.layout.to_json(), waiting[0].time_ns)
         track.number = len([one for one in self._tracks.values() if one.channels]) + 1
         track.channels = self._writer.open_block(
-            cast("Block", block), track.number, track.last["frames"], track.last["events"], of=block.of
+            block, track.number, track.last["frames"], track.last["events"], of=block.of
         )
         for entry in waiting:
             self._of_block(block, entry)

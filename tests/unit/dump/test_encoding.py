@@ -16,7 +16,7 @@ from shmio.dump.encoding import (
     decode_gap,
     encode_event,
     encode_frame,
-    encode_gap,
+    encode_json,
 )
 from shmio.segment import Event, Frame, Provenance, Quality
 
@@ -49,7 +49,7 @@ def test_an_event(fields: tuple[int, ...], data: bytes, text: str) -> None:
 
 def test_a_gap() -> None:
     gap = Gap("cell", 1, "frames", 5, 9, 5, Reason.OVERTAKEN, 10, 20)
-    assert decode_gap(encode_gap(gap)) == gap
+    assert decode_gap(encode_json(gap)) == gap
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_a_gap() -> None:
 def test_a_gap_that_contradicts_itself(change: dict[str, object]) -> None:
     fields = {"source": "c", "block": 1, "what": "frames", "first": 5, "last": 9, "count": 5, "reason": "overtaken"}
     with pytest.raises(ValueError, match="contradicts"):
-        decode_gap(encode_gap(Gap(**fields | change)))  # type: ignore[arg-type]
+        decode_gap(encode_json(Gap(**fields | change)))  # type: ignore[arg-type]
 
 
 @given(st.binary(max_size=200))

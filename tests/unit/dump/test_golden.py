@@ -29,9 +29,7 @@ from shmio.dump.encoding import (
     decode_step,
     encode_event,
     encode_frame,
-    encode_gap,
-    encode_process,
-    encode_step,
+    encode_json,
 )
 from shmio.dump.reader import Reader
 
@@ -40,9 +38,9 @@ FILES = ["closed.mem", "killed.mem"]
 CODECS: dict[str, tuple[Callable[[bytes], Any], Callable[[Any], bytes]]] = {
     FRAME: (decode_frame, encode_frame),
     EVENT: (decode_event, encode_event),
-    GAP: (decode_gap, encode_gap),
-    STEP: (decode_step, encode_step),
-    PROCESS: (decode_process, encode_process),
+    GAP: (decode_gap, encode_json),
+    STEP: (decode_step, encode_json),
+    PROCESS: (decode_process, encode_json),
 }
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.dump.encoding import Life, ProcessChange, decode_process, encode_process
+from shmio.dump.encoding import Life, ProcessChange, decode_process, encode_json
 from shmio.dump.reader import Reader
 from shmio.recording import recorder as recorder_module
 from shmio.recording import tap as tap_module
@@ -143,4 +143,4 @@ def test_what_is_no_change_is_refused(data: bytes) -> None:
 
 def test_a_change_comes_out_as_it_went_in() -> None:
     change = ProcessChange("cell", "source", 7, Life.DIED, "grün", 3)
-    assert decode_process(encode_process(change)) == change
+    assert decode_process(encode_json(change)) == change

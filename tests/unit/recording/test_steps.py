@@ -10,7 +10,7 @@ import pytest
 
 from shmio.cli.dump import main
 from shmio.dump.check import check
-from shmio.dump.encoding import Reason, StepMark, decode_step, encode_step
+from shmio.dump.encoding import Reason, StepMark, decode_step, encode_json
 from shmio.dump.reader import Reader
 from shmio.recording.recorder import Recorder
 from shmio.segment import Attributes, BlockSpec, Frame, ProcessSpec, Segment
@@ -161,4 +161,4 @@ def test_what_is_no_step_is_refused(data: bytes) -> None:
 
 def test_a_step_comes_out_as_it_went_in() -> None:
     mark = StepMark(7, 140 * MS, 20 * MS)
-    assert decode_step(encode_step(mark)) == mark
+    assert decode_step(encode_json(mark)) == mark
