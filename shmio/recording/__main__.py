@@ -74,9 +74,9 @@ def _record(worker: Worker, series: Series | Triggered) -> None:
     clock.deliver(slot, 0)  # from now on each step waits for it
     while not worker.stopping.is_set():
         if not more:
-            seen = bell.wait(seen, round(series.pause_s * 1e9))
+            seen = bell.wait(seen, round(series.tap.pause_s * 1e9))
         more = series.turn()
-        if (done := series.done) != clock.delivered(slot):
+        if (done := series.tap.done) != clock.delivered(slot):
             clock.deliver(slot, done)
         if time.monotonic() - told_s < BEAT_S:
             continue

@@ -33,13 +33,16 @@ def own_files(directory: Path, instance: str) -> list[Path]:
     for file in directory.glob(f"{instance}-*{SUFFIX}"):
         if name.fullmatch(file.name):
             with suppress(OSError):  # removed just now
-                status = file.lstat()
-                own = stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid()
-                (found if own else strange).append(file)
+                (found if is_own(file.lstat()) else strange).append(file)
     if strange:
         more = f", and {len(strange) - 1} others," if len(strange) > 1 else ""
         log.warning("%s%s passed over: no regular file of this user", strange[0], more)
     return found
+
+
+def is_own(status: os.stat_result) -> bool:
+    """Whether it is a regular file of this user."""
+    return stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid()
 
 
 def about_of(file: Path, instance: str, by: str, beat: Callable[[], object] = lambda: None) -> dict[str, str]:

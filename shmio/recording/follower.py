@@ -74,11 +74,6 @@ class Follower:
         self._frames = _Side("frames", block.cursor(after=place.frame), place.log_ns, reason)
         self._events = _Side("events", block.events.cursor(after=place.event), place.log_ns, reason)
 
-    @property
-    def place(self) -> Place:
-        """Behind what was taken last."""
-        return Place(self._frames.last, self._events.last, self._log_ns)
-
     def take(self, limit: int) -> Iterator[Entry]:
         """At most about so many entries that are there by now."""
         retired = self.block.retired  # before looking: what was published before the end is still read

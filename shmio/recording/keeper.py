@@ -6,8 +6,6 @@ In a thread of its own, so that neither many files nor a slow disk hold up the r
 from __future__ import annotations
 
 import logging
-import os
-import stat
 import threading
 import time
 from collections.abc import Callable
@@ -18,7 +16,7 @@ from shmio.config import Recorder as Settings
 from shmio.dump.reader import Reader
 from shmio.errors import RecordingError
 from shmio.recording.finalise import finalise
-from shmio.recording.folder import about_of, own_files
+from shmio.recording.folder import about_of, is_own, own_files
 
 LOOK_S: Final = 60.0
 DAY_S: Final = 86_400
@@ -139,6 +137,4 @@ def _file(path: Path) -> _File | None:
         found = path.lstat()
     except OSError:
         return None
-    if not stat.S_ISREG(found.st_mode) or found.st_uid != os.geteuid():
-        return None
-    return _File(path, found.st_ino, found.st_size, found.st_mtime_ns)
+    return _File(path, found.st_ino, found.st_size, found.st_mtime_ns) if is_own(found) else None

@@ -47,7 +47,6 @@ class Series:
 
         ``about``: what else is to be told of this recording. RecordingError: no file can be made.
         """
-        self._tap = tap
         self._settings = settings
         self._by = by
         self._attachments = attachments
@@ -84,9 +83,7 @@ class Series:
 
     def turn(self) -> bool:
         """Record what has been published; whether there is more at once. RecordingError: the file was removed."""
-        entries, more = self._tap.take()
-        self.put(entries)
-        return more
+        return self.recorder.turn()
 
     def put(self, entries: Iterable[Entry | Aside]) -> None:
         """Record what the tap gave. RecordingError: the file was removed."""
@@ -103,6 +100,11 @@ class Series:
         return all(recorder.output.ended for recorder in (*self._ending, self.recorder))
 
     @property
+    def tap(self) -> Tap:
+        """What is recorded from: another one after a file that was given up."""
+        return self.recorder.tap
+
+    @property
     def file(self) -> Path:
         """What is being written."""
         return self.recorder.output.path
@@ -111,16 +113,6 @@ class Series:
     def written(self) -> int:
         """Bytes in the present file."""
         return self.recorder.output.written
-
-    @property
-    def pause_s(self) -> float:
-        """How long to wait between two turns."""
-        return self._tap.pause_s
-
-    @property
-    def done(self) -> int:
-        """The last step of virtual time of which all is recorded, or lost for want of room."""
-        return self._tap.done
 
     @property
     def problem(self) -> str:
@@ -157,7 +149,7 @@ class Series:
         old = self.recorder
         old.settle()
         try:
-            self.recorder = self._begin(self._tap, old.places, {}, after=old.output)
+            self.recorder = self._begin(self.tap, old.places, {}, after=old.output)
         except RecordingError as error:
             log.error("%s; going on in %s", error, old.output.path)
             self._again_s = time.monotonic() + MAX_WAIT_S
@@ -173,7 +165,7 @@ class Series:
         self._wait_s = min(2 * self._wait_s, MAX_WAIT_S)
         output = doubtful.output
         about = {"doubtful": output.path.name, "doubtful_from": str(output.synced)}
-        tap, places = self._tap, None
+        tap, places = self.tap, None
         if self._takes:
             tap = tap.again(Start(doubtful.confirmed, True, Reason.UNSURE))
         else:  # somebody else's, who has no more of what is in doubt
@@ -189,7 +181,7 @@ class Series:
             self._ending.remove(doubtful)
             output.close(0)
         self._finish(CLOSE_S)
-        self._tap, self.recorder = tap, recorder
+        self.recorder = recorder
         return True
 
     def _finish(self, patience_s: float) -> bool:

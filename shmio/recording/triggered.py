@@ -33,7 +33,7 @@ class Triggered:
     ) -> None:  # fmt: skip
         """``going``: a recorder that died was within such a recording. ConfigError: the condition cannot be."""
         self.counters = Counters()
-        self._tap = tap
+        self.tap = tap
         self._settings = settings
         self._trigger = Trigger(trigger.when, tap.segment.blocks)
         self._times = trigger
@@ -49,8 +49,8 @@ class Triggered:
 
     def turn(self) -> bool:
         """Look what has been published, and record what is to be; whether there is more at once. RecordingError."""
-        self._trigger.follow(self._tap.segment.blocks)
-        entries, more = self._tap.take()
+        self._trigger.follow(self.tap.segment.blocks)
+        entries, more = self.tap.take()
         batch: list[Entry | Aside] = []
         for entry in entries:
             if self._series and entry.log_ns > self._until_ns:
@@ -64,7 +64,7 @@ class Triggered:
                 self._backlog.add(entry)
         if self._series:
             self._series.put(batch)
-            if not self._tap.segment.clock.read().virtual and self._tap.now() > self._until_ns + TURN_NS:
+            if not self.tap.segment.clock.read().virtual and self.tap.now() > self._until_ns + TURN_NS:
                 self._end([])  # nothing comes any more that would tell
         return more
 
@@ -77,7 +77,7 @@ class Triggered:
         about = {"trigger": self._trigger.when, "triggered_ns": str(log_ns)}
         try:
             series = Series(
-                self._tap, self._settings, self._by, self._attachments,
+                self.tap, self._settings, self._by, self._attachments,
                 places=self._backlog.places, about=about, counters=self.counters,
             )  # fmt: skip
         except RecordingError as error:  # the seconds before are kept; with the next frame that fires it is tried again
@@ -113,16 +113,6 @@ class Triggered:
         return bool(self._series and self._series.tend())
 
     @property
-    def pause_s(self) -> float:
-        """How long to wait between two turns."""
-        return self._tap.pause_s
-
-    @property
-    def done(self) -> int:
-        """The last step of virtual time of which all has been taken."""
-        return self._tap.done
-
-    @property
     def problem(self) -> str:
         """What is wrong at present, in words; empty: nothing."""
         return next(filter(None, (series.problem for series in self._all)), self._problem)
@@ -145,6 +135,6 @@ class Triggered:
         """Take what is there, close all files; what is wrong with those that are not whole."""
         while self.turn():
             pass
-        self._end(self._tap.rest())
+        self._end(self.tap.rest())
         until_s = time.monotonic() + patience_s
         return [text for series in self._ending for text in series.close(max(0.1, until_s - time.monotonic()))]

@@ -70,7 +70,7 @@ def _record(segment: Segment, work: Series | Triggered, stopping: threading.Even
     until_s = None if duration_s is None else time.monotonic() + duration_s
     look_s, more, problem, file = 0.0, False, "", work.file
     while True:
-        rest_s = work.pause_s if until_s is None else min(work.pause_s, until_s - time.monotonic())
+        rest_s = work.tap.pause_s if until_s is None else min(work.tap.pause_s, until_s - time.monotonic())
         if rest_s <= 0 or stopping.wait(0 if more else rest_s):
             return True
         more = work.turn()

@@ -112,7 +112,7 @@ def test_a_step_at_the_seam_is_told_once(segment: Segment, tmp_path: Path) -> No
         coordinator.step(1_000_000)
         work.turn()
         tend(work)
-    done = work.done
+    done = work.tap.done
     assert work.close() == []
     coordinator.close()
     found = files(tmp_path)
