@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
@@ -12,6 +11,7 @@ from mcap.opcode import Opcode
 from shmio.dump.channels import Channel
 from shmio.dump.damage import Damage, DamageLog
 from shmio.dump.encoding import EVENT, FRAME, Gap
+from shmio.dump.framing import U32, U64
 from shmio.dump.reader import Reader
 from shmio.dump.records import BROKEN, Record
 from shmio.dump.survey import MAX_BLOCKS, Count, read_index
@@ -19,9 +19,6 @@ from shmio.errors import RecordingError
 
 MAX_TOLD: Final = 1000
 """Damaged places, and contradictions, that are kept one by one; all are counted."""
-
-_CRC: Final = struct.Struct("<I")
-_NUMBER: Final = struct.Struct("<Q")  # how frames and events begin
 
 
 @dataclass(slots=True)
@@ -133,10 +130,8 @@ class _Check:
             self._problem(f"the chunk at byte {record.at}: its times are not those of its messages")
 
     def _message(self, channel: Channel, data: memoryview) -> None:
-        if (
-            channel.encoding in (EVENT, FRAME) and len(data) >= _NUMBER.size
-        ):  # even if the rest of it is not to be decoded
-            self._numbers.take(channel, *_NUMBER.unpack_from(data))
+        if channel.encoding in (EVENT, FRAME) and len(data) >= U64.size:  # even if the rest is not to be decoded
+            self._numbers.take(channel, *U64.unpack_from(data))
         item = self._reader.decode(channel, data)
         if isinstance(item, Gap):
             self._numbers.gap(item)
@@ -158,7 +153,7 @@ class _Check:
     def _check_data(self, record: Record) -> None:
         """The CRC of everything, for what has none of its own: metadata, times, indexes."""
         self._log.end()
-        (crc,) = _CRC.unpack(self._records.read(record.at, _CRC.size))
+        (crc,) = U32.unpack(self._records.read(record.at, U32.size))
         if crc and self._found.whole and self._records.crc(0, record.start) != crc:
             self._problem("bytes between the chunks were changed: the checksum of all data is wrong")
 

@@ -13,8 +13,10 @@ from mcap.opcode import Opcode
 MAX_CHUNK_BYTES: Final = 32 << 20
 """Far more than a recorder makes: 1 MiB and one message of at most 2 MiB."""
 
+HEAD: Final = struct.Struct("<BQ")  # of any record: opcode, size of its content
 CHUNK: Final = struct.Struct("<QQQI")  # start, end, uncompressed size, CRC; then the compression's name, size, data
 FOOTER: Final = struct.Struct("<QQI")  # start of the summary, start of its offsets, CRC of the summary up to here
+INDEX: Final = struct.Struct("<HI")  # channel, bytes of the entries that follow
 U32: Final = struct.Struct("<I")
 U64: Final = struct.Struct("<Q")
 SIZES: Final[dict[int, int]] = {Opcode.DATA_END: 4, Opcode.FOOTER: FOOTER.size}
@@ -60,10 +62,10 @@ def framed(opcode: int, size: int, look: bytes) -> bool:
 def unpack(content: bytes) -> bytes:
     """The records of a chunk, uncompressed; ValueError, struct.error, ZstdError."""
     _, _, size, crc = CHUNK.unpack_from(content)
-    (name_size,) = struct.unpack_from("<I", content, CHUNK.size)
+    (name_size,) = U32.unpack_from(content, CHUNK.size)
     at = CHUNK.size + 4 + name_size
     compression = content[CHUNK.size + 4 : at].decode()
-    (packed_size,) = struct.unpack_from("<Q", content, at)
+    (packed_size,) = U64.unpack_from(content, at)
     packed = memoryview(content)[at + 8 :]
     if packed_size != len(packed):
         raise ValueError("its sizes contradict each other")

@@ -38,9 +38,7 @@ class Part:
         except BaseException:
             self.reader.close()
             raise
-        times = [(track.first_ns, track.last_ns) for track in self.found.tracks.values() if track.channel.source]
-        self.begin_ns = min((first_ns for first_ns, _ in times), default=0)
-        self.end_ns = max((last_ns for _, last_ns in times), default=0)
+        self.begin_ns, self.end_ns = self.found.begin_ns, self.found.end_ns
 
     def messages(self, channels: Collection[int], from_ns: int, to_ns: int) -> Iterator[Message]:
         """Messages of the channels with these numbers in a range of log times, as the file has them."""

@@ -22,7 +22,7 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 
-from shmio.dump.framing import CHUNK, FOOTER, MAX_CHUNK_BYTES, U32, framed, unpack
+from shmio.dump.framing import CHUNK, FOOTER, HEAD, MAX_CHUNK_BYTES, U32, framed, unpack
 from shmio.errors import RecordingError
 
 MAGIC: Final = b"\x89MCAP0\r\n"
@@ -36,7 +36,6 @@ LOOK_BYTES: Final = 4096
 BEAT_BYTES: Final = 1 << 20
 """After so much that was read or unpacked the reader's caller is told that it goes on."""
 
-_HEAD: Final = struct.Struct("<BQ")
 _MARK: Final = re.compile(  # how each chunk and each attachment of ours begins
     rb"\x06(?=.{36}\x04\x00\x00\x00zstd)|\x09(?=.{24}.\x00\x00\x00(?:layouts|config|sources)/)", re.DOTALL
 )
@@ -56,7 +55,7 @@ class Record(NamedTuple):
     @property
     def start(self) -> int:
         """Where the record itself begins."""
-        return self.at - _HEAD.size
+        return self.at - HEAD.size
 
 
 class Records:
@@ -134,7 +133,7 @@ class Records:
         footer = self._footer(len(MAGIC))
         if not footer:
             return
-        at, _, _ = FOOTER.unpack(self.read(footer + _HEAD.size, FOOTER.size))
+        at, _, _ = FOOTER.unpack(self.read(footer + HEAD.size, FOOTER.size))
         while at >= len(MAGIC) and at < footer and (record := self.record(at)) is not None:
             yield record
             at = record.at + record.size
@@ -142,8 +141,8 @@ class Records:
     def summary_damage(self) -> str:
         """What the footer's CRC tells of the summary of a file that was closed; empty: it is whole, or has no CRC."""
         footer = self._footer(len(MAGIC))
-        start, _, crc = FOOTER.unpack(self.read(footer + _HEAD.size, FOOTER.size))
-        end = footer + _HEAD.size + FOOTER.size - U32.size
+        start, _, crc = FOOTER.unpack(self.read(footer + HEAD.size, FOOTER.size))
+        end = footer + HEAD.size + FOOTER.size - U32.size
         whole = not crc or (start <= end and self.crc(start, end) == crc)
         return "" if whole else f"the index between byte {start} and byte {footer} is damaged: its checksum is wrong"
 
@@ -174,12 +173,12 @@ class Records:
 
     def record(self, at: int) -> Record | None:
         """The record that begins there; None if what is there makes no sense."""
-        head = self._peek(at, _HEAD.size + LOOK_BYTES)
-        if len(head) < _HEAD.size:
+        head = self._peek(at, HEAD.size + LOOK_BYTES)
+        if len(head) < HEAD.size:
             return None
-        opcode, size = _HEAD.unpack_from(head)
-        content = at + _HEAD.size
-        if opcode == BROKEN or size > self.size - content or not framed(opcode, size, head[_HEAD.size :]):
+        opcode, size = HEAD.unpack_from(head)
+        content = at + HEAD.size
+        if opcode == BROKEN or size > self.size - content or not framed(opcode, size, head[HEAD.size :]):
             return None
         if opcode == Opcode.FOOTER and not MAGIC.startswith(self._peek(content + size, len(MAGIC))):
             return None
@@ -206,7 +205,7 @@ class Records:
 
     def _footer(self, at: int) -> int:
         """Where the footer is that ends the file, if not before here; 0: there is none."""
-        start = self.size - len(MAGIC) - FOOTER.size - _HEAD.size
+        start = self.size - len(MAGIC) - FOOTER.size - HEAD.size
         record = self.record(start) if start >= at else None
         if record is None or record.opcode != Opcode.FOOTER or record.at + record.size + len(MAGIC) != self.size:
             return 0
@@ -252,10 +251,10 @@ class Records:
     def _split(self, record: Record, data: memoryview) -> Iterator[tuple[int, memoryview]]:
         at = 0
         while at < len(data):
-            if len(data) - at < _HEAD.size:
+            if len(data) - at < HEAD.size:
                 raise RecordingError(f"{self.file}: the chunk at byte {record.at} ends within a record")
-            opcode, size = _HEAD.unpack_from(data, at)
-            at += _HEAD.size
+            opcode, size = HEAD.unpack_from(data, at)
+            at += HEAD.size
             if size > len(data) - at:
                 raise RecordingError(f"{self.file}: the chunk at byte {record.at} ends within a record")
             yield opcode, data[at : at + size]

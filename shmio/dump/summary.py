@@ -10,7 +10,7 @@ from typing import Final
 from mcap.opcode import Opcode
 
 from shmio.dump.encoding import GAP, Gap
-from shmio.dump.framing import FOOTER
+from shmio.dump.framing import FOOTER, HEAD
 from shmio.dump.reader import Reader
 from shmio.dump.records import Record
 from shmio.dump.survey import Survey, Track, read_index
@@ -19,7 +19,6 @@ from shmio.errors import RecordingError
 MAX_SUMMARY_BYTES: Final = 64 << 20
 """A chunk takes about 90 bytes of it: a week."""
 
-_HEAD: Final = struct.Struct("<BQ")
 _CHUNK_INDEX: Final = struct.Struct("<QQQQI")  # first and last log time, start, length; bytes of the map that follows
 _PLACE: Final = struct.Struct("<HQ")  # a channel and where its message index is, or how many messages it has
 _STATISTICS: Final = struct.Struct("<QHIIIIQQI")
@@ -80,9 +79,9 @@ class _Work:
 
     def _chunk(self, content: memoryview) -> None:
         first_ns, last_ns, start, length, _ = _CHUNK_INDEX.unpack_from(content)
-        if length < _HEAD.size or start + length > self._reader.records.size:
+        if length < HEAD.size or start + length > self._reader.records.size:
             raise ValueError
-        chunk = Record(Opcode.CHUNK, start + _HEAD.size, length - _HEAD.size)
+        chunk = Record(Opcode.CHUNK, start + HEAD.size, length - HEAD.size)
         places = list(_places(content, _CHUNK_INDEX.size))
         for number, index in places:
             self._first.setdefault(number, (chunk, index))
@@ -113,8 +112,8 @@ class _Work:
 def _records(data: bytes) -> Iterator[tuple[int, memoryview]]:
     view, at = memoryview(data), 0
     while at < len(data):
-        opcode, size = _HEAD.unpack_from(data, at)
-        at += _HEAD.size
+        opcode, size = HEAD.unpack_from(data, at)
+        at += HEAD.size
         if size > len(data) - at:
             raise ValueError
         yield opcode, view[at : at + size]

@@ -11,6 +11,7 @@ from mcap.opcode import Opcode
 from shmio.dump.channels import Channel
 from shmio.dump.chunks import Chunks
 from shmio.dump.encoding import GAP, Gap
+from shmio.dump.framing import INDEX, U64
 from shmio.dump.reader import Reader
 from shmio.dump.records import BROKEN, MAX_RECORD_BYTES, Record
 from shmio.errors import RecordingError
@@ -21,9 +22,7 @@ MAX_DAMAGE: Final = 20
 """Damaged places that are told."""
 MAX_BLOCKS: Final = 10_000
 
-_INDEX: Final = struct.Struct("<HI")  # channel, bytes of the entries
 _ENTRY: Final = struct.Struct("<QQ")  # log time, offset
-_NUMBER: Final = struct.Struct("<Q")  # how frames and events begin
 
 
 class Count(NamedTuple):
@@ -59,8 +58,8 @@ class Track:
         found: list[int] = []
         try:
             for channel, _, data in reader.raw(chunk):
-                if channel.number == self.channel.number and len(data) >= _NUMBER.size:
-                    found.append(_NUMBER.unpack_from(data)[0])
+                if channel.number == self.channel.number and len(data) >= U64.size:
+                    found.append(U64.unpack_from(data)[0])  # how frames and events begin
         except RecordingError:
             if not found:  # otherwise it is messages of other channels that are lost
                 raise
@@ -86,6 +85,16 @@ class Survey:
     """What could not be read."""
     chunks: Chunks = field(default_factory=Chunks)
     """All that can be told of, by their indexes or by themselves."""
+
+    @property
+    def begin_ns(self) -> int:
+        """Log time of the first frame or event; 0: there is none."""
+        return min((track.first_ns for track in self.tracks.values() if track.channel.source), default=0)
+
+    @property
+    def end_ns(self) -> int:
+        """Log time of the last one."""
+        return max((track.last_ns for track in self.tracks.values() if track.channel.source), default=0)
 
     def add_gap(self, gap: Gap) -> None:
         """Something was missed. RecordingError: it is of more blocks than a recorder tells of."""
@@ -134,13 +143,13 @@ def survey(reader: Reader) -> Survey:
 
 def read_index(reader: Reader, record: Record) -> Count | None:
     """What a message index says; None if it is of no use."""
-    if not _INDEX.size < record.size <= MAX_RECORD_BYTES or (record.size - _INDEX.size) % _ENTRY.size:
+    if not INDEX.size < record.size <= MAX_RECORD_BYTES or (record.size - INDEX.size) % _ENTRY.size:
         return None
     data = reader.records.read(record.at, record.size)
-    channel, _ = _INDEX.unpack_from(data)
-    first_ns, _ = _ENTRY.unpack_from(data, _INDEX.size)
+    channel, _ = INDEX.unpack_from(data)
+    first_ns, _ = _ENTRY.unpack_from(data, INDEX.size)
     last_ns, _ = _ENTRY.unpack_from(data, record.size - _ENTRY.size)
-    return Count(channel, (record.size - _INDEX.size) // _ENTRY.size, first_ns, last_ns)
+    return Count(channel, (record.size - INDEX.size) // _ENTRY.size, first_ns, last_ns)
 
 
 def _settle(reader: Reader, found: Survey, chunk: Record, counts: list[Count] | None) -> None:

@@ -23,7 +23,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
-from shmio.dump.framing import CHUNK, FOOTER, MAX_CHUNK_BYTES, U32, U64
+from shmio.dump.framing import CHUNK, FOOTER, HEAD, INDEX, MAX_CHUNK_BYTES, U32, U64
 from shmio.dump.reader import Reader
 from shmio.dump.records import BROKEN, MAGIC, Record, stream
 from shmio.errors import RecordingError
@@ -34,8 +34,6 @@ LOOK_BYTES: Final = 4096
 ZEROS_BYTES: Final = 1 << 20
 
 _MESSAGE: Final = struct.Struct("<HIQ")  # channel, sequence, log time
-_HEAD: Final = struct.Struct("<BQ")
-_INDEX: Final = struct.Struct("<HI")  # channel, bytes of the entries
 _ENTRY_BYTES: Final = 16
 
 
@@ -97,10 +95,10 @@ class Ending:
     def _tail(self) -> None:
         """Make sure that what will be cut off is the beginning of one record, or nothing but zeros."""
         size = self._records.size - self.cut
-        if size < _HEAD.size:
+        if size < HEAD.size:
             return
-        opcode, length = _HEAD.unpack(self._records.read(self.cut, _HEAD.size))
-        cut_short = opcode != BROKEN and size - _HEAD.size < length <= MAX_CHUNK_BYTES
+        opcode, length = HEAD.unpack(self._records.read(self.cut, HEAD.size))
+        cut_short = opcode != BROKEN and size - HEAD.size < length <= MAX_CHUNK_BYTES
         if not cut_short and not self._zeros():
             raise self._damaged(self.cut, "it makes no sense from there on")
 
@@ -123,7 +121,7 @@ class Ending:
         name = head[at : at + name_size].decode("ascii", "replace")
         (packed,) = U64.unpack_from(head, at + name_size)
         index = ChunkIndex(
-            chunk_length=record.size + _HEAD.size,
+            chunk_length=record.size + HEAD.size,
             chunk_start_offset=record.start,
             compression=name,
             compressed_size=packed,
@@ -138,11 +136,11 @@ class Ending:
     def _index(self, record: Record) -> None:
         """A message index of the chunk before; channels that are new are described in that chunk."""
         chunk = self._chunks[-1]
-        number, size = _INDEX.unpack(self._records.read(record.at, _INDEX.size))
+        number, size = INDEX.unpack(self._records.read(record.at, INDEX.size))
         if number not in self._channels:
             self._describe(chunk.record)
         chunk.index.message_index_offsets[number] = record.start
-        chunk.index.message_index_length += record.size + _HEAD.size
+        chunk.index.message_index_length += record.size + HEAD.size
         chunk.counts[number] = size // _ENTRY_BYTES
 
     def _describe(self, chunk: Record) -> None:
@@ -150,7 +148,7 @@ class Ending:
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 (number,) = struct.unpack_from("<H", content)
                 known = self._schemas if opcode == Opcode.SCHEMA else self._channels
-                known[number] = _HEAD.pack(opcode, len(content)) + bytes(content)
+                known[number] = HEAD.pack(opcode, len(content)) + bytes(content)
 
     def _index_anew(self) -> None:
         """Of the last chunk, whose indexes may be missing or cut off."""
@@ -164,7 +162,7 @@ class Ending:
                 if opcode == Opcode.MESSAGE:
                     number, _, log_ns = _MESSAGE.unpack_from(content)
                     found.setdefault(number, MessageIndex(number, [])).records.append((log_ns, at))
-                at += _HEAD.size + len(content)
+                at += HEAD.size + len(content)
         chunk.index.message_index_offsets = {}
         builder = RecordBuilder()
         for number, entries in found.items():
@@ -179,14 +177,14 @@ class Ending:
         data = stream(self._records.read(record.at, min(record.size, LOOK_BYTES)))
         log_ns, changed_ns = data.read8(), data.read8()
         name, media_type = data.read_prefixed_string(), data.read_prefixed_string()
-        length = record.size + _HEAD.size
+        length = record.size + HEAD.size
         index = AttachmentIndex(record.start, length, log_ns, changed_ns, data.read8(), name, media_type)
         self._attachments.append(index)
 
     def _metadatum(self, record: Record) -> None:
         self._reader.note(record)
         name = stream(self._records.read(record.at, record.size)).read_prefixed_string()
-        self._metadata.append(MetadataIndex(record.start, record.size + _HEAD.size, name))
+        self._metadata.append(MetadataIndex(record.start, record.size + HEAD.size, name))
 
     def _check(self) -> None:
         """Leave out of the index what is damaged near the end."""
@@ -215,7 +213,7 @@ class Ending:
             SummaryOffset(opcode, at, size).write(builder)
             at += size
         summary = builder.end()
-        covered = summary + _HEAD.pack(Opcode.FOOTER, FOOTER.size) + FOOTER.pack(start, offsets_at, 0)[: -U32.size]
+        covered = summary + HEAD.pack(Opcode.FOOTER, FOOTER.size) + FOOTER.pack(start, offsets_at, 0)[: -U32.size]
         Footer(start, offsets_at, zlib.crc32(covered)).write(builder)
         return b"".join((data, summary, builder.end(), MAGIC))
 
