@@ -6,7 +6,7 @@ import argparse
 import importlib
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from shmio import __version__
@@ -155,23 +155,21 @@ def _ignorable(text: str) -> str:
 
 
 def _amount(text: str) -> float:
-    try:
-        amount = float(text)
-    except ValueError:
-        amount = math.nan
-    if not 0 <= amount < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number from 0 on")
-    return amount
+    return _number(text, lambda amount: 0 <= amount < math.inf, "a number from 0 on")
 
 
 def _seconds(text: str) -> float:
+    return _number(text, lambda seconds: 0 < seconds <= 1e9, "a number of seconds above 0")
+
+
+def _number(text: str, fits: Callable[[float], bool], what: str) -> float:
     try:
-        seconds = float(text)
+        number = float(text)
     except ValueError:
-        seconds = math.nan
-    if not 0 < seconds <= 1e9:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds above 0")
-    return seconds
+        number = math.nan
+    if not fits(number):
+        raise argparse.ArgumentTypeError(f"{text!r} is not {what}")
+    return number
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from shmio.cli.dumping.complaints import Complaints
-from shmio.cli.dumping.moments import MAX_NS, parse_time, span
+from shmio.cli.dumping.moments import span, time_range
 from shmio.cli.dumping.printers import Csv, JsonLines, Printer, Table, View
 from shmio.dump.channels import Channel
 from shmio.dump.encoding import EVENT, FRAME, GAP, PROCESS, STEP, ProcessChange, StepMark
@@ -37,9 +37,7 @@ def execute(arguments: argparse.Namespace) -> int:
     complaints = Complaints()
     with Reader(arguments.file) as reader:
         found = survey(reader)
-        start_ns = min((track.first_ns for track in found.tracks.values() if track.channel.source), default=0)
-        from_ns = parse_time("--from", arguments.begin, start_ns, 0)
-        to_ns = parse_time("--to", arguments.end, start_ns, MAX_NS)
+        from_ns, to_ns = time_range(arguments, found.begin_ns)
         channels = [track.channel for track in found.tracks.values()]
         try:
             views = _views(reader, channels, arguments.patterns, complaints)
@@ -72,11 +70,9 @@ def execute(arguments: argparse.Namespace) -> int:
 
 def _nothing(found: Survey) -> str:
     """Why nothing was printed."""
-    tracks = [track for track in found.tracks.values() if track.channel.source]
-    if not tracks:
+    if not found.begin_ns:
         return "nothing is recorded in it"
-    first_ns, last_ns = min(track.first_ns for track in tracks), max(track.last_ns for track in tracks)
-    return f"nothing of what was asked for is in it then; it goes {span(first_ns, last_ns)}"
+    return f"nothing of what was asked for is in it then; it goes {span(found.begin_ns, found.end_ns)}"
 
 
 def _views(

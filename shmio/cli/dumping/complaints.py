@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from shmio.cli.dumping.moments import lost
 from shmio.dump.damage import Damage
+from shmio.dump.dump import Dump, open_dump
 from shmio.logs import printable
 
 
@@ -15,6 +17,13 @@ class Complaints:
 
     def __init__(self) -> None:
         self.any = False
+
+    def open(self, files: Sequence[Path]) -> Dump:
+        """Open a recording of which what cannot be read is told. OSError, RecordingError as ``open_dump``."""
+        dump = open_dump(files, self.damage)
+        for text in dump.damage:
+            self.say(text)
+        return dump
 
     def damage(self, file: Path, damage: Damage) -> None:
         """A part of a file is lost."""

@@ -6,11 +6,11 @@ import argparse
 from collections.abc import Iterator
 
 from shmio.cli.dumping.complaints import Complaints
-from shmio.cli.dumping.moments import MAX_NS, parse_time, span
+from shmio.cli.dumping.moments import span, time_range
 from shmio.cli.dumping.parts import Parts
 from shmio.cli.dumping.rewriting import rewrite, verified
 from shmio.cli.run import say
-from shmio.dump.dump import Dump, open_dump
+from shmio.dump.dump import Dump
 from shmio.dump.entries import Entry
 from shmio.dump.reader import Item
 from shmio.errors import RecordingError
@@ -19,11 +19,8 @@ from shmio.errors import RecordingError
 def execute(arguments: argparse.Namespace) -> int:
     """Write what lies between two times, of some sources or registers, to a new file."""
     complaints = Complaints()
-    with open_dump(arguments.files, complaints.damage) as dump:
-        for text in dump.damage:
-            complaints.say(text)
-        from_ns = parse_time("--from", arguments.begin, dump.begin_ns, 0)
-        to_ns = parse_time("--to", arguments.end, dump.begin_ns, MAX_NS)
+    with complaints.open(arguments.files) as dump:
+        from_ns, to_ns = time_range(arguments, dump.begin_ns)
         parts = Parts(dump, arguments.only) if arguments.only else None
         work = rewrite(
             dump, arguments.output, "shmio-dump cut", _entries(dump, arguments, parts, from_ns, to_ns), whole=False

@@ -10,7 +10,7 @@ from typing import IO, Protocol
 
 from shmio.cli.dumping.complaints import Complaints
 from shmio.cli.dumping.csvfile import CsvTable
-from shmio.cli.dumping.moments import MAX_NS, parse_time, span
+from shmio.cli.dumping.moments import span, time_range
 from shmio.cli.dumping.parquet import ParquetTable
 from shmio.cli.dumping.progress import Progress
 from shmio.cli.dumping.rewriting import new_file
@@ -18,7 +18,7 @@ from shmio.cli.dumping.viewer import export_mcap
 from shmio.cli.run import say
 from shmio.dump.blocks import DumpBlock
 from shmio.dump.columns import Columns
-from shmio.dump.dump import Dump, open_dump
+from shmio.dump.dump import Dump
 from shmio.dump.names import Chosen
 from shmio.dump.pieces import pieces
 from shmio.errors import PathError, RecordingError
@@ -44,13 +44,10 @@ def execute(arguments: argparse.Namespace) -> int:
     """Write tables, a file for each block, or one MCAP file for viewers."""
     complaints = Complaints()
     with (
-        open_dump(arguments.files, complaints.damage) as dump,
+        complaints.open(arguments.files) as dump,
         Progress(f"exporting to {arguments.output}") as progress,
     ):
-        for text in dump.damage:
-            complaints.say(text)
-        from_ns = parse_time("--from", arguments.begin, dump.begin_ns, 0)
-        to_ns = parse_time("--to", arguments.end, dump.begin_ns, MAX_NS)
+        from_ns, to_ns = time_range(arguments, dump.begin_ns)
         chosen = _chosen(dump, arguments)
         if not chosen:
             raise RecordingError(f"{dump.files[0]}: nothing is recorded in it")

@@ -3,48 +3,33 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Iterator
 from itertools import groupby
+from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from shmio.cli.dumping.each import each, ended
 from shmio.cli.dumping.moments import iso, local
-from shmio.cli.run import dumps
 from shmio.dump.encoding import EVENT, FRAME
 from shmio.dump.reader import Reader
 from shmio.dump.survey import Survey, Track, survey
 from shmio.errors import RecordingError
-from shmio.logs import printable
 
 
 def execute(arguments: argparse.Namespace) -> int:
     """Describe each file; 1 if one of them is none, or damaged."""
-    found, failed = [], False
-    for file in arguments.files:
-        try:
-            with Reader(file) as reader:
-                described = _describe(reader, survey(reader))
-        except (RecordingError, OSError) as error:
-            text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
-            print(printable(text), file=sys.stderr)
-            failed = True
-            continue
-        failed = failed or bool(described["damage"])
-        found.append(described)
-        if not arguments.json:
-            print("\n".join(map(printable, _folded(_lines(described)))))
-    if arguments.json and found:
-        print(dumps(found[0] if len(arguments.files) == 1 else found, indent=2))
-    return int(failed)
+    return each(arguments, _look, lambda found: _folded(_lines(found)))
+
+
+def _look(file: Path) -> dict[str, Any]:
+    with Reader(file) as reader:
+        return _describe(reader, survey(reader))
 
 
 def _describe(reader: Reader, found: Survey) -> dict[str, Any]:
-    tracks = [track for track in found.tracks.values() if track.channel.source]
-    first_ns = min((track.first_ns for track in tracks), default=0)
-    last_ns = max((track.last_ns for track in tracks), default=0)
-    duration_s = (last_ns - first_ns) / 1e9
+    duration_s = (found.end_ns - found.begin_ns) / 1e9
     size = reader.records.size
     about = reader.about
     started_ns = about.get("started_utc_ns", "")
@@ -62,8 +47,8 @@ def _describe(reader: Reader, found: Survey) -> dict[str, Any]:
         "recorder": about.get("recorder", ""),
         "made_by": about.get("made_by"),
         "started": iso(int(started_ns)) if started_ns.isdecimal() and len(started_ns) < 20 else None,
-        "from": iso(first_ns) if tracks else None,
-        "to": iso(last_ns) if tracks else None,
+        "from": iso(found.begin_ns) if found.begin_ns else None,
+        "to": iso(found.end_ns) if found.end_ns else None,
         "duration_s": round(duration_s, 3),
         "bytes_per_minute": round(size / duration_s * 60) if duration_s > 0 else None,
         "blocks": _blocks(reader, found),
@@ -124,12 +109,11 @@ def _block(reader: Reader, found: Survey, tracks: dict[str, Track]) -> dict[str,
 def _lines(found: dict[str, Any]) -> list[str]:
     size = f"{found['size'] / 1e6:.2f} MB"
     rate = f", {found['bytes_per_minute'] / 1e6:.2f} MB/min" if found["bytes_per_minute"] else ""
-    ended = "closed" if found["closed"] else f"not closed ({found['end']}): still being written, or cut off"
     by = f"recorded by {found['recorder']}, shmio {found['version']}, on {found['host']}"
     if found["made_by"]:
         by += f"; made of it by {found['made_by']}"
     lines = [
-        f"{found['file']}: {size}, {ended}",
+        f"{found['file']}: {size}, {ended(found)}",
         f"  instance {found['instance']}, mode {found['mode']}, started {found['started']}; {by}",
         f"  {found['from']} to {found['to']}, {found['duration_s']:.1f} s{rate}"
         if found["from"]

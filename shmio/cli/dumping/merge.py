@@ -7,15 +7,12 @@ import argparse
 from shmio.cli.dumping.complaints import Complaints
 from shmio.cli.dumping.rewriting import rewrite, verified
 from shmio.cli.run import say
-from shmio.dump.dump import open_dump
 
 
 def execute(arguments: argparse.Namespace) -> int:
     """Write what is in any of the files, once and in the order of time, to a new one."""
     complaints = Complaints()
-    with open_dump(arguments.files, complaints.damage) as dump:
-        for text in dump.damage:
-            complaints.say(text)
+    with complaints.open(arguments.files) as dump:
         work = rewrite(dump, arguments.output, "shmio-dump merge", dump.items())
     for line in verified(arguments.output):
         say(line)

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import argparse
 from datetime import UTC, datetime
 
 from shmio.dump.damage import Damage
+from shmio.dump.part import MAX_NS
 from shmio.errors import RecordingError
 
-MAX_NS = (1 << 63) - 1
 
+def time_range(arguments: argparse.Namespace, start_ns: int) -> tuple[int, int]:
+    """Log times in ns of ``--from`` and ``--to``: seconds since the recording's start, or ISO 8601, local unless it says.
 
-def parse_time(option: str, text: str | None, start_ns: int, default_ns: int) -> int:
-    """Log time in ns of ``--from`` or ``--to``: seconds since the recording's start, or ISO 8601, local unless it says.
-
-    RecordingError for what is neither.
+    Without them all there is. RecordingError for what is neither.
     """
-    if text is None:
-        return default_ns
+    begin, end = arguments.begin, arguments.end
+    from_ns = 0 if begin is None else _parse("--from", begin, start_ns)
+    to_ns = MAX_NS if end is None else _parse("--to", end, start_ns)
+    return from_ns, to_ns
+
+
+def _parse(option: str, text: str, start_ns: int) -> int:
     try:
         try:
             moment_ns = start_ns + round(float(text) * 1e9)

@@ -62,7 +62,8 @@ class Printer(Protocol):
         """What has happened to a process."""
 
 
-def _kind(event: Event) -> str:
+def kind_of(event: Event) -> str:
+    """What an event is called."""
     try:
         return str(EventKind(event.kind))
     except ValueError:  # of a later version
@@ -98,7 +99,7 @@ class JsonLines:
             time_ns,
             source,
             event=event.number,
-            kind=_kind(event),
+            kind=kind_of(event),
             after_frame=event.frame,
             quality=str(event.quality),
             **fields,
@@ -147,7 +148,7 @@ class Table:
 
     def event(self, time_ns: int, source: str, event: Event) -> str:
         """Kind and reason, and of a command which bytes."""
-        what = f"{_kind(event)} {event.quality}" if event.kind == EventKind.QUALITY else _kind(event)
+        what = f"{kind_of(event)} {event.quality}" if event.kind == EventKind.QUALITY else kind_of(event)
         if event.command and event.kind != EventKind.NOTED:
             what += (
                 f" command {event.command}.{event.item} of writer {event.writer}: {event.size} bytes at {event.offset}"
@@ -202,7 +203,7 @@ class Csv:
 
     def event(self, time_ns: int, source: str, event: Event) -> str:
         """``what`` is its kind."""
-        return self._row(time_ns, source, _kind(event), event.number, str(event.quality), event.text)
+        return self._row(time_ns, source, kind_of(event), event.number, str(event.quality), event.text)
 
     def gap(self, time_ns: int, gap: Gap) -> str:
         """``number`` is the first that is missing."""

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from mcap.writer import Writer
 
 from shmio import __version__
+from shmio.cli.dumping.printers import kind_of
 from shmio.cli.dumping.progress import Progress
 from shmio.dump.blocks import DumpBlock
 from shmio.dump.columns import Columns
@@ -20,7 +21,6 @@ from shmio.dump.dump import Dump
 from shmio.dump.names import Chosen
 from shmio.dump.pieces import pieces
 from shmio.layout.model import Register
-from shmio.segment import EventKind
 
 HEAD: Final = {"number": "integer", "cycle": "integer", "quality": "integer", "provenance": "integer"}
 """What each frame tells of itself, under ``frame``."""
@@ -78,11 +78,7 @@ def _events(dump: Dump, source: str, writer: Writer, from_ns: int, to_ns: int) -
     for log_ns, _, event in dump.events(source, from_ns, to_ns):
         schema = {name: {"type": kind} for name, kind in _EVENT.items()}
         channel = channel or _channel(writer, f"/{source}/events", "event", schema)
-        try:
-            kind = str(EventKind(event.kind))
-        except ValueError:  # of a later version
-            kind = f"kind {event.kind}"
-        told = {"kind": kind, "text": event.text, "quality": str(event.quality)}
+        told = {"kind": kind_of(event), "text": event.text, "quality": str(event.quality)}
         told_in_numbers = {"frame": event.frame, "command": event.command}
         yield _Row(log_ns, channel, log_ns, msgspec.json.encode(told | told_in_numbers))
 

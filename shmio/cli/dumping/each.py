@@ -1,0 +1,45 @@
+"""What ``info`` and ``verify`` have in common: they look at files one by one."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from shmio.cli.run import dumps
+from shmio.errors import RecordingError
+from shmio.logs import printable
+
+
+def each(
+    arguments: argparse.Namespace,
+    look: Callable[[Path], dict[str, Any]],
+    lines: Callable[[dict[str, Any]], Iterable[str]],
+) -> int:
+    """Print what ``look`` finds in each file, as ``lines`` or JSON; 1 if one of them is damaged, or no recording.
+
+    ``look``: OSError, RecordingError: it is none.
+    """
+    found, failed = [], False
+    for file in arguments.files:
+        try:
+            described = look(file)
+        except (RecordingError, OSError) as error:
+            text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
+            print(printable(text), file=sys.stderr)
+            failed = True
+            continue
+        failed = failed or bool(described["damage"])
+        found.append(described)
+        if not arguments.json:
+            print("\n".join(map(printable, lines(described))), flush=True)
+    if arguments.json and found:
+        print(dumps(found[0] if len(arguments.files) == 1 else found, indent=2))
+    return int(failed)
+
+
+def ended(found: dict[str, Any]) -> str:
+    """How a file ends, for people: by its ``closed`` and ``end``."""
+    return "closed" if found["closed"] else f"not closed ({found['end']}): still being written, or cut off"
