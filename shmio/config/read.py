@@ -114,6 +114,7 @@ def _resolve(tables: dict[str, Any], folder: Path) -> Config:
     config = convert({**tables, "folder": str(folder)}, Config)
     _check_names(config)
     _check_times(config)
+    _check_rotation(config)
     check_declarations(config.injection)
     check_listening(config)
     check_mqtt(config)
@@ -211,4 +212,13 @@ def _check_times(config: Config) -> None:
             raise ConfigError(
                 f"source[{index}].stale_ms: {source.stale_ms:g} is less than two periods of {source.period_ms:g} ms: "
                 "one late frame would make the source bad"
+            )
+
+
+def _check_rotation(config: Config) -> None:
+    for key, least in (("rotate_min", 0.1), ("rotate_mb", 1)) if config.recorder else ():
+        value: float = getattr(config.recorder, key)
+        if 0 < value < least:
+            raise ConfigError(
+                f"recorder.{key}: {value:g} is less than {least:g}, which would make files without number; 0: never"
             )

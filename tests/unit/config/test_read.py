@@ -144,6 +144,16 @@ def test_tls_files_are_relative_to_the_config(folder: Path) -> None:
             r"recorder\.directroy: unknown key; did you mean directory",
         ),
         ("[instance]", "[recorder]\nbuffer_mb = 0\n[instance]", r"recorder\.buffer_mb: expected a number > 0"),
+        (
+            "[instance]",
+            "[recorder]\nrotate_mb = 0.5\n[instance]",
+            r"recorder\.rotate_mb: 0\.5 is less than 1, .*0: never",
+        ),
+        (
+            "[instance]",
+            "[recorder]\nrotate_min = 1e-3\n[instance]",
+            r"recorder\.rotate_min: 0\.001 is less ",
+        ),
         ("[instance]", '[recorder]\nsources = ["x"]\n[instance]', r"recorder\.sources: no source 'x'; there are: "),
         ("[instance]", "[recorder.trigger]\nbefore_s = 1\n[instance]", r"recorder\.trigger\.when: this key is needed"),
         ('kind = "s7"\n', "", r'emulator\[0\]\.kind: this key is needed \(emulator "plc"\)$'),
