@@ -19,6 +19,8 @@ MAX_JSON_BYTES: Final = 4096
 PROFILE: Final = "shmio"
 ABOUT: Final = "shmio"
 """Name of the metadata that tell about the instance."""
+SUPERVISED: Final = "supervised"
+"""What these say of who records, where that is the instance's own recorder."""
 PLACES: Final = "places"
 """Name of the metadata that tell behind which numbers the recording begins."""
 GAPS_TOPIC: Final = "gaps"

@@ -9,7 +9,7 @@ import msgspec
 
 from shmio import worker
 from shmio.config import Recorder as Settings
-from shmio.dump.encoding import Reason
+from shmio.dump.encoding import SUPERVISED, Reason
 from shmio.recording.attach import ConfigFiles
 from shmio.recording.keeper import Keeper
 from shmio.recording.predecessor import interrupted, places
@@ -20,7 +20,6 @@ from shmio.recording.triggered import Triggered
 from shmio.segment import Report
 from shmio.worker import BEAT_S, Worker
 
-BY = "supervised"
 NOTE = "to "
 """How a recorder that is well begins its note; the name of its file follows."""
 WAITS = f"{NOTE}a file as soon as its trigger comes"
@@ -32,7 +31,7 @@ def run(worker: Worker) -> None:
     directory, segment = Path(settings.directory), worker.segment
     worker.running()  # its search for what its predecessor has may take a while
     segment.clock.abstain(worker.slot.index)  # for which no step waits: the rings have what comes meanwhile
-    known = places(directory, segment, BY, worker.slot.beat)
+    known = places(directory, segment, SUPERVISED, worker.slot.beat)
     elsewhere = _elsewhere(worker.before, directory)
     start = Start(known, reason=Reason.ELSEWHERE if elsewhere else Reason.NOT_RUNNING)
     selection = Selection(settings.sources or None, settings.registers)
@@ -41,13 +40,13 @@ def run(worker: Worker) -> None:
     tap, attachments = Tap(segment, start, selection), ConfigFiles(Path(worker.config["config_file"]))
     series: Series | Triggered
     if settings.trigger:
-        going = interrupted(directory, segment, BY, worker.slot.beat)
-        series = Triggered(tap, settings, settings.trigger, BY, attachments, going=going)
+        going = interrupted(directory, segment, SUPERVISED, worker.slot.beat)
+        series = Triggered(tap, settings, settings.trigger, SUPERVISED, attachments, going=going)
     else:
-        series = Series(tap, settings, BY, attachments)
+        series = Series(tap, settings, SUPERVISED, attachments)
     goes_on = ", going on where its predecessor ended" if known else ""
     worker.log.info("recording %s%s%s", _note(series), goes_on, elsewhere)
-    keeper = Keeper(segment.instance, settings, BY, series.present)
+    keeper = Keeper(segment.instance, settings, SUPERVISED, series.present)
     keeper.start()
     _record(worker, series)
     keeper.stop()

@@ -12,7 +12,7 @@ import msgspec
 
 from shmio.cli.dumping.each import each, ended
 from shmio.cli.dumping.moments import iso, local
-from shmio.dump.encoding import EVENT, FRAME
+from shmio.dump.encoding import EVENT, FRAME, SUPERVISED
 from shmio.dump.reader import Reader
 from shmio.dump.survey import Survey, Track, survey
 from shmio.errors import RecordingError
@@ -109,7 +109,8 @@ def _block(reader: Reader, found: Survey, tracks: dict[str, Track]) -> dict[str,
 def _lines(found: dict[str, Any]) -> list[str]:
     size = f"{found['size'] / 1e6:.2f} MB"
     rate = f", {found['bytes_per_minute'] / 1e6:.2f} MB/min" if found["bytes_per_minute"] else ""
-    by = f"recorded by {found['recorder']}, shmio {found['version']}, on {found['host']}"
+    recorder = "the instance's own recorder" if found["recorder"] == SUPERVISED else found["recorder"]
+    by = f"recorded by {recorder}, shmio {found['version']}, on {found['host']}"
     if found["made_by"]:
         by += f"; made of it by {found['made_by']}"
     lines = [

@@ -31,7 +31,9 @@ def ready(process: Process) -> bool:
     return process.slot.report.pid == process.popen.pid and process.slot.report.note.startswith("to ")
 
 
-def test_it_records_tells_its_counters_and_closes_its_file(segment: Segment, tmp_path: Path) -> None:
+def test_it_records_tells_its_counters_and_closes_its_file(
+    segment: Segment, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "supervisor.toml").write_text(
         f'[instance]\nname = "{segment.instance}"\n[[source]]\nname = "cell"\nconnector = "x"\nlayout = "a.db"\n'
     )
@@ -50,6 +52,8 @@ def test_it_records_tells_its_counters_and_closes_its_file(segment: Segment, tmp
         assert reader.records.closed
         assert {"config/supervisor.toml", "sources/cell/1/a.db"} < set(reader.attachments)
         assert reader.about["recorder"] == "supervised"
+    assert main(["info", str(file)]) == 0
+    assert "; recorded by the instance's own recorder, shmio " in capsys.readouterr().out
     assert "5 frames, 1 events, 0 missed" in process.log.read_text()
 
 
