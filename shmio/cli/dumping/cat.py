@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from shmio.cli.dumping.complaints import Complaints
+from shmio.cli.dumping.each import not_closed
 from shmio.cli.dumping.moments import span, time_range
 from shmio.cli.dumping.printers import Csv, JsonLines, Printer, Table, View
 from shmio.dump.channels import Channel
@@ -63,8 +64,7 @@ def execute(arguments: argparse.Namespace) -> int:
         if silent:
             print(printable(f"{reader.file}: {_nothing(found)}"), file=sys.stderr)
         if not reader.records.closed:
-            end = printable(f"{reader.file} was not closed: {reader.records.damage}")
-            print(end, file=sys.stderr)
+            print(printable(f"{reader.file}: {not_closed(reader.records.damage)}"), file=sys.stderr)
     return int(complaints.any)
 
 

@@ -42,4 +42,9 @@ def each(
 
 def ended(found: dict[str, Any]) -> str:
     """How a file ends, for people: by its ``closed`` and ``end``."""
-    return "closed" if found["closed"] else f"not closed ({found['end']}): still being written, or cut off"
+    return "closed" if found["closed"] else not_closed(found["end"])
+
+
+def not_closed(end: str) -> str:
+    """What is said of a file that has no end, whoever says it."""
+    return f"not closed ({end}): still being written, or its recorder was killed"

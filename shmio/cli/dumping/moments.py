@@ -11,13 +11,15 @@ from shmio.errors import RecordingError
 
 
 def time_range(arguments: argparse.Namespace, start_ns: int) -> tuple[int, int]:
-    """Log times in ns of ``--from`` and ``--to``: seconds since the recording's start, or ISO 8601, local unless it says.
+    """Log times in ns of ``--from`` and ``--to``: seconds from the recording's start, or ISO 8601, local unless told.
 
-    Without them all there is. RecordingError for what is neither.
+    Without them all there is. RecordingError for what is neither, and for an end before its beginning.
     """
     begin, end = arguments.begin, arguments.end
     from_ns = 0 if begin is None else _parse("--from", begin, start_ns)
     to_ns = MAX_NS if end is None else _parse("--to", end, start_ns)
+    if from_ns > to_ns:
+        raise RecordingError(f"--to {end} is before --from {begin}")
     return from_ns, to_ns
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from shmio.cli.dumping.each import not_closed
 from shmio.cli.dumping.moments import lost
 from shmio.cli.dumping.rewriting import rewrite, verified
 from shmio.cli.run import say
@@ -39,6 +40,6 @@ def execute(arguments: argparse.Namespace) -> int:
     for text in [*layouts, *places]:
         say(f"  {text}")
     if end:
-        say(f"  {file} was not closed: {end}")
+        say(f"  {file}: {not_closed(end)}")
     say(f"  {work.damaged} frames and events between these are lost" if work.damaged else "  nothing between is lost")
     return 0

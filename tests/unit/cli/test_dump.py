@@ -194,6 +194,15 @@ def test_what_is_no_time_is_refused(file: str, time: str, said: Output) -> None:
     assert out == []
 
 
+@pytest.mark.parametrize("verb", [["cat"], ["cut", "-o", "new"], ["export", "-o", "new"]])
+def test_an_end_before_its_beginning_is_refused(file: str, verb: list[str], said: Output) -> None:
+    assert main([*verb, file, "--from", "3", "--to", "2.5"]) == 1
+    assert said() == ([], ["--to 2.5 is before --from 3"])
+    assert main([*verb, file, "--from", "2026-01-02", "--to", "2026-01-01T08:00:00Z"]) == 1
+    assert said() == ([], ["--to 2026-01-01T08:00:00Z is before --from 2026-01-02"])
+    assert not Path("new").exists()
+
+
 def test_a_path_that_names_nothing_is_refused(file: str, said: Output) -> None:
     assert main(["cat", file, "cell/cout"]) == 1
     assert said() == ([], ["cell/cout: no such register in DB1; near: count"])
@@ -225,11 +234,14 @@ def test_a_recording_that_was_not_closed_is_read_and_that_is_told(file: str, sai
     found = json.loads("\n".join(said()[0]))
     assert (found["closed"], found["damage"]) == (False, [])
     assert main(["info", "cut.mem"]) == 0
-    assert "still being written, or cut off" in said()[0][0]
+    told = said()[0][0].partition(" MB, ")[2]
+    assert re.fullmatch(r"not closed \(it ends within .*\): still being written, or its recorder was killed", told)
+    assert main(["verify", "cut.mem"]) == 0
+    assert said()[0][0].startswith(f"cut.mem: {told}; "), "all in the same words"
     assert main(["cat", "cut.mem", "cell"]) == 0
     out, [line] = said()
     assert len(out) == 10
-    assert line.startswith("cut.mem was not closed: ")
+    assert line == f"cut.mem: {told}"
 
 
 @pytest.fixture
