@@ -93,8 +93,10 @@ def _parser() -> argparse.ArgumentParser:
 
     export = verb("export", "write values for other programs: Parquet, CSV, or MCAP for viewers")
     export.add_argument("files", nargs="+", type=Path, metavar="FILE")
-    _output(export, "the new folder; of --format mcap the new file")
-    export.add_argument("--format", choices=("parquet", "csv", "mcap"), default="parquet", help="default: parquet")
+    _output(export, "the new file, or of tables the new folder with a file for each block")
+    export.add_argument(
+        "--format", choices=("parquet", "csv", "mcap"), help="default: as the name of the new file ends; else parquet"
+    )
     _times(export)
     _some(export)
     export.add_argument("--raw", action="store_true", help="what sources delivered, without what was injected")

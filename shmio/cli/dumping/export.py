@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import IO, Protocol
+from typing import IO, Final, Protocol
 
 from shmio.cli.dumping.complaints import Complaints
 from shmio.cli.dumping.csvfile import CsvTable
@@ -38,11 +38,13 @@ class Table(Protocol):
 
 
 TABLES: dict[str, Callable[[IO[bytes], Sequence[Register]], Table]] = {"parquet": ParquetTable, "csv": CsvTable}
+FORMATS: Final = (*TABLES, "mcap")
 
 
 def execute(arguments: argparse.Namespace) -> int:
     """Write tables, a file for each block, or one MCAP file for viewers."""
     complaints = Complaints()
+    named, form = _form(arguments.output, arguments.format)
     with (
         complaints.open(arguments.files) as dump,
         Progress(f"exporting to {arguments.output}") as progress,
@@ -52,7 +54,7 @@ def execute(arguments: argparse.Namespace) -> int:
         if not chosen:
             raise RecordingError(f"{dump.files[0]}: nothing is recorded in it")
         sources = list(dict.fromkeys(block.source for block in chosen))
-        if arguments.format == "mcap":
+        if form == "mcap":
             progress.total = dump.end_ns - dump.begin_ns
             with new_file(arguments.output) as stream:
                 counts = export_mcap(dump, chosen, stream, from_ns, to_ns, raw=arguments.raw, progress=progress)
@@ -60,20 +62,42 @@ def execute(arguments: argparse.Namespace) -> int:
             return int(complaints.any)
         progress.total = len(sources) * (dump.end_ns - dump.begin_ns)
         with ExitStack() as stack:
-            tables = _Tables(stack, arguments.output, TABLES[arguments.format], arguments.format, chosen)
+            if named:
+                _require_one(arguments.output, [block for block in chosen if _within(block, from_ns, to_ns)])
+            tables = _Tables(stack, arguments.output, form, chosen, named=named)
             for place, source in enumerate(sources):
                 for block, columns in pieces(dump, source, chosen, from_ns, to_ns, raw=arguments.raw):
                     tables.write(block, columns)
                     past = int(columns.time_ns[-1]) - dump.begin_ns
                     progress.at(place * (dump.end_ns - dump.begin_ns) + past)
-            files = tables.close()
-        if not files:
+        if not tables.files:
             raise RecordingError(
                 f"no frames of {dump.files[0]} are in that time; it goes {span(dump.begin_ns, dump.end_ns)}"
             )
-    for path, rows in files:
+    for path, rows in tables.files:
         say(f"{path}: {rows} rows")
     return int(complaints.any)
+
+
+def _form(output: Path, asked: str | None) -> tuple[bool, str]:
+    """(whether the name is that of a file of some format, the format); RecordingError: another one is asked for."""
+    suffix = output.suffix.lower().removeprefix(".")
+    if suffix not in FORMATS or output.is_dir():
+        return False, asked or "parquet"
+    if asked not in (None, suffix):
+        raise RecordingError(f"{output}: as its name ends it is not --format {asked}; leave out one of them")
+    return True, suffix
+
+
+def _within(block: DumpBlock, from_ns: int, to_ns: int) -> bool:
+    return bool(block.frames) and block.begin_ns <= to_ns and block.end_ns >= from_ns
+
+
+def _require_one(output: Path, blocks: Sequence[DumpBlock]) -> None:
+    """RecordingError: these blocks do not go into one table."""
+    if len(blocks) > 1:
+        names = ", ".join(block.source for block in blocks)
+        raise RecordingError(f"{output} holds one block, and there are {len(blocks)} ({names}): name a folder")
 
 
 def _chosen(dump: Dump, arguments: argparse.Namespace) -> Chosen:
@@ -87,35 +111,50 @@ def _chosen(dump: Dump, arguments: argparse.Namespace) -> Chosen:
     return {block: some for block, some in chosen.items() if not arguments.sources or block.source in arguments.sources}
 
 
+@contextmanager
+def _folder(path: Path) -> Iterator[None]:
+    """A folder, made if need be; what was made is removed again unless all goes well."""
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        with suppress(OSError):  # others have put something into it
+            for folder in made:
+                folder.rmdir()
+        raise
+
+
 class _Tables:
     """A file for each block, named after its source; further blocks of it are numbered."""
 
-    def __init__(
-        self,
-        stack: ExitStack,
-        directory: Path,
-        make: Callable[[IO[bytes], Sequence[Register]], Table],
-        suffix: str,
-        chosen: Chosen,
-    ) -> None:
+    def __init__(self, stack: ExitStack, output: Path, form: str, chosen: Chosen, *, named: bool) -> None:
+        """``named``: ``output`` is the name of the only file, not their folder."""
         self._stack = stack
-        self._directory = directory
-        self._make = make
-        self._suffix = suffix
+        self._output = output
+        self._form = form
         self._chosen = chosen
+        self._named = named
         self._tables: dict[DumpBlock, tuple[Path, Table]] = {}
 
     def write(self, block: DumpBlock, columns: Columns) -> None:
         if block not in self._tables:
-            self._directory.mkdir(parents=True, exist_ok=True)
-            number = 1 + sum(other.source == block.source for other in self._tables)
-            path = self._directory / f"{block.source}{f'-{number}' if number > 1 else ''}.{self._suffix}"
+            if not self._named and not self._tables:
+                self._stack.enter_context(_folder(self._output))
+            path = self._path(block)
             stream = self._stack.enter_context(new_file(path))
-            self._tables[block] = path, self._make(stream, self._chosen[block])
+            table = TABLES[self._form](stream, self._chosen[block])
+            self._stack.callback(table.close)  # before its file is, also where that is then removed
+            self._tables[block] = path, table
         self._tables[block][1].write(columns)
 
-    def close(self) -> list[tuple[Path, int]]:
+    def _path(self, block: DumpBlock) -> Path:
+        if self._named:
+            return self._output
+        number = 1 + sum(other.source == block.source for other in self._tables)
+        return self._output / f"{block.source}{f'-{number}' if number > 1 else ''}.{self._form}"
+
+    @property
+    def files(self) -> list[tuple[Path, int]]:
         """Path and rows of each file."""
-        for _, table in self._tables.values():
-            table.close()
         return [(path, table.rows) for path, table in self._tables.values()]

@@ -32,4 +32,5 @@ class ParquetTable:
 
     def close(self) -> None:
         """Write the footer."""
-        self._writer.close()
+        if self._writer is not None:
+            self._writer.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from mcap.reader import make_reader
 
 import shmio
 from shmio.cli.dump import main
+from shmio.cli.dumping.progress import Progress
 from shmio.layout.codec import codec
 from shmio.layout.model import Layout, Register
 from shmio.segment import Quality
@@ -168,7 +170,56 @@ def test_what_is_refused_leaves_nothing(
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     assert main(["export", "kinds.mem", "-o", "more"]) == 1
     assert capsys.readouterr().err == "pyarrow is not installed: pip install 'shmio[parquet]'\n"
-    assert not list(Path("more").iterdir())
+    assert not Path("more").exists()
+
+
+@pytest.mark.parametrize("output", ["new/deep", "there", "new.csv", "new.mcap"])
+def test_ctrl_c_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, output: str) -> None:
+    """It comes when some of the frames are written."""
+    varied(tmp_path / "a.mem")
+    Path("there").mkdir()
+    before = sorted(tmp_path.rglob("*"))
+    made: list[Path] = []
+
+    def interrupt(*_: object) -> None:
+        made.extend(path for path in tmp_path.rglob("*") if path.is_file() and path not in before)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(Progress, "at", interrupt)
+    assert main(["export", "a.mem", "-o", output, "--source", "cell"]) == 130
+    assert len(made) == 1
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_the_format_is_as_the_name_ends(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A table with such a name is one file; else the name is that of a folder."""
+    for name in ("x.mcap", "x.csv", "X.Parquet", "x.d"):
+        assert main(["export", "kinds.mem", "-o", name]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "x.mcap: 3 messages",
+        "x.csv: 3 rows",
+        "X.Parquet: 3 rows",
+        "x.d/cell.parquet: 3 rows",
+    ]
+    with Path("x.mcap").open("rb") as file:
+        assert [channel.topic for _, channel, _ in make_reader(file).iter_messages()] == ["/cell"] * 3
+    assert main(["export", "kinds.mem", "-o", "out", "--format", "csv"]) == 0
+    assert Path("x.csv").read_bytes() == Path("out/cell.csv").read_bytes()
+    assert Path("X.Parquet").read_bytes() == Path("x.d/cell.parquet").read_bytes()
+    Path("there.csv").mkdir()
+    assert main(["export", "kinds.mem", "-o", "there.csv", "--format", "csv"]) == 0
+    assert Path("there.csv/cell.csv").is_file()
+
+
+def test_a_name_that_fits_not_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", "kinds.mem", "-o", "x.csv", "--format", "parquet"]) == 1
+    message = "x.csv: as its name ends it is not --format parquet; leave out one of them\n"
+    assert capsys.readouterr().err == message
+    varied(tmp_path / "a.mem")
+    assert main(["export", "a.mem", "-o", "x.csv"]) == 1
+    assert capsys.readouterr().err == "x.csv holds one block, and there are 2 (cell, press): name a folder\n"
+    assert not Path("x.csv").exists()
+    assert main(["export", "a.mem", "-o", "x.csv", "--source", "press"]) == 0
 
 
 def test_a_damaged_chunk_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
