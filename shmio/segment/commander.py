@@ -158,8 +158,11 @@ class Commander:
         return self._send(("",), writes, timeout_s, CommandKind.DECLARE, keep=keep, name=declaration.name)
 
     def note(self, text: str, timeout_s: float | None = None) -> None:
-        """Put a note into the source's events. ValueRangeError: it is empty or too long; CommandError: no answer."""
-        size = len(text.encode())
+        """Put a note into the source's events. ValueRangeError: empty, too long, no text; CommandError: no answer."""
+        try:
+            size = len(text.encode())
+        except UnicodeEncodeError as error:  # a terminal that is not UTF-8
+            raise ValueRangeError(f"a note is text in UTF-8, and character {error.start + 1} of this is none") from None
         if not 0 < size <= MAX_NAME_BYTES:
             raise ValueRangeError(f"a note has 1 to {MAX_NAME_BYTES} bytes in UTF-8, this has {size}")
         self._expect(self._send(("",), [], timeout_s, CommandKind.NOTE, name=text), EventKind.NOTED)

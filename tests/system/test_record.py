@@ -119,10 +119,15 @@ def test_notes_and_deaths_stand_in_the_recording(make_cell: Callable[..., Cell])
     assert (done.returncode, done.stderr) == (0, ""), cell.logs()
     for arguments, message in (
         (["x" * 257], "a note has 1 to 256 bytes in UTF-8, this has 257"),
+        ([""], "a note has 1 to 256 bytes in UTF-8, this has 0"),
+        (["Greifer \udce4b"], "a note is text in UTF-8, and character 9 of this is none"),
         (["x", "--source", "press"], "no source 'press'; there are: cell"),
     ):
         failed = cell.run("shmio-dump", "note", *arguments)
         assert (failed.returncode, message in failed.stderr) == (1, True), failed.stderr
+        assert failed.stderr.count("\n") == 1
+    longest = "\x1b[2J" + "ö" * 126
+    assert cell.run("shmio-dump", "note", longest).returncode == 0
     pid = cell.processes()["cell"]["pid"]
     kill(pid)
     until(lambda: cell.processes()["cell"]["state"] == "running" and cell.processes()["cell"]["pid"] != pid, "its end")
@@ -132,3 +137,4 @@ def test_notes_and_deaths_stand_in_the_recording(make_cell: Callable[..., Cell])
     assert f"process cell died, pid {pid}: killed by SIGKILL" in printed
     assert "process recorder is, pid" in printed
     assert ": noted: Greifer getauscht" in printed
+    assert rf": noted: \x1b[2J{'ö' * 126}" in printed, "whole, and moving no cursor"
