@@ -13,9 +13,9 @@ from collections.abc import Callable
 from enum import IntEnum
 from typing import Final, NamedTuple
 
-from shmio.errors import SegmentError
 from shmio.segment import _atomics
 from shmio.segment.header import Header, cut, text
+from shmio.segment.twin import TwinCell
 
 STEP_SIZE_NS: Final = 50_000_000
 """The size of a step unless somebody has set another."""
@@ -111,6 +111,7 @@ class ClockPage:
             raise ValueError("the clock page is too short, or has not a place for each process")
         self._memory = memory
         self._offset = offset
+        self._state = _cell(memory, offset)
         self._owned = owned
         self._started_ns, self._started_utc_ns = head.started_ns, head.started_utc_ns
         self.bell = Bell(memory, offset + _BELL_AT)
@@ -122,7 +123,8 @@ class ClockPage:
     def write_new(memory: memoryview, offset: int, slots: int, *, virtual: bool, time_ns: int = 0) -> None:
         """The page of a new segment; ``virtual``: time stands at ``time_ns`` until somebody steps."""
         struct.pack_into("<II", memory, offset + _SLOTS_AT, slots, virtual)
-        _write(memory, offset, ClockState(ClockMode.VIRTUAL if virtual else ClockMode.WALL, time_ns=time_ns))
+        state = ClockState(ClockMode.VIRTUAL if virtual else ClockMode.WALL, time_ns=time_ns)
+        _cell(memory, offset).write(_pack(state))
 
     @property
     def stepped(self) -> bool:
@@ -141,19 +143,11 @@ class ClockPage:
 
     def told(self) -> ClockState:
         """The page as its writer has left it, dead or alive. SegmentError."""
-        return _unpack(self._copy(_STATE.size))
-
-    def _copy(self, size: int) -> bytes:
-        """The first bytes of the state. SegmentError."""
-        for at in _COPIES_AT * 4:  # one of them is whole, whenever their writer was killed
-            data = _atomics.cell_read(self._memory, self._offset + at, size)
-            if data is not None:
-                return data
-        raise SegmentError("the clock page makes no sense: restart the instance: shmio-supervisor down, up")
+        return _unpack(self._state.read(_STATE.size))
 
     def write(self, state: ClockState, *, ring: bool = True) -> None:
         """Write the page and ring its bell; the owner of time alone. ``ring`` False: there is nothing to do yet."""
-        _write(self._memory, self._offset, state)
+        self._state.write(_pack(state))
         if ring:
             self.bell.ring()
 
@@ -162,7 +156,7 @@ class ClockPage:
 
         In wall time it is CLOCK_MONOTONIC.
         """
-        mode, flags, _, time_ns, dt_ns = _TIME.unpack(self._copy(_TIME.size))  # not all of it: each age asks
+        mode, flags, _, time_ns, dt_ns = _TIME.unpack(self._state.read(_TIME.size))  # not all of it: each age asks
         if not mode:
             return time.monotonic_ns()
         present_ns: int = time_ns - dt_ns if flags & _STEPPING else time_ns
@@ -220,14 +214,18 @@ def _word(memory: memoryview, offset: int) -> int:
     return int.from_bytes(memory[offset : offset + 4], "little")
 
 
-def _write(memory: memoryview, offset: int, state: ClockState) -> None:
+def _cell(memory: memoryview, offset: int) -> TwinCell:
+    first, second = _COPIES_AT
+    complaint = "the clock page makes no sense: restart the instance: shmio-supervisor down, up"
+    return TwinCell(memory, (offset + first, offset + second), complaint)
+
+
+def _pack(state: ClockState) -> bytes:
     flags = (_PLAYING if state.playing else 0) | (_STEPPING if state.stepping else 0)
-    data = _STATE.pack(
+    return _STATE.pack(
         state.mode, flags, state.step, state.time_ns, state.dt_ns, state.done, state.step_size_ns, state.rate,
         state.owner, cut(state.note, _NOTE_SIZE),
     )  # fmt: skip
-    for at in _COPIES_AT:
-        _atomics.cell_write(memory, offset + at, data)
 
 
 def _unpack(data: bytes) -> ClockState:

@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import msgspec
 
-from shmio.errors import CommandError, SegmentError
+from shmio.errors import CommandError
 from shmio.segment import _atomics
 from shmio.segment.header import cut, text
 from shmio.segment.shm import SharedObject
+from shmio.segment.twin import TwinCell
 
 if TYPE_CHECKING:
     from shmio.segment.clock import ClockPage
@@ -35,7 +36,7 @@ _COPIES_AT: Final = (64, 704)
 _ASK_AT: Final = 1344
 SECTION_SIZE: Final = 2560
 
-_STATE: Final = struct.Struct("<IIqqqqqqqdQQ256s256s")
+_STATE: Final = struct.Struct("<IIqqqqqqqdQQ256s256x")
 _ASK: Final = struct.Struct("<QII1000s")
 _TEXT: Final = 255
 _MAX_ASK: Final = 999
@@ -53,8 +54,8 @@ class Play(NamedTuple):
     clock, up to ``until_ns``. What is played is from ``begin_ns`` to before ``end_ns``; with ``loop`` again and again.
     ``base_ns``: what a position is counted from in the publish times of frames. ``utc_ns``: UTC of position 0.
     ``own_clock``: frames have the clock of the recording; else that of the instance when they were due. ``over``:
-    the end was reached. ``step``: the last step of virtual time that was answered, ``failure`` why it failed, or
-    empty. ``asked``: the last request that was answered, with ``answer``.
+    the end was reached. ``step``: the last step of virtual time that was answered. ``asked``: the last request that was
+    answered, with ``answer``.
     """
 
     begin_ns: int
@@ -72,12 +73,6 @@ class Play(NamedTuple):
     step: int = 0
     asked: int = 0
     answer: str = ""
-    failure: str = ""
-
-    @property
-    def playing(self) -> bool:
-        """Whether the position moves with the instance's clock."""
-        return not self.paused
 
     def reach_ns(self, clock_ns: int) -> int:
         """The position at a time of the instance's clock, if nothing ended it."""
@@ -94,7 +89,7 @@ class Play(NamedTuple):
     def at_ns(self, clock_ns: int) -> int:
         """The position at a time of the instance's clock."""
         reach_ns = self.reach_ns(clock_ns)
-        if reach_ns >= self.end_ns and self.wraps and self.playing:
+        if reach_ns >= self.end_ns and self.wraps and not self.paused:
             return self.begin_ns + (reach_ns - self.begin_ns) % (self.end_ns - self.begin_ns)
         return min(reach_ns, self.until_ns)
 
@@ -109,13 +104,13 @@ class Play(NamedTuple):
     def settled(self, clock_ns: int) -> Play:
         """The same, with the rounds that are over by then behind it, and paused where it was to stop."""
         reach_ns = self.reach_ns(clock_ns)
-        if self.wraps and self.playing and reach_ns >= self.end_ns:
+        if self.paused or reach_ns < self.until_ns:
+            return self
+        if self.wraps:
             rounds = (reach_ns - self.begin_ns) // (self.end_ns - self.begin_ns)
             anchor_ns = self.due_ns(self.begin_ns + rounds * (self.end_ns - self.begin_ns))
             return self._replace(anchor_ns=anchor_ns, position_ns=self.begin_ns)
-        if not self.wraps and self.playing and reach_ns >= self.until_ns:
-            return self.anchored(clock_ns)._replace(paused=True, until_ns=self.end_ns)
-        return self
+        return self.anchored(clock_ns)._replace(paused=True, until_ns=self.end_ns)
 
     def anchored(self, clock_ns: int) -> Play:
         """The same, told from a time of the instance's clock on."""
@@ -167,7 +162,10 @@ class Playhead:
             raise ValueError("the playhead's section is too short")
         self._shared = shared
         self._memory = memory
-        self._offset = offset
+        first, second = _COPIES_AT
+        complaint = "a playhead makes no sense: restart its source: shmio-supervisor restart NAME"
+        self._state = TwinCell(memory, (offset + first, offset + second), complaint)
+        self._ask_at = offset + _ASK_AT
         self._lock_byte = lock_byte
         self._clock = clock
         self._turn = threading.Lock()
@@ -176,15 +174,13 @@ class Playhead:
 
     def read(self) -> Play | None:
         """How it plays; None: no process of the source has begun yet. SegmentError: it cannot be read."""
-        data = self._copy(_STATE.size)
-        (flags, _, begin, end, anchor, position, until, base, utc, speed, step, asked, answer, failure) = _STATE.unpack(
-            data
-        )
+        data = self._state.read(_STATE.size)
+        (flags, _, begin, end, anchor, position, until, base, utc, speed, step, asked, answer) = _STATE.unpack(data)
         if not flags & _VALID or not begin < end or not (math.isfinite(speed) and speed > 0):
             return None
         return Play(
             begin, end, anchor, position, until, base, utc, speed, bool(flags & _PAUSED), bool(flags & _LOOP),
-            bool(flags & _OWN_CLOCK), bool(flags & _OVER), step, asked, text(answer), text(failure),
+            bool(flags & _OWN_CLOCK), bool(flags & _OVER), step, asked, text(answer),
         )  # fmt: skip
 
     def now_ns(self) -> int:
@@ -197,13 +193,6 @@ class Playhead:
         play = self.read()
         return self._clock.present_ns() if play is None or not play.own_clock else publish_ns - play.base_ns
 
-    def _copy(self, size: int) -> bytes:
-        for at in _COPIES_AT * 4:  # one of them is whole, whenever their writer was killed
-            data = _atomics.cell_read(self._memory, self._offset + at, size)
-            if data is not None:
-                return data
-        raise SegmentError("a playhead makes no sense: restart its source: shmio-supervisor restart NAME")
-
     # ---- the source's part ---------------------------------------------------------------------------------------
 
     def write(self, play: Play) -> None:
@@ -212,14 +201,12 @@ class Playhead:
         data = _STATE.pack(
             flags | (_OVER * play.over), 0, play.begin_ns, play.end_ns, play.anchor_ns, play.position_ns,
             play.until_ns, play.base_ns, play.utc_ns, play.speed, play.step, play.asked, cut(play.answer, _TEXT),
-            cut(play.failure, _TEXT),
         )  # fmt: skip
-        for at in _COPIES_AT:
-            _atomics.cell_write(self._memory, self._offset + at, data)
+        self._state.write(data)
 
     def asks(self, answered: int) -> tuple[int, Ask | None] | None:
         """Number and request that waits; None: there is none behind ``answered``. A request that is none is None."""
-        data = _atomics.cell_read(self._memory, self._offset + _ASK_AT, _ASK.size)
+        data = _atomics.cell_read(self._memory, self._ask_at, _ASK.size)
         if data is None:
             return None
         number, _, _, document = _ASK.unpack(data)
@@ -252,10 +239,10 @@ class Playhead:
         if len(document) > _MAX_ASK:
             raise CommandError("the request is too long")
         play = self.read()
-        data = _atomics.cell_read(self._memory, self._offset + _ASK_AT, _ASK.size)
+        data = _atomics.cell_read(self._memory, self._ask_at, _ASK.size)
         before = _ASK.unpack(data)[0] if data else 0
         number = max(before, play.asked if play else 0) + 1
-        _atomics.cell_write(self._memory, self._offset + _ASK_AT, _ASK.pack(number, os.getpid(), 0, document))
+        _atomics.cell_write(self._memory, self._ask_at, _ASK.pack(number, os.getpid(), 0, document))
         return number
 
     def found(self, number: int) -> Found | None:

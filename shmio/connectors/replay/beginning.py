@@ -63,7 +63,7 @@ def _as_others(source: Replay, heads: Iterable[Playhead]) -> Play | None:
     for head in heads:
         play = head.read()
         if play is not None and _is_of(source, play):
-            return play._replace(step=0, asked=0, answer="", failure="")
+            return play._replace(step=0, asked=0, answer="")
     return None
 
 

@@ -15,7 +15,6 @@ from shmio.segment import (
     Provenance,
     Quality,
     Record,
-    Segment,
 )
 from shmio.segment.commander import Commander
 from shmio.segment.coordinator import Coordinator
@@ -268,4 +267,3 @@ def test_age_is_the_recordings(tmp_path: Path, instance: str) -> None:
             age_ns = frame.age_ns(cell.block.now_ns())
             assert age_ns < 20 * MS
         assert cell.block.assess(frame)[0] is Quality.GOOD
-    assert isinstance(segment, Segment)
