@@ -8,9 +8,10 @@ from typing import NamedTuple, Protocol
 
 from shmio.config import Declaration
 from shmio.layout.model import Layout, Register
+from shmio.playing import Playing
 from shmio.segment.clock import ClockState
 from shmio.segment.commander import Outcome
-from shmio.segment.replays import Playing, Wanted
+from shmio.segment.replays import Wanted
 from shmio.segment.standing import Standing
 from shmio.segment.view import Reading
 

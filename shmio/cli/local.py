@@ -13,11 +13,12 @@ from shmio.cli.readings import choose
 from shmio.config import Declaration
 from shmio.errors import CommandError, NotRunningError, PathError
 from shmio.layout.model import Layout, Register
+from shmio.playing import Playing
 from shmio.segment import Block, Cursor, Event, EventKind, Frame, Quality
 from shmio.segment.attach import Attachment
 from shmio.segment.clock import ClockState
 from shmio.segment.commander import Outcome
-from shmio.segment.replays import Playing, Wanted
+from shmio.segment.replays import Wanted
 from shmio.segment.shadow import Shadow
 from shmio.segment.standing import Standing
 from shmio.segment.view import Reading, reading

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import queue
 import threading
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,10 +25,11 @@ from shmio.errors import ConfigError, NotRunningError, PathError, RemoteError, S
 from shmio.layout.codec import Value
 from shmio.layout.model import Layout, Register
 from shmio.layout.types import element_type
+from shmio.playing import Playing
 from shmio.segment import EventKind, Quality
 from shmio.segment.clock import ClockMode, ClockState
 from shmio.segment.commander import Outcome as LocalOutcome
-from shmio.segment.replays import Playing, Wanted
+from shmio.segment.replays import Wanted
 from shmio.segment.standing import Running, Standing
 from shmio.segment.view import Reading
 
@@ -173,7 +173,7 @@ class Remote:
     def replay(self, wanted: Wanted) -> list[Playing]:
         """Move what plays recordings, if anything is wanted; how they play then."""
         wish = msgspec.to_builtins(wanted)  # what is wanted alone
-        return [Playing(**dataclasses.asdict(one)) for one in self._client.replay(**wish)]
+        return self._client.replay(**wish)
 
 
 class _RemoteShadow:

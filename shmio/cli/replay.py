@@ -12,7 +12,8 @@ import msgspec
 from shmio.cli.cell import Cell
 from shmio.cli.run import dumps
 from shmio.logs import printable
-from shmio.segment.replays import Playing, Wanted
+from shmio.playing import Playing
+from shmio.segment.replays import Wanted
 
 HELP = "Tell how recordings play, and move them: pause, play, seek, and more."
 

@@ -21,7 +21,7 @@ from shmio.client.calls import Clock, Outcome, Stepped, Target
 from shmio.client.injections import Declared, Happening, Injection, Lifted, Running
 from shmio.client.layout import BlockLayout
 from shmio.client.model import Work
-from shmio.client.replay import Playing, Wish
+from shmio.client.replay import Wish
 from shmio.client.sync import Client, Subscription
 from shmio.client.sync_campaign import Campaign
 from shmio.client.sync_model import Simulation
@@ -29,6 +29,7 @@ from shmio.client.sync_shadow import Shadow
 from shmio.client.sync_steps import Steps
 from shmio.client.table import Change, Column, Register, Table
 from shmio.client.update import Piece, Provenance, Quality, Snapshot, Update
+from shmio.playing import Playing
 
 __all__ = [
     "BlockLayout",

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Any, Final, TypedDict
 
+from shmio.playing import Playing
 from shmio.wire import shmio_v1_pb2 as wire
 
 SEARCH_PATIENCE_S: Final = 600.0
@@ -34,38 +34,23 @@ class Wish(TypedDict, total=False):
     """Only these, and what else plays the same recording."""
 
 
-@dataclass(frozen=True, slots=True)
-class Playing:
-    """How a source plays its recording. ``time_s``: UTC of the position; ``position_s``: from the begin of what plays.
-
-    ``until_s``: where it is to pause; None: at the end. ``over``: it has come to that.
-    """
-
-    source: str
-    time_s: float
-    position_s: float
-    length_s: float
-    speed: float
-    paused: bool
-    loop: bool
-    over: bool
-    until_s: float | None = None
-
-    @classmethod
-    def of(cls, found: Any) -> Playing:
-        """From the wire."""
-        return cls(
-            found.source, found.time_s, found.position_s, found.length_s, found.speed, found.paused, found.loop,
-            found.over, found.until_s if found.HasField("until_s") else None,
-        )  # fmt: skip
-
-
 def request(wish: Wish) -> Any:
     """For Replay; times go as text."""
     keys: dict[str, Any] = {**wish}
     for key in {"seek", "until"} & keys.keys():
         keys[key] = str(keys[key])
     return wire.ReplayRequest(**keys)
+
+
+def told(found: Any) -> list[Playing]:
+    """From a ReplayResponse."""
+    return [
+        Playing(
+            one.source, one.time_s, one.position_s, one.length_s, one.speed, one.paused, one.loop, one.over,
+            one.until_s if one.HasField("until_s") else None,
+        )
+        for one in found.sources
+    ]  # fmt: skip
 
 
 def patience_s(wish: Wish) -> float | None:

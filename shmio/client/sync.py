@@ -14,13 +14,14 @@ from shmio.client.calls import Clock, Outcome, Target
 from shmio.client.injections import Injection, Lifted
 from shmio.client.layout import BlockLayout, layouts
 from shmio.client.model import PATIENCE_S
-from shmio.client.replay import Playing, Wish
+from shmio.client.replay import Wish
 from shmio.client.sync_campaign import Campaign
 from shmio.client.sync_model import Simulation, Step, serve
 from shmio.client.sync_shadow import Shadow
 from shmio.client.sync_steps import Steps
 from shmio.client.update import Snapshot, Tables, Update
 from shmio.errors import CommandError
+from shmio.playing import Playing
 from shmio.wire import shmio_v1_pb2 as wire
 from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
 
@@ -225,7 +226,7 @@ class Client:
         CommandError: nothing is played, what is looked for is not there, or a source does not answer.
         """
         found = self._call(self._stub.Replay, replay.request(wish), replay.patience_s(wish))
-        return list(map(Playing.of, found.sources))
+        return replay.told(found)
 
     def _call(self, method: Callable[..., Any], request: Any, timeout_s: float | None = None) -> Any:
         try:

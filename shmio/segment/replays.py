@@ -6,14 +6,15 @@ import math
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from datetime import datetime
 from typing import Final
 
 import msgspec
 
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.topic import look_up, parse_topic
+from shmio.playing import Playing
 from shmio.segment.block import Block
+from shmio.segment.moment import moment_ns
 from shmio.segment.playhead import MAX_SPEED, MIN_SPEED, Ask, Find, Found, Move, Play, Playhead
 from shmio.segment.segment import Segment
 
@@ -22,24 +23,6 @@ ANSWER_S: Final = 5.0
 SEARCH_S: Final = 600.0
 TURN_NS: Final = 500_000_000
 """How often it is looked whether who asks still wants to know."""
-
-
-class Playing(msgspec.Struct, frozen=True):
-    """How one source plays. ``time_s``: UTC of the position; ``position_s``: from the begin of what is played.
-
-    ``until_s``: where it is to pause; None: at the end. ``over``: it has come to that. ``paused`` or not, it moves only
-    as the instance's clock does.
-    """
-
-    source: str
-    time_s: float
-    position_s: float
-    length_s: float
-    speed: float
-    paused: bool
-    loop: bool
-    over: bool
-    until_s: float | None = None
 
 
 class Wanted(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -267,11 +250,8 @@ def _moved(play: Play, wanted: Wanted, clock_ns: int) -> Move:
 
 def _position(play: Play, text: str) -> int:
     try:
-        try:
-            position_ns = play.begin_ns + round(float(text) * 1e9)
-        except ValueError:
-            position_ns = round(datetime.fromisoformat(text).astimezone().timestamp() * 1e6) * 1000 - play.utc_ns
-    except (ValueError, OverflowError):
+        position_ns = moment_ns(text, play.utc_ns + play.begin_ns) - play.utc_ns
+    except ValueError:
         raise ValueRangeError(
             f"{text!r} is neither a time such as 2026-11-21T08:30:00 nor seconds from the begin of what is played"
         ) from None

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from shmio.dump.damage import Damage
 from shmio.dump.part import MAX_NS
 from shmio.errors import RecordingError
+from shmio.segment.moment import moment_ns
 
 
 def time_range(arguments: argparse.Namespace, start_ns: int) -> tuple[int, int]:
@@ -25,15 +26,11 @@ def time_range(arguments: argparse.Namespace, start_ns: int) -> tuple[int, int]:
 
 def _parse(option: str, text: str, start_ns: int) -> int:
     try:
-        try:
-            moment_ns = start_ns + round(float(text) * 1e9)
-        except ValueError:
-            moment_ns = round(datetime.fromisoformat(text).astimezone().timestamp() * 1e6) * 1000
-    except (ValueError, OverflowError, TypeError):  # argparse makes a list of --from=--
+        return min(max(0, moment_ns(text, start_ns)), MAX_NS)
+    except (ValueError, TypeError):  # argparse makes a list of --from=--
         raise RecordingError(
             f"{option}: {text!r} is neither a time such as 2026-11-21T08:30:00 nor seconds of the recording"
         ) from None
-    return min(max(0, moment_ns), MAX_NS)
 
 
 def iso(time_ns: int) -> str:

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import threading
 from typing import Any, Final
 
 import grpc
-import msgspec
 
 from shmio.endpoints.grpc.native.refusal import Context, refuse
 from shmio.errors import ShmioError, ValueRangeError
+from shmio.playing import Playing
 from shmio.segment import Segment
-from shmio.segment.replays import Playing, Replays, Wanted
+from shmio.segment.replays import Replays, Wanted
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_TEXT: Final = 4096
@@ -75,4 +76,4 @@ def _wanted(request: wire.ReplayRequest) -> Wanted:
 
 
 def _playing(play: Playing) -> wire.Playing:
-    return wire.Playing(**msgspec.structs.asdict(play))
+    return wire.Playing(**dataclasses.asdict(play))
