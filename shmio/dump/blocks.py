@@ -39,11 +39,16 @@ class DumpBlock:
     begin_ns: int = 0
     end_ns: int = 0
     """Log times of its first and last frame or event."""
+    first_ns: int = 0
+    last_ns: int = 0
+    """Log times of its first and last frame."""
 
     def add(self, kind: str, track: Track) -> None:
         """A file has these frames or events of it."""
         if kind == FRAME:
             self.frames += track.count
+            self.first_ns = min(self.first_ns or track.first_ns, track.first_ns)
+            self.last_ns = max(self.last_ns, track.last_ns)
         else:
             self.events += track.count
         self.begin_ns = min(self.begin_ns or track.first_ns, track.first_ns)

@@ -12,6 +12,7 @@ import msgspec
 from shmio.cli.supervise.host import check_host
 from shmio.cli.supervise.layouts import LayoutFiles
 from shmio.cli.supervise.ports import check_listening
+from shmio.cli.supervise.recordings import Recordings
 from shmio.cli.supervise.replaying import replayed
 from shmio.cli.supervise.sources import check_sources
 from shmio.config import Address, Config, Emulator, Source, load
@@ -54,12 +55,13 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
             'add one, such as [recorder] with directory = "dumps", or leave out --mode log'
         )
     try:
-        if mode == "replay":
-            config, origin, notices = replayed(config, keys or {})
-        files = LayoutFiles(config)
-        check_host(config)
-        check_listening(config)
-        sources = check_sources(config, files)
+        with Recordings() as recordings:
+            if mode == "replay":
+                config, origin, notices = replayed(config, keys or {}, recordings)
+            files = LayoutFiles(config)
+            check_host(config)
+            check_listening(config)
+            sources = check_sources(config, files, recordings)
         layouts = sources.layouts
         emulated = {emulator.name: _check_emulator(i, emulator, files) for i, emulator in enumerate(config.emulator)}
         declared, described = _check_injections(config, layouts)

@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple
 
 import msgspec
 
+from shmio.cli.supervise.recordings import Recordings
 from shmio.config import Config, Source
 from shmio.config.model import NAME_RULE, Replay
 from shmio.config.read import RESERVED_SOURCES, SECTION_PROCESSES, convert
@@ -64,20 +65,21 @@ def options(keys: Mapping[str, Any]) -> list[str]:
     return words
 
 
-def replayed(config: Config, keys: Mapping[str, Any]) -> Replayed:
+def replayed(config: Config, keys: Mapping[str, Any], recordings: Recordings) -> Replayed:
     """The configuration with the recording's sources alone. ConfigError, beginning with the key."""
-    from shmio.connectors.replay.recording import Recording  # noqa: PLC0415
-
     section = _section(config, keys)
     files = [str(config.path(file)) for file in _listed(section.file)]
     if not files:
         raise ConfigError('replay.file: what is to be played: --from FILE.mem, or [replay] with file = "FILE.mem"')
     try:
-        with Recording(files) as recording:
-            span = recording.span(section.start, section.end)
-            names, utc_ns = recording.sources, recording.utc_ns
+        recording = recordings.get(files)
     except RecordingError as error:
-        raise ConfigError(f"replay.{error}" if str(error).startswith("start") else f"replay.file: {error}") from None
+        raise ConfigError(f"replay.file: {error}") from None
+    try:
+        span = recording.span(section.start, section.end)
+    except RecordingError as error:
+        raise ConfigError(f"replay.{error}") from None
+    names = recording.sources
     _check_names(names, files[0])
     notices = list(_notices(config, section, names))
     there = {source.name: source for source in config.source}
@@ -95,7 +97,7 @@ def replayed(config: Config, keys: Mapping[str, Any]) -> Replayed:
         grpc=grpc,
     )
     lead_ns = 0 if config.instance.clock == "stepped" else LEAD_NS
-    return Replayed(changed, Origin(max(0, span.begin_ns - lead_ns), utc_ns), notices)
+    return Replayed(changed, Origin(max(0, span.begin_ns - lead_ns), recording.utc_ns), notices)
 
 
 def _section(config: Config, keys: Mapping[str, Any]) -> Replay:

@@ -10,9 +10,10 @@ from typing import NamedTuple
 import msgspec
 
 from shmio.cli.supervise.layouts import LayoutFiles
+from shmio.cli.supervise.recordings import Recordings
 from shmio.config import Config, Source
 from shmio.config.read import unknown_option
-from shmio.errors import ConfigError
+from shmio.errors import ConfigError, RecordingError
 from shmio.layout.model import Layout
 
 
@@ -28,7 +29,7 @@ class Sources(NamedTuple):
     """Patterns of what a program elsewhere computes, of sources that have such: outputs, in-outs."""
 
 
-def check_sources(config: Config, files: LayoutFiles) -> Sources:
+def check_sources(config: Config, files: LayoutFiles, recordings: Recordings) -> Sources:
     """Ask the connectors of all sources whether they can be as configured.
 
     Their ``options`` are complete and of their types from here on. ConfigError, LayoutError.
@@ -50,7 +51,7 @@ def check_sources(config: Config, files: LayoutFiles) -> Sources:
             computed.append(source.name)
         if issubclass(found, Replayed):
             replayed.append(source.name)
-            layouts[source.name] = _recorded(key, source, config)
+            layouts[source.name] = _recorded(key, source, config, recordings)
             continue
         if source.connector == "simulation":
             layouts[source.name], inputs[index] = _model(key, source, config, files)
@@ -95,9 +96,9 @@ def _options(index: int, source: Source) -> msgspec.Struct:
     return options
 
 
-def _recorded(key: str, source: Source, config: Config) -> Layout:
+def _recorded(key: str, source: Source, config: Config, recordings: Recordings) -> Layout:
     """The layout of a replay: that of the recording, which has its period and its age, too."""
-    from shmio.connectors.replay.source import Replay, files  # noqa: PLC0415
+    from shmio.connectors.replay.source import Replay, chosen, files  # noqa: PLC0415
 
     for name in ("layout", "block", "properties"):
         if getattr(source, name) is not None:
@@ -105,12 +106,15 @@ def _recorded(key: str, source: Source, config: Config) -> Layout:
     options = msgspec.convert(source.options, Replay.Options)
     source.options["file"] = [str(config.path(file)) for file in files(options)]
     try:
-        replay = Replay(msgspec.convert(source.options, Replay.Options), source.name)
+        recording = recordings.get(source.options["file"])
+    except RecordingError as error:
+        raise ConfigError(f"{key}.file: {error}") from None
+    try:
+        block = chosen(recording, options, source.name)[1].block
     except ConfigError as error:
         raise ConfigError(f"{key}.{error}") from None
-    replay.close()
-    source.period_ms, source.stale_ms = replay.tape.period_ns / 1e6, replay.tape.stale_ns / 1e6
-    return replay.layout
+    source.period_ms, source.stale_ms = block.period_ns / 1e6, block.stale_ns / 1e6
+    return block.layout
 
 
 def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tuple[Layout, tuple[str, ...]]:

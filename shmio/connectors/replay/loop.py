@@ -149,7 +149,7 @@ class ReplayLoop:
             self._writer.block.ring.wake()  # for who waits until it has come there
             return False
         self._keep(settled)
-        self._player.again(settled.begin_ns, self._source.tape.stale_ns, self._stamp)
+        self._player.again(settled.begin_ns, self._source.tape.block.stale_ns, self._stamp)
         return True
 
     def _stamp(self, position_ns: int, clock_ns: int) -> Stamp:

@@ -13,6 +13,7 @@ from shmio.dump.damage import Damage
 from shmio.dump.dump import open_dump
 from shmio.errors import RecordingError
 from shmio.segment.header import MAX_PROCESSES
+from shmio.segment.moment import date_ns
 
 Moment = float | str
 """Seconds from a recording's begin, or a date and time."""
@@ -65,15 +66,14 @@ class Recording:
                 f"{self._file} has {len(names)} sources, an instance at most {MAX_PROCESSES}: shmio-dump cut --source "
                 "takes some of them into a file of their own"
             )
-        firsts = {name: next(self._dump.frames(name), None) for name in names}
-        self.sources = [name for name in names if firsts[name] is not None]
-        """Names of those that have frames."""
-        lasts = [self._dump.latest(name) for name in self.sources]
-        if not self.sources:
+        spans = {name: span for name in names if (span := self._measured(name))}
+        if not spans:
             raise RecordingError(f"{self._file} holds no frames: there is nothing to play")
+        self.sources = list(spans)
+        """Names of those that have frames."""
         self.whole = Span(
-            min(first.time_ns for first in firsts.values() if first) - self.utc_ns,
-            max(last.time_ns + last.block.period_ns for last in lasts if last and last.block) - self.utc_ns,
+            min(span.begin_ns for span in spans.values()) - self.utc_ns,
+            max(span.end_ns for span in spans.values()) - self.utc_ns,
         )
         """From the first frame to a period behind the last one."""
         even = all(
@@ -83,12 +83,23 @@ class Recording:
         if not even or max(self.utc_ns, *map(abs, self.whole)) > MAX_NS:
             raise RecordingError(f"{self._file} has times that make no sense: it cannot be played")
 
+    def _measured(self, name: str) -> Span | None:
+        """From the first frame of a source to a period behind its last one, UTC; None: it has none."""
+        if self._dump.damage:  # then the index need not tell of all that can be read
+            first, last = next(self._dump.frames(name), None), self._dump.latest(name)
+            return Span(first.time_ns, last.time_ns + last.block.period_ns) if first and last and last.block else None
+        blocks = [block for block in self._dump.blocks if block.source == name and block.frames]
+        if not blocks:
+            return None
+        last_block = max(blocks, key=lambda block: block.last_ns)
+        return Span(min(block.first_ns for block in blocks), last_block.last_ns + last_block.period_ns)
+
     def _damaged(self, file: Path, damage: Damage) -> None:
         log.warning("%s: bytes %d to %d are lost: %s", file, damage.first, damage.last, damage.why)
         self._damage.append(damage)
 
     def span(self, start: Moment | None, end: Moment | None) -> Span:
-        """What is played. RecordingError: there is nothing between these."""
+        """What is played. RecordingError, beginning with the key: it is no time, or there is nothing between these."""
         begin_ns = self.whole.begin_ns if start is None else self.moment("start", start)
         end_ns = self.whole.end_ns if end is None else self.moment("end", end)
         span = Span(max(begin_ns, self.whole.begin_ns), min(end_ns, self.whole.end_ns))
@@ -105,20 +116,20 @@ class Recording:
         try:
             if not isinstance(text, str):
                 return self.whole.begin_ns + round(text * 1e9)
-            return round(datetime.fromisoformat(text).astimezone().timestamp() * 1e6) * 1000 - self.utc_ns
+            return date_ns(text) - self.utc_ns
         except (ValueError, OverflowError):
             raise RecordingError(
                 f"{key}: {text!r} is neither a time such as 2026-11-21T08:30:00 nor seconds of the recording"
             ) from None
 
-    def tape(self, source: str, span: Span | None = None) -> Tape:
+    def tape(self, source: str, span: Span) -> Tape:
         """What there is of a source. RecordingError: nothing, or its layout changes within what is played."""
         if source not in self.sources:
             raise RecordingError(
                 f"{self._file} has no frames of a source {source!r}; it has: {', '.join(self.sources)}"
             )
         blocks = [block for block in self._dump.blocks if block.source == source and block.frames]
-        begin_ns, end_ns = (position_ns + self.utc_ns for position_ns in span or self.whole)
+        begin_ns, end_ns = (position_ns + self.utc_ns for position_ns in span)
         played = [block for block in blocks if block.begin_ns < end_ns and block.end_ns >= begin_ns] or blocks[:1]
         last = played[-1]
         if any(block.layout_hash != last.layout_hash for block in played):
@@ -127,8 +138,7 @@ class Recording:
                 f"source {source}: its layout was changed within what is to be played, at {at_s:.3f} s: end before "
                 "that, or start there"
             )
-        period_ns, stale_ns = last.period_ns, last.stale_ns
-        return Tape(self._dump, self._damage, source, last.layout, period_ns, stale_ns, self.utc_ns)
+        return Tape(self._dump, self._damage, last, self.utc_ns)
 
     def close(self) -> None:
         """Close the files."""

@@ -43,7 +43,7 @@ def _happened(name: str) -> Callable[[Entry], bool]:
 
 
 def _changed(tape: Tape, wanted: Find, *, keep: bool) -> Callable[[Entry], bool]:
-    register = find(tape.layout, wanted.path)
+    register = find(tape.block.layout, wanted.path)
     span = slice(register.offset, register.offset + register.size)
     bits = bits_of(register)
 

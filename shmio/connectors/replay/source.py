@@ -9,6 +9,7 @@ import msgspec
 
 from shmio.config.model import ReplayedInjections
 from shmio.connectors.replay.recording import Recording, Span
+from shmio.connectors.replay.tape import Tape
 from shmio.connectors.replayed import Replayed
 from shmio.errors import ConfigError, RecordingError
 from shmio.layout.model import Layout
@@ -41,16 +42,15 @@ class Replay(Replayed):
         except RecordingError as error:
             raise ConfigError(f"file: {error}") from None
         try:
-            self.span: Span = self.recording.span(options.start, options.end)
-            self.tape = self.recording.tape(options.source or name, self.span)
-        except RecordingError as error:
+            self.span, self.tape = chosen(self.recording, options, name)
+        except ConfigError:
             self.recording.close()
-            raise ConfigError(str(error) if str(error).startswith(("start", "end")) else f"source: {error}") from None
+            raise
 
     @property
     def layout(self) -> Layout:
         """Of the frames."""
-        return self.tape.layout
+        return self.tape.block.layout
 
     @property
     def keep(self) -> bool:
@@ -65,3 +65,15 @@ class Replay(Replayed):
 def files(options: Replay.Options) -> Sequence[str]:
     """The files of the recording."""
     return [options.file] if isinstance(options.file, str) else options.file
+
+
+def chosen(recording: Recording, options: Replay.Options, name: str) -> tuple[Span, Tape]:
+    """What is played of a recording for the source of this name. ConfigError, beginning with the key."""
+    try:
+        span = recording.span(options.start, options.end)
+    except RecordingError as error:
+        raise ConfigError(str(error)) from None
+    try:
+        return span, recording.tape(options.source or name, span)
+    except RecordingError as error:
+        raise ConfigError(f"source: {error}") from None

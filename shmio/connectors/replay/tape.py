@@ -6,10 +6,10 @@ import logging
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from shmio.dump.blocks import DumpBlock
 from shmio.dump.damage import Damage
 from shmio.dump.dump import Dump
 from shmio.dump.encoding import Gap
-from shmio.layout.model import Layout
 from shmio.segment import Event, Frame
 
 log = logging.getLogger("shmio.source")
@@ -31,33 +31,30 @@ class Entry(NamedTuple):
 class Tape:
     """One source of a recording. Several of its iterators may be under way; for one thread."""
 
-    def __init__(
-        self, dump: Dump, damage: list[Damage], source: str, layout: Layout, period_ns: int, stale_ns: int, utc_ns: int
-    ) -> None:
-        """``damage``: what the dump has told of damaged places; ``utc_ns``: of position 0."""
+    def __init__(self, dump: Dump, damage: list[Damage], block: DumpBlock, utc_ns: int) -> None:
+        """``damage``: what the dump has told of damaged places; ``utc_ns``: of position 0.
+
+        Of the source's blocks those are played that have the layout of this one.
+        """
         self._dump = dump
         self._damage = damage
-        self.source = source
-        self.layout = layout
-        self.period_ns = period_ns
-        self.stale_ns = stale_ns
+        self.block = block
         self._utc_ns = utc_ns
-        self._hash = layout.hash.hex()  # what has another layout is of another block, which is not played
-        self._holes = [gap for gap in dump.gaps if gap.source == source and gap.what == "frames"]
+        self._holes = [gap for gap in dump.gaps if gap.source == block.source and gap.what == "frames"]
 
     def entries(self, from_ns: int | None) -> Iterator[Entry]:
         """All from a position on (None: from the first), in the order in which it happened; damage is a hole."""
         at_ns = from_ns
         begin_ns = 0 if from_ns is None else max(0, from_ns + self._utc_ns)
-        for time_ns, block, item in self._dump.items(self.source, begin_ns):
+        for time_ns, block, item in self._dump.items(self.block.source, begin_ns):
             position_ns = time_ns - self._utc_ns
             if self._damage:
                 self._damage.clear()
-                yield Entry(position_ns if at_ns is None else min(at_ns + self.period_ns, position_ns), _DAMAGED)
+                yield Entry(position_ns if at_ns is None else min(at_ns + self.block.period_ns, position_ns), _DAMAGED)
             if isinstance(item, Gap):
                 if item.what == "frames":
                     yield self._hole(item, position_ns)
-            elif isinstance(item, Frame | Event) and block is not None and block.layout_hash == self._hash:
+            elif isinstance(item, Frame | Event) and self._is_played(block):
                 yield Entry(position_ns, item)
             else:
                 continue
@@ -65,10 +62,10 @@ class Tape:
 
     def newest(self, position_ns: int) -> Entry | None:
         """The last frame at or before a position, or the hole that it lies in; None: there is none before."""
-        found = self._dump.latest(self.source, position_ns + self._utc_ns)
+        found = self._dump.latest(self.block.source, position_ns + self._utc_ns)
         self._damage.clear()
         last = None
-        if found is not None and found.block is not None and found.block.layout_hash == self._hash:
+        if found is not None and self._is_played(found.block):
             last = Entry(found.time_ns - self._utc_ns, found.item)
         holes = (self._hole(gap, position_ns) for gap in self._holes)
         return max(
@@ -77,9 +74,12 @@ class Tape:
             default=None,
         )
 
+    def _is_played(self, block: DumpBlock | None) -> bool:
+        return block is not None and block.layout_hash == self.block.layout_hash
+
     def _hole(self, gap: Gap, at_ns: int) -> Entry:
         """It begins a period after the frame before it, or with the one behind it."""
-        position_ns = gap.after_ns - self._utc_ns + self.period_ns if gap.after_ns else at_ns
+        position_ns = gap.after_ns - self._utc_ns + self.block.period_ns if gap.after_ns else at_ns
         if gap.before_ns:
             position_ns = min(position_ns, gap.before_ns - self._utc_ns)
         count = f"{gap.count} frame{'s' * (gap.count != 1)}"

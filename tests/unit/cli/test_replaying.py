@@ -118,6 +118,7 @@ def test_a_replay_beside_others_has_the_recordings_registers(
         ({"file": ["none.mem"]}, "replay.file: "),
         ({"start": 90.0}, "replay.start, end: there is nothing to play"),
         ({"start": "then"}, "replay.start: 'then' is neither"),
+        ({"end": "then"}, "replay.end: 'then' is neither"),
         ({"speed": -1.0}, "replay.speed: "),
     ],
 )
