@@ -26,6 +26,8 @@ PIECE: Final = 64
 """So many frames and events between two looks at what else there is to do."""
 LATE_NS: Final = 10_000_000_000
 """What is late is caught up with, up to this much of the instance's clock; what is later is left out."""
+ASK_TURN_NS: Final = 1_000_000
+"""How often it is looked whether a step is over that a request waits for: its end rings nothing here."""
 APART_NS: Final = 60_000_000_000
 """A request may be told of a moment that is so far from now."""
 
@@ -108,11 +110,12 @@ class ReplayLoop:
             self._writer.block.ring.wake()
         if not state.stepping:
             more |= self._listen(state.time_ns)
+        asked = state.stepping and self._head.asks(self._play.asked) is not None
         if self.desk.waiting:
             self.desk.settle()
             self.desk.carry_out(self._refuse)
         self.counters.polls = self._player.published
-        return self._clock.wait_ns(0 if more else self._patience_ns(virtual=state.virtual))
+        return self._clock.wait_ns(0 if more else ASK_TURN_NS if asked else self._patience_ns(virtual=state.virtual))
 
     def _patience_ns(self, *, virtual: bool) -> int | None:
         """How long nothing is due; None: until somebody rings."""
