@@ -20,10 +20,16 @@ def execute(arguments: argparse.Namespace) -> int:
         print(printable(f"  {_describe(block, peer(source))}"))
     for text in prepared.injections:
         print(printable(f"  {text}"))
+    warnings = [*plan.warnings]
+    if prepared.config.replay and prepared.config.replay.file:
+        replay = prepare(file, "replay").plan
+        for block in replay.blocks:
+            print(printable(f"  with --mode replay: {_describe(block, '')}"))
+        warnings += [warning for warning in replay.warnings if warning not in warnings]
     print(f"  segment {PREFIX}{plan.instance}: {plan.segment_bytes / 1e6:.2f} MB of shared memory")
-    for warning in plan.warnings:
+    for warning in warnings:
         print(printable(warning))
-    count = len(plan.warnings)
+    count = len(warnings)
     print(f"usable, with {count} warning{'s' * (count != 1)}" if count else "no faults found")
     return 0
 

@@ -111,6 +111,35 @@ def test_a_replay_beside_others_has_the_recordings_registers(
         assert line.startswith(f"supervisor.toml: {error}"), line
 
 
+def test_check_looks_at_the_section_too(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(file.parent)
+    text = (
+        '[instance]\nname = "line"\n[[source]]\nname = "panel"\nconnector = "memory"\nlayout = "panel.toml"\n[replay]\n'
+    )
+    config = Path("supervisor.toml")
+    config.write_text(f'{text}file = "{file.name}"\n')
+    assert main(["check"]) == 0
+    out = capsys.readouterr().out
+    assert "  with --mode replay: source cell: DB1, 2 registers, 4 bytes" in out
+    assert "warning: source panel is left out: the recording has none of it; it has cell, arm\n" in out
+    assert out.endswith("usable, with 1 warning\n")
+    config.write_text(text + "speed = 2.0\n")
+    assert main(["check"]) == 0
+    assert capsys.readouterr().out.endswith("no faults found\n"), "--from says what"
+    for keys, error in (
+        ('file = "none.mem"', f"replay.file: {Path('none.mem').absolute()}: No such file"),
+        ('file = "panel.toml"', "replay.file: "),
+        (f'file = "{file.name}"\nstart = 99', "replay.start, end: there is nothing to play"),
+        (f'file = "{file.name}"\nrecord = true', "replay.record: there is no [recorder] section"),
+    ):
+        config.write_text(f"{text}{keys}\n")
+        assert main(["check"]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"supervisor.toml: {error}"), line
+
+
 @pytest.mark.parametrize(
     ("keys", "error"),
     [
