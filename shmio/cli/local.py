@@ -146,7 +146,8 @@ class Local:
 
     def replay(self, wanted: Wanted) -> list[Playing]:
         """Move what plays recordings, if anything is wanted; how they play then."""
-        return self.attachment.replay.status() if wanted == Wanted() else self.attachment.replay.change(wanted)
+        replay = self.attachment.replay
+        return replay.status(wanted.sources) if wanted.nothing else replay.change(wanted)
 
 
 class LocalCampaign:

@@ -65,6 +65,7 @@ def _wanted(options: argparse.Namespace) -> Wanted:
     if options.jump and action not in ("to-change", "to-event"):
         options.refuse("--jump goes with to-change and to-event")
     wanted: dict[str, dict[str, Any]] = {
+        "status": {},
         "pause": {"paused": True},
         "play": {"paused": False, "speed": options.speed},
         "seek": {"seek": value},
@@ -76,7 +77,7 @@ def _wanted(options: argparse.Namespace) -> Wanted:
     }
     if action == "loop" and value not in ("on", "off"):
         options.refuse(f"loop is on or off, not {value!r}")
-    return Wanted(**wanted[action], sources=tuple(options.source)) if action != "status" else Wanted()
+    return Wanted(**wanted[action], sources=tuple(options.source))
 
 
 def _number(options: argparse.Namespace) -> float:

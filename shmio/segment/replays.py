@@ -43,6 +43,11 @@ class Wanted(msgspec.Struct, frozen=True, omit_defaults=True):
     jump: bool = False
     sources: tuple[str, ...] = ()
 
+    @property
+    def nothing(self) -> bool:
+        """Whether nothing is to change."""
+        return self == Wanted(sources=self.sources)
+
 
 class Replays:
     """The replays of an instance. Several threads may use it; of programs one at a time."""
@@ -51,10 +56,14 @@ class Replays:
         """``segment``: writable, to do more than look."""
         self._segment = segment
 
-    def status(self) -> list[Playing]:
-        """How each plays. CommandError: none does."""
+    def status(self, sources: Collection[str] = ()) -> list[Playing]:
+        """How each plays; with ``sources`` only these, and what else plays the same recording.
+
+        CommandError: none does; PathError: one of them does not.
+        """
         now_ns = self._segment.clock.present_ns()
-        return [_told(source, play, now_ns) for source, play in self._plays().items()]
+        plays = self._chosen(Wanted(sources=tuple(sources)))
+        return [_told(source, play, now_ns) for source, play in plays.items()]
 
     def pause(self) -> list[Playing]:
         """Have all stand where they are."""
@@ -104,7 +113,7 @@ class Replays:
                 self._go_to(wanted, heads, given_up)
             else:
                 self._move(heads, lambda play, clock_ns: _moved(play, wanted, clock_ns))
-        return self.status()
+        return self.status(wanted.sources)
 
     # ---- which -----------------------------------------------------------------------------------------------------
 

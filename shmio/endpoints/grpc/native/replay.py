@@ -40,8 +40,8 @@ class Moves:
         """
         try:
             wanted = _wanted(request)
-            if wanted == Wanted(sources=wanted.sources):
-                found = await asyncio.to_thread(self._replays.status)
+            if wanted.nothing:
+                found = await asyncio.to_thread(self._replays.status, wanted.sources)
             else:
                 found = await self._change(wanted)
         except ShmioError as error:

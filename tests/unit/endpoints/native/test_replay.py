@@ -52,6 +52,7 @@ def test_a_client_moves_it(tmp_path: Path, instance: str) -> None:
         ({"seek": "x" * 5000}, ValueRangeError),
         ({"change": "cell/none"}, PathError),
         ({"paused": True, "sources": ["none"]}, PathError),
+        ({"sources": ["none"]}, PathError),
         ({"event": "none"}, CommandError),
     ],
 )
