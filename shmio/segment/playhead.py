@@ -101,6 +101,10 @@ class Play(NamedTuple):
             clock_ns += 1
         return clock_ns
 
+    def next_round(self) -> Play:
+        """The same, with this round behind it, of one that wraps."""
+        return self._replace(anchor_ns=self.due_ns(self.end_ns), position_ns=self.begin_ns)
+
     def settled(self, clock_ns: int) -> Play:
         """The same, with the rounds that are over by then behind it, and paused where it was to stop."""
         reach_ns = self.reach_ns(clock_ns)
@@ -206,16 +210,26 @@ class Playhead:
 
     def asks(self, answered: int) -> tuple[int, Ask | None] | None:
         """Number and request that waits; None: there is none behind ``answered``. A request that is none is None."""
-        data = _atomics.cell_read(self._memory, self._ask_at, _ASK.size)
-        if data is None:
+        asked = self._asked()
+        if asked is None or asked[0] == answered:
             return None
-        number, _, _, document = _ASK.unpack(data)
-        if number == answered:
-            return None
+        number, document = asked
         try:
             return number, _ASKS.decode(document.rstrip(b"\0"))
         except msgspec.MsgspecError:
             return number, None
+
+    def asked(self) -> int:
+        """Number of the last request; 0: there was none."""
+        asked = self._asked()
+        return asked[0] if asked else 0
+
+    def _asked(self) -> tuple[int, bytes] | None:
+        data = _atomics.cell_read(self._memory, self._ask_at, _ASK.size)
+        if data is None:
+            return None
+        number, _, _, document = _ASK.unpack(data)
+        return number, document
 
     # ---- the part of who asks ------------------------------------------------------------------------------------
 
@@ -239,9 +253,7 @@ class Playhead:
         if len(document) > _MAX_ASK:
             raise CommandError("the request is too long")
         play = self.read()
-        data = _atomics.cell_read(self._memory, self._ask_at, _ASK.size)
-        before = _ASK.unpack(data)[0] if data else 0
-        number = max(before, play.asked if play else 0) + 1
+        number = max(self.asked(), play.asked if play else 0) + 1
         _atomics.cell_write(self._memory, self._ask_at, _ASK.pack(number, os.getpid(), 0, document))
         return number
 

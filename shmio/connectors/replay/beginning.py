@@ -40,7 +40,11 @@ def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]
     if own is not None and _is_of(source, own):  # without the lock: who holds it may wait for this process
         return Beginning(own, _done_ns(block, own))
     with heads[0].held():  # sources that begin at the same time begin together
-        play = _as_others(source, heads) or _as_configured(source, block, started_ns)
+        others = as_others(source, heads)
+        play = _as_configured(source, block, started_ns) if others is None else others
+        play = play._replace(
+            step=0, asked=block.playhead.asked(), answer=""
+        )  # what was asked before was not asked of it
         block.playhead.write(play)
         return Beginning(play, None)
 
@@ -59,12 +63,10 @@ def _is_of(source: Replay, play: Play) -> bool:
     return (play.begin_ns, play.end_ns, play.utc_ns) == (*source.span, source.recording.utc_ns)
 
 
-def _as_others(source: Replay, heads: Iterable[Playhead]) -> Play | None:
-    for head in heads:
-        play = head.read()
-        if play is not None and _is_of(source, play):
-            return play._replace(step=0, asked=0, answer="")
-    return None
+def as_others(source: Replay, heads: Iterable[Playhead]) -> Play | None:
+    """How what plays the same recording plays, as it was moved last; None: nothing does."""
+    plays = [play for head in heads if (play := head.read()) is not None and _is_of(source, play)]
+    return max(plays, key=lambda play: play.anchor_ns, default=None)
 
 
 def _as_configured(source: Replay, block: Block, started_ns: int) -> Play:

@@ -11,8 +11,9 @@ from shmio.connectors.campaign import Blocks
 from shmio.connectors.desk import CommandDesk
 from shmio.connectors.injector import OwnerOf
 from shmio.connectors.output import Output
-from shmio.connectors.replay.beginning import Beginning, stamp
+from shmio.connectors.replay.beginning import Beginning, as_others, stamp
 from shmio.connectors.replay.player import OVER, Player
+from shmio.connectors.replay.recording import MAX_NS
 from shmio.connectors.replay.search import Search
 from shmio.connectors.replay.source import Replay
 from shmio.connectors.stepped import StepClock
@@ -28,8 +29,8 @@ LATE_NS: Final = 10_000_000_000
 """What is late is caught up with, up to this much of the instance's clock; what is later is left out."""
 ASK_TURN_NS: Final = 1_000_000
 """How often it is looked whether a step is over that a request waits for: its end rings nothing here."""
-APART_NS: Final = 60_000_000_000
-"""A request may be told of a moment that is so far from now."""
+AHEAD_NS: Final = 60_000_000_000
+"""A request may be of a moment that is so far ahead, and of any that has passed: this process may have been held up."""
 
 log = logging.getLogger("shmio.source")
 
@@ -54,6 +55,7 @@ class ReplayLoop:
             raise SegmentError(f"the block of source {block.source} has no playhead")
         self._source = source
         self._writer = writer
+        self._blocks = blocks or dict
         self._head = block.playhead
         self._page = block.clock
         self._clock = clock
@@ -104,12 +106,12 @@ class ReplayLoop:
         # In virtual time what is published belongs to the end of the step.
         at_ns = self._play.base_ns + self._play.at_ns(state.time_ns) if state.virtual else None
         self._writer.at_ns = at_ns
-        more = self.counters.watch(self._clock.now_ns, lambda: self._advance(state.time_ns))
+        # Before anything is played: a request that waited tells of a moment at which this played as it still does.
+        more = not state.stepping and self._listen(state.time_ns)
+        more |= self.counters.watch(self._clock.now_ns, lambda: self._advance(state.time_ns))
         if not more and state.stepping and state.step != self._play.step:
             self._keep(self._play._replace(step=state.step))
             self._writer.block.ring.wake()
-        if not state.stepping:
-            more |= self._listen(state.time_ns)
         asked = state.stepping and self._head.asks(self._play.asked) is not None
         if self.desk.waiting:
             self.desk.settle()
@@ -127,15 +129,10 @@ class ReplayLoop:
 
     def _advance(self, clock_ns: int) -> bool:
         """Play what is due at a time of the instance's clock, a piece of it; whether there is more."""
+        self._leave_out(clock_ns)
         play = self._play
         # What lies at the place where it is to pause is played, what lies at the end is not.
         target_ns = min(play.reach_ns(clock_ns), play.until_ns, play.end_ns - 1)
-        next_ns = self._player.next_ns
-        late_ns = 0 if next_ns is None or play.paused else clock_ns - play.due_ns(next_ns)
-        if late_ns > LATE_NS and self._writer.at_ns is None:
-            left_out = self._player.skip(target_ns, self._stamp)
-            log.warning("%d frames were left out: this process was held up for %.1f s", left_out, late_ns / 1e9)
-            self.counters.overruns += left_out
         before = self._player.published
         if self._player.play(target_ns, self._stamp, PIECE):
             return True
@@ -151,9 +148,29 @@ class ReplayLoop:
             self._keep(settled._replace(over=over))
             self._writer.block.ring.wake()  # for who waits until it has come there
             return False
-        self._keep(settled)
-        self._player.again(settled.begin_ns, self._source.tape.block.stale_ns, self._stamp)
+        self._keep(play.next_round())
+        self._player.again(play.begin_ns, self._source.tape.block.stale_ns, self._stamp)
         return True
+
+    def _leave_out(self, clock_ns: int) -> None:
+        """Go on with the present, in wall time, where what comes next is too late.
+
+        In a loop that is also what is a round late: nobody could tell it from what is due.
+        """
+        play, next_ns = self._play, self._player.next_ns
+        if next_ns is None or play.paused or self._writer.at_ns is not None:
+            return
+        late_ns, behind_ns = clock_ns - play.due_ns(next_ns), play.reach_ns(clock_ns) - next_ns
+        too_late = late_ns > LATE_NS
+        if not too_late and not (play.wraps and behind_ns >= play.end_ns - play.begin_ns):
+            return
+        left_out = behind_ns // self._source.tape.block.period_ns
+        self.counters.overruns += left_out
+        if too_late:  # else it is too fast, and would be told all the time
+            log.warning("%d frames were left out: this process was held up for %.1f s", left_out, late_ns / 1e9)
+        if play.wraps:
+            self._keep(play.settled(clock_ns))
+        self._player.show(min(self._play.at_ns(clock_ns), play.end_ns - 1), self._stamp)
 
     def _stamp(self, position_ns: int, clock_ns: int) -> Stamp:
         """When what is at a position is published; ``clock_ns``: of the recording."""
@@ -179,9 +196,17 @@ class ReplayLoop:
             self._search = None
             return False
         number, ask = asked
+        missed = number != self._play.asked + 1
+        if missed:
+            self._catch_up(clock_ns)
         if isinstance(ask, Find):
             return self._find(number, ask)
-        found = self._move(ask, clock_ns) if isinstance(ask, Move) else Found("the request makes no sense")
+        if not isinstance(ask, Move):
+            found = Found("the request makes no sense")
+        elif missed and ask.clock_ns <= self._play.anchor_ns:
+            found = Found()  # it is in what others have done
+        else:
+            found = self._move(ask, clock_ns)
         self._answer(number, found)
         return True
 
@@ -203,11 +228,12 @@ class ReplayLoop:
         return True
 
     def _move(self, ask: Move, clock_ns: int) -> Found:
-        """Play otherwise from a moment on that is about now."""
+        """Play otherwise from a moment on."""
         if ask.speed is not None and not (math.isfinite(ask.speed) and MIN_SPEED <= ask.speed <= MAX_SPEED):
             return Found(f"a speed is from {MIN_SPEED:g} to {MAX_SPEED:g}, not {ask.speed:g}")
-        if abs(ask.clock_ns - clock_ns) > APART_NS:
-            return Found("the request came too late")
+        if not -MAX_NS < ask.clock_ns <= clock_ns + AHEAD_NS:
+            return Found("the request makes no sense")
+        was_ns = self._play.at_ns(clock_ns)
         play = self._play.anchored(ask.clock_ns)
         position_ns, paused = ask.position_ns, play.paused if ask.paused is None else ask.paused
         if position_ns is None and not paused and play.position_ns >= play.end_ns:
@@ -215,6 +241,9 @@ class ReplayLoop:
         if position_ns is not None and not play.begin_ns <= position_ns <= play.end_ns:
             length_s = (play.end_ns - play.begin_ns) / 1e9
             return Found(f"that is not within what is played, which is {length_s:.3f} s long")
+        at_ns = play.position_ns if position_ns is None else position_ns
+        if ask.until_ns is not None and ask.until_ns < at_ns:
+            return Found(f"that is past: it is at {(at_ns - play.begin_ns) / 1e9:.3f} s; seek to before that first")
         until_ns = play.end_ns if ask.until_ns is None else min(ask.until_ns, play.end_ns)
         if ask.until_ns is None and ask.paused is None and position_ns is None:
             until_ns = play.until_ns
@@ -223,12 +252,37 @@ class ReplayLoop:
                 paused=paused,
                 speed=play.speed if ask.speed is None else ask.speed,
                 loop=play.loop if ask.loop is None else ask.loop,
-                position_ns=play.position_ns if position_ns is None else position_ns,
-                until_ns=max(until_ns, play.position_ns if position_ns is None else position_ns),
+                position_ns=at_ns,
+                until_ns=until_ns,
                 over=play.over and position_ns is None,
             )
         )
         if position_ns is not None:
-            self._writer.at_ns = self._play.base_ns + position_ns
-            self._player.show(position_ns, self._stamp)
+            self._show(position_ns)
+        elif was_ns - self._play.at_ns(clock_ns) > self._source.tape.block.stale_ns:
+            self._show(self._play.at_ns(clock_ns))  # it is asked late to be where it was long ago
         return Found()
+
+    def _catch_up(self, clock_ns: int) -> None:
+        """Play as others of this recording that have been moved since, for requests were missed."""
+        heads = [block.playhead for block in self._blocks().values() if block.playhead is not None]
+        moved = as_others(self._source, heads)
+        if moved is None or moved.anchor_ns <= self._play.anchor_ns:
+            return
+        self._keep(
+            self._play._replace(
+                anchor_ns=moved.anchor_ns,
+                position_ns=moved.position_ns,
+                until_ns=moved.until_ns,
+                speed=moved.speed,
+                paused=moved.paused,
+                loop=moved.loop,
+                over=moved.over,
+            )
+        )
+        self._show(self._play.at_ns(clock_ns))
+
+    def _show(self, position_ns: int) -> None:
+        """Publish what was there at a position, and go on behind it."""
+        self._writer.at_ns = self._play.base_ns + position_ns
+        self._player.show(position_ns, self._stamp)

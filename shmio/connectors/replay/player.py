@@ -50,7 +50,6 @@ class Player:
         """Why quality is not good; empty if it is."""
         self._bad = False  # as last published
         self._missing = False  # whether the last frame was of this replay's own making
-        self._number = 0  # of the frame played last
         self.published = 0
 
     @property
@@ -84,12 +83,14 @@ class Player:
         self.go(position_ns + 1)
         entry = self._tape.newest(position_ns)
         if entry is not None and isinstance(entry.item, Frame):
-            self._number = entry.item.number
             self._output.resume(self._image(entry.item, None))
             self._bad = entry.item.quality is Quality.BAD
 
     def show(self, position_ns: int, stamp: StampOf) -> None:
-        """Publish the frame that is the newest at a position, and have what comes behind that be the next."""
+        """Publish the frame that is the newest at a position, and have what comes behind that be the next.
+
+        What lies before it is not read.
+        """
         entry = self._tape.newest(position_ns)
         if entry is None:
             self.fail(NOTHING, stamp(position_ns, position_ns))
@@ -105,18 +106,6 @@ class Player:
             self._publish(self._next, stamp)
             self._next = next(self._entries, None)
         return self._next is not None and self._next.position_ns <= until_ns
-
-    def skip(self, position_ns: int, stamp: StampOf) -> int:
-        """Go on at a position without what is before, but for the newest frame; how many frames are left out.
-
-        What is left out is not read: that would take longer than to play it.
-        """
-        before = self._number
-        entry = self._tape.newest(position_ns)
-        if entry is not None:
-            self._publish(entry, stamp)
-        self.go(position_ns + 1)
-        return max(0, self._number - before - 1)
 
     def end(self, reason: str, stamp: Stamp) -> None:
         """No more comes: what was good is so no longer."""
@@ -140,7 +129,6 @@ class Player:
         position_ns, item = entry
         if isinstance(item, Frame):
             at = stamp(position_ns, item.clock_ns)
-            self._number = item.number
             self._writer.cycle = item.cycle
             if self._missing:
                 self._missing = False

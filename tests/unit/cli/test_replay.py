@@ -68,5 +68,10 @@ def test_wrong_usage_is_told(
 def test_what_cannot_be_is_one_line(playing: Playing, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert replay(instance, "seek", "900") == 1
     assert capsys.readouterr().err == "900 is not within what is played, which is 0.400 s long\n"
+    assert replay(instance, "status", "--source", "none") == 1
+    assert capsys.readouterr().err == "source 'none' plays no recording; these do: cell\n"
+    assert replay(instance, "seek", "0.2") == 0
+    assert replay(instance, "until", "0.1") == 1
+    assert capsys.readouterr().err == "cell: that is past: it is at 0.200 s; seek to before that first\n"
     assert replay(instance, "to-event", "accepted") == 1
     assert capsys.readouterr().err == "there is no event accepted from here to the end of the recording\n"

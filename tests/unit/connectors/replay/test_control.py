@@ -8,13 +8,15 @@ from pathlib import Path
 import pytest
 
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
-from shmio.segment import EventKind, Quality, Record
+from shmio.segment import EventKind, Quality, Record, replays
 from shmio.segment.attach import Attachment, attach
+from shmio.segment.playhead import Found, Move
 from tests.unit.connectors.replay.harness import (
     BEGIN_NS,
     MS,
     PERIOD_NS,
     Playing,
+    S,
     built,
     counts,
     image,
@@ -111,6 +113,7 @@ def test_it_plays_to_the_next_event(tmp_path: Path, instance: str) -> None:
         (lambda replay: replay.seek("yesterday"), ValueRangeError),
         (lambda replay: replay.to_change("cell/none"), PathError),
         (lambda replay: replay.to_change("none/count"), PathError),
+        (lambda replay: replay.status(["none"]), PathError),
     ],
 )
 def test_what_cannot_be_is_refused(here: tuple[Playing, Attachment], what: object, error: type[ShmioError]) -> None:
@@ -147,3 +150,57 @@ def test_sources_of_one_recording_move_together(tmp_path: Path, instance: str) -
         for playing in (cell, other):
             playing.until(lambda: all(status.paused for status in attachment.replay.status()))
         assert {status.position_s for status in attachment.replay.status()} == {0.2}
+
+
+def test_a_time_that_is_past_is_not_played_to(here: tuple[Playing, Attachment]) -> None:
+    playing, attachment = here
+    attachment.replay.seek(0.2)
+    playing.next()
+    with pytest.raises(CommandError, match=r"^cell: that is past: it is at 0\.200 s; seek to before that first$"):
+        attachment.replay.play_until(0.1)
+    [status] = attachment.replay.status()
+    assert (status.paused, status.position_s, status.until_s) == (True, 0.2, None)
+    attachment.replay.play_until(0.3)
+    playing.until(lambda: attachment.replay.status()[0].position_s == 0.3)
+    assert counts(playing.frames()) == list(range(11, 16))
+
+
+def test_a_source_that_missed_requests_catches_up(
+    tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with recorded(tmp_path, instance, "cell", "other") as both:
+        for number in range(20):
+            for one in both:
+                one.frame(BEGIN_NS + number * PERIOD_NS, image(number))
+    [file] = tmp_path.glob("*.mem")
+    with (
+        built(instance, "cell", "other", stepped=False) as segment,
+        Playing(segment, file, paused=True) as cell,
+        attach(instance, writable=True) as attachment,
+    ):
+        with Playing(segment, file, "other", paused=True) as other:
+            other.next()
+        monkeypatch.setattr(replays, "ANSWER_S", 1.0)
+        with pytest.raises(CommandError, match="does not answer"):
+            attachment.replay.seek(0.1)
+        cell.until(lambda: attachment.replay.status(["cell"])[0].position_s == 0.1)
+        with pytest.raises(CommandError, match="does not answer"):
+            attachment.replay.speed(0.5)
+        with Playing(segment, file, "other", paused=True) as other:
+            other.until(lambda: len({one.position_s for one in attachment.replay.status()}) == 1)
+            assert counts([other.next(lambda frame: frame.quality is Quality.GOOD)]) == [5]
+            assert [(one.position_s, one.speed) for one in attachment.replay.status()] == [(0.1, 0.5)] * 2
+            assert counts([cell.next(lambda frame: frame.raw[1] == 5)]) == [5]
+
+
+def test_a_request_that_was_read_late_is_done_as_of_its_moment(here: tuple[Playing, Attachment]) -> None:
+    playing, _ = here
+    head = playing.block.playhead
+    assert head is not None
+    now_ns = playing.block.clock.present_ns()
+    with head.held():
+        number = head.ask(Move(now_ns - 90 * S, paused=False, speed=0.01, position_ns=BEGIN_NS))
+        playing.clock.nudge()
+        playing.until(lambda: head.found(number) is not None)
+        assert head.found(number) == Found()
+    assert playing.next(lambda frame: frame.quality is Quality.BAD).reason == "replay: the recording is over"

@@ -16,8 +16,10 @@ from shmio.segment import (
     Quality,
     Record,
 )
+from shmio.segment.attach import attach
 from shmio.segment.commander import Commander
 from shmio.segment.coordinator import Coordinator
+from shmio.segment.playhead import Move
 from tests.unit.connectors.replay.harness import (
     BEGIN_NS,
     MS,
@@ -199,6 +201,31 @@ def test_steps_give_the_same_each_time(tmp_path: Path, instance: str) -> None:
     assert len(cycles) > 30
 
 
+def test_a_step_plays_each_round_of_a_loop(tmp_path: Path, instance: str) -> None:
+    file = record(tmp_path, instance)
+    with built(instance) as segment, Playing(segment, file, loop=True) as cell:
+        coordinator = Coordinator(segment)
+        cell.next()
+        coordinator.step(2 * S - 1)
+        coordinator.close()
+        assert counts(cell.frames()) == (5 * list(range(20)))[1:]
+
+
+def test_a_loop_leaves_out_what_is_a_round_late(tmp_path: Path, instance: str) -> None:
+    """What it shows is always of the round that its position is in."""
+    file = record(tmp_path, instance)
+    with built(instance, stepped=False) as segment, Playing(segment, file, loop=True, paused=True) as cell:
+        cell.next()
+        head = cell.block.playhead
+        assert head is not None
+        now_ns = segment.clock.present_ns()
+        with head.held():
+            head.ask(Move(now_ns - 5 * S, paused=False))
+        segment.clock.slot_bell(0).ring()
+        assert cell.next().clock_ns > now_ns - S
+        cell.until(lambda: cell.loop.counters.overruns >= 200)
+
+
 def test_two_of_one_recording_stay_in_step(tmp_path: Path, instance: str) -> None:
     with recorded(tmp_path, instance, "cell", "other") as both:
         for number in range(20):
@@ -255,6 +282,17 @@ def test_another_recording_begins_anew_in_the_same_block(tmp_path: Path, instanc
             coordinator.step(100 * MS)
             assert counts(cell.frames()) == [5, 6, 7, 8, 9, 10]
         coordinator.close()
+
+
+def test_what_was_asked_of_another_recording_is_not_done_again(tmp_path: Path, instance: str) -> None:
+    files = [record(tmp_path / name, f"{instance}{name}") for name in "ab"]
+    with built(instance) as segment, attach(instance, writable=True) as attachment:
+        with Playing(segment, files[0]):
+            attachment.replay.seek(0.2)
+        with Playing(segment, files[1], start=0.1) as cell:
+            assert counts([cell.next()]) == [4]
+            attachment.step(0.02)
+            assert counts(cell.frames()) == [5, 6]
 
 
 def test_age_is_the_recordings(tmp_path: Path, instance: str) -> None:
