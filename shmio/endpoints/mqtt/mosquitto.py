@@ -58,8 +58,6 @@ def configuration(settings: Mqtt, place: Path) -> str:
         f"max_queued_messages {MAX_QUEUED_MESSAGES}",
         f"max_queued_bytes {MAX_QUEUED_BYTES}",
         "max_inflight_messages 1000",
-        f"listener 0 {place / SOCKET}",
-        "allow_anonymous true",
         f"listener {address.port} {address.host}",
     ]
     if settings.password_file:
@@ -70,6 +68,8 @@ def configuration(settings: Mqtt, place: Path) -> str:
         lines += [f"certfile {tls.certificate}", f"keyfile {tls.key}"]
         if tls.ca:
             lines += [f"cafile {tls.ca}", "require_certificate true"]
+    # Ours is the last one: who can connect there knows that the broker listens everywhere.
+    lines += [f"listener 0 {place / SOCKET}", "allow_anonymous true"]
     return "".join(f"{line}\n" for line in lines)
 
 
