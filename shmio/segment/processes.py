@@ -34,7 +34,7 @@ COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "source": ("polls", "overruns", "failures", "connects", "round_trip_us", "rate_mhz"),
     "emulator": ("cycles", "overruns"),
     "grpc": ("streams", "messages", "dropped", "published", "refused"),
-    "mqtt": ("messages", "commands", "refused", "waiting", "backlog", "dropped", "connects"),
+    "mqtt": ("messages", "commands", "refused", "waiting", "backlog", "dropped", "connects", "missed"),
     "recorder": ("frames", "events", "missed", "bytes"),
 }
 """Names of a worker's counters by its kind, in the order of their slots (at most 8)."""

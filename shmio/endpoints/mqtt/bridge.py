@@ -66,6 +66,8 @@ class Bridge:
         self._more: set[Feed] = set()
         self._rest_s = 0.0
         """So long there is nothing to do but what comes."""
+        self._missed = 0
+        """Frames of sources that have gone."""
         self._generation = -1
         self._reader = ThreadPoolExecutor(1, "reader")
         self._sparkplug: Session | None = None
@@ -84,6 +86,7 @@ class Bridge:
         refused = commands.refused + self.link.refused
         own = (
             outbox.sent, commands.received, refused, outbox.waiting, outbox.backlog, outbox.dropped, self.link.connects,
+            self._missed + sum(feed.missed for feed in self._feeds.values()),
         )  # fmt: skip
         return own if self._sparkplug is None else tuple(map(sum, zip(own, self._sparkplug.counters, strict=True)))
 
@@ -209,6 +212,7 @@ class Bridge:
         self._gone |= gone  # told again with each connection: the broker may be away
         self.outbox.mark_all(gone.values())
         del self._feeds[feed.block.source]
+        self._missed += feed.missed
         if self._sparkplug is not None:
             self._sparkplug.leave(feed.block.source)
         relay = self._relays.pop(feed.block.section)
@@ -223,7 +227,7 @@ class Bridge:
         until_s = time.monotonic() + LEAVE_S
         self._drain(until_s, lambda: not self.outbox.busy)
         for feed in self._feeds.values():
-            self.link.send(status(feed.status.topic, Quality.BAD, STOPPED))
+            self.link.send(status(feed.status.topic, Quality.BAD, STOPPED, feed.missed))
         self.link.send(Message(self._status, OFFLINE, 1, True))
         self._drain(until_s, lambda: not self.link.in_flight)
         self.link.close()

@@ -41,6 +41,10 @@ class Showing(Protocol):
     block: Block
     shown: Shown
 
+    @property
+    def missed(self) -> int:
+        """Frames of which nothing was told."""
+
 
 class Channel(Protocol):
     """A topic."""
@@ -146,7 +150,7 @@ class StatusChannel:
     def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  it is told again when the broker is back
         """As of now."""
         frame, quality, reason = self._showing.shown
-        return status(self.topic, quality, reason, frame)
+        return status(self.topic, quality, reason, self._showing.missed, frame)
 
 
 class Gone:
@@ -160,13 +164,14 @@ class Gone:
         return Message(self.topic, b"", 1, retain=True)
 
 
-def status(topic: str, quality: Quality, reason: str, frame: Frame | None = None) -> Message:
-    """What a source's status topic says."""
+def status(topic: str, quality: Quality, reason: str, missed: int, frame: Frame | None = None) -> Message:
+    """What a source's status topic says. ``missed``: frames of which nothing was told."""
     fields = {
         "quality": str(quality),
         "reason": reason,
         "source_time": frame.source_ns / 1e9 if frame and frame.source_ns else None,
         "cycle": frame.cycle if frame else None,
+        "missed": missed,
     }
     return Message(topic, msgspec.json.encode(fields), 1, retain=True)
 

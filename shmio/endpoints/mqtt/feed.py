@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from typing import Final
 
@@ -15,6 +16,8 @@ from shmio.layout.model import Layout, Register
 from shmio.layout.write import elements
 from shmio.segment import Block, Frame, Quality
 from shmio.segment.scan import ChangeScan
+
+log = logging.getLogger("shmio.mqtt")
 
 NO_DATA: Final = Shown(None, Quality.BAD, "no data yet")
 
@@ -46,6 +49,11 @@ class Feed:
         self._coming = Frames(block)
 
     @property
+    def missed(self) -> int:
+        """Frames that were not looked at, since the bridge was too slow."""
+        return self._coming.missed
+
+    @property
     def over(self) -> bool:
         """Whether a reload has ended the block, and all of it has been taken."""
         return self.block.retired and not self._coming.behind
@@ -54,7 +62,12 @@ class Feed:
         """Take frames that have come, a few at a time; whether there are more at once."""
         if self.held:
             return False
+        missed = self._coming.missed
         for frame in self._coming.come():
+            if self._coming.missed != missed:
+                missed = self._coming.missed
+                log.warning("source %s: the bridge was too slow: it has missed %d frames", self.block.source, missed)
+                self._outbox.mark(self.status)
             self.take(frame)
             if self._outbox.busy:
                 self._outbox.flush()  # so that each frame's changes are told, as long as the broker takes them

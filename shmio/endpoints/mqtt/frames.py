@@ -10,7 +10,7 @@ from shmio.segment import Block, Frame
 TURN_FRAMES: Final = 8
 """So many are taken before what else there is to do has its turn."""
 CATCH_UP_FRAMES: Final = 48
-"""Who is further behind than this goes on with the newest one: what he skips is conflated, not lost."""
+"""Who is further behind than this goes on with the newest one; what he skips is counted."""
 
 
 class Frames:
@@ -18,6 +18,8 @@ class Frames:
 
     def __init__(self, block: Block) -> None:
         self._block = block
+        self.missed = 0
+        """Frames that were skipped, or overwritten before they were read."""
         newest = block.latest()
         self._cursor = block.cursor(after=newest.number - 1 if newest else 0)
 
@@ -29,9 +31,13 @@ class Frames:
     def come(self) -> Iterator[Frame]:
         """Those that have come; at most a few."""
         if self._cursor.behind > CATCH_UP_FRAMES:
-            self.go_on_after(self._block.ring.head() - 1)
+            newest = self._block.ring.head()
+            self.missed += newest - 1 - self._cursor.last
+            self.go_on_after(newest - 1)
         for _ in range(TURN_FRAMES):
+            before = self._cursor.missed
             frame = self._cursor.poll()
+            self.missed += self._cursor.missed - before
             if frame is None:
                 return
             yield frame

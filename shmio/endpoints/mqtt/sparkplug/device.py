@@ -66,6 +66,11 @@ class Device:
             yield news
 
     @property
+    def missed(self) -> int:
+        """Frames that were not looked at, since the bridge was too slow."""
+        return self._coming.missed
+
+    @property
     def behind(self) -> int:
         """Frames that wait."""
         return self._coming.behind

@@ -67,14 +67,16 @@ class Session:
         """Whether a host wants the births again. However often it says so: once a turn, when the broker takes them."""
         self._defined = False
         """Whether the node is told of all devices that there are."""
-        self._sent = self._received = self._refused = 0
+        self._sent = self._received = self._refused = self._missed = 0
 
     @property
     def counters(self) -> tuple[int, ...]:
         """As those of the bridge."""
         waiting = sum(map(len, self._waiting.values()))
         refused, connects = self._refused + self.link.refused, self.link.connects
-        return self._sent, self._received, refused, waiting, self._backlog.count, self._backlog.dropped, connects
+        missed = self._missed + sum(device.missed for device in self._devices.values())
+        kept = self._backlog
+        return self._sent, self._received, refused, waiting, kept.count, kept.dropped, connects, missed
 
     @property
     def problem(self) -> str:
@@ -92,7 +94,7 @@ class Session:
 
     def leave(self, source: str) -> None:
         """There is one less."""
-        del self._devices[source]
+        self._missed += self._devices.pop(source).missed
         self._defined = False
 
     def _define(self) -> None:

@@ -57,6 +57,11 @@ class Listener:
         self.heard.append((message.topic, bytes(message.payload)))
         return message
 
+    def taken(self) -> None:
+        """Take what has come, without waiting."""
+        while not self._come.empty():
+            self.message()
+
     def until(self, topic: str, payload: bytes | None = None) -> bytes:
         """Take messages until there is one on this topic, with this payload if one is given."""
         while True:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import struct
 import time
+from collections.abc import Callable
 
 import pytest
 
-from shmio.config import MqttTopic
+from shmio.config import Mqtt, MqttTopic, Sparkplug
+from shmio.endpoints.mqtt.bridge import Bridge
 from shmio.segment import BlockWriter, ProcessSpec, Provenance, Quality, Segment
 from shmio.testing.mosquitto import Mosquitto
 from tests.unit.endpoints.harness import LAYOUT, image
@@ -183,3 +185,37 @@ def test_more_frames_than_it_follows_end_with_the_last(segment: Segment, broker:
         listener.until("cell/step/out", b"2999")
         steps = [int(value) for value in listener.values("cell/step/out")]
     assert steps == sorted(set(steps))
+
+
+@pytest.mark.parametrize("sparkplug", [None, Sparkplug(group="plant")])
+def test_frames_that_a_bridge_was_too_slow_for_are_counted_and_told(
+    segment: Segment, make_broker: Callable[..., Mosquitto], sparkplug: Sparkplug | None
+) -> None:
+    broker = make_broker("allow_anonymous true", "max_inflight_messages 10000")
+    writer, slot = segment.writer("cell"), segment.processes.find("mqtt")
+    burst(writer, range(1, 3))
+    assert slot.take()
+    settings = Mqtt(broker="external", host=str(broker.address), prefix=PREFIX, sparkplug=sparkplug)
+    bridge = Bridge(segment, slot, settings)
+    followers = 1 if sparkplug is None else 2
+    try:
+        with listening(broker.address, f"{PREFIX}/#") as listener:
+            while bridge.counters[6] < followers or bridge.outbox.busy:
+                bridge.turn()
+            assert listener.json("cell/status")["missed"] == 0
+            burst(writer, range(3, 52))
+            while listener.values("cell/step/out")[-1:] != ["51"]:
+                bridge.turn()
+                listener.taken()
+            assert bridge.counters[7] == 48 * followers
+            burst(writer, range(52, 100))
+            while listener.values("cell/step/out")[-1:] != ["99"]:
+                bridge.turn()
+                listener.taken()
+            assert bridge.counters[7] == 48 * followers
+    finally:
+        bridge.close()
+    steps = [int(value) for value in listener.values("cell/step/out")]
+    assert steps == [2, 51, *range(52, 100)]
+    told = [json.loads(payload)["missed"] for topic, payload in listener.heard if topic == f"{PREFIX}/cell/status"]
+    assert told[:2] == [0, 48]
