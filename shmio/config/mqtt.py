@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from typing import Final
+from unicodedata import category
 
 from shmio.config.address import Address
 from shmio.config.model import Config
@@ -25,9 +26,9 @@ def check_mqtt(config: Config) -> None:
     if mqtt.prefix is not None:
         _check_prefix(mqtt.prefix)
     if mqtt.sparkplug is not None:
-        for key, name in (("group", mqtt.sparkplug.group), ("node", mqtt.sparkplug.node or "node")):
-            if set("/+#").intersection(name):
-                raise ConfigError(f"mqtt.sparkplug.{key}: {name!r} is a part of a topic: it has no / + #")
+        for key, name in (("group", mqtt.sparkplug.group), ("node", mqtt.sparkplug.node)):
+            if name is not None:
+                _check_level(f"mqtt.sparkplug.{key}", name)
     if mqtt.broker == "external":
         _check_external(mqtt)
     else:
@@ -63,11 +64,24 @@ def _has_port(host: str) -> bool:
     return re.search(r"(^|\]|[^:\]]):[0-9]+\Z", host) is not None and (host.count(":") == 1 or "]" in host)
 
 
-def _check_prefix(prefix: str) -> None:
-    if len(prefix) > MAX_PREFIX or prefix.startswith("$") or "" in prefix.split("/") or set("+#").intersection(prefix):
+def _is_no_text(part: str) -> bool:
+    """Whether it has what brokers end a connection for: controls, and what is no character (MQTT 5.0, 1.5.4)."""
+    return any(category(one) == "Cc" or 0xFDD0 <= ord(one) <= 0xFDEF or ord(one) & 0xFFFE == 0xFFFE for one in part)
+
+
+def _check_level(key: str, name: str) -> None:
+    if len(name) > MAX_PREFIX or set("/+#").intersection(name) or _is_no_text(name):
         raise ConfigError(
-            f"mqtt.prefix: {prefix!r} cannot begin a topic: at most {MAX_PREFIX} characters, no + and #, no $ at its "
-            "beginning, no / at its ends and no two of them together; such as shmio/a50"
+            f"{key}: {name!r} is a part of a topic: at most {MAX_PREFIX} characters, all of them text, and no / + #"
+        )
+
+
+def _check_prefix(prefix: str) -> None:
+    bad = prefix.startswith("$") or "" in prefix.split("/") or set("+#").intersection(prefix)
+    if bad or len(prefix) > MAX_PREFIX or _is_no_text(prefix):
+        raise ConfigError(
+            f"mqtt.prefix: {prefix!r} cannot begin a topic: at most {MAX_PREFIX} characters, all of them text, no + "
+            "and #, no $ at its beginning, no / at its ends and no two of them together; such as shmio/a50"
         )
 
 
