@@ -6,6 +6,7 @@ import asyncio
 import logging
 import ssl
 from asyncio import StreamReader, StreamWriter
+from collections.abc import Collection
 from pathlib import Path
 from typing import Final
 
@@ -24,6 +25,10 @@ from shmio.errors import EndpointError
 from shmio.worker import BEAT_S, Worker
 
 MAX_CONNECTIONS: Final = 256
+MAX_UNREAD_BYTES: Final = 8 << 20
+"""That may wait for one client: several packets of the largest kind."""
+UNREAD_BYTES: Final = 64 << 20
+"""That may wait for all of them."""
 GREETING_S: Final = 10.0
 _CONNECT: Final = 0x10
 _UNSUPPORTED: Final = b"\x20\x03\x00\x84\x00"
@@ -86,7 +91,30 @@ async def _greeted(reader: StreamReader, writer: StreamWriter) -> bytes | None:
     return head
 
 
-class _BridgesWriter(StreamWriterAdapter):  # type: ignore[misc]
+class _Writer(StreamWriterAdapter):  # type: ignore[misc]
+    """Has nobody wait for a client that reads slowly: what the library sends it would pile up there, as tasks."""
+
+    def __init__(self, writer: StreamWriter, everybody: Collection[StreamWriter]) -> None:
+        super().__init__(writer)
+        self._own, self._everybody = writer.transport, everybody
+
+    async def drain(self) -> None:
+        """Give up a client that has too much to read. ConnectionResetError."""
+        if self._is_slow():
+            log.warning("client %s:%d reads too slowly: its connection is ended", *self.get_peer_info())
+            self._own.abort()
+        if self._own.is_closing():
+            raise ConnectionResetError
+
+    def _is_slow(self) -> bool:
+        unread = self._own.get_write_buffer_size()
+        if unread <= UNREAD_BYTES // MAX_CONNECTIONS:  # a fair part
+            return False
+        all_bytes = sum(one.transport.get_write_buffer_size() for one in self._everybody)
+        return unread > MAX_UNREAD_BYTES or all_bytes > UNREAD_BYTES
+
+
+class _BridgesWriter(_Writer):
     """That of a UNIX socket, whose peers have no address."""
 
     def get_peer_info(self) -> tuple[str, int]:
@@ -141,23 +169,23 @@ class _Connections:
 
     def __init__(self, broker: Broker) -> None:
         self._broker = broker
-        self._count = 0
+        self._open: set[StreamWriter] = set()
 
     async def take_bridge(self, reader: StreamReader, writer: StreamWriter) -> None:
         """Of the UNIX socket."""
-        await self._serve(reader, writer, _BridgesWriter(writer))
+        await self._serve(reader, writer, _BridgesWriter(writer, self._open))
 
     async def take(self, reader: StreamReader, writer: StreamWriter) -> None:
         """Of the address."""
-        if self._count >= MAX_CONNECTIONS:
-            log.warning("a connection is refused: there are %d", self._count)
+        if len(self._open) >= MAX_CONNECTIONS:
+            log.warning("a connection is refused: there are %d", len(self._open))
             writer.close()
             return
-        self._count += 1
+        self._open.add(writer)
         try:
-            await self._serve(reader, writer, StreamWriterAdapter(writer))
+            await self._serve(reader, writer, _Writer(writer, self._open))
         finally:
-            self._count -= 1
+            self._open.discard(writer)
 
     async def _serve(self, reader: StreamReader, writer: StreamWriter, adapter: StreamWriterAdapter) -> None:
         try:

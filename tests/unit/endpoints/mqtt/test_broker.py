@@ -6,7 +6,7 @@ import logging
 import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -174,6 +174,38 @@ def test_the_one_in_python_says_what_it_does_not_speak(
         assert answer(address, MQTTv311) == "Success"
 
 
+@pytest.mark.parametrize("bound", ["MAX_UNREAD_BYTES", "UNREAD_BYTES"])
+def test_a_client_that_never_reads_is_ended_by_the_one_in_python_and_others_hear_all(
+    segment: Segment, address: Address, monkeypatch: pytest.MonkeyPatch, bound: str
+) -> None:
+    monkeypatch.setenv("SHMIO_MOSQUITTO", "")
+    monkeypatch.setattr(f"shmio.endpoints.mqtt.builtin.{bound}", 1 << 20)
+    payload = bytes(500_000)
+    with (
+        serving(segment, address, "embedded"),
+        socket.create_connection((address.host, address.port)) as deaf,
+        listening(address, f"{PREFIX}/large", protocol=MQTTv311) as listener,
+    ):
+        deaf.sendall(b"\x10\x10\x00\x04MQTT\x04\x02\x00\x00\x00\x04deaf" + b"\x82\x06\x00\x01\x00\x01#\x00")
+        until_bytes(deaf, b"\x90\x03\x00\x01\x00")
+        for _ in range(40):
+            listener.publish("large", payload)
+            assert listener.until("large") == payload
+        deaf.settimeout(TIMEOUT_S)
+        heard = 0
+        with suppress(ConnectionResetError):
+            while data := deaf.recv(1 << 20):
+                heard += len(data)
+        assert heard < 40 * len(payload)
+
+
+def until_bytes(client: socket.socket, end: bytes) -> None:
+    """Read until this has come."""
+    read = b""
+    while not read.endswith(end):
+        read += client.recv(1)
+
+
 def test_tls_with_certificates_of_both_sides(segment: Segment, address: Address, program: str, tmp_path: Path) -> None:
     authority = trustme.CA()
     authority.cert_pem.write_to_path(tmp_path / "ca.pem")
@@ -237,8 +269,8 @@ def test_what_mosquitto_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     text = mosquitto.configuration(Mqtt(listen="[::1]:1883", password_file="/c/a", tls=tls), tmp_path)
     lines = text.splitlines()
     own, others = lines.index(f"listener 0 {tmp_path / 's'}"), lines.index("listener 1883 ::1")
-    assert lines[own + 1 : others] == ["allow_anonymous true"]
-    assert lines[others + 1 :] == [
+    assert lines[own + 1 :] == ["allow_anonymous true"]
+    assert lines[others + 1 : own] == [
         "allow_anonymous false",
         f"password_file {tmp_path / 'accounts'}",
         "certfile /c/c.pem",
@@ -246,5 +278,5 @@ def test_what_mosquitto_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         "cafile /c/ca.pem",
         "require_certificate true",
     ]
-    assert "persistence false" in lines[:own]
-    assert "user root" in lines[:own]
+    assert "persistence false" in lines[:others]
+    assert "user root" in lines[:others]
