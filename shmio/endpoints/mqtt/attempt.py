@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import threading
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, Final, cast
@@ -22,6 +23,8 @@ from shmio.errors import ConfigError
 
 CONNECT_S: Final = 4.0
 """For a connection, its TLS, and for the broker's answer to who we are; each."""
+SLOW_S: Final = 15.0
+SLOW: Final = "no answer yet: it is slow, or the name server, or the file system of mqtt.tls or mqtt.password_file"
 MAX_PACKET_BYTES: Final = 1 << 21
 """Of what a broker may send us, as far as it can be told so: with MQTT 5."""
 PACKETS: Final = 100
@@ -36,6 +39,7 @@ class Attempt:
     ) -> None:
         """``wake``: called by its thread when it is over, if anybody wants it then."""
         self.target = dialling.next()
+        self._begun_s = time.monotonic()
         self.over = False
         """Whether ``client``, ``socket`` and ``problem`` are what has come of it."""
         self.client: Client | None = None
@@ -47,6 +51,11 @@ class Attempt:
         self._handing = threading.Lock()
         self._unwanted = False
         threading.Thread(target=self._run, name="connect", daemon=True).start()
+
+    @property
+    def slow(self) -> bool:
+        """Whether it has taken longer than any should."""
+        return time.monotonic() >= self._begun_s + SLOW_S
 
     def abandon(self) -> None:
         """Nobody wants it any more: what it makes is closed, and nobody is woken."""

@@ -19,7 +19,7 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from shmio.endpoints.mqtt.attempt import CONNECT_S, PACKETS, Attempt, hang_up
+from shmio.endpoints.mqtt.attempt import CONNECT_S, PACKETS, SLOW, Attempt, hang_up
 from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.failure import refusal
 from shmio.endpoints.mqtt.limits import Limits
@@ -70,8 +70,7 @@ class Link:
         self._retry_s = 0.0
         self._until_s: float | None = None
         """When the broker must have answered."""
-        self._up_s = 0.0
-        self._misc_s = 0.0
+        self._up_s = self._misc_s = 0.0
         self._in_flight: dict[int, Message] = {}
         self._limits = Limits()
 
@@ -106,6 +105,8 @@ class Link:
             self._attempt = Attempt(self._dialling, self._protocol, self._will(), self._wake)
             self._target = self._attempt.target
         if self._client is None:
+            if self._attempt is not None and self._attempt.slow:
+                self._complain(f"broker {self._target}: {SLOW}")
             return CONNECT_S
         if self._until_s is not None and now_s >= self._until_s:
             self.drop("it does not answer")
@@ -228,13 +229,16 @@ class Link:
     def _fail(self, problem: str) -> None:
         self._close()
         self._protocol = MQTTv5
-        if problem != self.problem:
-            log.warning("%s", problem)
-        self.problem = problem
+        self._complain(problem)
         wait_s = min(MOST_WAIT_S, FIRST_WAIT_S * 2 ** min(self._failures // self._dialling.count, 16))
         self._failures += 1
         # Not all bridges of a plant at once, when their broker is back.
         self._retry_s = time.monotonic() + wait_s * random.uniform(0.5, 1.5)  # noqa: S311  not a secret
+
+    def _complain(self, problem: str) -> None:
+        if problem != self.problem:
+            log.warning("%s", problem)
+        self.problem = problem
 
     def _close(self) -> None:
         client, self._client = self._client, None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
 import threading
 from collections.abc import Callable
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.config import Address, MqttTopic
+from shmio.config import Address, MqttTls, MqttTopic
 from shmio.segment import BlockWriter, Segment
 from shmio.testing.mosquitto import Mosquitto
 from shmio.testing.ports import reserved_port
@@ -237,3 +238,21 @@ def test_a_host_that_accepts_and_says_nothing_is_given_up(segment: Segment, monk
         address = Address("127.0.0.1", silent.getsockname()[1])
         with bridge(segment, address) as running:
             running.until(lambda: "does not answer" in running.bridge.problem)
+
+
+def test_a_file_that_cannot_be_read_at_present_holds_up_nothing(
+    segment: Segment, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """As one on the network whose server is away: here, a pipe that nobody writes to."""
+    monkeypatch.setattr("shmio.endpoints.mqtt.attempt.SLOW_S", 0.1)
+    pipe = tmp_path / "ca.pem"
+    os.mkfifo(pipe)
+    writer = segment.writer("cell")
+    writer.publish(image(step=1), cycle=1)
+    with bridge(segment, broker.address, tls=MqttTls(ca=str(pipe))) as running:
+        running.until(lambda: "no answer yet" in running.bridge.problem)
+        writer.publish(image(step=2), cycle=2)
+        running.until(lambda: running.bridge.outbox.backlog)  # it goes on
+        with pipe.open("wb"):  # the one who waits has it now
+            pipe.unlink()
+        running.until(lambda: "mqtt.tls.ca" in running.bridge.problem)
