@@ -31,7 +31,7 @@ class Listener:
         self.heard: list[tuple[str, bytes]] = []
         self._come: queue.SimpleQueue[MQTTMessage] = queue.SimpleQueue()
         subscribed = threading.Event()
-        self.client = Client(CallbackAPIVersion.VERSION2, protocol=protocol)
+        self.client = Client(CallbackAPIVersion.VERSION2, protocol=protocol, reconnect_on_failure=False)
         if account:
             self.client.username_pw_set(account["username"], account["password"])
         self.client.on_connect = self._subscribe

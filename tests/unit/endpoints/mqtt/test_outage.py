@@ -82,6 +82,12 @@ class Load:
         self._stop.set()
         self._thread.join()
 
+    def __enter__(self) -> Load:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
 
 def test_a_connection_that_is_cut_again_and_again_loses_no_change(
     segment: Segment, make_broker: Callable[..., Mosquitto], monkeypatch: pytest.MonkeyPatch
@@ -125,6 +131,44 @@ def test_a_broker_that_dies_again_and_again_is_found_again(segment: Segment, bro
                 assert listener.until("cell/step/out") == str(load.last).encode()
     finally:
         load.stop()
+
+
+def test_who_listens_by_another_way_misses_nothing_of_a_broker_that_is_killed_again_and_again(
+    segment: Segment, make_broker: Callable[..., Mosquitto], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Under load. The bridge's own way is held up before each kill, so that what it sends then is acknowledged by none:
+    what a broker has acknowledged and takes to its grave nobody could send again."""
+    monkeypatch.setattr("shmio.endpoints.mqtt.frames.CATCH_UP_FRAMES", 500)
+    broker = make_broker("allow_anonymous true", "max_inflight_messages 10000")
+    filters = [f"{PREFIX}/{topic}" for topic in ("cell/step/out", "kill")]
+    told: list[str] = []
+    with (
+        FaultProxy(broker.address, framing=None) as proxy,
+        Load(segment.writer("cell")) as load,
+        bridge(segment, proxy.address) as running,
+    ):
+        for kill in range(20):
+            with listening(broker.address, *filters) as listener:
+                proxy.admit()
+                for _ in range(10):
+                    listener.message()
+                proxy.freeze()
+                listener.publish("kill", str(kill))
+                listener.until("kill")
+                told += listener.values("cell/step/out")
+                broker.kill()
+                proxy.refuse()
+                running.until(lambda: not running.bridge.link.up)
+            broker.start()
+            proxy.thaw()
+        with listening(broker.address, *filters) as listener:
+            proxy.admit()
+            load.stop()
+            listener.until("cell/step/out", str(load.last).encode())
+            told += listener.values("cell/step/out")
+        assert running.bridge.outbox.dropped == running.bridge.counters[7] == 0
+    first = list(dict.fromkeys(int(value) for value in told))
+    assert first == list(range(first[0], load.last + 1))
 
 
 def test_more_than_may_be_kept_goes_oldest_first_and_is_counted(segment: Segment, broker: Mosquitto) -> None:
