@@ -26,8 +26,8 @@ def check_mqtt(config: Config) -> None:
     if mqtt.prefix is not None:
         _check_prefix(mqtt.prefix)
     if mqtt.sparkplug is not None:
-        for key, name in (("group", mqtt.sparkplug.group), ("node", mqtt.sparkplug.node)):
-            if name is not None:
+        for key in ("group", "node", "primary_host"):
+            if (name := getattr(mqtt.sparkplug, key)) is not None:
                 _check_level(f"mqtt.sparkplug.{key}", name)
     if mqtt.broker == "external":
         _check_external(mqtt)

@@ -46,6 +46,7 @@ class Sparkplug(Section):
 
     group: Text
     node: Text | None = None
+    primary_host: Text | None = None
     match: Text | Texts = "**"
 
     @property

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import random
 import selectors
 import socket
 import time
@@ -25,8 +24,6 @@ from shmio.endpoints.mqtt.failure import refusal
 from shmio.endpoints.mqtt.limits import Limits
 from shmio.endpoints.mqtt.target import Dialling, Target
 
-FIRST_WAIT_S: Final = 0.25
-MOST_WAIT_S: Final = 15.0
 STABLE_S: Final = 5.0
 """Who was connected so long has put his failures behind him."""
 WITH_WILL: Final = "Disconnect with will message"
@@ -66,7 +63,6 @@ class Link:
         self._target: Target | None = None
         self._attempt: Attempt | None = None
         self._protocol = MQTTv5
-        self._failures = 0
         self._retry_s = 0.0
         self._until_s: float | None = None
         """When the broker must have answered."""
@@ -204,13 +200,19 @@ class Link:
 
     # ---- its end -----------------------------------------------------------------------------------------------------
 
-    def drop(self, problem: str) -> None:
-        """Give a connection up, or half of one, that does not do what it should."""
+    def drop(self, problem: str, *, politely: bool = False) -> None:
+        """Give a connection up, or half of one, that does not do what it should.
+
+        ``politely``: take leave, so that the will is not published. Not when called by what has come.
+        """
         problem = f"broker {self._target}: {problem}"
+        if politely and self._client is not None:
+            self._client.on_disconnect = None
+            self._client.disconnect()
         if self.up:
             lost = list(self._in_flight.values())
             if time.monotonic() - self._up_s >= STABLE_S:
-                self._failures = 0
+                self._dialling.forgive()
             self._fail(problem)
             self.on_lost(lost)
         elif self._protocol == MQTTv5 and self._until_s is not None:
@@ -230,10 +232,7 @@ class Link:
         self._close()
         self._protocol = MQTTv5
         self._complain(problem)
-        wait_s = min(MOST_WAIT_S, FIRST_WAIT_S * 2 ** min(self._failures // self._dialling.count, 16))
-        self._failures += 1
-        # Not all bridges of a plant at once, when their broker is back.
-        self._retry_s = time.monotonic() + wait_s * random.uniform(0.5, 1.5)  # noqa: S311  not a secret
+        self._retry_s = time.monotonic() + self._dialling.wait_s()
 
     def _complain(self, problem: str) -> None:
         if problem != self.problem:
@@ -274,13 +273,14 @@ class Link:
         """Whether this very message was sent, and the broker has not acknowledged it."""
         return any(one is message for one in self._in_flight.values())
 
-    def subscribe(self, filters: Sequence[str]) -> None:
-        """Ask for what is sent to these; what was there before is not sent, or has its flag."""
+    def subscribe(self, filters: Sequence[str], *, retained: bool = False) -> None:
+        """Ask for what is sent to these; unless ``retained``, what was there before is not sent, or has its flag."""
         client = self._client
         if client is None or not filters:
             return
         if self._protocol == MQTTv5:
-            options = partial(SubscribeOptions, 1, noLocal=True, retainHandling=SubscribeOptions.RETAIN_DO_NOT_SEND)
+            before = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE if retained else SubscribeOptions.RETAIN_DO_NOT_SEND
+            options = partial(SubscribeOptions, 1, noLocal=True, retainHandling=before)
             client.subscribe([(one, options()) for one in filters])
         else:
             client.subscribe([(one, 1) for one in filters])

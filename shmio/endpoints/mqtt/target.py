@@ -1,13 +1,17 @@
-"""Where the broker is."""
+"""Where the broker is, and when it is tried again."""
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 from shmio.config import Mqtt
 from shmio.config.mqtt import brokers
+
+FIRST_WAIT_S: Final = 0.25
+MOST_WAIT_S: Final = 15.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +28,7 @@ class Target:
 
 
 class Dialling:
-    """Which broker is tried next."""
+    """Which broker is tried next, and when."""
 
     def __init__(self, settings: Mqtt, client_id: str, own_socket: Callable[[], str]) -> None:
         """``own_socket``: where our own broker is reached, if there is no external one."""
@@ -33,6 +37,7 @@ class Dialling:
         self._own_socket = own_socket
         self._addresses = brokers(settings)
         self._next = 0
+        self._failures = 0
 
     @property
     def count(self) -> int:
@@ -50,3 +55,14 @@ class Dialling:
         address = self._addresses[self._next % len(self._addresses)]
         self._next += 1
         return Target(address.host, address.port, "tcp", str(address))
+
+    def wait_s(self) -> float:
+        """How long to wait after a failure: longer after each."""
+        wait_s: float = min(MOST_WAIT_S, FIRST_WAIT_S * 2 ** min(self._failures // self.count, 16))
+        self._failures += 1
+        # Not all bridges of a plant at once, when their broker is back.
+        return wait_s * random.uniform(0.5, 1.5)  # noqa: S311  not a secret
+
+    def forgive(self) -> None:
+        """The failures so far do not count any more."""
+        self._failures = 0

@@ -76,6 +76,7 @@ def test_where_an_external_broker_is(tmp_path: Path, text: str, expected: list[s
         (f'{OWN}[mqtt.sparkplug]\ngroup = "a\\n"\n', "mqtt.sparkplug.group: must not hold control characters"),
         (f'{OWN}[mqtt.sparkplug]\ngroup = "\\ufdd0"\n', r"mqtt.sparkplug.group: '\ufdd0' is a part of a topic"),
         (f'{OWN}[mqtt.sparkplug]\ngroup = "a"\nnode = "{"n" * 257}"\n', "is a part of a topic: at most 256 characters"),
+        (f'{OWN}[mqtt.sparkplug]\ngroup = "a"\nprimary_host = "a/b"\n', "mqtt.sparkplug.primary_host: 'a/b' is a part"),
         (f'{OWN}[mqtt.sparkplug]\ngroup = "a"\nnode = ""\n', "mqtt.sparkplug.node: must not be empty"),
         (f"{OWN}[mqtt.sparkplug]\n", "mqtt.sparkplug.group"),
         (f'{OWN}broker = "hive"\n', "mqtt.broker: 'hive' is none; there are: embedded, mosquitto, external"),

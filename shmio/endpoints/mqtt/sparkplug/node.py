@@ -55,6 +55,8 @@ class EdgeNode:
         self._sequence = 0
         # Not from 0 after each restart: a late will of the process before must not be taken for this one's.
         self._session = now_ms() // 1000 % _SEQUENCE
+        self.alive = False
+        """Whether it was born in this session, and has not died."""
         self._born: set[str] = set()
         self.metrics: dict[str, dict[str, Metric]] = {}
         """Of each device, by name, in the order in which they were given."""
@@ -83,12 +85,14 @@ class EdgeNode:
 
     def death(self) -> Message:
         """What is published before the node disconnects by itself."""
+        self.alive = False
         payload = wire.Payload(timestamp=self._now_ms())
         self._tell_session(payload)
         return Message(self._topic("NDEATH"), payload.SerializeToString(), 1, retain=False)
 
     def birth(self) -> Message:
         """What is published first in a session, and when it is asked for; births of the devices come next."""
+        self.alive = True
         self._born.clear()
         self._sequence = 0
         payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import selectors
+import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final
@@ -22,6 +23,7 @@ from shmio.endpoints.mqtt.place import own_socket
 from shmio.endpoints.mqtt.sparkplug.backlog import Backlog
 from shmio.endpoints.mqtt.sparkplug.device import Device, Kind
 from shmio.endpoints.mqtt.sparkplug.node import EdgeNode
+from shmio.endpoints.mqtt.sparkplug.primary import PrimaryHost
 from shmio.endpoints.mqtt.target import Dialling
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.glob import Glob
@@ -29,6 +31,9 @@ from shmio.segment import DONE, EventKind, Segment
 
 TURN_SAMPLES: Final = 2000
 """So many of those that were kept are sent before what else there is to do has its turn."""
+
+HOST_S: Final = 10.0
+"""For a primary host to say at one of several brokers that it is there."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -52,10 +57,13 @@ class Session:
         client_id = f"{settings.client_id or f'shmio-{segment.instance}'}-sparkplug"
         # A session begins with its births: the broker is to keep nothing of one before (5.4).
         clean = msgspec.structs.replace(settings, session_expiry_s=0)
-        dialling = Dialling(clean, client_id, partial(own_socket, segment))
-        self.link = Link(dialling, selector, wake, self.node.will)
+        self._dialling = Dialling(clean, client_id, partial(own_socket, segment))
+        self.link = Link(self._dialling, selector, wake, self.node.will)
         self.link.on_message = self._command
         self.link.on_lost = self._lose
+        self._host = None if sparkplug.primary_host is None else PrimaryHost(sparkplug.primary_host)
+        self._until_s = 0.0
+        """So long the host has to say that it is there; then another broker is tried, if there is one."""
         self._globs = [Glob(pattern) for pattern in sparkplug.patterns]
         self._devices: dict[str, Device] = {}
         self._waiting: dict[str, dict[int, None]] = {}
@@ -81,7 +89,10 @@ class Session:
     @property
     def problem(self) -> str:
         """What is wrong at present; empty: nothing."""
-        return f"Sparkplug: {self.link.problem}" if self.link.problem else ""
+        problem = self.link.problem
+        if self._host is not None and self.link.up and not self._host.online:
+            problem = f"the primary host is not there ({self._host.topic}): {self._backlog.count} changes are kept"
+        return f"Sparkplug: {problem}" if problem else ""
 
     def device(self, feed: Feed) -> Device:
         """What a source is to be; any thread may make it."""
@@ -105,7 +116,7 @@ class Session:
             device.named(list(self.node.metrics[name].values()))
         self._waiting = {name: {} for name in self._devices}
         self._backlog.clear()  # what is in it has other aliases
-        if self.link.up and not self.link.came_up:
+        if self.link.up and self.node.alive:
             self._birth()
 
     def turn(self) -> float:
@@ -117,8 +128,13 @@ class Session:
         if self.link.came_up:
             self.link.came_up, self._keeping = False, True
             self.link.subscribe(self.node.commands)
-            self._birth()
-        elif self._asked and self.link.ready:
+            if self._host is not None:
+                self._host.forget()
+                self.link.subscribe([self._host.topic], retained=True)
+                self._until_s = time.monotonic() + HOST_S
+        if self._host is not None and not self._host.online:
+            self._wait_for(self._host)
+        elif self.link.up and (not self.node.alive or (self._asked and self.link.ready)):
             self._birth()
         self._room = TURN_SAMPLES
         for name, device in self._devices.items():
@@ -129,11 +145,23 @@ class Session:
         more = self._room <= 0 or self.link.came_up or any(device.behind for device in self._devices.values())
         return 0.0 if more else rest_s
 
+    def _wait_for(self, host: PrimaryHost) -> None:
+        """Die if it has gone; go to where else it may be, and come back."""
+        if not self.link.up:
+            return
+        elsewhere = self._dialling.count > 1 and (host.online is False or time.monotonic() >= self._until_s)
+        if self.node.alive:
+            self._send(self.node.death())
+        elif not elsewhere:
+            return
+        self.link.drop(f"the primary host is not there ({host.topic})", politely=True)
+
     def close(self) -> None:
         """Say that the node dies, and go."""
-        if self.link.up:
+        alive = self.link.up and self.node.alive
+        if alive:
             self.link.send(self.node.death())
-        self.link.close(will=True)
+        self.link.close(will=alive)
 
     # ---- what goes out -----------------------------------------------------------------------------------------------
 
@@ -146,7 +174,7 @@ class Session:
             self._waiting[name].clear()
 
     def _tell(self, name: str, device: Device, kind: Kind, at: Sequence[int]) -> None:
-        if not self.link.up:
+        if not (self.link.up and self.node.alive):
             if self._keeping and kind is not Kind.DEATH:
                 self._backlog.keep(name, device.samples(None if kind is Kind.BIRTH else at))
             return
@@ -195,6 +223,9 @@ class Session:
             topic = message.topic
         except UnicodeDecodeError:
             self._refused += 1
+            return
+        if self._host is not None and topic == self._host.topic:
+            self._host.hear(bytes(message.payload))
             return
         self._received += 1
         if message.retain:  # it was there before we were

@@ -25,8 +25,8 @@ AWAY = "nothing listens there"
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tests do not wait for a bridge that has given up for a while."""
-    monkeypatch.setattr("shmio.endpoints.mqtt.link.FIRST_WAIT_S", 0.02)
-    monkeypatch.setattr("shmio.endpoints.mqtt.link.MOST_WAIT_S", 0.1)
+    monkeypatch.setattr("shmio.endpoints.mqtt.target.FIRST_WAIT_S", 0.02)
+    monkeypatch.setattr("shmio.endpoints.mqtt.target.MOST_WAIT_S", 0.1)
 
 
 def test_changes_are_kept_while_the_broker_is_away(segment: Segment, broker: Mosquitto) -> None:

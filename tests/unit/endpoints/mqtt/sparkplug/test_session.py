@@ -89,8 +89,8 @@ def node(segment: Segment, address: Address, **settings: Any) -> Iterator[Runnin
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shmio.endpoints.mqtt.link.FIRST_WAIT_S", 0.02)
-    monkeypatch.setattr("shmio.endpoints.mqtt.link.MOST_WAIT_S", 0.1)
+    monkeypatch.setattr("shmio.endpoints.mqtt.target.FIRST_WAIT_S", 0.02)
+    monkeypatch.setattr("shmio.endpoints.mqtt.target.MOST_WAIT_S", 0.1)
 
 
 def bd_seq(heard: Heard) -> int:
