@@ -164,7 +164,7 @@ class Block:
         Of a block that does not live on the instance's clock none does.
         """
         if self.playhead is not None:
-            return frame.publish_ns > self.playhead.now_ns()
+            return self.playhead.came_now(frame.number)
         return self.attributes.stepped and frame.cycle >= step
 
     def latest(self) -> Frame | None:

@@ -36,7 +36,7 @@ _COPIES_AT: Final = (64, 704)
 _ASK_AT: Final = 1344
 SECTION_SIZE: Final = 2560
 
-_STATE: Final = struct.Struct("<IIqqqqqqqdQQ256s256x")
+_STATE: Final = struct.Struct("<IIqqqqqqqdQQ256sQQ240x")
 _ASK: Final = struct.Struct("<QII1000s")
 _TEXT: Final = 255
 _MAX_ASK: Final = 999
@@ -54,8 +54,9 @@ class Play(NamedTuple):
     clock, up to ``until_ns``. What is played is from ``begin_ns`` to before ``end_ns``; with ``loop`` again and again.
     ``base_ns``: what a position is counted from in the publish times of frames. ``utc_ns``: UTC of position 0.
     ``own_clock``: frames have the clock of the recording; else that of the instance when they were due. ``over``:
-    the end was reached. ``step``: the last step of virtual time that was answered. ``asked``: the last request that was
-    answered, with ``answer``.
+    the end was reached. ``step``: the last step of virtual time that was answered; ``begun``: the last one that was
+    begun, when ``head`` was the number of the newest frame. ``asked``: the last request that was answered, with
+    ``answer``.
     """
 
     begin_ns: int
@@ -73,6 +74,8 @@ class Play(NamedTuple):
     step: int = 0
     asked: int = 0
     answer: str = ""
+    begun: int = 0
+    head: int = 0
 
     def reach_ns(self, clock_ns: int) -> int:
         """The position at a time of the instance's clock, if nothing ended it."""
@@ -179,18 +182,25 @@ class Playhead:
     def read(self) -> Play | None:
         """How it plays; None: no process of the source has begun yet. SegmentError: it cannot be read."""
         data = self._state.read(_STATE.size)
-        (flags, _, begin, end, anchor, position, until, base, utc, speed, step, asked, answer) = _STATE.unpack(data)
+        (flags, _, begin, end, anchor, position, until, base, utc, speed, step, asked, answer, begun, newest) = (
+            _STATE.unpack(data)
+        )
         if not flags & _VALID or not begin < end or not (math.isfinite(speed) and speed > 0):
             return None
         return Play(
             begin, end, anchor, position, until, base, utc, speed, bool(flags & _PAUSED), bool(flags & _LOOP),
-            bool(flags & _OWN_CLOCK), bool(flags & _OVER), step, asked, text(answer),
+            bool(flags & _OWN_CLOCK), bool(flags & _OVER), step, asked, text(answer), begun, newest,
         )  # fmt: skip
 
     def now_ns(self) -> int:
         """What ages of the block's frames are taken against: the position, as their publish times have it."""
         play = self.read()
         return time.monotonic_ns() if play is None else play.base_ns + play.at_ns(self._clock.present_ns())
+
+    def came_now(self, number: int) -> bool:
+        """Whether a frame was published in the step of virtual time that is under way."""
+        play, state = self.read(), self._clock.told()
+        return play is not None and state.stepping and play.begun == state.step and number > play.head
 
     def clock_ns(self, publish_ns: int) -> int:
         """The clock of what is published now at such a time."""
@@ -205,6 +215,7 @@ class Playhead:
         data = _STATE.pack(
             flags | (_OVER * play.over), 0, play.begin_ns, play.end_ns, play.anchor_ns, play.position_ns,
             play.until_ns, play.base_ns, play.utc_ns, play.speed, play.step, play.asked, cut(play.answer, _TEXT),
+            play.begun, play.head,
         )  # fmt: skip
         self._state.write(data)
 

@@ -106,10 +106,13 @@ class ReplayLoop:
         # In virtual time what is published belongs to the end of the step.
         at_ns = self._play.base_ns + self._play.at_ns(state.time_ns) if state.virtual else None
         self._writer.at_ns = at_ns
+        stepped = state.stepping and state.step != self._play.step
+        if stepped and state.step != self._play.begun:
+            self._keep(self._play._replace(begun=state.step, head=self._writer.block.ring.head()))
         # Before anything is played: a request that waited tells of a moment at which this played as it still does.
         more = not state.stepping and self._listen(state.time_ns)
         more |= self.counters.watch(self._clock.now_ns, lambda: self._advance(state.time_ns))
-        if not more and state.stepping and state.step != self._play.step:
+        if not more and stepped:
             self._keep(self._play._replace(step=state.step))
             self._writer.block.ring.wake()
         asked = state.stepping and self._head.asks(self._play.asked) is not None

@@ -211,6 +211,26 @@ def test_a_step_plays_each_round_of_a_loop(tmp_path: Path, instance: str) -> Non
         assert counts(cell.frames()) == (5 * list(range(20)))[1:]
 
 
+def test_what_came_before_a_step_is_known_though_a_loop_begins_anew_in_it(tmp_path: Path, instance: str) -> None:
+    """A model that computes the step is to see that, whoever is faster."""
+    file = record(tmp_path, instance)
+    with built(instance) as segment, Playing(segment, file, loop=True) as cell:
+        coordinator = Coordinator(segment)
+        coordinator.step(300 * MS)
+        stepping = coordinator.stepping(200 * MS)
+        next(stepping)
+        head = cell.block.playhead
+        assert head is not None
+        cell.until(lambda: (play := head.read()) is not None and play.step == 2)
+        frames = cell.frames()
+        assert counts(frames[-5:]) == [1, 2, 3, 4, 5]
+        assert counts([frame for frame in frames if not cell.block.came_with(frame, 2)]) == list(range(16))
+        for _ in stepping:
+            pass
+        assert not any(cell.block.came_with(frame, 2) for frame in frames), "all may be seen from now on"
+        coordinator.close()
+
+
 def test_a_loop_leaves_out_what_is_a_round_late(tmp_path: Path, instance: str) -> None:
     """What it shows is always of the round that its position is in."""
     file = record(tmp_path, instance)
