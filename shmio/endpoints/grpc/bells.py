@@ -11,7 +11,7 @@ from shmio.segment.relay import TURN_NS, Relay, Word
 
 Ring = Callable[[], object]
 
-REST_S: Final = 0.001
+REST_S: Final = 0.005
 """So long a bell is not heard when nobody listens to it but those that have time."""
 
 

@@ -16,8 +16,15 @@ class Stream(Protocol):
     """Called, once, as soon as it has nothing to send."""
 
     @property
-    def lags(self) -> bool:
-        """Whether its client is far behind, and takes what there was for it."""
+    def busy(self) -> bool:
+        """Whether its client takes what there was for it."""
+
+    @property
+    def behind(self) -> bool:
+        """Whether that is far less than there could be."""
+
+    def skip(self, frames: int, topics: int) -> None:
+        """So many frames of so many topics were not delivered to it, which is too slow for them."""
 
 
 class Listener(Protocol):

@@ -16,12 +16,6 @@ from shmio.segment import Block, Event, Frame, Quality
 
 log = logging.getLogger("shmio.grpc")
 
-CATCH_UP_FRAMES = 48
-"""A feed that is further behind than this goes on with the newest frame: what it skips is conflated, not lost.
-
-So does one that nobody listens to.
-"""
-
 TURN_FRAMES = 8
 """So many are shown before streams have their turn."""
 
@@ -55,7 +49,7 @@ class Feed:
         self._bells = bells
         self._on_quality = on_quality
         self._channels: dict[Subject, Channel] = {}
-        self._crowd = Crowd(self._refill)
+        self._crowd = Crowd(block, self._refill)
         self._free: list[int] = []  # slots
         self._table = Table.of((), 0)
         self._outdated = False
@@ -219,8 +213,7 @@ class Feed:
 
     def _follow(self) -> None:
         block = self.block
-        if self._cursor.behind > (CATCH_UP_FRAMES if self._channels and not self._crowd.passed() else 1):
-            self._cursor = block.cursor(after=block.ring.head() - 1)
+        self._cursor = self._crowd.look(self._cursor)
         retired = block.retired  # before looking: what was published before the end is still shown
         take = self._regard if self._held else self._take
         for count in range(TURN_FRAMES):

@@ -53,9 +53,19 @@ class Outbox:
         """Called, once, as soon as nothing waits: who has more, and waits for that."""
 
     @property
-    def lags(self) -> bool:
-        """Whether its client is far behind, and takes what there was for it."""
-        return self.pace.behind and not (self._asked and not self._waiting)
+    def busy(self) -> bool:
+        """Whether its client takes what there was for it."""
+        return bool(self._waiting) or not self._asked
+
+    @property
+    def behind(self) -> bool:
+        """Whether that is far less than there could be."""
+        return self.pace.behind
+
+    def skip(self, frames: int, topics: int) -> None:
+        """So many frames of so many topics were not delivered to it, which is too slow for them."""
+        self.dropped += frames
+        self.pace.skip(frames * topics)
 
     def add(self, lane: _Lane, message: Sized, now_s: float = 0.0) -> int:
         """Take a message; its number. ``now_s``: for :meth:`since`."""

@@ -35,3 +35,8 @@ class Pace:
     def lose(self, count: int) -> None:
         """So many were dropped for newer ones."""
         self._lost += count
+
+    def skip(self, count: int) -> None:
+        """So many were not even offered."""
+        self._offered += count
+        self._lost += count

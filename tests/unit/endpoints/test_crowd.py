@@ -1,4 +1,4 @@
-"""A feed whose streams are all too slow reads no more than they can take; what they take is the newest."""
+"""A feed reads no more than its streams can take; what those take that are far behind is the newest."""
 
 from __future__ import annotations
 
@@ -81,8 +81,9 @@ def follow(segment: Segment, test: Callable[[Followed], Awaitable[None]], *behin
 
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is looked at for its age."""
-    monkeypatch.setattr(crowd, "LATE_S", 1000.0)
+    """Nothing is looked at for its age, and nothing is new."""
+    monkeypatch.setattr(crowd, "LOOK_S", 1000.0)
+    monkeypatch.setattr(crowd, "LATE_S", 0.0)
     monkeypatch.setattr(bells, "REST_S", 1000.0)
 
 
@@ -95,6 +96,7 @@ def test_frames_that_nobody_could_take_are_not_read(segment: Segment) -> None:
         assert await followed.next(first) == MANY + 1, "the newest when it can be taken"
         assert await followed.next(second) == MANY + 1
         assert feed.messages == before + 1
+        assert first.dropped == second.dropped == MANY - 1
         await followed.publish(1)
         waiting = asyncio.ensure_future(followed.next(first))
         assert await waiting == MANY + 2
@@ -106,19 +108,49 @@ def test_frames_that_nobody_could_take_are_not_read(segment: Segment) -> None:
     follow(segment, test, True, True)
 
 
+def test_of_what_is_new_they_take_several(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crowd, "LATE_S", 1000.0)
+
+    async def test(followed: Followed) -> None:
+        (stream,) = followed.streams
+        await followed.publish(MANY)
+        last = MANY + 1
+        expected = range(last - crowd.FEW_FRAMES + 1, last + 1)
+        assert [await followed.next(stream) for _ in expected] == list(expected)
+
+    follow(segment, test, True)
+
+
+def test_one_that_is_not_far_behind_misses_nothing_for_having_been_busy(segment: Segment) -> None:
+    async def test(followed: Followed) -> None:
+        (stream,) = followed.streams
+        before = followed.feed.messages
+        await followed.publish(crowd.CATCH_UP_FRAMES)
+        assert followed.feed.messages == before, "they are where they are until it asks"
+        expected = range(2, crowd.CATCH_UP_FRAMES + 2)
+        assert [await followed.next(stream) for _ in expected] == list(expected)
+        assert stream.dropped == 0
+        await followed.publish(crowd.CATCH_UP_FRAMES + 1)
+        assert await followed.next(stream) == 2 * (crowd.CATCH_UP_FRAMES + 1)
+        assert stream.dropped == crowd.CATCH_UP_FRAMES
+
+    follow(segment, test, False)
+
+
 def test_beside_one_that_keeps_up_every_frame_is_read(segment: Segment) -> None:
     async def test(followed: Followed) -> None:
         late, good = followed.streams
         for number in range(2, 40):
+            waiting = asyncio.ensure_future(followed.next(good))
             await followed.publish(1)
-            assert await followed.next(good) == number
+            assert await waiting == number
         assert await followed.next(late) <= 39
 
     follow(segment, test, True, False)
 
 
 def test_what_waits_does_not_get_too_old(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crowd, "LATE_S", 0.0)
+    monkeypatch.setattr(crowd, "LOOK_S", 0.0)
 
     async def test(followed: Followed) -> None:
         before = followed.feed.messages
