@@ -42,6 +42,7 @@ class Crowd:
         self._streams[stream] -= 1
         if not self._streams[stream]:
             del self._streams[stream]
+            stream.refills.pop(self._refill, None)
 
     def passes(self) -> bool:
         """Whether what comes now is not to be read yet: all have something to take, and will ask for more.
