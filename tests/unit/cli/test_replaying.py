@@ -109,6 +109,11 @@ def test_a_replay_beside_others_has_the_recordings_registers(
         assert main(["check"]) == 1
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"supervisor.toml: {error}"), line
+    for name, error in (("none.mem", ": No such file"), ("panel.toml", " is no recording")):
+        config.write_text(text.replace(file.name, name))
+        assert main(["check"]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"supervisor.toml: source[0].file: {Path(name).absolute()}{error}"), line
 
 
 def test_check_looks_at_the_section_too(

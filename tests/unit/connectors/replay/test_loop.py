@@ -83,6 +83,7 @@ def test_events_are_told_again_as_nobodys(tmp_path: Path, instance: str) -> None
         cell.frame(BEGIN_NS, image(0))
         cell.event(BEGIN_NS + MS, Record(EventKind.ACCEPTED, "", 3, 77, 1, 1, 0, 0, 2, b"\0\5"))
         cell.event(BEGIN_NS + 2 * MS, Record(EventKind.WRITTEN, "", 3, 77, 1, 1, 0, 0, 2))
+        cell.event(BEGIN_NS + 3 * MS, Record(EventKind.NOTED, "valve 3 sticks"))
         cell.frame(BEGIN_NS + PERIOD_NS, image(1), quality=Quality.UNCERTAIN, reason="doubt")
         cell.event(BEGIN_NS + PERIOD_NS, Record(EventKind.QUALITY, "doubt"), Quality.UNCERTAIN)
         cell.frame(BEGIN_NS + 2 * PERIOD_NS, image(2), quality=Quality.BAD, reason="gone")
@@ -96,11 +97,12 @@ def test_events_are_told_again_as_nobodys(tmp_path: Path, instance: str) -> None
     assert told == [
         (EventKind.ACCEPTED, 77, 1, b"\0\5", "", Quality.GOOD),
         (EventKind.WRITTEN, 77, 1, b"", "", Quality.GOOD),
+        (EventKind.NOTED, 0, 0, b"", "valve 3 sticks", Quality.GOOD),
         (EventKind.QUALITY, 0, 0, b"", "doubt", Quality.UNCERTAIN),
     ]
     assert {event.writer for event in events} == {NO_WRITER}
-    assert [event.utc_ns for event in events] == [7_000 * S + BEGIN_NS + n for n in (MS, 2 * MS, PERIOD_NS)]
-    assert [event.frame for event in events] == [1, 1, 2]
+    assert [event.utc_ns for event in events] == [7_000 * S + BEGIN_NS + n for n in (MS, 2 * MS, 3 * MS, PERIOD_NS)]
+    assert [event.frame for event in events] == [1, 1, 1, 2]
     assert [(frame.quality, frame.reason) for frame in frames] == [
         (Quality.GOOD, ""),
         (Quality.UNCERTAIN, "doubt"),
