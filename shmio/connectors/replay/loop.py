@@ -163,7 +163,8 @@ class ReplayLoop:
         play, next_ns = self._play, self._player.next_ns
         if next_ns is None or play.paused or self._writer.at_ns is not None:
             return
-        late_ns, behind_ns = clock_ns - play.due_ns(next_ns), play.reach_ns(clock_ns) - next_ns
+        late_ns = clock_ns - play.due_ns(next_ns)
+        behind_ns = (play.reach_ns(clock_ns) if play.wraps else play.at_ns(clock_ns)) - next_ns
         too_late = late_ns > LATE_NS
         if not too_late and not (play.wraps and behind_ns >= play.end_ns - play.begin_ns):
             return
