@@ -2,8 +2,8 @@
 
 Sizes are of a minute at 50 Hz as a recorder chunks it, of three kinds of data: the emulated A50 cell, whose axes move
 by sines; the same with noise on all 20 REALs, as analog inputs have it; and the cell at rest. Beside it the same frames
-without compression, and what the mcap library writes by its defaults. CPU is that of a recorder's process beside a
-source that publishes by the clock.
+without compression, and what the mcap library writes by its defaults. Of the noisy one, also what its chunks would be
+if frames were laid out otherwise. CPU is that of a recorder's process beside a source that publishes by the clock.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ from pathlib import Path
 from typing import IO, cast
 
 import mcap.writer
+import zstandard
 from common import CpuTime, begin, db201, table
 
-from shmio.dump.encoding import FRAME, encode_frame
+from shmio.dump.encoding import FRAME, differ, encode_frame
 from shmio.emulators.a50 import A50
 from shmio.layout.model import Layout
 from shmio.recording.output import Output, create
@@ -37,6 +38,8 @@ START_NS = 1_700_000_000_000_000_000
 JITTER_NS = 60_000
 SEED_MB = 7.0
 """A minute of the seed's dumps."""
+LEVELS = (1, 3, 9, 19)
+"""Of zstd; 3 is what the recorder has."""
 
 Image = Callable[[int], bytes]
 """The block at a cycle."""
@@ -136,6 +139,42 @@ def sizes(minutes: int) -> None:
     table([f"MB a minute at {HZ} Hz", "raw frames", "mcap defaults", "shmio", "the seed"], rows)
 
 
+# -- other ways to lay out a chunk -------------------------------------------------------------------------------------
+
+
+def packed(messages: Sequence[bytes], pack: Callable[[bytes], bytes], *, turned: bool = False) -> int:
+    """Bytes of their chunks; ``turned``: first all first bytes, then all second ones, and so on."""
+    each, size = round(CHUNK_S * HZ), 0
+    for at in range(0, len(messages), each):
+        some = messages[at : at + each]
+        size += len(pack(b"".join(map(bytes, zip(*some, strict=True)) if turned else some)))
+    return size
+
+
+def layouts() -> None:
+    """Print MB a minute of the chunks' data alone, with noise: all that is in the file beside them stays the same."""
+    layout = db201()
+    some = list(frames(cell(layout, noise=0.01), 60 * HZ))
+    low = [register.offset + byte for byte in (3, 2, 1, 0) for register in layout.registers if register.type == "REAL"]
+    order = low + sorted(set(range(layout.size)) - set(low))
+
+    def message(frame: Frame, *, once: bool = True, sort: bool = False) -> bytes:
+        """``once``: times as differences, as they are written; ``sort``: the REALs' bytes in front, last ones first."""
+        header = frame.number & 0xFFFFFFFF, START_NS + frame.clock_ns, frame.source_ns
+        data = encode_frame(frame._replace(raw=bytes(map(frame.raw.__getitem__, order))) if sort else frame)
+        return struct.pack("<BQHIQQ", 5, 22 + len(data), 1, *header) + (differ(data, *header) if once else data)
+
+    plain = [message(frame) for frame in some]
+    default = zstandard.ZstdCompressor().compress
+    rows = [(f"as it is, zstd {level}", packed(plain, zstandard.ZstdCompressor(level).compress)) for level in LEVELS]
+    rows += [
+        ("times whole, as of shmio.frame.v1", packed([message(frame, once=False) for frame in some], default)),
+        ("bytes of the REALs side by side", packed([message(frame, sort=True) for frame in some], default)),
+        ("byte columns: no messages of MCAP", packed(plain, default, turned=True)),
+    ]
+    table([f"MB a minute at {HZ} Hz, chunks alone", ""], [[name, f"{size / 1e6:.3f}"] for name, size in rows])
+
+
 # -- CPU ---------------------------------------------------------------------------------------------------------------
 
 
@@ -204,6 +243,7 @@ def cpu(duration_s: float) -> None:
 def main() -> None:
     quick = begin("Recording: a minute's size, and CPU")
     sizes(1 if quick else 10)
+    layouts()
     cpu(2.0 if quick else 30.0)
 
 

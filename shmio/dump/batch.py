@@ -11,7 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from mcap.opcode import Opcode
 
-from shmio.dump.encoding import decode_frame
+from shmio.dump.channels import Channel
+from shmio.dump.encoding import decode_frame, restore
 from shmio.errors import RecordingError
 from shmio.segment.frame import Frame, Provenance
 
@@ -37,6 +38,17 @@ HEAD: Final = np.dtype(
 
 _RECORD: Final = struct.Struct("<BQH")  # opcode, size; of a message: its channel
 _MESSAGE: Final = struct.Struct("<BQHIQQ")  # opcode, size; channel, sequence, log time, publish time
+_TOLD: Final = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("size", "<u8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_ns", "<i8"),
+        ("publish_ns", "<i8"),
+    ]
+)
+"""The same for numpy."""
 _HEAD_SIZE: Final = 9
 _LOG_AT: Final = 15
 _WORTH: Final = 4
@@ -77,20 +89,20 @@ class Batch:
         return Batch(self.time_ns[some], self.records[some], self.reasons and self.reasons[some])
 
 
-def batch(data: bytes, channel: int, size: int, from_ns: int, to_ns: int, *, raw: bool = False) -> Batch | None:
+def batch(data: bytes, channel: Channel, size: int, from_ns: int, to_ns: int, *, raw: bool = False) -> Batch | None:
     """The frames of a channel, whose images have this size, in a chunk, in this range of log times; None without any.
 
     RecordingError: they cannot be decoded.
     """
     array = np.frombuffer(data, np.uint8)
     found = []
-    for run in _runs(array, data, channel):
+    for run in _runs(array, data, channel.number):
         time_ns = np.ascontiguousarray(run[:, _LOG_AT : _LOG_AT + 8]).view("<i8")[:, 0]
         inside = (time_ns >= from_ns) & (time_ns <= to_ns)
         if not inside.all():
             time_ns, run = time_ns[inside], run[inside]  # noqa: PLW2901
         if len(run):
-            frames = run[:, _MESSAGE.size :]
+            frames = _restored(run) if channel.differences else run[:, _MESSAGE.size :]
             records = frames if _regular(frames, size) else None
             found.append((time_ns, *((records, None) if records is not None else _decoded(frames, size, raw=raw))))
     if len(found) <= 1:
@@ -101,7 +113,7 @@ def batch(data: bytes, channel: int, size: int, from_ns: int, to_ns: int, *, raw
     return Batch(np.concatenate([item[0] for item in found]), np.concatenate([item[1] for item in found]), reasons)
 
 
-def frames(data: bytes, channel: int, size: int, from_ns: int, to_ns: int) -> list[tuple[int, Frame]]:
+def frames(data: bytes, channel: Channel, size: int, from_ns: int, to_ns: int) -> list[tuple[int, Frame]]:
     """The same frames as objects, with their log times; RecordingError."""
     found = []
     at, end, unpack = 0, len(data), _MESSAGE.unpack_from
@@ -112,9 +124,12 @@ def frames(data: bytes, channel: int, size: int, from_ns: int, to_ns: int) -> li
         if following > end:
             raise RecordingError("it ends within a record")
         if data[at] == Opcode.MESSAGE and following - at >= _MESSAGE.size:
-            _, _, number, _, log_ns, _ = unpack(data, at)
-            if number == channel and from_ns <= log_ns <= to_ns:
-                found.append((log_ns, _frame(data[at + _MESSAGE.size : following], size)))
+            _, _, number, sequence, log_ns, publish_ns = unpack(data, at)
+            if number == channel.number and from_ns <= log_ns <= to_ns:
+                piece = data[at + _MESSAGE.size : following]
+                if channel.differences:
+                    piece = restore(piece, sequence, log_ns, publish_ns)
+                found.append((log_ns, _frame(piece, size)))
         at = following
     return found
 
@@ -178,6 +193,20 @@ def _cut(array: _Bytes, begin: int, period: int, count: int, size: int) -> _Byte
     if count == 1:
         return array[begin : begin + size].reshape(1, size)
     return array[begin : begin + count * period].reshape(count, period)[:, :size]
+
+
+def _restored(run: _Bytes) -> _Bytes:
+    """What :func:`~shmio.dump.encoding.restore` makes of each message of FRAME_V2, for all of them at once."""
+    told = run[:, : _MESSAGE.size].view(_TOLD)[:, 0]
+    frames = run[:, _MESSAGE.size :].copy()
+    if frames.shape[1] >= HEAD.itemsize:
+        head = frames[:, : HEAD.itemsize].view(HEAD)[:, 0]
+        head["number"] += told["sequence"]
+        head["cycle"] += head["number"]
+        head["clock_ns"] += told["log_ns"]
+        head["publish_ns"] += head["clock_ns"]
+        head["source_ns"] += told["publish_ns"]
+    return frames
 
 
 def _regular(frames: _Bytes, size: int) -> bool:

@@ -28,6 +28,8 @@ STEPS_TOPIC: Final = "steps"
 PROCESSES_TOPIC: Final = "processes"
 
 FRAME: Final = "shmio.frame.v1"
+FRAME_V2: Final = "shmio.frame.v2"
+"""The same with differences in place of what stands in the message's own header already: see :func:`differ`."""
 EVENT: Final = "shmio.event.v1"
 PLAIN: Final = "json"
 GAP: Final = "gap"
@@ -36,9 +38,11 @@ PROCESS: Final = "process"
 """What gaps, steps and changes of processes are called here; in the file all are PLAIN, told apart by their topics."""
 
 _FRAME: Final = struct.Struct("<QQqqqQIBBHHHII")
+_COUNTED: Final = struct.Struct("<QQQQQ")  # how a frame begins: number, cycle, publish, clock, source
 _EVENT: Final = struct.Struct("<QQQqqqQQIIIIIIHBBHH")
 _QUALITIES: Final = (*Quality, Quality.BAD)  # what is none is not to be trusted
 _PROVENANCES: Final = tuple(Provenance)
+_MAX_U64: Final = (1 << 64) - 1
 _EFFECTIVE: Final = 1  # flag: an effective image follows the raw one
 
 T = TypeVar("T")
@@ -48,6 +52,10 @@ the instance's start), i64 source (ns UTC), u64 event (last one before), u32 inc
 1 uncertain, 2 good), u8 provenance (0 live, 1 simulated, 2 replayed, 3 injected), u16 flags (1: effective), \
 u16 reason size, u16 0, u32 image size, u32 delay (us; age of the image when published); then reason (UTF-8), raw, \
 effective."""
+FRAME_V2_SCHEMA: Final = (
+    b"As shmio.frame.v1, but for five fields, which are differences modulo 2^64: number - sequence, cycle - number, "
+    b"publish - clock, clock - log_time, source - publish_time. " + FRAME_SCHEMA
+)
 EVENT_SCHEMA: Final = b"""Little-endian. u64 number, u64 frame (last one before), u64 cycle, i64 publish (ns, \
 CLOCK_MONOTONIC), i64 clock (ns since the instance's start), i64 UTC (ns), u64 command, u64 injection, \
 u32 incarnation, u32 writer, u32 item, u32 items, u32 offset, u32 size, u16 kind, u8 quality, u8 mask, \
@@ -178,6 +186,34 @@ def decode_frame(data: bytes) -> Frame:
         data[raw_at : raw_at + size],
         data[raw_at + size :] if images == 2 else None,
     )  # fmt: skip
+
+
+def differ(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
+    """A frame as FRAME_V2: with what its message's header tells, or nearly, as differences modulo 2^64.
+
+    Times differ in their last bytes from frame to frame, so that each costs as much again however often it is there;
+    differences hardly ever do.
+    """
+    number, cycle, publish, clock, source = _COUNTED.unpack_from(data)
+    head = _COUNTED.pack(
+        number - sequence & _MAX_U64, cycle - number & _MAX_U64, publish - clock & _MAX_U64, clock - log_ns & _MAX_U64,
+        source - publish_ns & _MAX_U64,
+    )  # fmt: skip
+    return head + data[_COUNTED.size :]
+
+
+def restore(data: bytes, sequence: int, log_ns: int, publish_ns: int) -> bytes:
+    """The frame that was made differences of; what is too short for one stays as it is, for the decoder to refuse."""
+    if len(data) < _FRAME.size:
+        return data
+    number, cycle, publish, clock, source = _COUNTED.unpack_from(data)
+    number += sequence
+    clock += log_ns
+    head = _COUNTED.pack(
+        number & _MAX_U64, cycle + number & _MAX_U64, publish + clock & _MAX_U64, clock & _MAX_U64,
+        source + publish_ns & _MAX_U64,
+    )  # fmt: skip
+    return head + data[_COUNTED.size :]
 
 
 def encode_event(event: Event) -> bytes:

@@ -55,17 +55,19 @@ class Part:
             wanted = lambda channel: channel.number in channels  # noqa: E731
             yield list(self.reader.messages(wanted, 0, time_ns, damaged, [record]))
 
-    def batches(self, channel: int, size: int, from_ns: int, to_ns: int, *, raw: bool) -> Iterator[Batch]:
+    def batches(self, number: int, size: int, from_ns: int, to_ns: int, *, raw: bool) -> Iterator[Batch]:
         """Frames of a channel, whose images have this size, chunk by chunk."""
+        channel = self.reader.channels[number]
         for found in self._each(
-            channel, from_ns, to_ns, lambda data: batch(data, channel, size, from_ns, to_ns, raw=raw)
+            channel.number, from_ns, to_ns, lambda data: batch(data, channel, size, from_ns, to_ns, raw=raw)
         ):
             if found is not None:
                 yield found
 
-    def frames(self, channel: int, size: int, from_ns: int, to_ns: int) -> Iterator[tuple[int, Frame]]:
+    def frames(self, number: int, size: int, from_ns: int, to_ns: int) -> Iterator[tuple[int, Frame]]:
         """The same as objects, with their log times."""
-        for found in self._each(channel, from_ns, to_ns, lambda data: frames(data, channel, size, from_ns, to_ns)):
+        channel = self.reader.channels[number]
+        for found in self._each(number, from_ns, to_ns, lambda data: frames(data, channel, size, from_ns, to_ns)):
             yield from found
 
     def _each(self, channel: int, from_ns: int, to_ns: int, decode: Callable[[bytes], T]) -> Iterator[T]:

@@ -32,6 +32,7 @@ from shmio.dump.encoding import (
     decode_place,
     decode_process,
     decode_step,
+    restore,
 )
 from shmio.dump.records import BROKEN, Record, Records, stream
 from shmio.errors import LayoutError, RecordingError
@@ -158,6 +159,7 @@ class Reader:
     def raw(self, record: Record) -> Iterator[tuple[Channel, int, memoryview]]:
         """(channel, log time, data) of a chunk's messages, those of others passed over; its channels are noted.
 
+        Frames are as FRAME has them, of whichever version they are.
         RecordingError: at once if the chunk as a whole is damaged; at its end if messages had to be left out.
         """
         return self._raw(self.records.chunk(record))
@@ -170,12 +172,16 @@ class Reader:
             elif opcode == Opcode.MESSAGE:
                 if len(content) < _MESSAGE.size:
                     raise RecordingError(f"{self.file}: a message is shorter than its header")
-                number, _, log_ns, _ = _MESSAGE.unpack_from(content)
+                number, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(content)
                 channel = self.channel(number)
                 if channel is None:
                     unknown = number
-                elif channel.encoding:
-                    yield channel, log_ns, content[_MESSAGE.size :]
+                    continue
+                data = content[_MESSAGE.size :]
+                if channel.differences:
+                    data = memoryview(restore(bytes(data), sequence, log_ns, publish_ns))
+                if channel.encoding:
+                    yield channel, log_ns, data
         if unknown is not None:
             raise RecordingError(f"{self.file}: messages of channel {unknown}, which is not described")
 

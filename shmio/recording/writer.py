@@ -14,8 +14,8 @@ from shmio.dump.encoding import (
     ABOUT,
     EVENT,
     EVENT_SCHEMA,
-    FRAME,
-    FRAME_SCHEMA,
+    FRAME_V2,
+    FRAME_V2_SCHEMA,
     GAP_SCHEMA,
     GAPS_TOPIC,
     PLACES,
@@ -29,6 +29,7 @@ from shmio.dump.encoding import (
     Place,
     ProcessChange,
     StepMark,
+    differ,
     encode_event,
     encode_frame,
     encode_json,
@@ -102,7 +103,9 @@ class Writer:
             about["of"] = of or block.layout.hash.hex()
         frames, events = about | {"after": str(after_frame)}, about | {"after": str(after_event)}
         return Channels(
-            self._mcap.register_channel(f"{block.source}/frames", FRAME, self._schema(FRAME, FRAME_SCHEMA), frames),
+            self._mcap.register_channel(
+                f"{block.source}/frames", FRAME_V2, self._schema(FRAME_V2, FRAME_V2_SCHEMA), frames
+            ),
             self._mcap.register_channel(f"{block.source}/events", EVENT, self._schema(EVENT, EVENT_SCHEMA), events),
         )
 
@@ -114,7 +117,9 @@ class Writer:
     def frame(self, channels: Channels, frame: Frame, log_ns: int) -> None:
         """Add a frame."""
         told_ns = frame.source_ns if frame.source_ns > 0 else log_ns
-        self._mcap.add_message(channels.frames, log_ns, encode_frame(frame), told_ns, frame.number & 0xFFFFFFFF)
+        sequence = frame.number & 0xFFFFFFFF
+        data = differ(encode_frame(frame), sequence, log_ns, told_ns)
+        self._mcap.add_message(channels.frames, log_ns, data, told_ns, sequence)
 
     def event(self, channels: Channels, event: Event, log_ns: int) -> None:
         """Add an event."""

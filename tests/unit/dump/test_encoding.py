@@ -14,9 +14,11 @@ from shmio.dump.encoding import (
     decode_event,
     decode_frame,
     decode_gap,
+    differ,
     encode_event,
     encode_frame,
     encode_json,
+    restore,
 )
 from shmio.segment import Event, Frame, Provenance, Quality
 
@@ -31,10 +33,14 @@ images = st.integers(0, 50).flatmap(
 @given(
     st.tuples(u64, u64, i64, i64, i64, u32, quality, st.sampled_from(Provenance), u64, u32, st.text(max_size=60)),
     images,
+    st.tuples(u32, u64, u64),
 )
-def test_a_frame(fields: tuple[int, ...], images: tuple[bytes, bytes | None]) -> None:
+def test_a_frame(fields: tuple[int, ...], images: tuple[bytes, bytes | None], header: tuple[int, int, int]) -> None:
+    """Of both versions, whatever the message's own header says."""
     frame = Frame._make((*fields, *images))
-    assert decode_frame(encode_frame(frame)) == frame
+    data = encode_frame(frame)
+    assert decode_frame(data) == frame
+    assert restore(differ(data, *header), *header) == data
 
 
 @given(

@@ -18,6 +18,7 @@ from shmio.dump.check import check
 from shmio.dump.encoding import (
     EVENT,
     FRAME,
+    FRAME_V2,
     GAP,
     PROCESS,
     STEP,
@@ -27,14 +28,18 @@ from shmio.dump.encoding import (
     decode_gap,
     decode_process,
     decode_step,
+    differ,
     encode_event,
     encode_frame,
     encode_json,
+    restore,
 )
 from shmio.dump.reader import Reader
 
 GOLDEN = Path(__file__).parents[2] / "golden/dump"
 FILES = ["closed.mem", "killed.mem"]
+DIFFERENCES = "differences.mem"
+"""What ``closed.mem`` holds, its frames of the second version."""
 CODECS: dict[str, tuple[Callable[[bytes], Any], Callable[[Any], bytes]]] = {
     FRAME: (decode_frame, encode_frame),
     EVENT: (decode_event, encode_event),
@@ -103,6 +108,41 @@ def test_a_dump_of_it_has_the_same(name: str) -> None:
         counts = [message["item"]["number"] for message in expected if message["topic"] == "cell/frames"]
         assert dump.columns("cell/count").number.tolist() == counts
         assert [entry.item.count for entry in entries if isinstance(entry.item, Gap)] == [3]
+
+
+def test_frames_of_the_second_version_are_the_same() -> None:
+    """One by one, as objects, and as arrays."""
+    expected = json.loads((GOLDEN / "closed.json").read_text())
+    found = described(GOLDEN / DIFFERENCES)
+    for part in ("closed", "layouts", "messages"):
+        assert found[part] == expected[part]
+    with shmio.open_dump(GOLDEN / DIFFERENCES) as dump, shmio.open_dump(GOLDEN / "closed.mem") as first:
+        for source in first.sources:
+            assert [entry.item for entry in dump.frames(source)] == [entry.item for entry in first.frames(source)]
+            some, others = (b"".join(b.records.tobytes() for _, b in d.batches(source)) for d in (dump, first))
+            assert some == others
+        with Reader(GOLDEN / DIFFERENCES) as reader:
+            assert check(reader).whole
+
+
+def test_the_second_version_is_written_as_it_is_there() -> None:
+    """By what any reader of MCAP finds, whose messages of the first version are made into the second."""
+    messages: list[list[tuple[Any, ...]]] = []
+    for name in ("closed.mem", DIFFERENCES):
+        with (GOLDEN / name).open("rb") as stream:
+            found = NonSeekingReader(stream, validate_crcs=True).iter_messages(log_time_order=False)
+            messages.append([(channel.message_encoding, message) for _, channel, message in found])
+    frames = 0
+    for (encoding, one), (second, other) in zip(*messages, strict=True):
+        times = one.sequence, one.log_time, one.publish_time
+        assert times == (other.sequence, other.log_time, other.publish_time)
+        if encoding == FRAME:
+            frames += 1
+            assert (second, differ(one.data, *times)) == (FRAME_V2, other.data)
+            assert restore(other.data, *times) == one.data
+        else:
+            assert (second, other.data) == (encoding, one.data)
+    assert frames > 10
 
 
 def test_any_reader_of_mcap_reads_them() -> None:

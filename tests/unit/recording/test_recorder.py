@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import mcap.reader
 import pytest
 
-from shmio.dump.encoding import Reason, decode_event, decode_frame
+from shmio.dump.encoding import FRAME_V2, Reason, decode_event, decode_frame, restore
 from shmio.dump.reader import Reader
 from shmio.errors import RecordingError
 from shmio.recording import recorder as module
@@ -208,7 +208,9 @@ def test_the_file_is_plain_mcap(segment: Segment, tmp_path: Path) -> None:
         gap = next(json.loads(message.data) for _, channel, message in messages if channel.topic == "gaps")
         assert gap["count"] == recording.counters.missed
         [(_, channel, last)] = [entry for entry in messages if entry[1].topic == "cell/frames"][-1:]
-        assert decode_frame(last.data) == writer.block.latest()
+        assert channel.message_encoding == FRAME_V2
+        data = restore(last.data, last.sequence, last.log_time, last.publish_time)
+        assert decode_frame(data) == writer.block.latest()
         assert (channel.metadata["source"], channel.metadata["layout"]) == ("cell", writer.block.layout.hash.hex())
         event = next(message for _, channel, message in messages if channel.topic == "cell/events")
         assert decode_event(event.data).kind == EventKind.STARTED
