@@ -94,6 +94,18 @@ def test_recording_is_measured() -> None:
     assert len(sizes) == 3
     assert all(0 < float(ours) < float(raw) / 10 for raw, _, ours in sizes)
     assert len(re.findall(r"^(?:50|1000) Hz +\d+\.\d+ +\d+\.\d+ +\d+\.\d+ +\d+$", found, re.MULTILINE)) == 2
+    [ours] = re.findall(r"^as it is, zstd 3 +(\d\.\d+)$", found, re.MULTILINE)
+    [whole] = re.findall(r"^times whole, as of shmio.frame.v1 +(\d\.\d+)$", found, re.MULTILINE)
+    assert 0 < float(ours) < 0.9 * float(whole)
+
+
+def test_what_kills_of_the_recorder_cost_is_measured() -> None:
+    found = re.findall(
+        r"^\d+ +\d+\.\d+ +\d+ +\d+\.\d+ +([1-9]\d*) of (\d+) +(\d+) +(\d+)$", printed("recorder_kills"), re.MULTILINE
+    )
+    assert len(found) == 2
+    for recovered, written, lost, told in found:
+        assert (recovered, lost) == (written, told)
 
 
 def test_reading_recordings_is_measured() -> None:
