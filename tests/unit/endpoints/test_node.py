@@ -132,12 +132,13 @@ def test_a_client_that_is_killed_in_the_middle_of_all_calls_leaves_nothing(segme
         process = await started("rude.js", served.port, "hold")
         assert process.stdin is not None
         assert process.stdout is not None
-        process.stdin.write(given(CALLS))
+        calls = [call for call in CALLS if not call.method.endswith("LiftAll")]  # ends others
+        process.stdin.write(given(calls))
         process.stdin.write_eof()
         try:
             async with asyncio.timeout(TIMEOUT_S):
                 assert await process.stdout.readline() == b"holding\n"
-                stays = sum(call.stays for call in CALLS)
+                stays = sum(call.stays for call in calls)
 
                 async def held() -> bool:
                     await asyncio.sleep(0)
