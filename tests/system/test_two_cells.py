@@ -1,0 +1,73 @@
+"""Two cells at one broker, by the commands of the page on MQTT."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from shmio.config import Address
+from shmio.testing.cell import BIN, PATIENCE_S
+from shmio.testing.ports import reserved_port
+from tests.unit.endpoints.mqtt.harness import listening
+
+ROOT = Path(__file__).parents[2]
+BLOCK = re.compile(r"^```sh\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+CELLS = ("north", "south")
+
+
+@pytest.fixture
+def broker() -> Iterator[Address]:
+    with reserved_port() as address:
+        yield address
+
+
+@pytest.fixture
+def folder(tmp_path: Path, instance: str, broker: Address) -> Iterator[Path]:
+    """The examples, with names and a port of the test's own."""
+    shutil.copytree(ROOT / "examples", tmp_path / "examples")
+    for cell in CELLS:
+        file = tmp_path / "examples/two-cells" / cell / "supervisor.toml"
+        text = file.read_text()
+        assert text.count("127.0.0.1:1883") == text.count(f'name = "{cell}"') == 1
+        file.write_text(text.replace("127.0.0.1:1883", str(broker)).replace(f'"{cell}"', f'"{instance}-{cell}"'))
+    yield tmp_path
+    for cell in CELLS:
+        run(tmp_path, f"shmio-supervisor down -c examples/two-cells/{cell}/supervisor.toml")
+
+
+def run(folder: Path, commands: str) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PATH": f"{BIN}:{os.environ['PATH']}"}
+    return subprocess.run(
+        ["bash", "-euo", "pipefail", "-c", commands],
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+
+
+def test_the_page_on_two_cells(folder: Path, broker: Address, instance: str) -> None:
+    page = (ROOT / "docs/how-to/use-mqtt.md").read_text().replace("127.0.0.1:1883", str(broker))
+    begin, end = BLOCK.findall(page)
+    done = run(folder, begin)
+    assert done.returncode == 0, done.stdout + done.stderr
+    shown = [line.rpartition(" ")[0] for line in done.stdout.splitlines()[-2:]]
+    assert sorted(shown) == [f"plant/{cell}/sim/joints/Kuka.j1/R/out" for cell in CELLS]
+    with listening(broker, "plant/#", f"spBv1.0/plant/NDEATH/{instance}-south", protocol=4) as listener:
+        found: dict[str, bytes] = {}
+        expected = {"plant/north/sim/joints/Kuka.j1/R/out": b"1.5", "plant/south/sim/joints/Kuka.j1/R/out": b"2.5"}
+        while {topic: found.get(topic) for topic in expected} != expected:
+            message = listener.message()
+            found[message.topic] = bytes(message.payload)
+        done = run(folder, end)
+        assert done.returncode == 0, done.stdout + done.stderr
+        while listener.message().topic != f"spBv1.0/plant/NDEATH/{instance}-south":
+            pass
