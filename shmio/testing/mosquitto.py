@@ -13,6 +13,8 @@ from shmio.config import Address
 
 PLACES = f"{os.environ.get('PATH', os.defpath)}:/usr/sbin:/usr/local/sbin"
 PATIENCE_S = 20.0
+TETHER = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
+"""Of util-linux: what it starts dies with the thread that starts it, so that a test run that is killed leaves none."""
 
 
 def missing() -> str:
@@ -37,11 +39,16 @@ class Mosquitto:
         """What it has logged so far."""
         return (self.folder / "mosquitto.log").read_text()
 
+    @property
+    def pid(self) -> int:
+        """Of the process, if it runs; 0: it does not."""
+        return self._process.pid if self._process else 0
+
     def start(self) -> None:
         """Start it; returns when it listens."""
         program = shutil.which("mosquitto", path=PLACES) or "mosquitto"
         with (self.folder / "mosquitto.log").open("ab") as log:
-            self._process = subprocess.Popen([program, "-c", self._file], stdout=log, stderr=log)
+            self._process = subprocess.Popen([*TETHER, program, "-c", self._file], stdout=log, stderr=log)
         until_s = time.monotonic() + PATIENCE_S
         while True:
             try:
