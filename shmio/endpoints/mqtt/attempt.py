@@ -10,7 +10,7 @@ from contextlib import suppress
 from typing import Any, Final, cast
 
 from paho.mqtt.client import Client, MQTTv5
-from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode, MQTTProtocolVersion
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
@@ -29,6 +29,21 @@ MAX_PACKET_BYTES: Final = 1 << 21
 """Of what a broker may send us, as far as it can be told so: with MQTT 5."""
 PACKETS: Final = 100
 """So many are taken from the broker before what else there is to do has its turn."""
+
+
+class _Client(Client):
+    """Reads no more packets at once than it is told to: paho's reads as many as we have in flight."""
+
+    def loop_read(self, max_packets: int = 1) -> MQTTErrorCode:
+        for _ in range(max_packets):
+            if self._sock is None:
+                return MQTTErrorCode.MQTT_ERR_NO_CONN
+            code = self._packet_read()
+            if code > 0:
+                return self._loop_rc_handle(code)
+            if code == MQTTErrorCode.MQTT_ERR_AGAIN:
+                break
+        return MQTTErrorCode.MQTT_ERR_SUCCESS
 
 
 class Attempt:
@@ -84,7 +99,7 @@ class Attempt:
         """ConfigError: a file that is needed for it will not do."""
         settings, target, new = self._dialling.settings, self.target, self._protocol == MQTTv5
         # A client of its own for each attempt: what one has not got rid of is none of the next one's business.
-        client = self.client = Client(
+        client = self.client = _Client(
             CallbackAPIVersion.VERSION2,
             self._dialling.client_id,
             clean_session=None if new else not settings.session_expiry_s,
