@@ -166,7 +166,7 @@ def test_recover_gives_back_every_whole_chunk(tmp_path: Path, capsys: pytest.Cap
 def test_recover_of_a_file_cut_off_at_every_byte_of_its_last_chunk(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = varied(tmp_path / "a.mem")
+    file = varied(tmp_path / "a.mem", first=41)
     data = file.read_bytes()
     before = contents(file)
     with Reader(file) as reader:

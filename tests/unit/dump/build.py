@@ -62,6 +62,7 @@ class Build:
             source=source, section=section, layout=layout, period_ns=PERIOD_NS, stale_ns=10 * PERIOD_NS
         )
         number = len(self.blocks) + 1
+        self.events[source] = after_event
         self.blocks[source] = self.writer.open_block(cast("Block", block), number, self.first - 1, after_event)
 
     def frame(self, at: int, data: bytes, source: str = "cell", *, late_ns: int = 0, **other: Any) -> None:
@@ -139,13 +140,13 @@ def plain(file: Path, first: int = 1, last: int = 100, chunk: int = 10) -> Path:
     return file
 
 
-def varied(file: Path) -> Path:
-    """Two sources, gaps, events, steps, frames with reasons and injections."""
-    with build(file) as work:
-        work.block("cell")
+def varied(file: Path, first: int = 1) -> Path:
+    """Two sources, gaps, events, steps, frames with reasons and injections, or of these the last ones."""
+    with build(file, first=first) as work:
+        work.block("cell", after_event=(first - 1) // 15)
         work.block("press", section=2)
-        work.process(Life.IS, 1)
-        for number in range(1, 61):
+        work.process(Life.IS, first)
+        for number in range(first, 61):
             if number % 20 == 7:
                 work.frame(number, image(number), quality=Quality.BAD, reason="no answer")
             elif number % 20 == 9:
