@@ -1,4 +1,7 @@
-"""A bare grpc.aio server, as a process: each call sends so many ready messages on the stream, and is answered then."""
+"""A bare grpc.aio server, as a process: each step's call sends what is ready on the stream, and is answered then.
+
+What it sends is what an endpoint has sent to the same client before, as it came: see ``ready.py``.
+"""
 
 from __future__ import annotations
 
@@ -10,34 +13,56 @@ from typing import Any
 
 import grpc
 from common import tell
+from ready import Ready
 
-from shmio.wire import simlog_v2_pb2 as v2
 
+class Bare(grpc.GenericRpcHandler):
+    """All that the client calls; for one client at a time."""
 
-async def serve(count: int) -> None:
-    """Until standard input ends."""
-    message = v2.SimlogMessage(header=v2.Header(path="sim/values/r00"), type=v2.NUMBER).SerializeToString()
-    asked: asyncio.Queue[asyncio.Future[None]] = asyncio.Queue()
+    def __init__(self, ready: Ready) -> None:
+        self._ready = ready
+        self._asked: asyncio.Queue[asyncio.Future[None]] = asyncio.Queue()
+        self._handlers: dict[str, grpc.RpcMethodHandler[Any, Any]] = {
+            ready.stream: grpc.unary_stream_rpc_method_handler(self._follow),
+            ready.call: grpc.unary_unary_rpc_method_handler(self._step),
+            ready.steps: grpc.stream_stream_rpc_method_handler(self._steps),
+        }
+        self._other = grpc.unary_unary_rpc_method_handler(self._nothing)
 
-    async def follow(_: bytes, __: Any) -> AsyncIterator[bytes]:
+    def service(self, handler_call_details: Any) -> grpc.RpcMethodHandler[Any, Any] | None:
+        """What answers a call."""
+        return self._handlers.get(handler_call_details.method, self._other)
+
+    async def _follow(self, _: bytes, context: Any) -> AsyncIterator[bytes]:
+        asked = self._asked = asyncio.Queue()
+        await context.send_initial_metadata(())
+        for message in self._ready.first:
+            yield message
         while True:
             done = await asked.get()
-            for _number in range(count):
+            for message in self._ready.step:
                 yield message
             done.set_result(None)
 
-    async def step(_: bytes, __: Any) -> bytes:
+    async def _step(self, _: bytes, __: Any) -> bytes:
         done = asyncio.get_running_loop().create_future()
-        asked.put_nowait(done)
+        self._asked.put_nowait(done)
         await done
+        return self._ready.answer
+
+    async def _steps(self, requests: AsyncIterator[bytes], context: Any) -> AsyncIterator[bytes]:
+        async for request in requests:
+            await self._step(request, context)
+            yield self._ready.steps_answer
+
+    async def _nothing(self, _: bytes, __: Any) -> bytes:
         return b""
 
-    calls: dict[str, grpc.RpcMethodHandler[Any, Any]] = {
-        "Follow": grpc.unary_stream_rpc_method_handler(follow),
-        "Step": grpc.unary_unary_rpc_method_handler(step),
-    }
+
+async def serve(ready: Ready) -> None:
+    """Until standard input ends."""
     server = grpc.aio.server()
-    server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler("benchmark.Bare", calls),))
+    server.add_generic_rpc_handlers((Bare(ready),))
     port = server.add_insecure_port("127.0.0.1:0")
     await server.start()
     tell(f"127.0.0.1:{port}")
@@ -47,8 +72,8 @@ async def serve(count: int) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("count", type=int)
-    asyncio.run(serve(parser.parse_args().count))
+    parser.add_argument("ready", help="what is sent, as JSON")
+    asyncio.run(serve(Ready.of(parser.parse_args().ready)))
 
 
 if __name__ == "__main__":

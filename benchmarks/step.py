@@ -1,24 +1,27 @@
 """Steps a second: a model with 100 registers that all change, stepped from another process that receives them.
 
 Each client steps, waits for the answer, and for everything that it has subscribed to. Model, endpoint and client are
-processes of their own. They take turns; while one steps, nobody else has subscribed. The bare server has no model, and
-nothing to find out: it is what sending alone takes.
+processes of their own. They take turns; while one steps, nobody else has subscribed. A bare server has no model, and
+nothing to find out: it sends the same client the same messages, which it has ready. That is the limit, and what the
+client itself costs.
 """
 
 from __future__ import annotations
 
+import statistics
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 
-from common import HERE, Child, begin, interleave, report
-from counting import COUNT
+import ready
+from common import HERE, Child, begin, interleave, report, table
 from instance import started
+from stepping import PATHS
 
 from shmio import attach
 
 OURS = "v2, 100 topics in one stream"
-BARE = "a bare grpc.aio server, 101 ready messages in one stream"
+BARE = "a bare server: {}"
 MODEL = f"""
 [[source]]
 name = "sim"
@@ -67,11 +70,30 @@ def main() -> None:
             name: remote(stack.enter_context(Child("stepping.py", running.grpc, kind)), duration_s)
             for name, kind in CONTENDERS.items()
         }
-        ready = stack.enter_context(Child("bare_steps.py", COUNT + 1))
-        client = stack.enter_context(Child("stepping.py", ready.hello, "bare"))
-        contenders[BARE] = remote(client, duration_s)
+        for name, messages in _ready(str(running.grpc)).items():
+            server = stack.enter_context(Child("bare_steps.py", messages.to_json()))
+            client = stack.enter_context(Child("stepping.py", server.hello, CONTENDERS[name]))
+            contenders[BARE.format(name)] = remote(client, duration_s)
         contenders["a program on the host, no subscriber"] = local(running.segment.instance, duration_s)
-        report("steps a second", interleave(contenders, rounds), OURS, "more")
+        samples = interleave(contenders, rounds)
+    report("steps a second", samples, OURS, "more")
+    medians = {name: statistics.median(values) for name, values in samples.items()}
+    rows = [
+        [name, f"{medians[name] / medians[bare]:.2f}"] for name in CONTENDERS if (bare := BARE.format(name)) in medians
+    ]
+    table(["beside a bare server with the same client", "of its rate"], rows)
+
+
+def _ready(target: str) -> dict[str, ready.Ready]:
+    """What bare servers send, by the contender that gets the same."""
+    kinds = {kind: name for name, kind in CONTENDERS.items()}
+    native = ready.native(target, "sim/values/*")
+    return {
+        kinds["v2"]: ready.version_2(target, PATHS),
+        kinds["v2-array"]: ready.version_2(target, ["sim/row"]),
+        kinds["native"]: native,
+        kinds["native-stream"]: native,
+    }
 
 
 if __name__ == "__main__":

@@ -1,7 +1,6 @@
 """A client that steps and has subscribed to what changes, as a process. A number of seconds in; steps a second out.
 
-It steps when it has received all of the step before. ``alone``: it has subscribed to nothing; ``bare``: to a server
-that has its messages ready.
+It steps when it has received all of the step before. ``alone``: it has subscribed to nothing.
 """
 
 from __future__ import annotations
@@ -112,22 +111,6 @@ def native_many(target: str) -> Iterator[Callable[[], None]]:
 
 
 @contextmanager
-def bare(channel: grpc.Channel) -> Iterator[Callable[[], None]]:
-    """As many messages of a server that does nothing else."""
-    follow: Any = channel.unary_stream("/benchmark.Bare/Follow")
-    call: Any = channel.unary_unary("/benchmark.Bare/Step")
-    stream = follow(b"")
-
-    def step() -> None:
-        call(b"", timeout=PATIENCE_S)
-        for _ in range(COUNT + 1):
-            v2.SimlogMessage.FromString(next(stream))
-
-    yield step
-    stream.cancel()
-
-
-@contextmanager
 def version_1(channel: grpc.Channel) -> Iterator[Callable[[], None]]:
     """A stream for each register, and one for the clock, each followed in a thread."""
     stub: Any = V1Stub(channel)  # type: ignore[no-untyped-call]
@@ -165,7 +148,7 @@ def main() -> None:
     parser.add_argument("target")
     parser.add_argument(
         "kind",
-        choices=["alone", "native", "native-stream", "native-many", "v2", "v2-array", "v2-structure", "v1", "bare"],
+        choices=["alone", "native", "native-stream", "native-many", "v2", "v2-array", "v2-structure", "v1"],
     )
     arguments = parser.parse_args()
     kinds: dict[str, Callable[[grpc.Channel], Any]] = {
@@ -174,7 +157,6 @@ def main() -> None:
         "v2-array": lambda channel: version_2(channel, ["sim/row"]),
         "v2-structure": lambda channel: version_2(channel, ["sim/values"]),
         "v1": version_1,
-        "bare": bare,
         "native": lambda _: native(arguments.target),
         "native-stream": lambda _: native_stream(arguments.target),
         "native-many": lambda _: native_many(arguments.target),
