@@ -27,11 +27,12 @@ class Bare(grpc.GenericRpcHandler):
             ready.call: grpc.unary_unary_rpc_method_handler(self._step),
             ready.steps: grpc.stream_stream_rpc_method_handler(self._steps),
         }
-        self._other = grpc.unary_unary_rpc_method_handler(self._nothing)
+        self._other: grpc.RpcMethodHandler[Any, Any] = grpc.unary_unary_rpc_method_handler(self._nothing)
 
     def service(self, handler_call_details: Any) -> grpc.RpcMethodHandler[Any, Any] | None:
         """What answers a call."""
-        return self._handlers.get(handler_call_details.method, self._other)
+        handler: grpc.RpcMethodHandler[Any, Any] = self._handlers.get(handler_call_details.method, self._other)
+        return handler
 
     async def _follow(self, _: bytes, context: Any) -> AsyncIterator[bytes]:
         asked = self._asked = asyncio.Queue()

@@ -113,6 +113,7 @@ class ClockPage:
         self._offset = offset
         self._state = _cell(memory, offset)
         self._owned = owned
+        self._last = b"", ClockState()  # what was read last
         self._started_ns, self._started_utc_ns = head.started_ns, head.started_utc_ns
         self.bell = Bell(memory, offset + _BELL_AT)
         """Rung at every change of the page."""
@@ -143,7 +144,12 @@ class ClockPage:
 
     def told(self) -> ClockState:
         """The page as its writer has left it, dead or alive. SegmentError."""
-        return _unpack(self._state.read(_STATE.size))
+        data = self._state.read(_STATE.size)
+        before, state = self._last
+        if data != before:
+            state = _unpack(data)
+            self._last = data, state
+        return state
 
     def write(self, state: ClockState, *, ring: bool = True) -> None:
         """Write the page and ring its bell; the owner of time alone. ``ring`` False: there is nothing to do yet."""

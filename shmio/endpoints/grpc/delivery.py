@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable, Mapping
-from typing import Final
+from collections.abc import Callable, Mapping
+from typing import Final, Protocol
 
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.hold import Hold, Moment
@@ -16,16 +16,28 @@ from shmio.segment.coordinator import Step
 
 PATIENCE_S: Final = 3.0
 """So long clients have for the values of a step, those of shmio.v1 after the others, and again for its marker; all
-together less than a step's own time-out."""
+together less than a step's own time-out. A stream that is the only one has so long for both."""
 
 log = logging.getLogger("shmio.grpc")
+
+
+class Other(Protocol):
+    """Who has streams of his own."""
+
+    @property
+    def streams(self) -> int:
+        """How many there are."""
+
+    async def deliver(self, step: Step) -> None:
+        """Send what has changed in a step, then that it is over, and wait until they have it."""
 
 
 class Delivery:
     """Delivers steps in one order to all streams, whoever has made them; for the event loop's thread.
 
     First what was written before, then what has changed in all blocks on the instance's clock, in the segment's order;
-    when all streams have taken that, the marks; when they have taken those, it is over.
+    when all streams have taken that, the marks; when they have taken those, it is over. Within a stream all comes in
+    order anyhow: nothing is waited for before the marks if there is only one.
     """
 
     def __init__(self, hold: Hold, feeds: Mapping[str, Feed], outboxes: Outboxes) -> None:
@@ -33,8 +45,7 @@ class Delivery:
         self._feeds = feeds
         self._outboxes = outboxes
         self._turn = asyncio.Lock()
-        self.others: list[Callable[[Step], Awaitable[None]]] = []
-        """Who has streams of his own: sends what has changed in a step, then that it is over, and waits for them."""
+        self.others: list[Other] = []
 
     def begin(self, moment: Moment) -> None:
         """Time has become virtual, and this is what was delivered of it."""
@@ -52,9 +63,10 @@ class Delivery:
             if step.number <= self._hold.moment.number:
                 return False
             self._show(step)
-            await self._outboxes.taken(PATIENCE_S)
+            if len(self._outboxes) + sum(other.streams for other in self.others) > 1:
+                await self._outboxes.taken(PATIENCE_S)
             for other in self.others:
-                await other(step)
+                await other.deliver(step)
             mark()
             await self._outboxes.taken(PATIENCE_S)
             return True

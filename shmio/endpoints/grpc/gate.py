@@ -141,6 +141,7 @@ class Gate(grpc.aio.ServerInterceptor):
         found: Any = handler  # what it has depends on its kind
         behaviour = found.stream_stream or found.stream_unary or found.unary_stream or found.unary_unary
         decode = handler.request_deserializer
+        many = inspect.isasyncgenfunction(behaviour)
 
         async def run(messages: AsyncIterator[bytes], context: Context) -> Any:
             try:
@@ -153,7 +154,7 @@ class Gate(grpc.aio.ServerInterceptor):
                     request = await self._message(method, decode, context)
                 elif decode is not None:
                     request = _decoded(method, decode, messages, context)
-                if not inspect.isasyncgenfunction(behaviour):
+                if not many:
                     return await behaviour(request, context)
                 async with aclosing(behaviour(request, context)) as responses:
                     async for response in responses:

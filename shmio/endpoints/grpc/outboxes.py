@@ -52,6 +52,8 @@ class Outboxes:
     async def taken(self, patience_s: float) -> None:
         """Wait until all clients have taken what they are owed; the streams of those that do not in time end."""
         owing = [outbox for outbox in self._open if outbox.owing]
+        if not owing:
+            return
         try:
             async with asyncio.timeout(patience_s):
                 for outbox in owing:

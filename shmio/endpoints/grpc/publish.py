@@ -158,6 +158,8 @@ class Publisher:
 
         What has come and was not read yet is read. A client that goes on sending is waited for ``SETTLE_S`` at most.
         """
+        if peer not in self._streams:
+            return
         before: dict[_Stream, int] = {}
         with suppress(TimeoutError):
             async with asyncio.timeout(SETTLE_S):

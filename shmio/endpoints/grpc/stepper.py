@@ -55,6 +55,7 @@ class Stepper:
         self._changing = asyncio.Lock()  # one begins to play, or ends
         self._moving: asyncio.Task[Any] | None = None
         self._rest: asyncio.TimerHandle | None = None
+        self._rest_s = 0.0  # when time is given up if nobody has moved it by then
         self._player = Player(self._make, lambda: segment.clock.read().step_size_ns)
         self._tasks: set[asyncio.Task[Any]] = set()
         self.timeline = Timeline(segment, slot, hold, feeds, outboxes, audience, lambda: self._player.dt_ns)
@@ -86,9 +87,10 @@ class Stepper:
         Before it, what was received on this peer's Publish streams is with its sources. One that was begun is done even
         if its client is gone, one that waits is not. TimeError: it failed, is not ours, or time plays; ValueRangeError.
         """
-        task = self._spawn(self._step(dt_ns, peer))
+        done: asyncio.Future[Step] = self._loop.create_future()
+        task = self._spawn(_tell(self._step(dt_ns, peer), done))
         try:
-            return await asyncio.shield(task)
+            return await done
         finally:
             if task is not self._moving:  # it is over, or others would wait for a step that nobody waits for
                 task.cancel()
@@ -169,12 +171,15 @@ class Stepper:
         self.timeline.own(owns)
 
     def _set_rest(self) -> None:
-        if self._rest is not None:
-            self._rest.cancel()
-        self._rest = self._loop.call_later(REST_S, self._give_up)
+        self._rest_s = self._loop.time() + REST_S
+        if self._rest is None:
+            self._rest = self._loop.call_at(self._rest_s, self._give_up)
 
     def _give_up(self) -> None:
-        if self._owns and not self._player.on and not self._turn.locked():
+        self._rest = None
+        if self._loop.time() < self._rest_s:  # time was moved meanwhile
+            self._rest = self._loop.call_at(self._rest_s, self._give_up)
+        elif self._owns and not self._player.on and not self._turn.locked():
             self._spawn(self._release())
 
     async def _release(self) -> None:
@@ -198,6 +203,21 @@ class Stepper:
             await self._player.end()
             await self._change(partial(self._coordinator.set_playing, False), end=end)
         return self.timeline.status
+
+
+async def _tell(work: Coroutine[Any, Any, _Result], done: asyncio.Future[_Result]) -> None:
+    """Do it, whoever waits for what comes of it; who is cancelled meanwhile is not told."""
+    try:
+        result = await work
+    except Exception as error:  # noqa: BLE001  who waits is told, whatever it is
+        if not done.done():
+            done.set_exception(error)
+    except asyncio.CancelledError:
+        done.cancel()
+        raise
+    else:
+        if not done.done():
+            done.set_result(result)
 
 
 def _check(dt_ns: int | None) -> None:

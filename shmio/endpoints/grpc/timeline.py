@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
 from shmio.endpoints.grpc.audience import Audience
 from shmio.endpoints.grpc.bells import Bell
-from shmio.endpoints.grpc.delivery import Delivery, before
+from shmio.endpoints.grpc.delivery import Delivery, Other, before
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.hold import Hold, Moment, Status
 from shmio.endpoints.grpc.marks import Marks
@@ -90,9 +90,9 @@ class Timeline:
         if self._page is not None:
             (self._page.mute if owns else self._page.unmute)()
 
-    def also(self, deliver: Callable[[Step], Awaitable[None]]) -> None:
+    def also(self, other: Other) -> None:
         """Have each step delivered to others, too, before it is over."""
-        self._delivery.others.append(deliver)
+        self._delivery.others.append(other)
 
     def watch(self, watcher: Callable[[Status], None]) -> None:
         """Have it told of each step and of each change."""
@@ -101,8 +101,7 @@ class Timeline:
     @property
     def status(self) -> Status:
         """How time stands."""
-        self.look()
-        return self._status(self._clock.read())
+        return self._status(self.look())
 
     async def deliver(self, step: Step) -> None:
         """Have all streams take what a step has changed, and its marker, unless they have already."""
@@ -111,7 +110,7 @@ class Timeline:
             if self._awaited:
                 self._clock.deliver(self._slot.index, step.number)
 
-    def look(self) -> None:
+    def look(self) -> ClockState:
         """Heed what the page says by now; also called now and then, for the death of who plays rings no bell."""
         state = self._clock.read()
         if state.virtual and not self.hold.on:
@@ -125,8 +124,9 @@ class Timeline:
             else:
                 self._delivered = step.number
                 self._delivery.pass_over(step, partial(self._mark, step))
-        elif self._status(state)[1:] != self._told:
-            self._tell(self._status(state))
+        elif (status := self._status(state))[1:] != self._told:
+            self._tell(status, state)
+        return state
 
     def _attend(self) -> None:
         """Have steps wait for this process from now on, or no longer."""
@@ -141,14 +141,15 @@ class Timeline:
     def _mark(self, step: Step) -> None:
         self.ended = False
         self.marks.tell()
-        self._tell(Status(step.time_ns, step.dt_ns, True, self._clock.read().playing))
+        state = self._clock.read()
+        self._tell(Status(step.time_ns, step.dt_ns, True, state.playing), state)
 
     def _status(self, state: ClockState) -> Status:
         dt_ns = (self._play_dt_ns() if state.playing else None) or state.step_size_ns
         return Status(self._now().clock_ns, dt_ns, not self.ended, state.playing)
 
-    def _tell(self, status: Status) -> None:
-        self._told = self._status(self._clock.read())[1:]
+    def _tell(self, status: Status, state: ClockState) -> None:
+        self._told = self._status(state)[1:]
         for watcher in self._watchers:
             watcher(status)
 

@@ -57,7 +57,7 @@ class NativeService:
         self._clocks = Clocks(segment, stepper)
         self._hold = stepper.timeline.hold
         self._audience = audience
-        stepper.timeline.also(self._deliver)
+        stepper.timeline.also(self)
         self._orders = Orders(topics, feeds, self._selections, self._bells)
         self._simulations = Simulations(feeds, segment)
         self._moves = Moves(segment)
@@ -143,7 +143,7 @@ class NativeService:
             self._ended_updates += subscription.updates
             subscription.close()
 
-    async def _deliver(self, step: Step) -> None:
+    async def deliver(self, step: Step) -> None:
         """Have all streams send what has changed in a step, and then say so; wait until they have."""
         marks = {subscription.mark(step): subscription for subscription in self._open}
         if marks:
