@@ -50,6 +50,12 @@ class _Call:
         self.task = asyncio.current_task()
         self.denial: DeniedError | None = None
 
+    def end(self, denial: DeniedError) -> None:
+        """Have it end with this."""
+        self.denial = denial
+        if self.task is not None:
+            self.task.cancel()
+
 
 class Calls:
     """All calls that are open, whichever address they came by; for the event loop's thread."""
@@ -59,6 +65,8 @@ class Calls:
         self.refusals = Refusals("call refused", "call")
         self._open: set[_Call] = set()
         self._by_client: Counter[str] = Counter()
+        self._silent: dict[_Call, float] = {}  # whose one message is waited for, and until when: the first is due first
+        self._timer: asyncio.TimerHandle | None = None
 
     def __len__(self) -> int:
         return len(self._open)
@@ -85,6 +93,28 @@ class Calls:
         if not self._by_client[call.client]:
             del self._by_client[call.client]
 
+    async def message(self, call: _Call, context: Context) -> Any:
+        """The one message of a call, or EOF. One that does not come in time ends the call."""
+        loop = asyncio.get_running_loop()
+        self._silent[call] = due_s = loop.time() + self.limits.message_s
+        if self._timer is None:  # one for all: nearly every message comes at once
+            self._timer = loop.call_at(due_s, self._end_silent)
+        try:
+            return await context.read()
+        finally:
+            self._silent.pop(call, None)
+
+    def _end_silent(self) -> None:
+        loop = asyncio.get_running_loop()
+        self._timer = None
+        for call, due_s in list(self._silent.items()):
+            if due_s > loop.time():
+                self._timer = loop.call_at(due_s, self._end_silent)
+                return
+            del self._silent[call]
+            limit = f"no message came within {self.limits.message_s:g} s"
+            call.end(DeniedError(grpc.StatusCode.DEADLINE_EXCEEDED, f"{call.method}: {limit}"))
+
     def review(self) -> int:
         """End the calls that would not be admitted any more; how many."""
         ended = 0
@@ -92,9 +122,7 @@ class Calls:
             try:
                 call.door.admit(call.method, call.shown)
             except DeniedError as error:
-                call.denial = error
-                if call.task is not None:
-                    call.task.cancel()
+                call.end(error)
                 ended += 1
         return ended
 
@@ -151,7 +179,7 @@ class Gate(grpc.aio.ServerInterceptor):
             try:
                 request: Any = messages
                 if not handler.request_streaming:
-                    request = await self._message(method, decode, context)
+                    request = await self._message(call, decode, context)
                 elif decode is not None:
                     request = _decoded(method, decode, messages, context)
                 if not many:
@@ -172,17 +200,12 @@ class Gate(grpc.aio.ServerInterceptor):
             return grpc.stream_stream_rpc_method_handler(run, None, handler.response_serializer)
         return grpc.stream_unary_rpc_method_handler(run, None, handler.response_serializer)
 
-    async def _message(self, method: str, decode: Decode | None, context: Context) -> Any:
+    async def _message(self, call: _Call, decode: Decode | None, context: Context) -> Any:
         """The one message of a call."""
-        limit_s = self._calls.limits.message_s
-        try:
-            async with asyncio.timeout(limit_s):
-                data = await context.read()
-        except TimeoutError:
-            await context.abort(grpc.StatusCode.DEADLINE_EXCEEDED, f"{method}: no message came within {limit_s:g} s")
+        data = await self._calls.message(call, context)
         if data is grpc.aio.EOF:
-            await context.abort(grpc.StatusCode.INVALID_ARGUMENT, f"{method}: the call has no message")
-        return await _parsed(method, decode, data, context)
+            await context.abort(grpc.StatusCode.INVALID_ARGUMENT, f"{call.method}: the call has no message")
+        return await _parsed(call.method, decode, data, context)
 
 
 async def _decoded(method: str, decode: Decode, messages: AsyncIterator[bytes], context: Context) -> AsyncIterator[Any]:
