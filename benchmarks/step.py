@@ -56,9 +56,9 @@ def local(instance: str, duration_s: float) -> Callable[[], float]:
     return sample
 
 
-def remote(client: Child, duration_s: float) -> Callable[[], float]:
-    """A client in a process of its own."""
-    return lambda: float(client.ask(duration_s))
+def remote(client: Child, target: str, kind: str, duration_s: float) -> Callable[[], float]:
+    """A client in a process of its own, connected anew."""
+    return lambda: float(client.ask(f"{target} {kind} {duration_s}"))
 
 
 def main() -> None:
@@ -66,14 +66,16 @@ def main() -> None:
     duration_s, rounds = (0.1, 1) if quick else (3.0, 9)
     with ExitStack() as stack:
         running = stack.enter_context(started([], more=MODEL, clock="stepped"))
-        contenders = {
-            name: remote(stack.enter_context(Child("stepping.py", running.grpc, kind)), duration_s)
-            for name, kind in CONTENDERS.items()
-        }
-        for name, messages in _ready(str(running.grpc)).items():
+        client = stack.enter_context(Child("stepping.py"))
+        target = str(running.grpc)
+        contenders = {name: remote(client, target, kind, duration_s) for name, kind in CONTENDERS.items()}
+        for kinds, messages in _ready(target).items():
             server = stack.enter_context(Child("bare_steps.py", messages.to_json()))
-            client = stack.enter_context(Child("stepping.py", server.hello, CONTENDERS[name]))
-            contenders[BARE.format(name)] = remote(client, duration_s)
+            contenders |= {
+                BARE.format(name): remote(client, server.hello, kind, duration_s)
+                for name, kind in CONTENDERS.items()
+                if kind in kinds
+            }
         contenders["a program on the host, no subscriber"] = local(running.segment.instance, duration_s)
         samples = interleave(contenders, rounds)
     report("steps a second", samples, OURS, "more")
@@ -84,15 +86,12 @@ def main() -> None:
     table(["beside a bare server with the same client", "of its rate"], rows)
 
 
-def _ready(target: str) -> dict[str, ready.Ready]:
-    """What bare servers send, by the contender that gets the same."""
-    kinds = {kind: name for name, kind in CONTENDERS.items()}
-    native = ready.native(target, "sim/values/*")
+def _ready(target: str) -> dict[tuple[str, ...], ready.Ready]:
+    """What bare servers send, by the kinds of clients that get the same."""
     return {
-        kinds["v2"]: ready.version_2(target, PATHS),
-        kinds["v2-array"]: ready.version_2(target, ["sim/row"]),
-        kinds["native"]: native,
-        kinds["native-stream"]: native,
+        ("v2",): ready.version_2(target, PATHS),
+        ("v2-array",): ready.version_2(target, ["sim/row"]),
+        ("native", "native-stream"): ready.native(target, "sim/values/*"),
     }
 
 

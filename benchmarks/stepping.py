@@ -1,4 +1,6 @@
-"""A client that steps and has subscribed to what changes, as a process. A number of seconds in; steps a second out.
+"""A client that steps and has subscribed to what changes, as a process.
+
+An address, a kind and seconds in; steps a second out.
 
 It steps when it has received all of the step before. ``alone``: it has subscribed to nothing.
 """
@@ -144,33 +146,27 @@ def version_1(channel: grpc.Channel) -> Iterator[Callable[[], None]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("target")
-    parser.add_argument(
-        "kind",
-        choices=["alone", "native", "native-stream", "native-many", "v2", "v2-array", "v2-structure", "v1"],
-    )
-    arguments = parser.parse_args()
-    kinds: dict[str, Callable[[grpc.Channel], Any]] = {
-        "alone": alone,
-        "v2": lambda channel: version_2(channel, PATHS),
-        "v2-array": lambda channel: version_2(channel, ["sim/row"]),
-        "v2-structure": lambda channel: version_2(channel, ["sim/values"]),
-        "v1": version_1,
-        "native": lambda _: native(arguments.target),
-        "native-stream": lambda _: native_stream(arguments.target),
-        "native-many": lambda _: native_many(arguments.target),
+    argparse.ArgumentParser(description=__doc__).parse_args()
+    kinds: dict[str, Callable[[grpc.Channel, str], Any]] = {
+        "alone": lambda channel, _: alone(channel),
+        "v2": lambda channel, _: version_2(channel, PATHS),
+        "v2-array": lambda channel, _: version_2(channel, ["sim/row"]),
+        "v2-structure": lambda channel, _: version_2(channel, ["sim/values"]),
+        "v1": lambda channel, _: version_1(channel),
+        "native": lambda _, target: native(target),
+        "native-stream": lambda _, target: native_stream(target),
+        "native-many": lambda _, target: native_many(target),
     }
-    with grpc.insecure_channel(arguments.target) as channel:
-        tell("ready")
-        for line in sys.stdin:
-            with kinds[arguments.kind](channel) as step:
+    tell("ready")
+    for line in sys.stdin:
+        target, kind, duration_s = line.split()
+        with grpc.insecure_channel(target) as channel, kinds[kind](channel, target) as step:
+            step()
+            steps, begun_s = 0, time.perf_counter()
+            while (taken_s := time.perf_counter() - begun_s) < float(duration_s):
                 step()
-                steps, begun_s = 0, time.perf_counter()
-                while (taken_s := time.perf_counter() - begun_s) < float(line):
-                    step()
-                    steps += 1
-            tell(steps / taken_s)
+                steps += 1
+        tell(steps / taken_s)
     tell("done")
 
 

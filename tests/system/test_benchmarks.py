@@ -61,7 +61,10 @@ def printed(benchmark: str) -> str:
                 "v2, an array of 100 as one topic": 1,
                 "v1, 100 topics and model/clock": 1,
                 "shmio.v1, 100 registers in one update": 1,
-                "a bare grpc.aio server, 101 ready messages in one stream": 1,
+                "a bare server: v2, 100 topics in one stream": 1,
+                "a bare server: v2, an array of 100 as one topic": 1,
+                "a bare server: shmio.v1, 100 registers in one update": 1,
+                "a bare server: the same, steps on a stream, one by one": 1,
             },
         ),
         (
