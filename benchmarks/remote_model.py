@@ -58,10 +58,13 @@ def main() -> None:
     samples: dict[str, list[float]] = {}
     for _ in range(rounds):
         for where, instance in (("a model elsewhere", elsewhere), ("the same in the instance", here)):
-            with instance() as running, Child("stepping.py", running.grpc, "native") as client:
+            with instance() as running, Child("stepping.py") as client:
                 for who, sample in (
                     ("a program on the host steps", local(running.segment.instance, duration_s)),
-                    ("a client of shmio.v1 steps, and has all values", remote(client, duration_s)),
+                    (
+                        "a client of shmio.v1 steps, and has all values",
+                        remote(client, str(running.grpc), "native", duration_s),
+                    ),
                 ):
                     samples.setdefault(f"{where}, {who}", []).append(sample())
     report("steps a second", samples, OURS, "more")
