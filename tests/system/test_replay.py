@@ -27,7 +27,10 @@ from shmio.wire.simlog_v2_pb2_grpc import SimlogAPIStub as V2Stub
 from tests.system.armed import ARMED
 from tests.unit.endpoints.mqtt.harness import PREFIX, listening
 
-RECORDED = ARMED + '\n[recorder]\ndirectory = "dumps"\n'
+# A host that is busy for a moment is in no recording: it is to make no value stale, the first time or the second.
+RECORDED = (
+    ARMED.replace('connector = "s7"\n', 'connector = "s7"\nstale_ms = 10_000\n') + '\n[recorder]\ndirectory = "dumps"\n'
+)
 MQTT = """
 [mqtt]
 listen = "{broker}"
