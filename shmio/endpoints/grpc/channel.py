@@ -37,8 +37,8 @@ class Listener(Protocol):
     since: int
     """Frame whose value the stream already has."""
 
-    def deliver(self, message: Sized) -> None:
-        """Take one message for this stream."""
+    def deliver(self, message: Sized, at_s: float | None = None) -> None:
+        """Take one message for this stream. ``at_s``: of when it is, by the clock of its topic; default: now."""
 
     def keep(self, message: Sized) -> None:
         """Take one message of a step: it must not be left out."""

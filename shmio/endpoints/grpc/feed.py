@@ -165,7 +165,7 @@ class Feed:
             listener.since = frame.number
             message = channel.encode(frame)
             if message is not None:
-                listener.deliver(message)
+                listener.deliver(message, frame.publish_ns / 1e9)
         self._owed.clear()
 
     def _turn_bad(self, frame: int) -> None:
@@ -268,7 +268,7 @@ class Feed:
             for listener in channel.listeners:
                 if frame.number > listener.since:
                     self._owed.pop(listener, None)
-                    listener.deliver(message)
+                    listener.deliver(message, frame.publish_ns / 1e9)
         if self._owed:
             self._settle()
 

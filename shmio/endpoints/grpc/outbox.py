@@ -40,7 +40,7 @@ class Outbox:
         """Why it ended; empty: it did not fail."""
         self.on_failure: Callable[[], object] | None = None
         """Called then: the stream itself may wait for its client, who does not read, for ever."""
-        self._waiting: OrderedDict[int, tuple[_Lane, Sized, float]] = OrderedDict()  # and since when
+        self._waiting: OrderedDict[int, tuple[_Lane, Sized, float]] = OrderedDict()  # and of when it is
         self._next = 0
         self._waiter: asyncio.Future[None] | None = None
         self._ended = False
@@ -67,18 +67,18 @@ class Outbox:
         self.dropped += frames
         self.pace.skip(frames * topics)
 
-    def add(self, lane: _Lane, message: Sized, now_s: float = 0.0) -> int:
-        """Take a message; its number. ``now_s``: for :meth:`since`."""
+    def add(self, lane: _Lane, message: Sized, at_s: float = 0.0) -> int:
+        """Take a message; its number. ``at_s``: for :meth:`since`."""
         number = self._next
         self._next = number + 1
-        self._waiting[number] = lane, message, now_s
+        self._waiting[number] = lane, message, at_s
         lane.load.add(message)
         if self._waiter is not None:
             self._wake()
         return number
 
     def since(self, number: int) -> float:
-        """When one that waits was added."""
+        """Of when one is that waits."""
         return self._waiting[number][2]
 
     def drop(self, number: int) -> None:
@@ -200,11 +200,11 @@ class _Lane:
         self._add(message)
         self._outbox.owe()
 
-    def _add(self, message: Sized, now_s: float = 0.0) -> None:
+    def _add(self, message: Sized, at_s: float = 0.0) -> None:
         if self._outbox.failure:
             self._outbox.dropped += 1
         else:
-            self._numbers.append(self._outbox.add(self, message, now_s))
+            self._numbers.append(self._outbox.add(self, message, at_s))
 
 
 class StateLane(_Lane):
@@ -219,18 +219,19 @@ class StateLane(_Lane):
         self.stream = outbox
         self.since = 0
 
-    def deliver(self, message: Sized) -> None:
-        """Add a message, in place of the topic's that wait if they are too many."""
+    def deliver(self, message: Sized, at_s: float | None = None) -> None:
+        """Add a message, in place of the topic's that wait if they are too many, or too old beside it."""
         waits = len(self._numbers)  # of a client that keeps up nothing does, and this is all
         outbox, numbers, now_s = self._outbox, self._numbers, time.monotonic()
+        at_s = now_s if at_s is None else at_s
         outbox.pace.offer(now_s)
         if waits >= TOPIC_BOUND or (self.load.count and self.load.full(message, STATE_BOUND)):
             self.drop()
         elif waits and outbox.pace.behind:
-            while numbers and now_s > outbox.since(numbers[0]) + LATE_S:
+            while numbers and at_s > outbox.since(numbers[0]) + LATE_S:
                 outbox.drop(numbers.popleft())
         outbox.pace.lose(waits - len(numbers))
-        self._add(message, now_s)
+        self._add(message, at_s)
 
     def lose(self) -> None:
         """What waits must not be sent any more."""

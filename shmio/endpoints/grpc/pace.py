@@ -6,8 +6,9 @@ from typing import Final
 
 WINDOW_S: Final = 0.25
 """So often it is looked at."""
-BEHIND_S: Final = 2.0
-"""So long a client is far behind; then it is tried again, for what it loses meanwhile does not say how fast it is."""
+BEHIND_S: Final = 5.0
+"""At the next multiple of this one that is far behind is tried again, for what it loses meanwhile does not say how fast
+it is: with all others, for what is read for one of them is there for all."""
 PART: Final = 3
 """A client that has lost more than one in so many values is far behind."""
 LATE_S: Final = 0.002
@@ -29,7 +30,7 @@ class Pace:
         if now_s >= self._until_s:
             self.behind = not self.behind and PART * self._lost > self._offered
             self._offered = self._lost = 0
-            self._until_s = now_s + (BEHIND_S if self.behind else WINDOW_S)
+            self._until_s = (now_s // BEHIND_S + 1) * BEHIND_S if self.behind else now_s + WINDOW_S
         self._offered += 1
 
     def lose(self, count: int) -> None:

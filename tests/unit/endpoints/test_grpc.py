@@ -283,7 +283,7 @@ class Recorder:
         self.got: list[Any] = []
         self.lost = 0
 
-    def deliver(self, message: Sized) -> None:
+    def deliver(self, message: Sized, at_s: float | None = None) -> None:
         self.got.append(message)
 
     def keep(self, message: Sized) -> None:

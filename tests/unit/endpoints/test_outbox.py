@@ -74,6 +74,20 @@ def test_one_that_is_far_behind_is_given_no_value_that_has_waited_as_long_as_it_
     asyncio.run(test())
 
 
+def test_of_values_that_come_at_once_it_is_given_those_that_are_not_older_than_that() -> None:
+    async def test() -> None:
+        outbox = Outbox()
+        lane = StateLane(outbox)
+        for behind, left in ((False, [b"a", b"b", b"c"]), (True, [b"b", b"c"])):
+            outbox.pace.behind = behind
+            for letter, at_s in ((b"a", 7.0), (b"b", 7.0 + pace.LATE_S), (b"c", 7.0 + 1.5 * pace.LATE_S)):
+                lane.deliver(letter, at_s)
+                outbox.pace.behind = behind
+            assert await rest(outbox) == left
+
+    asyncio.run(test())
+
+
 def test_topics_share_a_stream_in_the_order_of_their_values() -> None:
     async def test() -> None:
         outbox = Outbox()
