@@ -123,6 +123,18 @@ class Play(NamedTuple):
         """The same, told from a time of the instance's clock on."""
         return self._replace(anchor_ns=clock_ns, position_ns=self.at_ns(clock_ns))
 
+    def moved_as(self, other: Play) -> Play:
+        """The same, moved as another that plays the same recording."""
+        return self._replace(
+            anchor_ns=other.anchor_ns,
+            position_ns=other.position_ns,
+            until_ns=other.until_ns,
+            speed=other.speed,
+            paused=other.paused,
+            loop=other.loop,
+            over=other.over,
+        )
+
 
 class Move(msgspec.Struct, tag="move", forbid_unknown_fields=True, omit_defaults=True):
     """Ask that it plays otherwise, from ``clock_ns`` of the instance's clock on; what is None stays as it is.

@@ -91,10 +91,14 @@ class ReplayLoop:
         """Go on from what the process before this one has published, if there was one."""
         play, clock_ns = self._play, self._page.read().time_ns
         if self._done_ns is not None:
-            self._player.resume(min(self._done_ns, play.at_ns(clock_ns)))
+            reach_ns = play.reach_ns(clock_ns) if play.wraps else play.at_ns(clock_ns)
+            # What lies ahead was done before it was moved back, or in the round before.
+            self._player.resume(self._done_ns if self._done_ns <= reach_ns else play.position_ns - 1)
         else:  # who joins others that play is where they are
             joined = clock_ns - play.anchor_ns > LATE_NS
             self._player.begin(play.at_ns(clock_ns if joined else play.anchor_ns), self._stamp)
+            if play.over:
+                self._end()
         self.desk.open()
         self.counters.connects += 1
 
@@ -104,14 +108,15 @@ class ReplayLoop:
         """Play what is due, do what is asked for, then wait for news; True: told to stop."""
         state = self._page.read()
         # In virtual time what is published belongs to the end of the step.
-        at_ns = self._play.base_ns + self._play.at_ns(state.time_ns) if state.virtual else None
-        self._writer.at_ns = at_ns
+        self._writer.at_ns = self._play.base_ns + self._play.at_ns(state.time_ns) if state.virtual else None
         stepped = state.stepping and state.step != self._play.step
         if stepped and state.step != self._play.begun:
             self._keep(self._play._replace(begun=state.step, head=self._writer.block.ring.head()))
         # Before anything is played: a request that waited tells of a moment at which this played as it still does.
-        more = not state.stepping and self._listen(state.time_ns)
-        more |= self.counters.watch(self._clock.now_ns, lambda: self._advance(state.time_ns))
+        rounds_ns = None if state.stepping else self._rounds_ns(state.time_ns)
+        more = rounds_ns is not None or (not state.stepping and self._listen(state.time_ns))
+        clock_ns = state.time_ns if rounds_ns is None else rounds_ns
+        more |= self.counters.watch(self._clock.now_ns, lambda: self._advance(clock_ns))
         if not more and stepped:
             self._keep(self._play._replace(step=state.step))
             self._writer.block.ring.wake()
@@ -147,13 +152,17 @@ class ReplayLoop:
         if settled.paused:
             over = settled.position_ns >= settled.end_ns
             if over:
-                self._player.end(OVER, self._stamp(settled.end_ns, settled.end_ns))
+                self._end()
             self._keep(settled._replace(over=over))
             self._writer.block.ring.wake()  # for who waits until it has come there
             return False
         self._keep(play.next_round())
         self._player.again(play.begin_ns, self._source.tape.block.stale_ns, self._stamp)
         return True
+
+    def _end(self) -> None:
+        end_ns = self._play.end_ns
+        self._player.end(OVER, self._stamp(end_ns, end_ns))
 
     def _leave_out(self, clock_ns: int) -> None:
         """Go on with the present, in wall time, where what comes next is too late.
@@ -192,6 +201,14 @@ class ReplayLoop:
         return [f"source {self._writer.block.source} is a replay: nothing is written"] * len(writes)
 
     # ---- what others ask for -------------------------------------------------------------------------------------
+
+    def _rounds_ns(self, clock_ns: int) -> int | None:
+        """The moment of a request that waits, if rounds of a loop were over by then: they are played before it."""
+        number, ask = self._head.asks(self._play.asked) or (0, None)
+        if not isinstance(ask, Move) or number != self._play.asked + 1:
+            return None
+        moment_ns = min(ask.clock_ns, clock_ns)
+        return moment_ns if self._play.wraps and self._play.settled(moment_ns) is not self._play else None
 
     def _listen(self, clock_ns: int) -> bool:
         """Answer a request, or go on with the search for an answer; whether there is more to do."""
@@ -243,8 +260,9 @@ class ReplayLoop:
         if position_ns is None and not paused and play.position_ns >= play.end_ns:
             position_ns = play.begin_ns  # from the end it goes on at the beginning
         if position_ns is not None and not play.begin_ns <= position_ns <= play.end_ns:
-            length_s = (play.end_ns - play.begin_ns) / 1e9
-            return Found(f"that is not within what is played, which is {length_s:.3f} s long")
+            return Found(
+                f"that is not within what is played, which is {(play.end_ns - play.begin_ns) / 1e9:.3f} s long"
+            )
         at_ns = play.position_ns if position_ns is None else position_ns
         if ask.until_ns is not None and ask.until_ns < at_ns:
             return Found(f"that is past: it is at {(at_ns - play.begin_ns) / 1e9:.3f} s; seek to before that first")
@@ -269,22 +287,13 @@ class ReplayLoop:
 
     def _catch_up(self, clock_ns: int) -> None:
         """Play as others of this recording that have been moved since, for requests were missed."""
-        heads = [block.playhead for block in self._blocks().values() if block.playhead is not None]
-        moved = as_others(self._source, heads)
+        moved = as_others(self._source, [head for block in self._blocks().values() if (head := block.playhead)])
         if moved is None or moved.anchor_ns <= self._play.anchor_ns:
             return
-        self._keep(
-            self._play._replace(
-                anchor_ns=moved.anchor_ns,
-                position_ns=moved.position_ns,
-                until_ns=moved.until_ns,
-                speed=moved.speed,
-                paused=moved.paused,
-                loop=moved.loop,
-                over=moved.over,
-            )
-        )
-        self._show(self._play.at_ns(clock_ns))
+        self._keep(self._play.moved_as(moved))
+        self._show(moved.end_ns - 1 if moved.over else moved.at_ns(clock_ns))
+        if moved.over:
+            self._end()
 
     def _show(self, position_ns: int) -> None:
         """Publish what was there at a position, and go on behind it."""

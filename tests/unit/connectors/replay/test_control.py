@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from shmio.connectors.replay.player import OVER
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.segment import EventKind, Quality, Record, replays
 from shmio.segment.attach import Attachment, attach
@@ -165,14 +166,20 @@ def test_a_time_that_is_past_is_not_played_to(here: tuple[Playing, Attachment]) 
     assert counts(playing.frames()) == list(range(11, 16))
 
 
+def both(folder: Path, instance: str) -> Path:
+    """A recording of two sources that count."""
+    with recorded(folder, instance, "cell", "other") as sources:
+        for number in range(20):
+            for one in sources:
+                one.frame(BEGIN_NS + number * PERIOD_NS, image(number))
+    [file] = folder.glob("*.mem")
+    return file
+
+
 def test_a_source_that_missed_requests_catches_up(
     tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with recorded(tmp_path, instance, "cell", "other") as both:
-        for number in range(20):
-            for one in both:
-                one.frame(BEGIN_NS + number * PERIOD_NS, image(number))
-    [file] = tmp_path.glob("*.mem")
+    file = both(tmp_path, instance)
     with (
         built(instance, "cell", "other", stepped=False) as segment,
         Playing(segment, file, paused=True) as cell,
@@ -191,6 +198,64 @@ def test_a_source_that_missed_requests_catches_up(
             assert counts([other.next(lambda frame: frame.quality is Quality.GOOD)]) == [5]
             assert [(one.position_s, one.speed) for one in attachment.replay.status()] == [(0.1, 0.5)] * 2
             assert counts([cell.next(lambda frame: frame.raw[1] == 5)]) == [5]
+
+
+def test_a_source_that_joins_others_at_the_end_is_there_as_they_are(tmp_path: Path, instance: str) -> None:
+    file = both(tmp_path, instance)
+    with (
+        built(instance, "cell", "other", stepped=False) as segment,
+        Playing(segment, file) as cell,
+        attach(instance, writable=True) as attachment,
+    ):
+        cell.until(lambda: attachment.replay.status()[0].over)
+        with Playing(segment, file, "other") as other:
+            shown = [other.next(), other.next()]
+            assert [one.over for one in attachment.replay.status()] == [True, True]
+    assert counts(shown) == [19, 19]
+    assert [(frame.quality, frame.reason) for frame in shown] == [(Quality.GOOD, ""), (Quality.BAD, OVER)]
+
+
+def test_a_source_that_catches_up_with_others_at_the_end_is_there_as_they_are(
+    tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = both(tmp_path, instance)
+    with (
+        built(instance, "cell", "other", stepped=False) as segment,
+        Playing(segment, file, paused=True) as cell,
+        attach(instance, writable=True) as attachment,
+    ):
+        with Playing(segment, file, "other", paused=True) as other:
+            other.next()
+        monkeypatch.setattr(replays, "ANSWER_S", 1.0)
+        with pytest.raises(CommandError, match="does not answer"):
+            attachment.replay.seek(0.3)
+        with pytest.raises(CommandError, match="does not answer"):
+            attachment.replay.play()
+        cell.until(lambda: attachment.replay.status()[0].over)
+        with Playing(segment, file, "other", paused=True) as other:
+            shown = [other.next(), other.next()]
+            assert [one.over for one in attachment.replay.status()] == [True, True]
+    assert counts(shown) == [19, 19]
+    assert [(frame.quality, frame.reason) for frame in shown] == [(Quality.GOOD, ""), (Quality.BAD, OVER)]
+
+
+def test_a_request_of_the_next_round_waits_until_this_one_is_played(tmp_path: Path, instance: str) -> None:
+    """A source that was held up shows what is at the place where it is to stand, and nothing twice before."""
+    file = record(tmp_path, instance)
+    with built(instance, stepped=False) as segment, attach(instance, writable=True) as attachment:
+        with Playing(segment, file, loop=True, paused=True):
+            attachment.replay.seek(0.3)
+        head = segment.blocks["cell"].playhead
+        assert head is not None
+        play, now_ns = head.read(), segment.clock.present_ns()
+        assert play is not None
+        head.write(play._replace(paused=False, anchor_ns=now_ns - 200 * MS))
+        with head.held():
+            head.ask(Move(now_ns, paused=True))
+        with Playing(segment, file) as cell:
+            assert counts([cell.next() for _ in range(10)]) == [16, 17, 18, 19, 0, 1, 2, 3, 4, 5]
+            [status] = attachment.replay.seek(0.2)
+            assert (status.paused, counts(cell.frames())) == (True, [10]), "it stood"
 
 
 def test_a_request_that_was_read_late_is_done_as_of_its_moment(here: tuple[Playing, Attachment]) -> None:
