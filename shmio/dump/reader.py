@@ -272,7 +272,8 @@ class Reader:
             channel = describe(content)
         except (ValueError, KeyError, struct.error, McapError):
             raise RecordingError(f"{self.file}: the description of a channel is damaged") from None
-        self.channels[channel.number] = channel
+        if self.channels.setdefault(channel.number, channel) != channel:  # whose messages could be read in two ways
+            raise RecordingError(f"{self.file}: channel {channel.number} is described twice, and differently")
 
     def require_ours(self) -> None:
         """RecordingError if nothing in what was read is of a recorder of shmio."""

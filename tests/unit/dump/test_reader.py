@@ -12,8 +12,11 @@ import pytest
 import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.data_stream import RecordBuilder
+from mcap.records import Channel
 from mcap.writer import CompressionType, Writer
 
+from shmio.dump.encoding import EVENT, FRAME, FRAME_V2
 from shmio.dump.framing import MAX_CHUNK_BYTES
 from shmio.dump.reader import Message, Reader
 from shmio.dump.records import MAGIC
@@ -147,6 +150,25 @@ def test_hostile_chunks_cost_no_memory_and_no_traceback(content: bytes, message:
         list(reader.messages())
     assert str(file) in str(problem.value)
     assert "\n" not in str(problem.value)
+
+
+def described(encoding: str) -> bytes:
+    """A chunk that describes channel 1."""
+    about = dict.fromkeys(("block", "section", "after", "period_ns", "stale_ns"), "1")
+    builder = RecordBuilder()
+    Channel(1, "cell/frames", encoding, {**about, "source": "cell", "layout": "00"}, 1).write(builder)
+    data = builder.end()
+    return chunk(len(data), data, b"")
+
+
+@pytest.mark.parametrize("encodings", [(FRAME, FRAME_V2), (FRAME_V2, FRAME), (FRAME, EVENT)])
+def test_a_channel_of_two_descriptions_is_refused(encodings: tuple[str, str], tmp_path: Path) -> None:
+    """Its messages could be read in two ways, and would be, by who reads the file from another place on."""
+    file = tmp_path / "x.mem"
+    first, second = map(described, encodings)
+    file.write_bytes(first + described(encodings[0])[len(MAGIC) :] + second[len(MAGIC) :])
+    with Reader(file) as reader, pytest.raises(RecordingError, match="channel 1 is described twice, and differently"):
+        list(reader.messages())
 
 
 def test_a_chunk_larger_than_any_of_ours_is_not_read(tmp_path: Path) -> None:
