@@ -90,7 +90,7 @@ def _form(output: Path, asked: str | None) -> tuple[bool, str]:
 
 
 def _within(block: DumpBlock, from_ns: int, to_ns: int) -> bool:
-    return bool(block.frames) and block.begin_ns <= to_ns and block.end_ns >= from_ns
+    return bool(block.frames) and block.first_ns <= to_ns and block.last_ns >= from_ns
 
 
 def _require_one(output: Path, blocks: Sequence[DumpBlock]) -> None:

@@ -222,6 +222,20 @@ def test_a_name_that_fits_not_is_refused(tmp_path: Path, capsys: pytest.CaptureF
     assert main(["export", "a.mem", "-o", "x.csv", "--source", "press"]) == 0
 
 
+def test_a_file_is_of_the_one_block_that_has_frames_then(capsys: pytest.CaptureFixture[str]) -> None:
+    """What another has told then is no row of a table."""
+    with build(Path("a.mem")) as work:
+        work.block("cell")
+        work.block("press", section=2)
+        for number in range(1, 31):
+            work.frame(number, image(number))
+            if number <= 10:
+                work.frame(number, image(number), "press")
+        work.event(1, 30, "late", "press")
+    assert main(["export", "a.mem", "-o", "x.csv", "--from", str(19 * PERIOD_NS / 1e9)]) == 0
+    assert capsys.readouterr().out == "x.csv: 11 rows\n"
+
+
 def test_a_damaged_chunk_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What is whole is exported, and the status says that something is missing."""
     file = varied(tmp_path / "a.mem")
