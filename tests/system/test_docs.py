@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import signal
 import subprocess
@@ -12,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from shmio.segment import instances
+from tests.system.page import printed
 
 ROOT = Path(__file__).parents[2]
 BLOCK = re.compile(r"^```sh( background)?\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -22,19 +22,6 @@ PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *s
 def blocks(page: Path) -> Iterator[tuple[bool, str]]:
     for match in BLOCK.finditer(page.read_text()):
         yield bool(match[1]), match[2]
-
-
-def shell(commands: str) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PATH": f"{ROOT / '.venv/bin'}:{os.environ['PATH']}"}
-    return subprocess.run(
-        ["bash", "-euo", "pipefail", "-c", commands],
-        cwd=ROOT,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
 
 
 @pytest.mark.skipif("a50" in instances(), reason="an instance a50 is running here")
@@ -54,9 +41,7 @@ def test_the_readme_runs_as_shown() -> None:
             assert any("127.0.0.1:8089" in line for line in lines), "".join(lines)
             for background, commands in found:
                 if not background:
-                    done = shell(commands)
-                    assert done.returncode == 0, f"{commands}\n{done.stdout}\n{done.stderr}"
-                    assert done.stdout.strip(), f"printed nothing:\n{commands}"
+                    assert printed(commands, ROOT).strip(), f"printed nothing:\n{commands}"
         finally:
             cell.send_signal(signal.SIGINT)
             cell.communicate(timeout=30)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import subprocess
 from collections.abc import Iterator
@@ -14,8 +13,9 @@ import pytest
 
 import shmio
 from shmio.segment import Quality
-from shmio.testing.cell import BIN, PATIENCE_S, until
+from shmio.testing.cell import PATIENCE_S, until
 from shmio.testing.ports import reserved_port
+from tests.system.page import printed, shell
 
 PAGE = Path(__file__).parents[2] / "docs/how-to/emulate-an-s7-plc.md"
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
@@ -45,24 +45,14 @@ class Reader:
                 yield text, shown if following == "text" else ""
 
     def run(self, commands: str) -> subprocess.CompletedProcess[str]:
-        environment = {**os.environ, "PATH": f"{BIN}:{os.environ['PATH']}"}
-        return subprocess.run(
-            ["bash", "-euo", "pipefail", "-c", commands],
-            cwd=self.folder,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE_S,
-            check=False,
-        )
+        return shell(commands, self.folder)
 
     def follow(self, commands: str, shown: str) -> None:
         """Run commands; those that only look, until they print what is shown."""
         if shown:
             until(lambda: self.run(commands).stdout == shown, f"{commands}{shown}", 2 * PATIENCE_S)
             return
-        done = self.run(commands)
-        assert done.returncode == 0, f"{commands}\n{done.stdout}\n{done.stderr}"
+        printed(commands, self.folder)
 
 
 @pytest.fixture

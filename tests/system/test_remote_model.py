@@ -16,6 +16,7 @@ import pytest
 
 import shmio
 from shmio.testing.cell import BIN, PATIENCE_S, Cell, kill, until
+from tests.system.page import environment, printed
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/how-to/remote-model.md").read_text()
@@ -270,28 +271,13 @@ def test_the_page_runs_as_shown(make_cell: Callable[..., Cell], tmp_path: Path, 
     (tmp_path / "drive.toml").write_text(table)
     (tmp_path / "examples").mkdir()
     shutil.copy(ROOT / "examples/remote_model.py", tmp_path / "examples")
-    environment = {**os.environ, "PATH": f"{BIN}:{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
-
-    def shell(commands: str) -> str:
-        done = subprocess.run(
-            ["bash", "-euo", "pipefail", "-c", commands],
-            cwd=tmp_path,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=False,
-        )
-        assert done.returncode == 0, f"{commands}\n{done.stdout}\n{done.stderr}"
-        return done.stdout
-
     begin, use = blocks("sh")
     (program,) = blocks("sh background")
-    shell(begin)
+    printed(begin, tmp_path, PYTHONPATH=str(ROOT))
     with subprocess.Popen(
         ["bash", "-c", f"exec {program.replace('127.0.0.1:8089', address)}"],
         cwd=tmp_path,
-        env=environment,
+        env=environment(PYTHONPATH=str(ROOT)),
         stdout=subprocess.PIPE,
         text=True,
     ) as model:
@@ -299,7 +285,7 @@ def test_the_page_runs_as_shown(make_cell: Callable[..., Cell], tmp_path: Path, 
             assert model.stdout is not None
             assert model.stdout.readline() == "joined drive, the position is 0\n"
             until(lambda: cell.processes()["drive"]["quality"] == "good", "good quality")
-            out = shell(use)
+            out = printed(use, tmp_path, PYTHONPATH=str(ROOT))
             assert re.search(r"drive/position +0\.1\b", out), out
             model.send_signal(signal.SIGINT)
             assert model.wait(PATIENCE_S) == 130

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from shmio.config import Address
-from shmio.testing.cell import BIN, PATIENCE_S
 from shmio.testing.ports import reserved_port
+from tests.system.page import printed, shell
 from tests.unit.endpoints.mqtt.harness import listening
 
 ROOT = Path(__file__).parents[2]
@@ -38,28 +36,13 @@ def folder(tmp_path: Path, instance: str, broker: Address) -> Iterator[Path]:
         file.write_text(text.replace("127.0.0.1:1883", str(broker)).replace(f'"{cell}"', f'"{instance}-{cell}"'))
     yield tmp_path
     for cell in CELLS:
-        run(tmp_path, f"shmio-supervisor down -c examples/two-cells/{cell}/supervisor.toml")
-
-
-def run(folder: Path, commands: str) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PATH": f"{BIN}:{os.environ['PATH']}"}
-    return subprocess.run(
-        ["bash", "-euo", "pipefail", "-c", commands],
-        cwd=folder,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
+        shell(f"shmio-supervisor down -c examples/two-cells/{cell}/supervisor.toml", tmp_path)
 
 
 def test_the_page_on_two_cells(folder: Path, broker: Address, instance: str) -> None:
     page = (ROOT / "docs/how-to/use-mqtt.md").read_text().replace("127.0.0.1:1883", str(broker))
     begin, end = BLOCK.findall(page)
-    done = run(folder, begin)
-    assert done.returncode == 0, done.stdout + done.stderr
-    shown = [line.rpartition(" ")[0] for line in done.stdout.splitlines()[-2:]]
+    shown = [line.rpartition(" ")[0] for line in printed(begin, folder).splitlines()[-2:]]
     assert sorted(shown) == [f"plant/{cell}/sim/joints/Kuka.j1/R/out" for cell in CELLS]
     with listening(broker, "plant/#", f"spBv1.0/plant/NDEATH/{instance}-south", protocol=4) as listener:
         found: dict[str, bytes] = {}
@@ -67,7 +50,6 @@ def test_the_page_on_two_cells(folder: Path, broker: Address, instance: str) -> 
         while {topic: found.get(topic) for topic in expected} != expected:
             message = listener.message()
             found[message.topic] = bytes(message.payload)
-        done = run(folder, end)
-        assert done.returncode == 0, done.stdout + done.stderr
+        printed(end, folder)
         while listener.message().topic != f"spBv1.0/plant/NDEATH/{instance}-south":
             pass
