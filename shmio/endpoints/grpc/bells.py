@@ -45,7 +45,13 @@ class Bell:
         """Ring not for a while, if all listeners have time."""
         if self._resting is None and self.patient >= self.listeners.keys():
             self.mute()
-            self._resting = self._loop.call_later(REST_S, self.resume)
+            self._resting = self._loop.call_later(REST_S, self._rested)
+
+    def _rested(self) -> None:
+        """Ring for what was heard, and left, before."""
+        self.resume()
+        for ring in tuple(self.listeners):
+            ring()
 
     def resume(self) -> None:
         """Rest no more."""

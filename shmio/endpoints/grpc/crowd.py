@@ -36,6 +36,8 @@ class Crowd:
     def join(self, stream: Stream) -> None:
         """One more topic of a stream."""
         self._streams[stream] += 1
+        if self._passing:
+            stream.refills[self._refill] = None
 
     def leave(self, stream: Stream) -> None:
         """One less."""

@@ -193,7 +193,10 @@ class Feed:
             return  # it has left while the bell rang
         if not self._held and self._crowd.passes():
             self._bells.rest(self.block, self._look)
-            return
+        else:
+            self._read()
+
+    def _read(self) -> None:
         try:
             self._follow()
         except Exception:
@@ -205,15 +208,16 @@ class Feed:
         self._look()
 
     def _refill(self) -> None:
-        """A stream that was too slow has nothing to send now: what is newest."""
+        """A stream that was too slow has asked for more: what is newest, though it may have that of others by now."""
         if self._following:
-            self._look()
+            self._read()
             if not self._crowd.passes():
                 self._bells.resume(self.block, self._look)
 
     def _follow(self) -> None:
         block = self.block
-        self._cursor = self._crowd.look(self._cursor)
+        if not self._held:  # else nothing that is shown is read here
+            self._cursor = self._crowd.look(self._cursor)
         retired = block.retired  # before looking: what was published before the end is still shown
         take = self._regard if self._held else self._take
         for count in range(TURN_FRAMES):
@@ -236,7 +240,8 @@ class Feed:
         good = frame is not None and block.assess(frame)[0] is not Quality.BAD
         # Age by the next frame's time, if there is one: it may have been stale while nobody was awake to see it.
         until_ns = frame.publish_ns if frame else block.now_ns()
-        stale = isinstance(shown, Frame) and shown.age_ns(until_ns) > block.stale_ns
+        known = shown is None or frame is None or frame.number == shown.number + 1  # not if some were passed over
+        stale = known and isinstance(shown, Frame) and shown.age_ns(until_ns) > block.stale_ns
         if shown is not None and (stale or (frame is not None and not good)):
             since = shown.number + 1 if frame is None else frame.number
             shown = self._shown = None

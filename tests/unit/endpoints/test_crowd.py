@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from contextlib import closing
 
 import pytest
 
-from shmio.endpoints.grpc import bells, crowd
+from shmio.endpoints.grpc import bells, crowd, outbox
 from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.outbox import Outbox, StateLane
 from shmio.endpoints.grpc.pace import Pace
-from shmio.segment import Segment
-from tests.unit.endpoints.harness import TIMEOUT_S, WRITER, image
+from shmio.segment import Attributes, BlockSpec, ProcessSpec, Quality, Segment
+from tests.unit.endpoints.harness import LAYOUT, SOON_STALE_NS, STALE_NS, TIMEOUT_S, WRITABLE, WRITER, image
 from tests.unit.endpoints.test_grpc import STEP
 
 MANY = 300
@@ -32,11 +33,12 @@ class Known(Pace):
 class Followed:
     """A feed, its source, and streams of one register, of which each has had its first value."""
 
-    def __init__(self, segment: Segment, *behind: bool) -> None:
-        self._writer = segment.writer("cell")
+    def __init__(self, segment: Segment, *behind: bool, source: str = "cell") -> None:
+        self._writer = segment.writer(source)
         self._bells = Bells()
-        self.feed = Feed(segment.blocks["cell"], WRITER, self._bells, lambda source, good: None)
-        self._count = 0
+        self.told = list[bool]()
+        self.feed = Feed(segment.blocks[source], WRITER, self._bells, lambda _, good: self.told.append(good))
+        self.count = 0
         self.feed.start()
         self.streams = [Outbox() for _ in behind]
         for stream, late in zip(self.streams, behind, strict=True):
@@ -51,10 +53,19 @@ class Followed:
     async def publish(self, count: int) -> None:
         """Frames with the next numbers, each shown or passed over before the next one comes."""
         for _ in range(count):
-            self._count += 1
-            self._writer.publish(image(step=self._count), cycle=self._count)
-            for _ in range(3):
-                await asyncio.sleep(0)
+            self.count += 1
+            self._writer.publish(image(step=self.count), cycle=self.count)
+            await self.pass_by()
+
+    async def fail(self) -> None:
+        """A frame that says that there are no values."""
+        self.count += 1
+        self._writer.publish(image(), cycle=self.count, quality=Quality.BAD, reason="cable out")
+        await self.pass_by()
+
+    async def pass_by(self) -> None:
+        for _ in range(3):
+            await asyncio.sleep(0)
 
     async def next(self, stream: Outbox) -> int:
         async with asyncio.timeout(TIMEOUT_S):
@@ -109,7 +120,8 @@ def test_frames_that_nobody_could_take_are_not_read(segment: Segment) -> None:
 
 
 def test_of_what_is_new_they_take_several(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(crowd, "LATE_S", 1000.0)
+    for module in (crowd, outbox):
+        monkeypatch.setattr(module, "LATE_S", 1000.0)
 
     async def test(followed: Followed) -> None:
         (stream,) = followed.streams
@@ -159,3 +171,87 @@ def test_what_waits_does_not_get_too_old(segment: Segment, monkeypatch: pytest.M
                 await followed.publish(1)
 
     follow(segment, test, True)
+
+
+def test_a_stream_of_several_sources_is_given_what_is_newest_of_each_when_it_asks(instance: str) -> None:
+    blocks = [BlockSpec(name, LAYOUT, 20_000_000, STALE_NS, 1 << 20, Attributes("test", WRITABLE)) for name in "ab"]
+    processes = [*(ProcessSpec(name, "source") for name in "ab"), ProcessSpec("grpc", "grpc")]
+
+    async def run(segment: Segment) -> None:
+        a = Followed(segment, False, source="a")
+        (stream,) = a.streams
+        b = Followed(segment, source="b")
+        StateLane(stream).join(b.feed, STEP)
+        try:
+            await a.publish(1)
+            await b.publish(1)
+            assert [await a.next(stream) for _ in range(2)] == [1, 1]
+            for number in range(2, 10):
+                await b.publish(1)
+                await a.publish(1)
+                assert [await a.next(stream) for _ in range(2)] == [number, number], "of both, one after the other"
+        finally:
+            a.stop()
+            b.stop()
+
+    with Segment.create(instance, blocks, processes) as segment:
+        with closing(segment):
+            asyncio.run(run(segment))
+        segment.unlink()
+
+
+def test_who_joins_while_a_feed_rests_asks_for_more_as_the_others_do(segment: Segment) -> None:
+    async def test(followed: Followed) -> None:
+        await followed.publish(1)  # passed over: the one that there is never reads
+        async with asyncio.timeout(TIMEOUT_S):
+            while not followed.streams[0].refills:  # noqa: ASYNC110  another thread's doing
+                await asyncio.sleep(0)
+        late = Outbox()
+        StateLane(late).join(followed.feed, STEP)
+        await followed.publish(2)
+        assert await followed.next(late) == 2, "as it was when it came"
+        assert [await followed.next(late) for _ in range(2)] == [3, 4]
+
+    follow(segment, test, False)
+
+
+def test_bad_news_of_a_source_that_says_nothing_more_wait_for_no_ring(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bells, "TURN_NS", 1_000_000_000_000)
+    monkeypatch.setattr(bells, "REST_S", 0.001)
+
+    async def test(followed: Followed) -> None:
+        passes, heard = followed.feed._crowd.passes, asyncio.Event()
+
+        def passed() -> bool:
+            heard.set()
+            return passes()
+
+        monkeypatch.setattr(followed.feed._crowd, "passes", passed)
+        await followed.fail()
+        async with asyncio.timeout(TIMEOUT_S):
+            await heard.wait()
+        assert followed.told == [True], "nobody has looked yet"
+        monkeypatch.setattr(crowd, "LOOK_S", 0.0)
+        followed.feed._crowd._until_s = 0.0
+        async with asyncio.timeout(TIMEOUT_S):
+            while followed.told == [True]:  # noqa: ASYNC110  it has no bell of its own
+                await asyncio.sleep(0)
+        assert followed.told == [True, False]
+
+    follow(segment, test, False)
+
+
+def test_what_was_passed_over_was_no_silence(soon_stale: Segment) -> None:
+    async def test(followed: Followed) -> None:
+        (stream,) = followed.streams
+        begun_s = asyncio.get_running_loop().time()
+        while asyncio.get_running_loop().time() < begun_s + 1.5e-9 * SOON_STALE_NS:
+            await followed.publish(1)
+        await followed.publish(MANY)
+        last = followed.count
+        assert await followed.next(stream) == last
+        assert followed.told == [True]
+
+    follow(soon_stale, test, True)
