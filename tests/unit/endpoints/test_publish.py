@@ -342,6 +342,7 @@ def test_a_source_that_says_nothing_holds_nobody_for_long(
         async with endpoint(segment) as served:
             await publish(served, [message("cell/step", str(n)) for n in range(3000)])
             assert counted(served) == (0, 3000)
+            monkeypatch.setattr("shmio.segment.commander.TIMEOUT_S", TIMEOUT_S)  # now it is to have the time to answer
             served.writer = segment.writer("cell")
             async with plant(served) as device:
                 await publish(served, [message("cell/step", "3")])
