@@ -62,6 +62,8 @@ class Session:
         self.link.on_message = self._command
         self.link.on_lost = self._lose
         self._host = None if sparkplug.primary_host is None else PrimaryHost(sparkplug.primary_host)
+        self._deserted = False
+        """Whether the host has gone since the births, though it may be back: it knows nothing of them then."""
         self._until_s = 0.0
         """So long the host has to say that it is there; then another broker is tried, if there is one."""
         self._globs = [Glob(pattern) for pattern in sparkplug.patterns]
@@ -130,9 +132,10 @@ class Session:
             self.link.subscribe(self.node.commands)
             if self._host is not None:
                 self._host.forget()
+                self._deserted = False
                 self.link.subscribe([self._host.topic], retained=True)
                 self._until_s = time.monotonic() + HOST_S
-        if self._host is not None and not self._host.online:
+        if self._host is not None and (self._deserted or not self._host.online):
             self._wait_for(self._host)
         elif self.link.up and (not self.node.alive or (self._asked and self.link.ready)):
             self._birth()
@@ -226,6 +229,7 @@ class Session:
             return
         if self._host is not None and topic == self._host.topic:
             self._host.hear(bytes(message.payload))
+            self._deserted = self._deserted or (self.node.alive and not self._host.online)
             return
         self._received += 1
         if message.retain:  # it was there before we were

@@ -83,6 +83,19 @@ def test_a_node_is_born_when_its_primary_host_is_there_dies_with_it_and_keeps_wh
     assert host.next().kind == "NDEATH"
 
 
+def test_a_host_that_is_back_at_once_is_told_everything_anew(segment: Segment, broker: Mosquitto) -> None:
+    segment.writer("cell").publish(image(step=1), cycle=1)
+    with listening(broker.address, NODES) as listener, bridge(segment, broker.address, sparkplug=WAITING):
+        host = Host(listener)
+        say(listener, online(1))
+        assert [host.next().kind for _ in range(2)] == ["NBIRTH", "DBIRTH"]
+        for at_ms in range(2, 12):
+            for state in (offline(at_ms), online(at_ms)):
+                listener.client.publish(STATE, json.dumps(state), 1, retain=True)
+            assert [host.next().kind for _ in range(3)] == ["NDEATH", "NBIRTH", "DBIRTH"]
+    assert host.next().kind == "NDEATH"
+
+
 def test_of_several_brokers_the_one_is_chosen_at_which_the_host_is(
     segment: Segment, make_broker: Callable[..., Mosquitto], monkeypatch: pytest.MonkeyPatch
 ) -> None:
