@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import ssl
 import threading
 import time
 from collections.abc import Callable
@@ -140,3 +141,8 @@ def hang_up(client: Client) -> None:
     if made is not None:
         with suppress(OSError):
             made.close()
+
+
+def unseen(made: socket.socket | None) -> bool:
+    """Whether TLS has read from it what was not taken yet: a selector does not see that."""
+    return isinstance(made, ssl.SSLSocket) and made.pending() > 0

@@ -18,7 +18,7 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from shmio.endpoints.mqtt.attempt import CONNECT_S, PACKETS, SLOW, Attempt, hang_up
+from shmio.endpoints.mqtt.attempt import CONNECT_S, PACKETS, SLOW, Attempt, hang_up, unseen
 from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.failure import refusal
 from shmio.endpoints.mqtt.limits import Limits
@@ -109,8 +109,10 @@ class Link:
         elif self.up and now_s >= self._misc_s:
             self._misc_s = now_s + 1.0
             self._client.loop_misc()
+        if unseen(self._socket):
+            self._serve(selectors.EVENT_READ)
         self._rearm()
-        return 1.0
+        return 0.0 if unseen(self._socket) else 1.0
 
     def _take(self, attempt: Attempt) -> None:
         """A connection was made, or was not."""
@@ -138,9 +140,6 @@ class Link:
             code = client.loop_write()
         if events & selectors.EVENT_READ and not code:
             code = client.loop_read(PACKETS)
-            pending = getattr(made, "pending", None)  # of TLS: what select does not see
-            while not code and pending is not None and self._socket is made and pending():
-                code = client.loop_read(PACKETS)
         if code and client is self._client:
             self.drop(str(MQTTErrorCode(code).name).removeprefix("MQTT_ERR_").replace("_", " ").lower())
         self._rearm()
