@@ -67,6 +67,8 @@ def _row(process: ProcessStatus) -> tuple[str, ...]:
             details.append(f"cycle {process.cycle}, {rate} Hz, {overruns}")
     if process.note and not _said(process):
         details.append(process.note)
+    if process.kind == "mqtt" and (missed := process.counters.get("missed")):
+        details.append(f"{missed} frame{'s' * (missed != 1)} missed")
     pid = "-" if process.pid is None else str(process.pid)
     uptime = _duration(process.uptime_s)
     return process.name, process.kind, process.state, pid, str(process.restarts), uptime, "; ".join(details)

@@ -511,6 +511,22 @@ def test_status_says_why_once(
         segment.unlink()
 
 
+@pytest.mark.parametrize(("missed", "shown"), [(0, "0 s"), (1, "; 1 frame missed"), (7, "; 7 frames missed")])
+def test_status_says_what_the_bridge_has_missed(
+    instance: str, missed: int, shown: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Segment.create(instance, [], [ProcessSpec("mqtt", "mqtt")]) as segment:
+        worker = Segment.open(instance, writable=True)
+        slot = worker.processes.find("mqtt")
+        assert slot.take()
+        note = "the broker is away" if missed else ""
+        slot.report = Report(os.getpid(), Activity.RUNNING, segment.header.started_ns, (*7 * (0,), missed), note)
+        assert main(["status", "--instance", instance]) == 0
+        assert capsys.readouterr().out.splitlines()[-1].endswith(shown)
+        worker.close()
+        segment.unlink()
+
+
 def test_status_of_nothing_is_an_object(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["status", "--json", "--instance", instance]) == 1
     output = capsys.readouterr()
