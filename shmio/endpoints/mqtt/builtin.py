@@ -8,11 +8,10 @@ import ssl
 from asyncio import StreamReader, StreamWriter
 from collections.abc import Collection
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from amqtt.adapters import StreamReaderAdapter, StreamWriterAdapter
 from amqtt.broker import Broker
-from amqtt.errors import MQTTError
 from amqtt.plugins.base import BaseAuthPlugin
 from amqtt.session import Session
 
@@ -29,6 +28,14 @@ MAX_UNREAD_BYTES: Final = 8 << 20
 """That may wait for one client: several packets of the largest kind."""
 UNREAD_BYTES: Final = 64 << 20
 """That may wait for all of them."""
+UNHANDLED_BYTES: Final = 256 << 10
+"""Of one client's messages that were read, and not handed on: then no more is read of it."""
+MAX_UNHANDLED: Final = 64
+"""Messages of all that are being handed on."""
+MAX_KEPT: Final = 1000
+"""Messages for one client's session while it is away; as mosquitto, it is given the oldest."""
+MESSAGE_BYTES: Final = 1000
+"""Of one in memory, about, beside its payload."""
 GREETING_S: Final = 10.0
 _CONNECT: Final = 0x10
 _UNSUPPORTED: Final = b"\x20\x03\x00\x84\x00"
@@ -54,8 +61,54 @@ class Accounts(BaseAuthPlugin):  # type: ignore[misc]  # the library's classes h
         return secret is not None and await asyncio.to_thread(matches, password, secret)
 
 
+class _Unhandled(asyncio.Queue[Any]):
+    """What was read of a client. Its bound is kept by who reads: a full one would drop what has QoS 0."""
+
+    def _init(self, maxsize: int) -> None:
+        super()._init(maxsize)
+        self._bytes = 0
+        self._room = asyncio.Event()
+        self._room.set()
+
+    def _put(self, item: Any) -> None:
+        super()._put(item)
+        self._count(MESSAGE_BYTES + len(item.data))
+
+    def _get(self) -> Any:
+        item = super()._get()
+        self._count(-MESSAGE_BYTES - len(item.data))
+        return item
+
+    def _count(self, size: int) -> None:
+        self._bytes += size
+        (self._room.set if self._bytes < UNHANDLED_BYTES else self._room.clear)()
+
+    async def room(self) -> None:
+        """Wait until there is some."""
+        await self._room.wait()
+
+
 class _Broker(Broker):  # type: ignore[misc]
-    """Sends a client what is retained for its own subscriptions alone; aMQTT sends who connects that of everybody's."""
+    """Sends a client what is retained for its own subscriptions alone; aMQTT sends who connects that of everybody's.
+
+    What it has read and not handed on is bounded: who publishes faster than that goes is slowed down by TCP.
+    """
+
+    def __init__(self, config: dict[str, Any]) -> None:
+        super().__init__(config)
+        self._broadcast_queue: asyncio.Queue[Any] = asyncio.Queue(MAX_UNHANDLED)
+
+    async def _handle_client_session(
+        self, reader: _Reader, writer: _Writer, client_session: Session, *rest: Any
+    ) -> None:
+        if not isinstance(client_session.delivered_message_queue, _Unhandled):  # else it is one from before
+            client_session.delivered_message_queue = _Unhandled()
+        reader.unhandled = client_session.delivered_message_queue
+        await super()._handle_client_session(reader, writer, client_session, *rest)
+
+    async def _retain_broadcast_message(self, broadcast: dict[str, Any], qos: int, target_session: Session) -> None:
+        if target_session.retained_messages.qsize() < MAX_KEPT:
+            await super()._retain_broadcast_message(broadcast, qos, target_session)
 
     async def _publish_retained_messages_for_subscription(
         self, subscription: tuple[str, int], session: Session
@@ -65,15 +118,21 @@ class _Broker(Broker):  # type: ignore[misc]
 
 
 class _Reader(StreamReaderAdapter):  # type: ignore[misc]
-    """Takes no packet that is too large. ``begun``: what was read before."""
+    """Takes no packet that is too large, nor any while too much waits. ``begun``: what was read before."""
 
     def __init__(self, reader: StreamReader, begun: bytes) -> None:
         super().__init__(reader)
         self._begun = begun
+        self.unhandled: _Unhandled | None = None
+        """What was read of this client, as soon as it is known."""
 
     async def read(self, n: int = -1) -> bytes:
         if n > MAX_PACKET_BYTES:
-            raise MQTTError(f"a packet of {n} bytes; {MAX_PACKET_BYTES} are the most")
+            # With one of its own errors the library would go on, and take what is in the packet for packets.
+            log.warning("a packet of %d bytes; %d are the most: its connection is ended", n, MAX_PACKET_BYTES)
+            raise OSError("too large a packet")
+        if n > 1 and self.unhandled is not None:  # not at a packet's beginning, which has to come within the keep-alive
+            await self.unhandled.room()
         head, self._begun = self._begun[:n], self._begun[n:]
         rest: bytes = await super().read(n - len(head)) if len(head) < n else b""
         return head + rest

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import socket
 import threading
@@ -17,7 +18,7 @@ from paho.mqtt.client import Client, MQTTv5, MQTTv311
 from paho.mqtt.enums import CallbackAPIVersion
 
 from shmio.config import Address, Mqtt, MqttTls
-from shmio.endpoints.mqtt import broker, mosquitto
+from shmio.endpoints.mqtt import broker, builtin, mosquitto
 from shmio.endpoints.mqtt.place import folder
 from shmio.errors import ConfigError, EndpointError
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
@@ -197,6 +198,72 @@ def test_a_client_that_never_reads_is_ended_by_the_one_in_python_and_others_hear
             while data := deaf.recv(1 << 20):
                 heard += len(data)
         assert heard < 40 * len(payload)
+
+
+def test_who_publishes_faster_than_that_goes_is_slowed_down_by_the_one_in_python_and_nothing_is_lost(
+    segment: Segment, address: Address, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SHMIO_MOSQUITTO", "")
+    go_on, waits = threading.Event(), list[int]()
+    broadcast, room = builtin._Broker._run_broadcast, builtin._Unhandled.room
+
+    async def late(self: Any, tasks: Any) -> None:
+        """Hand nothing on until the publisher is through, or has to wait."""
+        await asyncio.to_thread(go_on.wait, TIMEOUT_S)
+        await broadcast(self, tasks)
+
+    async def watched(self: Any) -> None:
+        waits.append(self._bytes)
+        if not self._room.is_set():
+            go_on.set()
+        await room(self)
+
+    monkeypatch.setattr(builtin._Broker, "_run_broadcast", late)
+    monkeypatch.setattr(builtin._Unhandled, "room", watched)
+    topic, payload = f"{PREFIX}/many".encode(), bytes(100_000)
+    size = 2 + len(topic) + len(payload)
+    head = bytes([0x30, size & 0x7F | 0x80, size >> 7 & 0x7F | 0x80, size >> 14, 0, len(topic)]) + topic
+    with (
+        serving(segment, address, "embedded"),
+        listening(address, f"{PREFIX}/many", protocol=MQTTv311) as listener,
+        socket.create_connection((address.host, address.port)) as fast,
+    ):
+        fast.sendall(b"\x10\x10\x00\x04MQTT\x04\x02\x00\x00\x00\x04fast")
+        until_bytes(fast, b"\x20\x02\x00\x00")
+
+        def publish() -> None:
+            for number in range(200):
+                fast.sendall(head + number.to_bytes(4, "big") + payload[4:])
+            go_on.set()
+
+        thread = threading.Thread(target=publish)
+        thread.start()
+        for number in range(200):
+            assert listener.until("many")[:4] == number.to_bytes(4, "big")
+        thread.join()
+    assert builtin.UNHANDLED_BYTES < max(waits) < 4 * builtin.UNHANDLED_BYTES, "of 20 MB"
+
+
+def test_a_packet_that_is_too_large_ends_its_connection_and_is_not_taken_for_packets(
+    segment: Segment, address: Address, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SHMIO_MOSQUITTO", "")
+    with (
+        serving(segment, address, "embedded"),
+        listening(address, protocol=MQTTv311) as listener,
+        socket.create_connection((address.host, address.port)) as large,
+    ):
+        large.sendall(b"\x10\x11\x00\x04MQTT\x04\x02\x00\x00\x00\x05large")
+        until_bytes(large, b"\x20\x02\x00\x00")
+        topic = f"{PREFIX}/hidden".encode()
+        hidden = bytes([0x30, len(topic) + 3, 0, len(topic)]) + topic + b"!"
+        large.sendall(b"\x30\xff\xff\xff\x01\x00\x01t" + hidden)
+        large.settimeout(TIMEOUT_S)
+        with suppress(ConnectionResetError):
+            assert large.recv(1) == b""
+        listener.publish("last", "!")
+        listener.until("last")
+        assert not listener.values("hidden")
 
 
 def until_bytes(client: socket.socket, end: bytes) -> None:
