@@ -88,12 +88,17 @@ def test_a_host_that_is_back_at_once_is_told_everything_anew(segment: Segment, b
     with listening(broker.address, NODES) as listener, bridge(segment, broker.address, sparkplug=WAITING):
         host = Host(listener)
         say(listener, online(1))
-        assert [host.next().kind for _ in range(2)] == ["NBIRTH", "DBIRTH"]
+        session = newest = bd_seq(host.until("NBIRTH"))
         for at_ms in range(2, 12):
             for state in (offline(at_ms), online(at_ms)):
                 listener.client.publish(STATE, json.dumps(state), 1, retain=True)
-            assert [host.next().kind for _ in range(3)] == ["NDEATH", "NBIRTH", "DBIRTH"]
-    assert host.next().kind == "NDEATH"
+            died = born = False  # its death may come as the broker's will, which does not wait for the next birth
+            while not (died and born):
+                heard = host.next()
+                died |= heard.kind == "NDEATH" and bd_seq(heard) == session
+                born |= heard.kind == "NBIRTH"
+                newest = bd_seq(heard) if heard.kind == "NBIRTH" else newest
+            session = newest
 
 
 def test_of_several_brokers_the_one_is_chosen_at_which_the_host_is(
