@@ -12,7 +12,7 @@ from shmio.connectors.desk import CommandDesk
 from shmio.connectors.injector import OwnerOf
 from shmio.connectors.output import Output
 from shmio.connectors.replay.beginning import Beginning, as_others, stamp
-from shmio.connectors.replay.player import OVER, Player
+from shmio.connectors.replay.player import OVER, STOPPED, Player
 from shmio.connectors.replay.recording import MAX_NS
 from shmio.connectors.replay.search import Search
 from shmio.connectors.replay.source import Replay
@@ -21,7 +21,7 @@ from shmio.connectors.telling import Counters
 from shmio.errors import PathError, SegmentError
 from shmio.layout.write import Write
 from shmio.segment import BlockWriter, EventKind, Record, Stamp
-from shmio.segment.playhead import MAX_SPEED, MIN_SPEED, OWN_WORDS, Find, Found, Move, Play, answered
+from shmio.segment.playhead import MAX_SPEED, MIN_SPEED, Find, Found, Move, Play, answered
 
 PIECE: Final = 64
 """So many frames and events between two looks at what else there is to do."""
@@ -82,9 +82,8 @@ class ReplayLoop:
                 pass
         finally:
             self.desk.stop()
-            reason = f"{OWN_WORDS}the source was stopped"
-            self.desk.close(reason)
-            self._player.end(reason, self._stamp_now())
+            self.desk.close(STOPPED)
+            self._player.end(STOPPED, self._stamp_now())
             self._writer.event(Record(EventKind.STOPPED))
 
     def _begin(self) -> None:
@@ -95,8 +94,8 @@ class ReplayLoop:
             # What lies ahead was done before it was moved back, or in the round before.
             self._player.resume(self._done_ns if self._done_ns <= reach_ns else play.position_ns - 1)
         else:  # who joins others that play is where they are
-            joined = clock_ns - play.anchor_ns > LATE_NS
-            self._player.begin(play.at_ns(clock_ns if joined else play.anchor_ns), self._stamp)
+            since_ns = clock_ns if clock_ns - play.anchor_ns > LATE_NS else play.anchor_ns
+            self._player.begin(play.at_ns(since_ns), self._stamp)
             if play.over:
                 self._end()
         self.desk.open()
@@ -148,6 +147,8 @@ class ReplayLoop:
             self.desk.release(self._writer.cycle)
         settled = play.settled(clock_ns)
         if settled is play:
+            if play.paused and self._player.stopped and not play.over:
+                self._show(play.position_ns)  # it stands again, and no next frame would tell
             return False
         if settled.paused:
             over = settled.position_ns >= settled.end_ns
@@ -161,8 +162,7 @@ class ReplayLoop:
         return True
 
     def _end(self) -> None:
-        end_ns = self._play.end_ns
-        self._player.end(OVER, self._stamp(end_ns, end_ns))
+        self._player.end(OVER, self._stamp(self._play.end_ns, self._play.end_ns))
 
     def _leave_out(self, clock_ns: int) -> None:
         """Go on with the present, in wall time, where what comes next is too late.
@@ -217,8 +217,7 @@ class ReplayLoop:
             self._search = None
             return False
         number, ask = asked
-        missed = number != self._play.asked + 1
-        if missed:
+        if missed := number != self._play.asked + 1:
             self._catch_up(clock_ns)
         if isinstance(ask, Find):
             return self._find(number, ask)
@@ -243,8 +242,7 @@ class ReplayLoop:
             except PathError as error:
                 self._answer(number, Found(str(error)))
                 return True
-        found = self._search[1].go_on()
-        if found is not None:
+        if (found := self._search[1].go_on()) is not None:
             self._answer(number, found)
         return True
 

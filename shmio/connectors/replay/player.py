@@ -13,6 +13,7 @@ from shmio.segment.commands import MAX_WRITES
 from shmio.segment.playhead import OWN_WORDS
 
 OVER: Final = f"{OWN_WORDS}the recording is over"
+STOPPED: Final = f"{OWN_WORDS}the source was stopped"
 NOTHING: Final = f"{OWN_WORDS}nothing of this source was recorded up to here"
 GOES_ON: Final = f"{OWN_WORDS}the recording goes on"
 
@@ -50,6 +51,8 @@ class Player:
         """Why quality is not good; empty if it is."""
         self._bad = False  # as last published
         self._missing = False  # whether the last frame was of this replay's own making
+        self.stopped = False
+        """Whether the last frame is that by which the process before this one told its end."""
         self.published = 0
 
     @property
@@ -85,6 +88,9 @@ class Player:
         if entry is not None and isinstance(entry.item, Frame):
             self._output.resume(self._image(entry.item, None))
             self._bad = entry.item.quality is Quality.BAD
+        last = self._writer.block.latest()
+        reason = "" if last is None else last.reason
+        self.stopped, self._missing = reason == STOPPED, reason.startswith(OWN_WORDS)
 
     def show(self, position_ns: int, stamp: StampOf) -> None:
         """Publish the frame that is the newest at a position, and have what comes behind that be the next.
@@ -151,6 +157,7 @@ class Player:
         self._output.publish(image)
         self.note = image.reason
         self._bad = image.quality is Quality.BAD
+        self.stopped = False
         self.published += 1
 
     def _happen(self, event: Event, at: Stamp) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.connectors.replay.player import OVER
+from shmio.connectors.replay.player import GOES_ON, OVER, STOPPED
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.segment import EventKind, Quality, Record, replays
 from shmio.segment.attach import Attachment, attach
@@ -237,6 +237,21 @@ def test_a_source_that_catches_up_with_others_at_the_end_is_there_as_they_are(
             assert [one.over for one in attachment.replay.status()] == [True, True]
     assert counts(shown) == [19, 19]
     assert [(frame.quality, frame.reason) for frame in shown] == [(Quality.GOOD, ""), (Quality.BAD, OVER)]
+
+
+def test_a_replay_that_stands_is_good_again_when_its_process_is(tmp_path: Path, instance: str) -> None:
+    file = record(tmp_path, instance)
+    with built(instance, stepped=False) as segment, attach(instance, writable=True) as attachment:
+        with Playing(segment, file, paused=True):
+            attachment.replay.seek(0.2)
+        assert attachment.read("cell/count").reason == STOPPED
+        with Playing(segment, file, paused=True) as cell:
+            frame = cell.next()
+            assert (counts([frame]), frame.quality, frame.reason) == ([10], Quality.GOOD, "")
+            told = [(event.kind, event.quality, event.text) for event in cell.happened()]
+            assert told == [(EventKind.QUALITY, Quality.GOOD, GOES_ON)]
+            attachment.replay.seek(0.3)
+            assert counts(cell.frames()) == [15], "it was told once"
 
 
 def test_a_request_of_the_next_round_waits_until_this_one_is_played(tmp_path: Path, instance: str) -> None:
