@@ -61,6 +61,8 @@ class Attempt:
         self.client: Client | None = None
         self.socket: socket.socket | None = None
         """A connection, on which nothing was read yet."""
+        self.offered = False
+        """Whether a broker may have been told who we are, and our will."""
         self.problem = ""
         """Why there is none."""
         self._dialling, self._protocol, self._will, self._wake = dialling, protocol, will, wake
@@ -125,6 +127,7 @@ class Attempt:
             properties.ReceiveMaximum = PACKETS
             options = {"properties": properties, "clean_start": not settings.session_expiry_s}
         client.connect(target.host, target.port, settings.keep_alive_s, **options)
+        self.offered = True
         self.socket = cast("socket.socket | None", client.socket())
         if self.socket is None:
             self.problem = f"broker {target}: it closes the connection at once"

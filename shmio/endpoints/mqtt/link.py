@@ -44,7 +44,7 @@ class Link:
         wake: Callable[[], object],
         will: Callable[[], Message],
     ) -> None:
-        """``wake``: has the thread turn the link; callable from any thread. ``will``: asked for at each attempt."""
+        """``wake``: has the thread turn the link; callable from any thread. ``will``: asked for for each CONNECT."""
         self.up = False
         self.came_up = False
         """Set when a connection has been made; who has greeted it takes it back."""
@@ -52,8 +52,7 @@ class Link:
         """Called when a connection is gone, with what it has not taken for certain."""
         self.problem = ""
         """Why there is no connection, or what the broker refuses; empty: all is well."""
-        self.connects = 0
-        self.refused = 0
+        self.connects = self.refused = 0
         self._dialling, self._selector, self._wake, self._will = dialling, selector, wake, will
         self.on_message: Callable[[MQTTMessage], None] = lambda _: None
         """Called with each message that comes."""
@@ -63,10 +62,10 @@ class Link:
         self._target: Target | None = None
         self._attempt: Attempt | None = None
         self._protocol = MQTTv5
-        self._retry_s = 0.0
         self._until_s: float | None = None
         """When the broker must have answered."""
-        self._up_s = self._misc_s = 0.0
+        self._retry_s = self._up_s = self._misc_s = 0.0
+        self._new_will: Message | None = None  # that no broker was told yet
         self._in_flight: dict[int, Message] = {}
         self._limits = Limits()
 
@@ -98,7 +97,8 @@ class Link:
         if self._attempt is None and self._client is None:
             if now_s < self._retry_s:
                 return self._retry_s - now_s
-            self._attempt = Attempt(self._dialling, self._protocol, self._will(), self._wake)
+            self._new_will = self._new_will or self._will()
+            self._attempt = Attempt(self._dialling, self._protocol, self._new_will, self._wake)
             self._target = self._attempt.target
         if self._client is None:
             if self._attempt is not None and self._attempt.slow:
@@ -118,6 +118,7 @@ class Link:
         """A connection was made, or was not."""
         self._attempt = None
         client, made = attempt.client, attempt.socket
+        self._new_will = None if attempt.offered else self._new_will
         if client is None or made is None:
             self._fail(attempt.problem)
             return
