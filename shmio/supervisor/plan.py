@@ -188,6 +188,14 @@ def make_plan(
     )
 
 
+def process_names(config: Config) -> list[str]:
+    """Of all processes that an instance of this configuration may have, whatever its mode."""
+    names = [emulator.name for emulator in config.emulator] + [source.name for source in config.source]
+    names += ["grpc"] if config.grpc else []
+    names += [name for name, _, _ in _mqtt(config.mqtt)] if config.mqtt else []
+    return [*names, "recorder"] if config.recorder else names
+
+
 def _mqtt(mqtt: Mqtt) -> list[tuple[str, str, dict[str, Any]]]:
     """The bridge, and the broker if it is ours: each gets the keys that it needs, so that it alone is replaced."""
     section = msgspec.to_builtins(mqtt)

@@ -13,6 +13,7 @@ from shmio.config import load
 from shmio.errors import ConfigError
 from shmio.logs import printable
 from shmio.supervisor import control
+from shmio.supervisor.plan import process_names
 
 WHERE_S = 5.0
 SUPERVISOR = "supervisor"
@@ -42,8 +43,7 @@ def _where(arguments: argparse.Namespace) -> tuple[Path, list[str]]:
     """Folder and processes: as the file says, else as the running instance does, whose file may be gone."""
     if arguments.instance is None and (arguments.config is not None or DEFAULT_CONFIG.exists()):
         config = load(config_file(arguments))
-        names = [emulator.name for emulator in config.emulator] + [source.name for source in config.source]
-        return config.log_dir, names + [name for name in ("grpc", "recorder") if getattr(config, name)]
+        return config.log_dir, process_names(config)
     with open_supervised(instance_name(arguments)) as segment:
         names = [slot.name for slot in segment.processes]
         return Path(ask(segment, control.Where(), WHERE_S)["log_dir"]), names

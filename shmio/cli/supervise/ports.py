@@ -119,7 +119,7 @@ def _holder(address: Address) -> str:
     for instance in instances():
         with suppress(ShmioError):
             for process in read_status(instance).processes:
-                if process.pid and links.intersection(_open_files(process.pid)):
+                if process.pid and any(links.intersection(_open_files(pid)) for pid in _with_children(process.pid)):
                     return (
                         f"process {process.name} of instance {instance}, pid {process.pid}, listens there; choose "
                         f"another port, or stop that instance: shmio-supervisor down --instance {instance}"
@@ -142,6 +142,14 @@ def _listening(address: Address) -> Iterator[str]:
 
 def _words(packed: bytes) -> str:
     return "".join(packed[at : at + 4][::-1].hex() for at in range(0, len(packed), 4)).upper()
+
+
+def _with_children(pid: int) -> Iterator[int]:
+    """It, and the programs that it runs: a broker's process has mosquitto."""
+    yield pid
+    with suppress(OSError):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            yield from map(int, (task / "children").read_text().split())
 
 
 def _open_files(pid: int) -> Iterator[str]:

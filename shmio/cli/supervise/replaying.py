@@ -111,6 +111,8 @@ def _notices(config: Config, section: Replay, names: list[str]) -> Iterator[str]
     for name in own:
         if name not in names:
             yield f"source {name} is left out: the recording has none of it; it has {', '.join(names)}"
+    for emulator in config.emulator:
+        yield f"emulator {emulator.name} is left out: a recording is played, not a device read"
     if config.injection and section.injections == "keep":
         yield (
             "the configuration's injections are left out: those of the recording are kept; "

@@ -68,6 +68,7 @@ def test_its_sources_take_the_places_of_the_configurations(file: Path) -> None:
     assert (options["own_clock"], options["loop"], options["file"]) == (True, True, [str(file)])
     notices = "\n".join(plan.warnings)
     assert "source panel is left out: the recording has none of it; it has cell, arm" in notices
+    assert "emulator plc is left out: a recording is played, not a device read" in notices
     assert "the configuration's injections are left out" in notices
     assert "grpc.default_source is left out" in notices
 

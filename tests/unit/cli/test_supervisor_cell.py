@@ -253,6 +253,23 @@ def test_a_left_over_segment_without_processes_hides_no_taken_port(cell: Cell) -
     assert error.startswith(f"grpc: cannot listen on 127.0.0.1:{port}: another program listens there; ")
 
 
+def test_what_an_instances_broker_has_is_said_to_be_its(cell: Cell) -> None:
+    """Though the broker's process may have a program of its own for it."""
+    serve_on(cell, f"127.0.0.1:{free_port()}")
+    cell.run("up", "--detach", status=0)
+    text = (cell.folder / "supervisor.toml").read_text()
+    broker = re.compile(r'(?<=\[mqtt\]).*?listen = "([^"]+)"', re.DOTALL)
+    port = broker.search(text)
+    assert port is not None
+    text = broker.sub(lambda _: port[0], moved(text)).replace("listen = [", 'listen = ["127.0.0.1:0"] #')
+    text = text.replace(f'"{cell.instance}"', f'"{cell.instance}-2"\nlog_dir = "logs-2"')
+    (cell.folder / "second.toml").write_text(text)
+    assert cell.run("up", "-c", "second.toml", status=1).stderr.startswith(
+        f"broker: cannot listen on {port[1]}: process broker of instance {cell.instance}, pid {cell.of('broker').pid}, "
+    )
+    cell.run("down", status=0)
+
+
 def test_what_another_instance_has_is_said_to_be_its(cell: Cell) -> None:
     serve_on(cell, f"127.0.0.1:{free_port()}")
     cell.run("up", "--detach", status=0)

@@ -102,7 +102,20 @@ def test_logs_of_an_unknown_process_names_those_there_are(
     instance_logs: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["logs", "cel"]) == 1
-    assert capsys.readouterr().err == "no process 'cel'; there are: supervisor, plc, cell, grpc, recorder\n"
+    assert (
+        capsys.readouterr().err == "no process 'cel'; there are: supervisor, plc, cell, grpc, broker, mqtt, recorder\n"
+    )
+
+
+def test_the_bridge_and_its_broker_have_logs_too(instance_logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (instance_logs / "broker.log").write_text(stamped(3, "broker ready"))
+    (instance_logs / "mqtt.log").write_text(stamped(4, "bridge connected"))
+    for name, word in (("broker", "ready\n"), ("mqtt", "connected\n")):
+        assert main(["logs", name]) == 0
+        assert capsys.readouterr().out.endswith(word)
+    config = Path("supervisor.toml")
+    config.write_text(config.read_text().replace('broker = "embedded"', 'broker = "external"\nhost = "broker.example"'))
+    assert main(["logs", "broker"]) == 1, "it is somebody else's"
 
 
 def test_logs_before_the_first_start(instance_logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
