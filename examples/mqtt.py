@@ -7,54 +7,77 @@ examples/mqtt.py 127.0.0.1:1883 shmio/a50 --write cell/Outputs/13=1
 from __future__ import annotations
 
 import argparse
+import queue
 import sys
-import threading
 
-from paho.mqtt.client import Client, MQTTMessage
+from paho.mqtt.client import Client, ConnectFlags, MQTTMessage
 from paho.mqtt.enums import CallbackAPIVersion
-
-TIMEOUT_S = 10
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
 
 
 def main() -> int:
-    """Follow, or write and follow what becomes of it; 1: nothing came in time."""
+    """Follow, or write and follow what becomes of it; 1: it did not come, for a reason that is told."""
     parser = argparse.ArgumentParser()
     parser.add_argument("broker", metavar="HOST:PORT")
     parser.add_argument("prefix")
     parser.add_argument("paths", nargs="*", metavar="PATH")
     parser.add_argument("--write", metavar="PATH=VALUE")
     parser.add_argument("--count", type=int, default=0, help="end after so many messages")
+    parser.add_argument("--timeout", type=float, default=10, metavar="S", help="with --count, --write: wait so long")
     arguments = parser.parse_intermixed_args()
     host, _, port = arguments.broker.rpartition(":")
+    if not host or not port.isdecimal():
+        parser.error(f"{arguments.broker!r} is not HOST:PORT")
     prefix, (path, _, value) = arguments.prefix, (arguments.write or "").partition("=")
     topics = [f"{prefix}/{path}/out" for path in arguments.paths] + ([f"{prefix}/{path}/in/result"] if path else [])
-    done, seen = threading.Event(), 0
+    if not topics:
+        parser.error("name a PATH, or --write PATH=VALUE")
+    over: queue.SimpleQueue[str] = queue.SimpleQueue()  # why it is; empty: all has come
+    seen = 0
 
     def heard(_client: Client, _data: object, message: MQTTMessage) -> None:
         nonlocal seen
-        print(message.topic.removeprefix(f"{prefix}/"), message.payload.decode() or "no good value")
+        print(message.topic.removeprefix(f"{prefix}/"), message.payload.decode() or "no good value", flush=True)
         seen += 1
         if message.topic.endswith("/in/result") or seen == arguments.count:
-            done.set()
+            over.put("")
 
-    def subscribe(client: Client, *_: object) -> None:
-        client.subscribe([(topic, 1) for topic in topics])
+    def subscribe(client: Client, _data: object, _flags: ConnectFlags, code: ReasonCode, _: Properties | None) -> None:
+        if code.is_failure:
+            over.put(f"{arguments.broker}: the broker refuses us: {code}")
+        else:
+            client.subscribe([(topic, 1) for topic in topics])
 
     def write(client: Client, *_: object) -> None:
         if path:
             client.publish(f"{prefix}/{path}/in", value, qos=1)
 
-    client = Client(CallbackAPIVersion.VERSION2)
+    def lost(*_: object) -> None:
+        over.put(f"{arguments.broker}: the broker has closed the connection; shmio-supervisor status says how it is")
+
+    client = Client(CallbackAPIVersion.VERSION2, reconnect_on_failure=False)
     client.on_message = heard
     client.on_connect = subscribe
     client.on_subscribe = write
-    client.connect(host, int(port))
-    client.loop_start()
-    ended = done.wait(TIMEOUT_S if path or arguments.count else None)
+    client.on_disconnect = lost
+    try:
+        client.connect(host, int(port))
+        client.loop_start()
+        why = over.get(timeout=arguments.timeout if path or arguments.count else None)
+    except OSError as error:
+        why = f"{arguments.broker}: {error.strerror or error}; shmio-supervisor status says whether the broker runs"
+    except queue.Empty:
+        why = f"{seen} messages in {arguments.timeout:g} s on {', '.join(topics)}; shmio list names the registers"
     client.disconnect()
     client.loop_stop()
-    return 0 if ended else 1
+    if why:
+        print(why, file=sys.stderr)
+    return 1 if why else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        sys.exit(130)
