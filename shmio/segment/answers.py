@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Final, NamedTuple
 
 from shmio.errors import SegmentError
 from shmio.segment.block import Block
 from shmio.segment.frame import Quality
 from shmio.segment.segment import Segment
+
+_NOBODY: Final = "no source lives on the instance's clock: steps move none; those with a device go on in real time"
+_REAL: Final = "; a restart of the instance brings real time back"
 
 
 class Wait(NamedTuple):
@@ -47,3 +51,23 @@ def silence(segment: Segment, block: Block, hard_ns: int) -> str:
             told = slot.supervised
             return f"{what}: its process does not run ({told.phase}{told.note and f': {told.note}'})"
     return what
+
+
+def standing(segment: Segment, participants: Sequence[Block]) -> str:
+    """What the next step does not move, though who steps may expect it, and the remedy; empty: it moves all."""
+    if not participants:
+        return _NOBODY if segment.clock.stepped else f"{_NOBODY}{_REAL}"
+    found: dict[str, list[str]] = {"paused": [], "over": []}
+    for block in participants:
+        try:
+            play = block.playhead.read() if block.playhead is not None else None
+        except SegmentError:  # the step says so
+            continue
+        if play is not None and play.paused:
+            found["over" if play.over else "paused"].append(block.source)
+    return "; ".join(
+        f"the replay of {names[0]}{f' and {len(names) - 1} more' if names[1:] else ''} was {how} and did not move: "
+        "shmio replay play starts it"
+        for how, names in found.items()
+        if names
+    )

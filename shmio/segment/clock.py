@@ -51,7 +51,7 @@ class ClockState(NamedTuple):
     ``step``: number of the last step asked for; ``time_ns``: the instance's clock after it, ``dt_ns`` before which it
     was that much less; in wall time ``time_ns`` is now. ``stepping``: that step is under way. ``done``: number of the
     last one that all participants have finished. ``owner``: pid of who moves time; 0: nobody. ``note``: whom a step
-    waits for, why the last one failed, or that it moved nothing.
+    waits for, why the last one failed, or what it did not move.
     """
 
     mode: ClockMode = ClockMode.WALL

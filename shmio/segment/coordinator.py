@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from shmio.errors import TimeError, ValueRangeError
-from shmio.segment.answers import Wait, answer, silence
+from shmio.segment.answers import Wait, answer, silence, standing
 from shmio.segment.block import Block
 from shmio.segment.clock import ClockMode, ClockState, time_lock
 from shmio.segment.processes import ProcessSlot
@@ -23,7 +23,6 @@ MAX_STEP_NS: Final = 3_600_000_000_000
 TURN_NS: Final = 100_000_000
 """Who waits for an owner of time looks by itself, too: the bell of one that dies is silent."""
 MAX_RATE: Final = 1000.0
-_NOBODY: Final = "no source lives on the instance's clock: steps move none; those with a device go on in real time"
 DISPATCHERS: Final = frozenset({"grpc", "mqtt", "recorder"})
 """Kinds of processes that a step may wait for until they have delivered it."""
 
@@ -147,6 +146,7 @@ class Coordinator:
         check_step(dt_ns)
         step = Step(before.step + 1, before.time_ns + dt_ns, dt_ns)
         participants = self._participants()
+        stands = standing(self._segment, participants)
         asked = before._replace(step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
         problem = "it was broken off"
         try:
@@ -154,7 +154,7 @@ class Coordinator:
             self._ring([block.source for block in participants])
             problem = yield from self._await_frames(step.number, participants, asked)
         finally:
-            note = f"step {step.number} failed: {problem}" if problem else "" if participants else _NOBODY
+            note = f"step {step.number} failed: {problem}" if problem else stands
             done = before.done if problem else step.number
             self._write(asked._replace(done=done, stepping=False, note=note))
         if not problem:

@@ -139,7 +139,7 @@ class Play(NamedTuple):
 class Move(msgspec.Struct, tag="move", forbid_unknown_fields=True, omit_defaults=True):
     """Ask that it plays otherwise, from ``clock_ns`` of the instance's clock on; what is None stays as it is.
 
-    ``until_ns``: where it is to pause, once; None: at the end.
+    ``until_ns``: where it is to pause, once; with ``position_ns`` None is at the end.
     """
 
     clock_ns: int

@@ -51,7 +51,7 @@ class SupervisorStatus(msgspec.Struct):
 class ClockStatus(msgspec.Struct):
     """The instance's clock. ``mode``: wall or virtual. ``step``: number of the last one that all have finished.
 
-    ``note``: whom a step waits for, why the last one failed, or that it moved nothing.
+    ``note``: whom a step waits for, why the last one failed, or what it did not move.
     """
 
     mode: str

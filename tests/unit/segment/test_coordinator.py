@@ -91,11 +91,18 @@ def test_a_step_is_over_when_all_have_done_it(instance: str) -> None:
 
 
 def test_a_step_that_moves_nothing_says_so(instance: str) -> None:
-    with built(instance, spec("plc", stepped=False)) as segment:
+    with built(instance, spec("plc", stepped=False), stepped=False) as segment:
         coordinator = Coordinator(segment)
         assert coordinator.step() == Step(1, coordinator.read().time_ns, 50 * MS)
         assert coordinator.read().note.startswith("no source lives on the instance's clock: steps move none; ")
-        assert coordinator.read().note.endswith("go on in real time"), "it was not cut off"
+        assert coordinator.read().note.endswith("; a restart of the instance brings real time back"), "not cut off"
+
+
+def test_where_real_time_never_was_no_restart_brings_it_back(instance: str) -> None:
+    with built(instance, spec("plc", stepped=False), stepped=True) as segment:
+        coordinator = Coordinator(segment)
+        coordinator.step()
+        assert coordinator.read().note.endswith("go on in real time")
 
 
 def test_frames_are_stamped_with_the_time_after_their_step(instance: str) -> None:
