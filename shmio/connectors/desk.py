@@ -259,7 +259,7 @@ class CommandDesk:
     def _refusal(self, command: Command) -> str:
         """Why a command is not accepted; empty if it is."""
         if command.incarnation != self._writer.incarnation:
-            return "it was meant for the source's process before this one, which ended"
+            return "it was meant for the source's process before this one, which ended: try again"
         late_ns = self._now_ns() - command.deadline_ns
         if late_ns > 0:
             return f"it came {late_ns / 1e6:.0f} ms after its deadline"

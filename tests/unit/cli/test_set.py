@@ -9,6 +9,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from typing import Any
 
 import pytest
@@ -243,6 +244,28 @@ def test_a_source_without_its_device_says_so(device: Device, capsys: pytest.Capt
         "cell/count: not written, the source took nothing: the source is not connected: no answer from 10.0.0.1; "
         "see shmio-supervisor status (and 1 more)\n"
     )
+
+
+def test_a_source_that_is_replaced_before_it_took_it_is_to_be_asked_again(
+    device: Device, instance: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with Segment.open(instance, writable=True) as segment, ExitStack() as stack:
+        queues = segment.blocks["other"].commands
+        seen = queues.bell()
+
+        def replace() -> None:
+            queues.wait(seen, 20 * 10**9)  # the command is there
+            stack.callback(Device(segment.writer("other")).stop)
+
+        replacing = threading.Thread(target=replace)
+        replacing.start()
+        assert main(["set", "other/count", "1"]) == 1
+        replacing.join()
+        assert capsys.readouterr().err == (
+            "other/count: not written, the source took nothing: it was meant for the source's process before this one, "
+            "which ended: try again; see shmio-supervisor status\n"
+        )
+        assert main(["set", "other/count", "1"]) == 0, "the remedy works"
 
 
 def test_a_reason_that_is_not_that_of_the_error_stands_beside_its_value(
