@@ -19,6 +19,9 @@ import grpc
 from shmio.wire.simlog_v1_pb2 import TopicDescriptor
 from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
 
+STOPPED = ("Cancelling all calls", "Socket closed")
+"""What gRPC says of a server that has ended."""
+
 
 async def follow(stub: Any, path: str, options: argparse.Namespace) -> None:
     """Print a topic's values as they come; the first is the present one."""
@@ -57,7 +60,9 @@ async def main() -> int:
         try:
             await asyncio.gather(*(follow(stub, path, options) for path in options.topics))
         except grpc.aio.AioRpcError as error:
-            print(f"{options.address}: {error.code().name}: {error.details()}", file=sys.stderr)
+            stopped = error.details() in STOPPED
+            told = "the endpoint has stopped" if stopped else f"{error.code().name}: {error.details()}"
+            print(f"{options.address}: {told}", file=sys.stderr)
             return 1
     return 0
 

@@ -97,6 +97,8 @@ _PLAIN: Final = {
     "Connection refused": "nothing listens on that port",
     "No such file or directory": "there is no such socket",
     "Domain name not found": "there is no host of that name",
+    "Cancelling all calls": "the endpoint has stopped",
+    "Socket closed": "the endpoint has stopped",
 }
 """What gRPC says at length."""
 _MEANING: Final = {

@@ -16,13 +16,14 @@ import pytest
 
 from shmio.cli.user import main
 from shmio.segment import Segment
+from shmio.testing.cell import BIN
 from tests.unit.endpoints.conftest import segment as segment  # noqa: PLC0414  the fixture
 from tests.unit.endpoints.harness import Endpoint
 from tests.unit.endpoints.plant import Plant
 from tests.unit.endpoints.stepped import Model, simulate, stepped_segment
 from tests.unit.endpoints.test_publish import with_plant
 
-EXAMPLE = Path(__file__).parents[3] / "examples/remote.py"
+EXAMPLES = Path(__file__).parents[3] / "examples"
 
 Output = Callable[..., tuple[int, str, str]]
 Test = Callable[[Output, Output, Plant], None]
@@ -231,10 +232,34 @@ def test_what_is_wrong_with_the_host(capsys: pytest.CaptureFixture[str], tmp_pat
 def test_the_example(segment: Segment) -> None:
     async def run(served: Endpoint, device: Plant) -> None:
         device.memory[13] = 7
-        command = [sys.executable, str(EXAMPLE), f"127.0.0.1:{served.port}", "cell/step", "--count", "1"]
+        command = [sys.executable, str(EXAMPLES / "remote.py"), f"127.0.0.1:{served.port}", "cell/step", "--count", "1"]
         done = await asyncio.to_thread(subprocess.run, command, capture_output=True, text=True, timeout=60, check=False)
         assert done.returncode == 0, done.stderr
         assert re.search(r"cell/step +7\b", done.stdout)
+
+    with_plant(segment, run)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ((sys.executable, str(EXAMPLES / "subscribe.py"), "{}", "cell/step"), "{}: the endpoint has stopped\n"),
+        (
+            (str(BIN / "shmio"), "watch", "--host", "{}", "cell/step"),
+            "{}: no instance serves there, or it has ended: the endpoint has stopped\n",
+        ),
+    ],
+)
+def test_an_endpoint_that_stops_is_told(segment: Segment, words: tuple[str, ...], told: str) -> None:
+    async def run(served: Endpoint, _: Plant) -> None:
+        address = f"127.0.0.1:{served.port}"
+        command = [word.format(address) for word in words]
+        client = await asyncio.create_subprocess_exec(*command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        assert client.stdout is not None
+        assert await asyncio.wait_for(client.stdout.readline(), 60)
+        await served.server.stop()
+        error = (await asyncio.wait_for(client.communicate(), 60))[1]
+        assert (client.returncode, error.decode()) == (1, told.format(address))
 
     with_plant(segment, run)
 
