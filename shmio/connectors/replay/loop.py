@@ -265,8 +265,8 @@ class ReplayLoop:
         if ask.until_ns is not None and ask.until_ns < at_ns:
             return Found(f"that is past: it is at {(at_ns - play.begin_ns) / 1e9:.3f} s; seek to before that first")
         until_ns = play.end_ns if ask.until_ns is None else min(ask.until_ns, play.end_ns)
-        if ask.until_ns is None and ask.paused is None and position_ns is None:
-            until_ns = play.until_ns
+        if ask.until_ns is None and position_ns is None and (ask.paused is None or play.until_ns > at_ns):
+            until_ns = play.until_ns  # `pause` and `play` keep one that lies ahead
         self._keep(
             play._replace(
                 paused=paused,

@@ -75,3 +75,39 @@ def test_what_cannot_be_is_one_line(playing: Playing, instance: str, capsys: pyt
     assert capsys.readouterr().err == "cell: that is past: it is at 0.200 s; seek to before that first\n"
     assert replay(instance, "to-event", "accepted") == 1
     assert capsys.readouterr().err == "there is no event accepted from here to the end of the recording\n"
+
+
+def test_a_step_tells_of_a_replay_that_stands(
+    playing: Playing, instance: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def step(*words: str) -> str:
+        capsys.readouterr()
+        assert main(["step", "--instance", instance, *words]) == 0
+        return capsys.readouterr().out
+
+    stands = "; the replay of cell was {} and did not move: shmio replay play starts it\n"
+    assert step().endswith(", steps of 50 ms\n")
+    assert replay(instance, "pause") == 0
+    assert step("--count", "2", "--dt-ms", "20").endswith("of 20 ms, step size 50 ms" + stands.format("paused"))
+    assert replay(instance, "play") == 0
+    assert step("--dt-ms", "1000").endswith(" of 1000 ms, step size 50 ms\n"), "it moved, to the end"
+    assert json.loads(step("--json"))["note"] == stands.format("over")[2:-1]
+
+
+def test_until_stays_when_it_pauses_and_plays_on(
+    playing: Playing, instance: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def told(*words: str) -> str:
+        capsys.readouterr()
+        assert replay(instance, *words) == 0
+        return capsys.readouterr().out.partition("), ")[2]
+
+    assert told("until", "0.3") == "speed 1, until 0.300 s\n"
+    assert told("pause") == told("play") == "speed 1, until 0.300 s\n"
+    assert told("play", "--speed", "2") == "speed 2, until 0.300 s\n"
+    assert main(["step", "--instance", instance, "--dt-ms", "1000"]) == 0
+    assert [told(), told("play")] == ["speed 2\n", "speed 2\n"], "it has been there"
+    assert told("until", "0.35") == "speed 2, until 0.350 s\n"
+    assert told("until", "0.4") == "speed 2\n"
+    assert told("until", "0.35") == "speed 2, until 0.350 s\n"
+    assert told("seek", "0.1") == "speed 2\n"
