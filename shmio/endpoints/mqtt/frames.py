@@ -9,8 +9,8 @@ from shmio.segment import Block, Frame
 
 TURN_FRAMES: Final = 8
 """So many are taken before what else there is to do has its turn."""
-CATCH_UP_FRAMES: Final = 48
-"""Who is further behind than this goes on with the newest one; what he skips is counted."""
+CATCH_UP_S: Final = 3.0
+"""Who is further behind than this, or than half of the ring, goes on with the newest frame; skips are counted."""
 
 
 class Frames:
@@ -20,6 +20,7 @@ class Frames:
         self._block = block
         self.missed = 0
         """Frames that were skipped, or overwritten before they were read."""
+        self._most = max(1, min(round(CATCH_UP_S * 1e9 / block.period_ns), block.ring.slot_count // 2))
         newest = block.latest()
         self._cursor = block.cursor(after=newest.number - 1 if newest else 0)
 
@@ -30,7 +31,7 @@ class Frames:
 
     def come(self) -> Iterator[Frame]:
         """Those that have come; at most a few."""
-        if self._cursor.behind > CATCH_UP_FRAMES:
+        if self._cursor.behind > self._most:
             newest = self._block.ring.head()
             self.missed += newest - 1 - self._cursor.last
             self.go_on_after(newest - 1)
