@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from shmio.errors import ShmioError
 from shmio.layout.lexer import Kind, Token
 from shmio.layout.model import Diagnostic
@@ -9,6 +11,7 @@ from shmio.layout.report import Report
 from shmio.layout.syntax import Position
 
 _OPENING, _CLOSING = "([", ")]"
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 MAX_INITIAL = 65_536
 
 
@@ -116,11 +119,17 @@ class Cursor:
         return self.token.kind is Kind.WORD and following.kind is Kind.PUNCT and following.text in (":", "{", ",")
 
     def words(self) -> str:
-        """Step over the words and numbers on this line and return them as written, spaces included."""
+        """Step over the words and numbers on this line and return them as written, spaces included.
+
+        What stands between two of them becomes spaces: a tab or a comment is no part of a name.
+        """
         first = last = self.advance()
+        name = first.text
         while self.token.kind in (Kind.WORD, Kind.NUMBER) and self.token.line == first.line:
+            gap = self._text[last.stop : self.token.start]
             last = self.advance()
-        return self._text[first.start : last.stop]
+            name += (" " if gap.strip() else _CONTROL.sub(" ", gap)) + last.text
+        return name
 
     def last_comment(self, start: int) -> str:
         """Return the last comment on the tokens from ``start`` up to the current one."""

@@ -78,6 +78,14 @@ def test_names_of_any_script_and_keywords_before_a_colon() -> None:
     assert list(registers(members)) == ["Осла", "データ", "Type", "Begin", "Name", "Title", "x", "y"]
 
 
+@pytest.mark.parametrize("gap", [" ", "\t", "\x1f", "(* note *)", " (*\x1f*) "])
+def test_what_stands_between_the_words_of_a_name_becomes_spaces(gap: str) -> None:
+    text = block(f"fill{gap}level : Int;", f"fill{gap}level := 3;")
+    layout = layout_of(text)
+    assert [(r.path, r.initial) for r in layout.registers] == [("fill level", "3")]
+    assert Layout.from_json(layout.to_json()) == layout
+
+
 def test_comments() -> None:
     found = registers(
         """
