@@ -20,8 +20,11 @@ from shmio.testing.mosquitto import missing
 # Tests interrupt themselves and others; who runs in the background, or beside others, begins with SIGINT ignored.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-settings.register_profile("unhurried", deadline=None)  # the machine may be busy with other things
-settings.load_profile("unhurried")
+# No deadline: the machine may be busy with other things. Each run has the same examples; --hypothesis-profile=search
+# looks for others.
+settings.register_profile("repeat", deadline=None, derandomize=True)
+settings.register_profile("search", deadline=None, max_examples=1000)
+settings.load_profile("repeat")
 
 SHM = Path("/dev/shm")
 PREFIX = f"test-{os.getpid()}-"
