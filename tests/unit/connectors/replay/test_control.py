@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from shmio.connectors.replay.player import GOES_ON, OVER, STOPPED
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
-from shmio.segment import EventKind, Quality, Record, replays
+from shmio.segment import EventKind, Quality, Record, Segment, replays
 from shmio.segment.attach import Attachment, attach
 from shmio.segment.playhead import Found, Move
 from tests.unit.connectors.replay.harness import (
@@ -166,28 +167,24 @@ def test_a_time_that_is_past_is_not_played_to(here: tuple[Playing, Attachment]) 
     assert counts(playing.frames()) == list(range(11, 16))
 
 
-def both(folder: Path, instance: str) -> Path:
-    """A recording of two sources that count."""
-    with recorded(folder, instance, "cell", "other") as sources:
-        for number in range(20):
-            for one in sources:
-                one.frame(BEGIN_NS + number * PERIOD_NS, image(number))
-    [file] = folder.glob("*.mem")
-    return file
-
-
-def test_a_source_that_missed_requests_catches_up(
-    tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = both(tmp_path, instance)
+@contextmanager
+def without_its_other(folder: Path, instance: str) -> Iterator[tuple[Path, Segment, Playing, Attachment]]:
+    """A replay of two sources that stands; the other's process has ended, and is not waited for long."""
+    file = record(folder, instance, "cell", "other")
     with (
         built(instance, "cell", "other", stepped=False) as segment,
         Playing(segment, file, paused=True) as cell,
         attach(instance, writable=True) as attachment,
+        pytest.MonkeyPatch.context() as monkeypatch,
     ):
         with Playing(segment, file, "other", paused=True) as other:
             other.next()
         monkeypatch.setattr(replays, "ANSWER_S", 1.0)
+        yield file, segment, cell, attachment
+
+
+def test_a_source_that_missed_requests_catches_up(tmp_path: Path, instance: str) -> None:
+    with without_its_other(tmp_path, instance) as (file, segment, cell, attachment):
         with pytest.raises(CommandError, match="does not answer"):
             attachment.replay.seek(0.1)
         cell.until(lambda: attachment.replay.status(["cell"])[0].position_s == 0.1)
@@ -201,7 +198,7 @@ def test_a_source_that_missed_requests_catches_up(
 
 
 def test_a_source_that_joins_others_at_the_end_is_there_as_they_are(tmp_path: Path, instance: str) -> None:
-    file = both(tmp_path, instance)
+    file = record(tmp_path, instance, "cell", "other")
     with (
         built(instance, "cell", "other", stepped=False) as segment,
         Playing(segment, file) as cell,
@@ -215,18 +212,8 @@ def test_a_source_that_joins_others_at_the_end_is_there_as_they_are(tmp_path: Pa
     assert [(frame.quality, frame.reason) for frame in shown] == [(Quality.GOOD, ""), (Quality.BAD, OVER)]
 
 
-def test_a_source_that_catches_up_with_others_at_the_end_is_there_as_they_are(
-    tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = both(tmp_path, instance)
-    with (
-        built(instance, "cell", "other", stepped=False) as segment,
-        Playing(segment, file, paused=True) as cell,
-        attach(instance, writable=True) as attachment,
-    ):
-        with Playing(segment, file, "other", paused=True) as other:
-            other.next()
-        monkeypatch.setattr(replays, "ANSWER_S", 1.0)
+def test_a_source_that_catches_up_with_others_at_the_end_is_there_as_they_are(tmp_path: Path, instance: str) -> None:
+    with without_its_other(tmp_path, instance) as (file, segment, cell, attachment):
         with pytest.raises(CommandError, match="does not answer"):
             attachment.replay.seek(0.3)
         with pytest.raises(CommandError, match="does not answer"):

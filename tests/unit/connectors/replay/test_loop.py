@@ -249,11 +249,7 @@ def test_a_loop_leaves_out_what_is_a_round_late(tmp_path: Path, instance: str) -
 
 
 def test_two_of_one_recording_stay_in_step(tmp_path: Path, instance: str) -> None:
-    with recorded(tmp_path, instance, "cell", "other") as both:
-        for number in range(20):
-            for one in both:
-                one.frame(BEGIN_NS + number * PERIOD_NS, image(number))
-    [file] = tmp_path.glob("*.mem")
+    file = record(tmp_path, instance, "cell", "other")
     with (
         built(instance, "cell", "other", stepped=False) as segment,
         Playing(segment, file) as cell,
