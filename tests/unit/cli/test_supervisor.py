@@ -341,31 +341,36 @@ def test_faults_of_a_layout_have_their_place(example: Edit, capsys: pytest.Captu
     assert "db201.db: no regular file; name the file of a data block" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("pattern", "odd"),
-    [("Outpts", True), ("Robot_9*/*", True), ("Outputs/5", False), ("Inputs/*", False), ("Robot_800", False)],
+WRITABLE = '"Outputs"', '"{}"', "source[0].writable: '{}' names nothing in "
+RECORDED = (
+    'directory = "dumps"',
+    'directory = "dumps"\nregisters = ["{}"]',
+    "recorder.registers: {}: no register has such a path",
 )
-def test_a_writable_that_names_nothing_is_odd(
-    example: Edit, pattern: str, odd: bool, capsys: pytest.CaptureFixture[str]
-) -> None:
-    example('"Outputs"', f'"{pattern}"')
-    assert main(["check"]) == 0
-    output = capsys.readouterr().out
-    assert (f"warning: source[0].writable: '{pattern}' names nothing" in output) is odd
-    assert ("usable, with 1 warning\n" in output) is odd
 
 
 @pytest.mark.parametrize(
-    ("pattern", "odd"),
-    [("cell/Robot_9/**", True), ("cel/Inputs", True), ("cell/Robot_*/Axs1_Pos", False), ("cell/Inputs/5", False)],
+    ("key", "pattern", "odd"),
+    [
+        (WRITABLE, "Outpts", True),
+        (WRITABLE, "Robot_9*/*", True),
+        (WRITABLE, "Outputs/5", False),
+        (WRITABLE, "Inputs/*", False),
+        (WRITABLE, "Robot_800", False),
+        (RECORDED, "cell/Robot_9/**", True),
+        (RECORDED, "cel/Inputs", True),
+        (RECORDED, "cell/Robot_*/Axs1_Pos", False),
+        (RECORDED, "cell/Inputs/5", False),
+    ],
 )
-def test_recorded_registers_that_name_nothing_are_odd(
-    example: Edit, pattern: str, odd: bool, capsys: pytest.CaptureFixture[str]
+def test_a_pattern_that_names_nothing_is_odd(
+    example: Edit, key: tuple[str, str, str], pattern: str, odd: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    example('directory = "dumps"', f'directory = "dumps"\nregisters = ["{pattern}"]')
+    old, new, warning = key
+    example(old, new.format(pattern))
     assert main(["check"]) == 0
     output = capsys.readouterr().out
-    assert (f"warning: recorder.registers: {pattern}: no register has such a path" in output) is odd
+    assert (f"warning: {warning.format(pattern)}" in output) is odd
     assert ("usable, with 1 warning\n" in output) is odd
 
 
