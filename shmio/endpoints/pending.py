@@ -13,7 +13,6 @@ from shmio.segment.events import EVENT_DATA_SIZE
 
 MAX_OPEN: Final = 512
 """Events that may be outstanding: a quarter of the ring, so that none is overwritten before it is read."""
-RETIRED: Final = "the source was changed or removed by a reload"
 
 End = tuple[EventKind, str]
 """What became of an item, one of ``ENDS`` or, if that is waited for, ACCEPTED; and the reason, if there is one."""

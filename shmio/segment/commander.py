@@ -28,9 +28,11 @@ MIN_PERIODS: Final = 3
 _MODELS: Final = frozenset({"simulation", "remote"})  # connectors whose sources have registers that nobody writes
 PATIENCE_S: Final = 1.0
 """What is added for the device's answer to arrive."""
-RESTARTED: Final = "the source was restarted meanwhile; it is not known whether the value was written"
-REPLACED: Final = "the source was changed or removed by a reload; it is not known whether the value was written"
-SILENT: Final = "the source gave no answer in time; it is not known whether the value was written"
+RETIRED: Final = "the source was changed or removed by a reload"
+_UNKNOWN: Final = "; it is not known whether the value was written"
+RESTARTED: Final = f"the source was restarted meanwhile{_UNKNOWN}"
+REPLACED: Final = f"{RETIRED}{_UNKNOWN}"
+SILENT: Final = f"the source gave no answer in time{_UNKNOWN}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,11 @@ from typing import Any, Final, Unpack
 from shmio.config import Declaration
 from shmio.endpoints.grpc.followers import Follower
 from shmio.endpoints.grpc.inlet import Inlet
-from shmio.endpoints.pending import RETIRED, Done, End
+from shmio.endpoints.pending import Done, End
 from shmio.errors import CommandError
 from shmio.layout.write import Write
 from shmio.segment import EventKind
+from shmio.segment.commander import RETIRED
 from shmio.segment.commands import Laid
 
 RETRY_S: Final = 0.25

@@ -15,11 +15,12 @@ from shmio.endpoints.grpc.followers import Follower
 from shmio.endpoints.grpc.outbox import EventLane, Finish, Outbox, StateLane
 from shmio.endpoints.grpc.shape import Shape
 from shmio.endpoints.grpc.subject import Encode, Source, Subject
-from shmio.endpoints.pending import RETIRED, Done, End, worst
+from shmio.endpoints.pending import Done, End, worst
 from shmio.errors import CommandError, PathError
 from shmio.layout.topic import Topic, find
 from shmio.layout.write import covering, encode
 from shmio.segment import DONE, Direction, EventKind
+from shmio.segment.commander import RETIRED
 from shmio.segment.diverted import Diverted, apply
 from shmio.segment.scan import ChangeScan
 

@@ -15,13 +15,13 @@ from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.ear import Ear
 from shmio.endpoints.grpc.echo import Echo
 from shmio.endpoints.grpc.followers import Follower, Followers
-from shmio.endpoints.pending import MAX_OPEN, RETIRED, Cost, Done, Pendings
+from shmio.endpoints.pending import MAX_OPEN, Cost, Done, Pendings
 from shmio.errors import CommandError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
 from shmio.layout.write import Write, merge
 from shmio.segment import Block, Event, EventKind
-from shmio.segment.commander import Commander, Ticket
+from shmio.segment.commander import RETIRED, Commander, Ticket
 from shmio.segment.commands import Laid
 
 

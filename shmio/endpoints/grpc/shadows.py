@@ -16,9 +16,9 @@ from shmio.endpoints.grpc.connections import Peer, connected, peer_of
 from shmio.endpoints.grpc.injection import Injection
 from shmio.endpoints.grpc.shape import Shape
 from shmio.endpoints.grpc.topics import Mark, Topics
-from shmio.endpoints.pending import RETIRED
 from shmio.errors import ConflictError, EndpointError, ValueRangeError
 from shmio.layout.topic import Topic, encode_segment, shorten
+from shmio.segment.commander import RETIRED
 
 MAX_INJECTIONS: Final = 64
 """Of this endpoint, over one source."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from shmio.endpoints.pending import MAX_OPEN, RETIRED, Cost, End, Pendings, worst
+from shmio.endpoints.pending import MAX_OPEN, Cost, End, Pendings, worst
 from shmio.errors import CommandError
 from shmio.layout.model import Register
 from shmio.segment import DONE, Block, EventKind
-from shmio.segment.commander import REPLACED, Commander
+from shmio.segment.commander import REPLACED, RETIRED, Commander
 
 Done = Callable[[EventKind, str], None]
 """Called once: what became of a command, and why."""
