@@ -11,6 +11,7 @@ from shmio.cli.supervise.replaying import options
 from shmio.cli.supervisor import main
 from shmio.errors import ConfigError
 from shmio.segment import Origin
+from shmio.supervisor.plan import process_names
 from tests.unit.connectors.replay.harness import BEGIN_NS, S, image, recorded
 
 CONFIG = """
@@ -75,8 +76,10 @@ def test_its_sources_take_the_places_of_the_configurations(file: Path) -> None:
 
 def test_what_is_asked_for_is_there(file: Path) -> None:
     keys = {"file": [str(file)], "injections": "leave out", "record": True}
-    plan = prepare(file.with_name("supervisor.toml"), "replay", keys).plan
+    prepared = prepare(file.with_name("supervisor.toml"), "replay", keys)
+    plan = prepared.plan
     assert [job.kind for job in plan.jobs] == ["source", "source", "grpc", "recorder"]
+    assert [job.name for job in plan.jobs] == process_names(prepared.config)
     assert plan.blocks[0].declared != b"[]"
 
 

@@ -6,13 +6,14 @@ import json
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 
-from shmio.config import Config, Emulator, Grpc, Instance, Recorder, Source, Token
+from shmio.config import Config, Emulator, Grpc, Instance, Mqtt, Recorder, Source, Token
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout, Register
 from shmio.segment import Segment
-from shmio.supervisor.plan import MAX_PROCESSES, MODULES, RANKS, Job, make_plan
+from shmio.supervisor.plan import MAX_PROCESSES, MODES, MODULES, RANKS, Job, make_plan, process_names
 
 LAYOUT = Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
 PLAYED = {"plc": [LAYOUT]}
@@ -36,6 +37,27 @@ def test_blocks_and_processes_follow_the_configuration(tmp_path: Path) -> None:
     assert [(p.name, p.kind) for p in plan.processes] == [("plc", "emulator"), ("cell0", "source"), ("grpc", "grpc")]
     assert [job.rank for job in plan.jobs] == [0, 1, 2]
     assert plan.segment_bytes > block.size
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    "sections",
+    [
+        {},
+        {"source": [], "emulator": [], "grpc": None},
+        {"mqtt": Mqtt(), "recorder": Recorder()},
+        {"mqtt": Mqtt(broker="mosquitto"), "grpc": None},
+        {"mqtt": Mqtt(broker="external", host="broker.example"), "emulator": []},
+    ],
+)
+def test_all_processes_are_known_by_name_before_they_are_planned(
+    tmp_path: Path, sections: dict[str, Any], mode: str
+) -> None:
+    settings = msgspec.structs.replace(config(tmp_path, sources=2), **sections)
+    layouts = {"cell0": LAYOUT, "cell1": LAYOUT}
+    plan = make_plan(settings, layouts, PLAYED, config_file=tmp_path / "s.toml", mode=mode)
+    left_out = ("grpc", "broker", "mqtt") if mode == "log" else ()
+    assert [job.name for job in plan.jobs] == [name for name in process_names(settings) if name not in left_out]
 
 
 def test_what_is_computed_lives_on_the_clock_which_may_stand_from_the_start(tmp_path: Path) -> None:
