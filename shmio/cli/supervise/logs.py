@@ -5,13 +5,15 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from shmio.cli.supervise.tail import Follower, last_lines
 from shmio.cli.target import DEFAULT_CONFIG, ask, config_file, instance_name, open_supervised
 from shmio.config import load
-from shmio.errors import ConfigError
+from shmio.errors import ConfigError, SegmentError
 from shmio.logs import printable
+from shmio.segment import Segment
 from shmio.supervisor import control
 from shmio.supervisor.plan import process_names
 
@@ -40,13 +42,22 @@ def execute(arguments: argparse.Namespace) -> int:
 
 
 def _where(arguments: argparse.Namespace) -> tuple[Path, list[str]]:
-    """Folder and processes: as the file says, else as the running instance does, whose file may be gone."""
+    """Folder and processes: as the file says, else as the running instance does, whose file may be gone.
+
+    What runs and is in no file, as a replay's sources may be, is known too.
+    """
     if arguments.instance is None and (arguments.config is not None or DEFAULT_CONFIG.exists()):
         config = load(config_file(arguments))
-        return config.log_dir, process_names(config)
+        return config.log_dir, list(dict.fromkeys([*process_names(config), *_running(config.instance.name)]))
     with open_supervised(instance_name(arguments)) as segment:
         names = [slot.name for slot in segment.processes]
         return Path(ask(segment, control.Where(), WHERE_S)["log_dir"]), names
+
+
+def _running(instance: str) -> list[str]:
+    with suppress(SegmentError), Segment.open(instance) as segment:
+        return [slot.name for slot in segment.processes]
+    return []
 
 
 def _print(lines: Iterable[bytes]) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from shmio.cli.supervise.tail import MAX_LINE_BYTES, Follower, last_lines
 from shmio.cli.supervisor import main
+from shmio.segment import ProcessSpec, Segment
 
 
 def stamped(second: int, text: str) -> str:
@@ -79,10 +80,14 @@ def test_a_follower_of_no_folder_is_an_error(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def instance_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Path:
+def instance_logs(
+    tmp_path: Path, instance: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Path:
     monkeypatch.chdir(tmp_path)
     assert main(["init"]) == 0
     capsys.readouterr()
+    config = Path("supervisor.toml")
+    config.write_text(config.read_text().replace('name = "a50"', f'name = "{instance}"'))
     logs = tmp_path / "logs"
     logs.mkdir()
     (logs / "supervisor.log").write_text(stamped(1, "cell running"))
@@ -116,6 +121,24 @@ def test_the_bridge_and_its_broker_have_logs_too(instance_logs: Path, capsys: py
     config = Path("supervisor.toml")
     config.write_text(config.read_text().replace('broker = "embedded"', 'broker = "external"\nhost = "broker.example"'))
     assert main(["logs", "broker"]) == 1, "it is somebody else's"
+
+
+def test_what_runs_and_is_in_no_file_has_logs_too(
+    instance_logs: Path, instance: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As a source does that ``--mode replay`` has added."""
+    (instance_logs / "arm.log").write_text(stamped(3, "arm plays"))
+    assert main(["logs", "arm"]) == 1
+    assert capsys.readouterr().err.startswith("no process 'arm'; ")
+    with Segment.create(instance, [], [ProcessSpec("cell", "source"), ProcessSpec("arm", "source")]) as segment:
+        try:
+            assert main(["logs", "arm"]) == 0
+            assert capsys.readouterr().out == stamped(3, "arm plays")
+            assert main(["logs", "-n", "1"]) == 0
+            assert capsys.readouterr().out == stamped(3, "arm plays")
+            assert main(["logs", "plc"]) == 1, "it is in the file, and has no log"
+        finally:
+            segment.unlink()
 
 
 def test_logs_before_the_first_start(instance_logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
