@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from shmio import __version__
+from shmio.cli.interrupt import undone_by_signals
 from shmio.cli.run import run
 
 PROGRAM = "shmio-dump"
@@ -35,7 +36,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         status: int = verb.execute(arguments)
         return status
 
-    return run(PROGRAM, command)
+    with undone_by_signals():  # a file that is being made is removed again
+        return run(PROGRAM, command)
 
 
 def _parser() -> argparse.ArgumentParser:

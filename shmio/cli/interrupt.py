@@ -1,8 +1,9 @@
-"""Ctrl-C, SIGTERM and a closed terminal, for commands that run until they are told to stop."""
+"""Ctrl-C, SIGTERM and a closed terminal, for commands that run until they are told to stop, or are cut short."""
 
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +22,29 @@ def told_to_stop() -> Iterator[threading.Event]:
     old = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         yield stopping
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def undone_by_signals() -> Iterator[None]:
+    """SIGTERM and a closed terminal end what is at work as Ctrl-C does, by an exception: nothing is left half done.
+
+    The exit status is 128 + n, as shells have it. What was ignored, as SIGHUP is under nohup, still is.
+    """
+
+    def end(number: int, _frame: FrameType | None) -> None:
+        for other in old:
+            signal.signal(other, signal.SIG_IGN)  # a shell that ends tells it once more, and what is undone is undone
+        sys.exit(128 + number)
+
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
+    old = {number: handler for number, handler in handlers.items() if handler is not signal.SIG_IGN}
+    for number in old:
+        signal.signal(number, end)
+    try:
+        yield
     finally:
         for number, handler in old.items():
             signal.signal(number, handler)

@@ -6,6 +6,7 @@ import errno
 import os
 import random
 import re
+import signal
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from mcap.reader import make_reader
 
 import shmio
 from shmio.cli.dump import main
+from shmio.cli.dumping.progress import Progress
 from shmio.dump.check import check
 from shmio.dump.encoding import Gap, Reason, StepMark
 from shmio.dump.reader import Reader
@@ -230,10 +232,15 @@ def test_a_flipped_bit_anywhere_is_told_and_costs_one_chunk_at_most(
         new.unlink()
 
 
-@pytest.mark.parametrize(
-    ("verb", "output"),
-    [("cut", "new.mem"), ("merge", "new.mem"), ("recover", "new.mem"), ("export", "new.mcap"), ("export", "tables")],
-)
+NEW = [("cut", "new.mem"), ("merge", "new.mem"), ("recover", "new.mem"), ("export", "new.mcap"), ("export", "tables")]
+
+
+def options(verb: str, output: str) -> list[str]:
+    """What ``export`` is told more, to make one file."""
+    return ["--format", "mcap" if output == "new.mcap" else "csv", "--source", "cell"] if verb == "export" else []
+
+
+@pytest.mark.parametrize(("verb", "output"), NEW)
 def test_a_full_disk_is_told_with_the_file_and_leaves_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], verb: str, output: str
 ) -> None:
@@ -242,8 +249,48 @@ def test_a_full_disk_is_told_with_the_file_and_leaves_none(
 
     file, new = varied(tmp_path / "a.mem"), tmp_path / output
     monkeypatch.setattr(os, "fsync", full)
-    options = ["--format", "mcap" if new.suffix else "csv", "--source", "cell"] if verb == "export" else []
-    assert main([verb, str(file), "-o", str(new), *options]) == 1
+    assert main([verb, str(file), "-o", str(new), *options(verb, output)]) == 1
     path = new if new.suffix else new / "cell.csv"
     assert capsys.readouterr().err == f"{path}: No space left on device\n"
     assert not new.exists()
+
+
+@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize(("verb", "output"), NEW)
+def test_what_is_told_to_end_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verb: str, output: str, sign: signal.Signals
+) -> None:
+    """It is told when some of the frames are written, and while it removes them once more."""
+    file = varied(tmp_path / "a.mem")
+    made: list[Path] = []
+    unlink = Path.unlink
+
+    def tell(*_: object) -> None:
+        made.extend(path for path in tmp_path.rglob("*") if path.is_file() and path != file)
+        signal.raise_signal(sign)
+
+    def unlink_late(path: Path, missing_ok: bool = False) -> None:
+        if sign != signal.SIGINT:
+            signal.raise_signal(sign)
+        unlink(path, missing_ok)
+
+    monkeypatch.setattr(Progress, "at", tell)
+    monkeypatch.setattr(Path, "unlink", unlink_late)
+    try:
+        status: object = main([verb, str(file), "-o", str(tmp_path / output), *options(verb, output)])
+    except SystemExit as end:
+        status = end.code
+    assert (len(made), status) == (1, 128 + sign)
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_what_is_to_go_on_without_its_terminal_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As nohup has it."""
+    file = varied(tmp_path / "a.mem")
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        monkeypatch.setattr(Progress, "at", lambda *_: signal.raise_signal(signal.SIGHUP))
+        assert main(["cut", str(file), "-o", "new.mem"]) == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    whole(Path("new.mem"))
