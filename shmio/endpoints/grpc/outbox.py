@@ -244,7 +244,7 @@ class StateLane(_Lane):
 
 
 class EventLane(_Lane):
-    """For events, of which none replaces another: all of them up to the one that did not fit, and then the end.
+    """For events, of which none replaces another: every one of them, or the end, with what waits dropped and counted.
 
     It is an echo's listener.
     """
@@ -261,7 +261,7 @@ class EventLane(_Lane):
         self._add(message)
 
     def fail(self, reason: str) -> None:
-        """End the whole outbox: what comes next is not all there was."""
+        """End the whole outbox, what waits included: it is not all there was any more."""
         self._outbox.fail(f"{self._path}: {reason}")
 
     def join(self, feed: Feed, subject: Subject) -> Callable[[], None]:
