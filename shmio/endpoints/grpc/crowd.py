@@ -14,7 +14,8 @@ from shmio.segment import Block, Cursor, Frame
 CATCH_UP_FRAMES: Final = 48
 """A feed that is further behind than this goes on with the newest frame: what it skips is conflated, not lost.
 
-So does one that nobody listens to.
+So does one that nobody listens to. Frames, not a time as for the MQTT bridge, which falls behind only if it is held up
+itself: here what clients are too slow for waits in the ring, and each takes it late, as many as an outbox has room for.
 """
 FEW_FRAMES: Final = 8
 """So many, if they are new, are better than the newest alone for a client that is behind: it need not wait for more."""
