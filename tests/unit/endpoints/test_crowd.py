@@ -215,6 +215,29 @@ def test_who_joins_while_a_feed_rests_asks_for_more_as_the_others_do(segment: Se
     follow(segment, test, False)
 
 
+def test_who_has_left_asks_for_nothing_more(segment: Segment) -> None:
+    """What others have no time for is not read on its behalf."""
+
+    async def test(followed: Followed) -> None:
+        feed, (stream,) = followed.feed, followed.streams
+        gone = Outbox()
+        leave = StateLane(gone).join(feed, STEP)
+        await followed.publish(1)  # passed over: neither asks
+        async with asyncio.timeout(TIMEOUT_S):
+            while not (gone.refills and stream.refills):  # noqa: ASYNC110  another thread's doing
+                await asyncio.sleep(0)
+        leave()
+        before = feed.messages
+        assert await followed.next(gone) == 1, "what it was given"
+        asking = asyncio.ensure_future(followed.next(gone))
+        await asyncio.sleep(0)
+        assert feed.messages == before
+        asking.cancel()
+        assert await followed.next(stream) == 2
+
+    follow(segment, test, False)
+
+
 def test_bad_news_of_a_source_that_says_nothing_more_wait_for_no_ring(
     segment: Segment, monkeypatch: pytest.MonkeyPatch
 ) -> None:

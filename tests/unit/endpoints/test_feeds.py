@@ -9,11 +9,13 @@ import weakref
 
 import pytest
 
+from shmio.endpoints.grpc import bells as ringing
+from shmio.endpoints.grpc import crowd
 from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.feeds import Feeds
 from shmio.endpoints.grpc.hold import Hold, Moment
 from shmio.endpoints.grpc.subject import Subject
-from shmio.segment import Attributes, BlockSpec, Segment
+from shmio.segment import Attributes, BlockSpec, Quality, Segment
 from tests.unit.endpoints.harness import LAYOUT, STALE_NS, TIMEOUT_S, WRITABLE, WRITER, image
 from tests.unit.endpoints.stepped import LAYOUT as MODEL_LAYOUT
 from tests.unit.endpoints.stepped import stepped_segment
@@ -122,4 +124,34 @@ def test_a_model_that_a_reload_changes_in_virtual_time_is_shown_step_by_step_too
         bells.close()
 
     with stepped_segment(instance, "sim") as segment:
+        asyncio.run(run(segment))
+
+
+def test_a_feed_that_is_held_passes_nothing_over(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it reads is not for its streams: they have nothing to be too slow for."""
+    monkeypatch.setattr(crowd, "LOOK_S", 1000.0)
+    monkeypatch.setattr(ringing, "REST_S", 0.001)
+
+    async def run(opened: Segment) -> None:
+        told, bells = list[bool](), Bells()
+        feeds = Feeds(opened, WRITER, bells, lambda _, good: told.append(good))
+        feeds.start()
+        feed, stream, writer = feeds["sim"], Recorder(), opened.writer("sim")
+        feed.listen(COUNT, stream)
+        writer.publish(bytes(MODEL_LAYOUT.size), cycle=1)
+        async with asyncio.timeout(TIMEOUT_S):
+            while told[-1:] != [True]:  # noqa: ASYNC110  another thread's doing
+                await asyncio.sleep(0)
+            feed.hold()
+            for cycle in range(2, 2 * crowd.CATCH_UP_FRAMES):
+                writer.publish(bytes(MODEL_LAYOUT.size), cycle=cycle)
+            writer.publish(bytes(MODEL_LAYOUT.size), cycle=2 * crowd.CATCH_UP_FRAMES, quality=Quality.BAD)
+            while told[-1]:  # noqa: ASYNC110  another thread's doing
+                await asyncio.sleep(0)
+        assert stream.stream.dropped == 0
+        feed.leave(COUNT, stream)
+        feeds.stop()
+        bells.close()
+
+    with stepped_segment(instance, "sim", virtual=False) as segment:
         asyncio.run(run(segment))
