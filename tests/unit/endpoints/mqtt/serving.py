@@ -1,0 +1,183 @@
+"""Our own broker, in a thread, as its process runs it; and a client that is no good."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from shmio.config import Address, Mqtt
+from shmio.endpoints.mqtt import broker
+from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
+from tests.unit.endpoints.harness import LAYOUT, STALE_NS, WRITABLE, image
+from tests.unit.endpoints.mqtt.harness import PREFIX, TIMEOUT_S, Running
+
+
+@contextmanager
+def broker_segment(instance: str, folder: Path) -> Iterator[Segment]:
+    block = BlockSpec("cell", LAYOUT, 20_000_000, STALE_NS, 1 << 20, Attributes("test", WRITABLE))
+    processes = [ProcessSpec("cell", "source"), ProcessSpec("broker", "mqtt"), ProcessSpec("mqtt", "mqtt")]
+    with Segment.create(instance, [block], processes, control=str(folder / "a.sock")) as segment:
+        segment.writer("cell").publish(image(step=7), cycle=1)
+        yield segment
+        segment.unlink()
+
+
+class Process:
+    """The broker's process, as far as it needs one."""
+
+    def __init__(self, segment: Segment, **config: Any) -> None:
+        self.stopping, self.ready = threading.Event(), threading.Event()
+        self.failure: Exception | None = None
+        self.refused = 0
+        """As its counters tell."""
+        self._told = threading.Condition()
+        self._stops: list[Callable[[], object]] = []
+        self._worker: Any = SimpleNamespace(
+            name="broker",
+            config=config,
+            segment=segment,
+            log=logging.getLogger("test"),
+            stopping=self.stopping,
+            on_stop=self._stops.append,
+            running=self.ready.set,
+            report=self._report,
+        )
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _report(self, counters: tuple[int, ...] = (0, 0, 0)) -> None:
+        with self._told:
+            self.refused = counters[2]
+            self._told.notify_all()
+
+    def until_refused(self, count: int) -> None:
+        """Wait until it tells that so many were."""
+        with self._told:
+            assert self._told.wait_for(lambda: self.refused >= count, TIMEOUT_S), self.refused
+
+    def _run(self) -> None:
+        try:
+            broker.run(self._worker)
+        except Exception as error:  # noqa: BLE001  whatever it is, it is the test's to tell
+            self.failure = error
+        finally:
+            self.ready.set()
+
+    def stop(self) -> None:
+        self.stopping.set()
+        for stop in self._stops:
+            stop()
+        self._thread.join(TIMEOUT_S)
+        assert not self._thread.is_alive()
+
+
+@contextmanager
+def serving(segment: Segment, address: Address, program: str, **config: Any) -> Iterator[Process]:
+    process = Process(segment, broker=program, listen=str(address), **config)
+    try:
+        assert process.ready.wait(TIMEOUT_S)
+        if process.failure is not None:
+            raise process.failure
+        yield process
+    finally:
+        process.stop()
+
+
+@contextmanager
+def bridged(segment: Segment) -> Iterator[Running]:
+    """A bridge to the broker of this instance."""
+    running = Running(segment, Mqtt(listen="127.0.0.1:1", prefix=PREFIX))
+    try:
+        running.until(lambda: running.bridge.link.up)
+        yield running
+    finally:
+        running.stop()
+
+
+class Raw:
+    """A client that sends what it likes; MQTT 3.1.1."""
+
+    def __init__(self, address: Address, name: str, *, clean: bool = True) -> None:
+        self._socket = socket.create_connection((address.host, address.port), TIMEOUT_S)
+        self._numbers = 0
+        self.send(0x10, b"\0\4MQTT\4" + bytes([2 * clean]) + b"\0\0" + _text(name))
+        kind, told = self.packet()
+        assert kind == 0x20
+        self.before, self.code = bool(told[0]), told[1]
+        """Whether there was a session; whether it was let in: 0."""
+
+    def __enter__(self) -> Raw:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+    def send(self, kind: int, body: bytes) -> None:
+        length, rest = bytearray(), len(body)
+        while rest > 127:
+            length.append(rest & 0x7F | 0x80)
+            rest >>= 7
+        self._socket.sendall(bytes([kind, *length, rest]) + body)
+
+    def packet(self) -> tuple[int, bytes]:
+        """The next one; ConnectionError: there will be none."""
+        (kind,) = self._exactly(1)
+        size, place = 0, 0
+        while True:
+            (byte,) = self._exactly(1)
+            size |= (byte & 0x7F) << place
+            place += 7
+            if byte < 0x80:
+                return kind, self._exactly(size)
+
+    def _exactly(self, size: int) -> bytes:
+        read = b""
+        while len(read) < size:
+            part = self._socket.recv(size - len(read))
+            if not part:
+                raise ConnectionResetError
+            read += part
+        return read
+
+    def ended(self) -> bool:
+        """Wait for its end; TimeoutError: there is none."""
+        with suppress(ConnectionError):
+            while True:
+                self.packet()
+        return True
+
+    def number(self) -> bytes:
+        self._numbers += 1
+        return self._numbers.to_bytes(2, "big")
+
+    def publish(self, topic: str, payload: bytes, *, qos: int = 0, retain: bool = False) -> None:
+        self.send(0x30 | qos << 1 | retain, _text(topic) + (self.number() if qos else b"") + payload)
+
+    def subscribe(self, *filters: str) -> bytes:
+        """What the broker says to each: 0, or 0x80, it refuses."""
+        self.send(0x82, self.number() + b"".join(_text(one) + b"\1" for one in filters))
+        while True:
+            kind, told = self.packet()
+            if kind == 0x90:
+                return told[2:]
+
+    def unsubscribe(self, *filters: str) -> None:
+        self.send(0xA2, self.number() + b"".join(map(_text, filters)))
+        while self.packet()[0] != 0xB0:
+            pass
+
+    def ping(self) -> None:
+        """Wait until all that was sent has been read."""
+        self.send(0xC0, b"")
+        while self.packet()[0] != 0xD0:
+            pass
+
+
+def _text(text: str) -> bytes:
+    return len(text).to_bytes(2, "big") + text.encode()
