@@ -32,8 +32,11 @@ PACKETS: Final = 100
 """So many are taken from the broker before what else there is to do has its turn."""
 
 
-class _Client(Client):
+class BrokerClient(Client):
     """Reads no more packets at once than it is told to: paho's reads as many as we have in flight."""
+
+    tls_error: ssl.SSLError | None = None
+    """What TLS said against the connection after it was made, if that is why it has ended."""
 
     def loop_read(self, max_packets: int = 1) -> MQTTErrorCode:
         for _ in range(max_packets):
@@ -47,6 +50,15 @@ class _Client(Client):
         return MQTTErrorCode.MQTT_ERR_SUCCESS
 
 
+class _TlsClient(BrokerClient):
+    def _sock_recv(self, bufsize: int) -> bytes:
+        try:
+            return super()._sock_recv(bufsize)
+        except ssl.SSLError as error:  # with TLS 1.3 a broker says only then that it does not take our certificate
+            self.tls_error = error
+            raise
+
+
 class Attempt:
     """Begins at once, with the broker whose turn it is."""
 
@@ -58,7 +70,7 @@ class Attempt:
         self._begun_s = time.monotonic()
         self.over = False
         """Whether ``client``, ``socket`` and ``problem`` are what has come of it."""
-        self.client: Client | None = None
+        self.client: BrokerClient | None = None
         self.socket: socket.socket | None = None
         """A connection, on which nothing was read yet."""
         self.offered = False
@@ -102,7 +114,7 @@ class Attempt:
         """ConfigError: a file that is needed for it will not do."""
         settings, target, new = self._dialling.settings, self.target, self._protocol == MQTTv5
         # A client of its own for each attempt: what one has not got rid of is none of the next one's business.
-        client = self.client = _Client(
+        client = self.client = (BrokerClient if settings.tls is None else _TlsClient)(
             CallbackAPIVersion.VERSION2,
             self._dialling.client_id,
             clean_session=None if new else not settings.session_expiry_s,

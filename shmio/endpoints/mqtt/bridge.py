@@ -83,7 +83,7 @@ class Bridge:
     def counters(self) -> tuple[int, ...]:
         """As the process table names them."""
         commands, outbox = self._commands, self.outbox
-        refused = commands.refused + self.link.refused
+        refused = commands.refused + self.link.complaints.refused
         own = (
             outbox.sent, commands.received, refused, outbox.waiting, outbox.backlog, outbox.dropped, self.link.connects,
             self._missed + sum(feed.missed for feed in self._feeds.values()),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 import ssl
+import time
 from typing import TYPE_CHECKING, Final
 
 from paho.mqtt.reasoncodes import ReasonCode
@@ -15,6 +17,50 @@ if TYPE_CHECKING:
 _WHO: Final = frozenset({0x86, 0x87})
 _BUSY: Final = frozenset({0x88, 0x89, 0x97, 0x9F})
 _TAKEN_OVER: Final = 0x8E
+
+REFUSED_S: Final = 10.0
+"""So long it is told that a broker refuses messages, though it has taken others since."""
+
+log = logging.getLogger("shmio.mqtt")
+
+
+class Complaints:
+    """What is wrong with a connection at present, once each in the log."""
+
+    def __init__(self) -> None:
+        self.problem = ""
+        """Empty: all is well."""
+        self.refused = 0
+        """Messages that the broker did not take."""
+        self._refused_s = 0.0
+        self._deaf = ""
+
+    def say(self, problem: str) -> None:
+        """There is something else wrong now."""
+        if problem != self.problem:
+            log.warning("%s", problem)
+        self.problem = problem
+
+    def clear(self) -> None:
+        """There is a connection."""
+        self.problem = self._deaf = ""
+
+    def deaf(self, problem: str) -> None:
+        """By this connection no command can come."""
+        self._deaf = problem
+        self.say(problem)
+
+    def refuse(self, problem: str) -> None:
+        """A message was not taken."""
+        self.refused += 1
+        self._refused_s = time.monotonic()
+        if not self.problem:  # the first stands for all that follow
+            self.say(problem)
+
+    def taken(self) -> None:
+        """A message was taken."""
+        if self.problem and time.monotonic() >= self._refused_s + REFUSED_S:
+            self.problem = self._deaf
 
 
 def refusal(code: ReasonCode, dialling: Dialling) -> str:
@@ -28,12 +74,18 @@ def refusal(code: ReasonCode, dialling: Dialling) -> str:
     return f"it refuses: {code}"
 
 
+def ended(error: ssl.SSLError | None, *, up: bool) -> str:
+    """Why a connection has ended. ``error``: what TLS said; ``up``: the broker had let us in."""
+    if error is not None:
+        return _tls(error)
+    lost = "the connection was lost"
+    return lost if up else f"{lost} before it let us in: it is full, or expects TLS there (mqtt.tls), or is no broker"
+
+
 def why(error: Exception, target: Target) -> str:
     """Why no connection could be made."""
-    if isinstance(error, ssl.SSLCertVerificationError):
-        return f"its certificate is not to be trusted ({error.verify_message}): check mqtt.tls.ca, and the host's name"
     if isinstance(error, ssl.SSLError):
-        return f"no TLS with it ({error.reason or 'it ended the connection'}): check mqtt.tls, and the port"
+        return _tls(error)
     if isinstance(error, socket.gaierror):
         return f"no host of this name is known ({error.strerror})"
     if isinstance(error, TimeoutError):
@@ -45,3 +97,11 @@ def why(error: Exception, target: Target) -> str:
     if isinstance(error, ConnectionError):
         return "it closed the connection"
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
+
+
+def _tls(error: ssl.SSLError) -> str:
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"its certificate is not to be trusted ({error.verify_message}): check mqtt.tls.ca, and the host's name"
+    if "_ALERT_" in (error.reason or ""):
+        return f"it refuses our TLS ({error.reason}): check mqtt.tls.certificate and key, which it may want"
+    return f"no TLS with it ({error.reason or 'it ended the connection'}): check mqtt.tls, and the port"

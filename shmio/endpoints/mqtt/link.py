@@ -18,9 +18,9 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 from paho.mqtt.subscribeoptions import SubscribeOptions
 
-from shmio.endpoints.mqtt.attempt import CONNECT_S, PACKETS, SLOW, Attempt, hang_up, unseen
+from shmio.endpoints.mqtt.attempt import CONNECT_S, PACKETS, SLOW, Attempt, BrokerClient, hang_up, unseen
 from shmio.endpoints.mqtt.channel import Message
-from shmio.endpoints.mqtt.failure import refusal
+from shmio.endpoints.mqtt.failure import Complaints, ended, refusal
 from shmio.endpoints.mqtt.limits import Limits
 from shmio.endpoints.mqtt.target import Dialling, Target
 
@@ -50,13 +50,12 @@ class Link:
         """Set when a connection has been made; who has greeted it takes it back."""
         self.on_lost: Callable[[list[Message]], None] = lambda _: None
         """Called when a connection is gone, with what it has not taken for certain."""
-        self.problem = ""
-        """Why there is no connection, or what the broker refuses; empty: all is well."""
-        self.connects = self.refused = 0
+        self.complaints = Complaints()
+        self.connects = 0
         self._dialling, self._selector, self._wake, self._will = dialling, selector, wake, will
         self.on_message: Callable[[MQTTMessage], None] = lambda _: None
         """Called with each message that comes."""
-        self._client: Client | None = None
+        self._client: BrokerClient | None = None
         self._socket: socket.socket | None = None
         self._writing = False
         self._target: Target | None = None
@@ -68,6 +67,11 @@ class Link:
         self._new_will: Message | None = None  # that no broker was told yet
         self._in_flight: dict[int, Message] = {}
         self._limits = Limits()
+
+    @property
+    def problem(self) -> str:
+        """Why there is no connection, or what the broker refuses; empty: all is well."""
+        return self.complaints.problem
 
     @property
     def mqtt5(self) -> bool:
@@ -102,7 +106,7 @@ class Link:
             self._target = self._attempt.target
         if self._client is None:
             if self._attempt is not None and self._attempt.slow:
-                self._complain(f"broker {self._target}: {SLOW}")
+                self.complaints.say(f"broker {self._target}: {SLOW}")
             return CONNECT_S
         if self._until_s is not None and now_s >= self._until_s:
             self.drop("it does not answer")
@@ -170,33 +174,33 @@ class Link:
         self._misc_s = self._up_s + 1.0
         self.up = self.came_up = True
         self.connects += 1
-        self.problem = ""
+        self.complaints.clear()
         version = "5" if self._protocol == MQTTv5 else "3.1.1"
         log.info("connected to broker %s, MQTT %s", self._target, version)
 
     def _disconnected(
         self, client: Client, _data: Any, flags: DisconnectFlags, code: ReasonCode, _properties: Properties | None
     ) -> None:
-        if client is self._client:
-            told = flags.is_disconnect_packet_from_server
-            self.drop(refusal(code, self._dialling) if told else "the connection was lost")
+        if self._client is None or client is not self._client:
+            return
+        told = flags.is_disconnect_packet_from_server
+        self.drop(refusal(code, self._dialling) if told else ended(self._client.tls_error, up=self.up))
 
     def _acknowledged(
         self, client: Client, _data: Any, mid: int, code: ReasonCode, _properties: Properties | None
     ) -> None:
-        if client is self._client and self._in_flight.pop(mid, None) is not None and code.is_failure:
-            self.refused += 1
-            if not self.problem:
-                log.warning("broker %s refuses messages: %s", self._target, code)
-            self.problem = f"broker {self._target} refuses messages: {code}"
-        elif self.up:
-            self.problem = ""
+        if client is not self._client:
+            return
+        if (message := self._in_flight.pop(mid, None)) is not None and code.is_failure:
+            self.complaints.refuse(f"broker {self._target} refuses messages: {code}: {message.topic}")
+        else:
+            self.complaints.taken()
 
     def _subscribed(
         self, client: Client, _data: Any, _mid: int, codes: Sequence[ReasonCode], _properties: Properties | None
     ) -> None:
-        if client is self._client and any(code.is_failure for code in codes):
-            log.warning("broker %s does not let us subscribe: no command can come: %s", self._target, codes[0])
+        if client is self._client and (refused := [code for code in codes if code.is_failure]):
+            self.complaints.deaf(f"broker {self._target} does not let us subscribe: no command can come: {refused[0]}")
 
     # ---- its end -----------------------------------------------------------------------------------------------------
 
@@ -231,13 +235,8 @@ class Link:
     def _fail(self, problem: str) -> None:
         self._close()
         self._protocol = MQTTv5
-        self._complain(problem)
+        self.complaints.say(problem)
         self._retry_s = time.monotonic() + self._dialling.wait_s()
-
-    def _complain(self, problem: str) -> None:
-        if problem != self.problem:
-            log.warning("%s", problem)
-        self.problem = problem
 
     def _close(self) -> None:
         client, self._client = self._client, None
@@ -259,8 +258,8 @@ class Link:
             return
         limits = self._limits
         if not limits.fit(message):
-            self.refused += 1
-            self.problem = f"broker {self._target} takes {limits.packet_bytes} bytes at once: {message.topic} has more"
+            most = f"takes {limits.packet_bytes} bytes at once"
+            self.complaints.refuse(f"broker {self._target} {most}: {message.topic} has more")
             return
         qos, retain = min(message.qos, limits.qos), message.retain and limits.retain
         if qos:

@@ -83,7 +83,7 @@ class Session:
     def counters(self) -> tuple[int, ...]:
         """As those of the bridge."""
         waiting = sum(map(len, self._waiting.values()))
-        refused, connects = self._refused + self.link.refused, self.link.connects
+        refused, connects = self._refused + self.link.complaints.refused, self.link.connects
         missed = self._missed + sum(device.missed for device in self._devices.values())
         kept = self._backlog
         return self._sent, self._received, refused, waiting, kept.count, kept.dropped, connects, missed

@@ -5,6 +5,7 @@ from __future__ import annotations
 import selectors
 import socket
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -44,3 +45,76 @@ def test_a_connection_that_comes_about_after_the_end_is_closed_and_wakes_nobody(
             while connection.recv(1000):
                 pass
         assert not woken.is_set()
+
+
+class Broker:
+    """The other end of a link, as a test plays it byte by byte. (MQTT 5.0, section 3.)"""
+
+    def __init__(self, server: socket.socket) -> None:
+        self._server = server
+        self._selector = selectors.DefaultSelector()
+        settings = Mqtt(broker="external", host=f"127.0.0.1:{server.getsockname()[1]}")
+        self.link = Link(
+            Dialling(settings, "test", str), self._selector, lambda: None, lambda: Message("will", b"", 1, retain=True)
+        )
+        self.link.turn()
+        self._socket, _ = server.accept()
+        self._socket.settimeout(TIMEOUT_S)
+        self.hear(0x10)
+        self.say("20 03 00 00 00", lambda: self.link.up)
+
+    def hear(self, kind: int) -> None:
+        """Take a packet of this kind, and no more."""
+        assert self._socket.recv(1)[0] & 0xF0 == kind
+        length = shift = 0
+        while (byte := self._socket.recv(1)[0]) & 0x80:
+            length, shift = length | (byte & 0x7F) << shift, shift + 7
+        length |= byte << shift
+        while length:
+            length -= len(self._socket.recv(length))
+
+    def say(self, packet: str, until: Callable[[], bool]) -> None:
+        """Send one, and turn the link until it has brought something about."""
+        self._socket.sendall(bytes.fromhex(packet))
+        while not until():
+            self.link.turn()
+            for key, events in self._selector.select(0.1):
+                key.data(events)
+
+    def close(self) -> None:
+        self.link.close()
+        self._socket.close()
+        self._selector.close()
+
+
+def test_what_a_broker_refuses_is_told_as_long_as_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not only until it takes something else."""
+
+    def publish(topic: str) -> None:
+        link.send(Message(topic, b"1", 1, retain=True))
+        broker.hear(0x30)
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        broker = Broker(server)
+        link = broker.link
+        try:
+            publish("secret")
+            broker.say("40 03 00 01 87", lambda: not link.in_flight)
+            assert link.problem.endswith("refuses messages: Not authorized: secret")
+            publish("open")
+            broker.say("40 02 00 02", lambda: not link.in_flight)
+            assert "secret" in link.problem
+            monkeypatch.setattr("shmio.endpoints.mqtt.failure.REFUSED_S", 0.0)
+            publish("open")
+            broker.say("40 02 00 03", lambda: not link.in_flight)
+            assert not link.problem
+            link.subscribe(["a/in", "b/in"])
+            broker.hear(0x80)
+            broker.say("90 05 00 04 00 01 87", lambda: bool(link.problem))
+            told = "does not let us subscribe: no command can come: Not authorized"
+            assert told in link.problem
+            publish("open")
+            broker.say("40 02 00 05", lambda: not link.in_flight)
+            assert told in link.problem
+        finally:
+            broker.close()
