@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import hmac
+import re
 import secrets
 from typing import Final
 
@@ -15,6 +16,8 @@ MAX_BYTES: Final = 1 << 20
 ROUNDS: Final = 101
 """Of mosquitto's own hashes, as its versions up to 2.0 make them; passwords come once a connection."""
 KEY: Final = "mqtt.password_file"
+_HASH: Final = re.compile(r"\$[0-9a-z-]{1,16}\$")
+"""How a hash begins, of whatever kind."""
 
 
 def read_password(name: str) -> str:
@@ -41,7 +44,14 @@ def read_accounts(name: str) -> dict[str, str]:
             raise ConfigError(f"{KEY}: {name}: line {number}: expected name:password")
         if user in accounts:
             raise ConfigError(f"{KEY}: {name}: line {number}: this name has a line already")
+        if user != user.strip() or secret != secret.strip():
+            raise ConfigError(f"{KEY}: {name}: line {number}: a blank beside the colon, or at an end, would count: remove it")
         known = _parts(secret)
+        if not known and _HASH.match(secret):
+            raise ConfigError(
+                f"{KEY}: {name}: line {number}: a hash of a kind that is not known here, or a damaged one: use "
+                "mosquitto_passwd -H sha512-pbkdf2, or write the password itself"
+            )
         accounts[user] = secret if known else hashed(secret)
     if not accounts:
         raise ConfigError(f"{KEY}: {name}: it has no account: a line each, name:password")

@@ -125,6 +125,10 @@ def test_accounts_are_hashed_as_mosquitto_does(tmp_path: Path) -> None:
         ("a:x\na:y\n", "line 2: this name has a line already"),
         ("# none\n", "it has no account"),
         (":x\n", "line 1: expected name:password"),
+        ("anna: secret\n", "line 1: a blank beside the colon"),
+        ("a:x\nanna :secret\n", "line 2: a blank beside the colon"),
+        ("anna:$argon2id$v=19$m=65536,t=3,p=1$c2FsdA$aGFzaA\n", "line 1: a hash of a kind that is not known here"),
+        ("anna:$7$101$c2Fs*A==$aGFzaA==\n", "or a damaged one: use mosquitto_passwd -H sha512-pbkdf2"),
     ],
 )
 def test_accounts_that_will_not_do_are_named_and_not_shown(tmp_path: Path, text: str, told: str) -> None:
