@@ -18,13 +18,17 @@ NUMBERS: Final = (int, float)
 
 
 class Message(NamedTuple):
-    """What goes to the broker. ``keep``: it is a change of a value, which is not lost while the broker is away."""
+    """What goes to the broker. ``keep``: it is a change of a value, which is not lost while the broker is away.
+
+    ``source_ns``: when the source had the value, ns since 1970; 0: unknown, or no value.
+    """
 
     topic: str
     payload: bytes
     qos: int
     retain: bool
     keep: bool = False
+    source_ns: int = 0
 
 
 class Shown(NamedTuple):
@@ -82,7 +86,8 @@ class RegisterChannel:
     def message(self, *, late: bool = False) -> Message:
         """As of now; empty while there is no good value, but as JSON, which says so."""
         payload = self._json(late=late) if self.json else self._text()
-        return Message(self.topic, payload, self._qos, self._retain and not late, keep=True)
+        frame = self._showing.shown.frame
+        return Message(self.topic, payload, self._qos, self._retain and not late, True, frame.source_ns if frame else 0)
 
     def _text(self) -> bytes:
         frame, quality, _ = self._showing.shown
@@ -137,7 +142,7 @@ class FramesChannel:
         frame, quality, _ = self._showing.shown
         self.due_ns = self._showing.block.now_ns() + self._pause_ns
         payload = b"" if frame is None or quality is Quality.BAD else frame.image
-        return Message(self.topic, payload, self._qos, self._retain and not late, keep=True)
+        return Message(self.topic, payload, self._qos, self._retain and not late, True, frame.source_ns if frame else 0)
 
 
 class StatusChannel:
@@ -170,6 +175,7 @@ def status(topic: str, quality: Quality, reason: str, missed: int, frame: Frame 
         "quality": str(quality),
         "reason": reason,
         "source_time": frame.source_ns / 1e9 if frame and frame.source_ns else None,
+        "provenance": str(frame.provenance) if frame else None,
         "cycle": frame.cycle if frame else None,
         "missed": missed,
     }

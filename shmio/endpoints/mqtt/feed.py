@@ -43,6 +43,11 @@ class Feed:
         self.depths = _depths(block.layout)
         """Numbers of segments that paths in this source have."""
         self._json = [channel for channel in self.channels if channel.json]
+        self._injected: frozenset[RegisterChannel] = frozenset()
+        """Those told, or to be told, as injected."""
+        self._covered = self._injected
+        self._standing = 0
+        """Of which sequence of what stands on the block ``_covered`` is."""
         self._scan = ChangeScan([register for register, _ in chosen])
         self._outbox = outbox
         self._later: dict[RegisterChannel | FramesChannel, None] = {}
@@ -94,12 +99,24 @@ class Feed:
             changed = self._scan.changed(old.image, frame.image) if old else range(len(self.channels))
             for index in changed:
                 self._mark(self.channels[index])
-            if old and (old.effective is None) != (frame.effective is None):
-                self._outbox.mark_all(self._json)  # provenance may be another one
+            if self._json and (frame.effective is not None or self._injected):
+                self._tell_injected(frame)
             if self.frames:
                 self._mark(self.frames)
         if self._later:
             self.settle()
+
+    def _tell_injected(self, frame: Frame) -> None:
+        """Tell whose value is injected now and was not, or the reverse, also if it is the same value."""
+        sequence, before = self.block.standing.sequence, self._injected
+        if sequence != self._standing:
+            self._standing = sequence
+            over = [one for one in self.block.standing.read() if one.direction == "out"]
+            self._covered = frozenset(
+                channel for channel in self._json if any(one.covers(channel.register) for one in over)
+            )
+        self._injected = frozenset() if frame.effective is None else self._covered
+        self._outbox.mark_all(one for one in self._json if (one in before) != (one in self._injected))
 
     def _age(self) -> None:
         """Turn bad with age."""

@@ -10,7 +10,7 @@ from shmio.endpoints.mqtt.channel import Message
 
 MOST_IN_FLIGHT: Final = 1000
 """Messages that the broker has not acknowledged."""
-HEAD_BYTES: Final = 64
+HEAD_BYTES: Final = 128
 """Of a packet, beside topic and payload, at most."""
 
 

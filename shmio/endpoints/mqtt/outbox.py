@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Final, Protocol
 
+from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
 from shmio.endpoints.mqtt.channel import Channel, Message
@@ -142,12 +143,21 @@ class Outbox:
                 link.send(*self._answers.popleft())
             elif (message := self._kept.pop()) is not None:
                 self._room -= _size(message) // 2
-                link.send(message)
+                link.send(message, _time_of(message))
             else:
                 channel = next(iter(self._waiting))
                 del self._waiting[channel]
                 link.send(channel.message())
                 self._settling = self._settling and bool(self._waiting)
+
+
+def _time_of(message: Message) -> Properties | None:
+    """For MQTT 5: when a value that comes late was there; most payloads have no place for it."""
+    if not message.source_ns:
+        return None
+    properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]
+    properties.UserProperty = ("source_time", repr(message.source_ns / 1e9))
+    return properties
 
 
 def _size(message: Message) -> int:

@@ -7,11 +7,13 @@ import struct
 import time
 from collections.abc import Callable
 
+import msgspec
 import pytest
 
 from shmio.config import Mqtt, MqttTopic, Sparkplug
 from shmio.endpoints.mqtt.bridge import Bridge
 from shmio.segment import BlockWriter, ProcessSpec, Provenance, Quality, Segment
+from shmio.segment.standing import Standing, encode
 from shmio.testing.mosquitto import Mosquitto
 from tests.unit.endpoints.harness import LAYOUT, image
 from tests.unit.endpoints.mqtt.harness import PREFIX, Listener, bridge, listening
@@ -51,7 +53,7 @@ def test_a_source_that_turns_bad_says_so_on_each_topic(segment: Segment, broker:
     writer.publish(image(position=1.5, step=3), cycle=1)
     with listening(broker.address) as listener, bridge(segment, broker.address, topic=rules):
         good = listener.json("cell/status")
-        assert (good["quality"], good["cycle"]) == ("good", 1)
+        assert (good["quality"], good["provenance"], good["cycle"]) == ("good", "live", 1)
         assert listener.until("cell/axis/position/out") == b"1.5"
         value = listener.json("cell/step/out")
         assert (value["value"], value["quality"], value["provenance"]) == (3, "good", "live")
@@ -100,6 +102,37 @@ def test_injected_values_are_the_ones_shown(segment: Segment, broker: Mosquitto)
         listener.until("cell/secret/out")
         writer.publish(image(position=1.5), cycle=2, effective=image(position=9.5), provenance=Provenance.LIVE)
         assert listener.until("cell/axis/position/out") == b"9.5"
+
+
+def test_json_says_whose_value_is_injected_also_if_it_is_the_same(segment: Segment, broker: Mosquitto) -> None:
+    cell, writer, data = segment.blocks["cell"], segment.writer("cell"), image(position=1.5, step=7)
+
+    def stand(*places: tuple[int, int]) -> None:
+        ones = [
+            Standing(number, "out", 0, keep=False, name="", writer=0, pid=1, ranges=((at, size, 255),))
+            for number, (at, size) in enumerate(places)
+        ]
+        cell.standing.write(encode(map(msgspec.json.encode, ones)))
+
+    position, step = (0, 4), (12, 2)
+    writer.publish(data, cycle=1)
+    rules = [MqttTopic(match="**", payload="json")]
+    with listening(broker.address) as listener, bridge(segment, broker.address, topic=rules):
+        listener.until("cell/secret/out")
+        stand(position)
+        writer.publish(data, cycle=2, effective=data)
+        assert listener.json("cell/axis/position/out")["provenance"] == "injected"
+        stand(position, step)
+        writer.publish(data, cycle=3, effective=data)
+        assert listener.json("cell/step/out")["provenance"] == "injected"
+        stand(step)
+        writer.publish(data, cycle=4, effective=data)
+        assert listener.json("cell/axis/position/out")["provenance"] == "live"
+        stand()
+        writer.publish(data, cycle=5)
+        assert listener.json("cell/step/out")["provenance"] == "live"
+    assert len(listener.values("cell/axis/position/out")) == 3
+    assert len(listener.values("cell/axis/speed/out")) == 1
 
 
 def test_rules_say_what_is_published_and_how(segment: Segment, broker: Mosquitto) -> None:
