@@ -45,7 +45,7 @@ def read_accounts(name: str) -> dict[str, str]:
         if user in accounts:
             raise ConfigError(f"{KEY}: {name}: line {number}: this name has a line already")
         if user != user.strip() or secret != secret.strip():
-            raise ConfigError(f"{KEY}: {name}: line {number}: a blank beside the colon, or at an end, would count: remove it")
+            raise ConfigError(f"{KEY}: {name}: line {number}: a blank beside the colon, or at an end, would count")
         known = _parts(secret)
         if not known and _HASH.match(secret):
             raise ConfigError(

@@ -8,7 +8,7 @@ from unicodedata import category
 
 from shmio.config.address import Address
 from shmio.config.model import Config
-from shmio.config.mqttmodel import Mqtt
+from shmio.config.mqttmodel import Mqtt, MqttTopic
 from shmio.errors import ConfigError
 
 PORT: Final = 1883
@@ -25,6 +25,8 @@ def check_mqtt(config: Config) -> None:
         return
     if mqtt.prefix is not None:
         _check_prefix(mqtt.prefix)
+    for index, rule in enumerate(mqtt.topic):
+        _check_topic(f"mqtt.topic[{index}]", rule)
     if mqtt.sparkplug is not None:
         for key in ("group", "node", "primary_host"):
             if (name := getattr(mqtt.sparkplug, key)) is not None:
@@ -83,6 +85,13 @@ def _check_prefix(prefix: str) -> None:
             f"mqtt.prefix: {prefix!r} cannot begin a topic: at most {MAX_PREFIX} characters, all of them text, no + "
             "and #, no $ at its beginning, no / at its ends and no two of them together; such as shmio/a50"
         )
+
+
+def _check_topic(key: str, rule: MqttTopic) -> None:
+    if rule.payload in ("structure", "frames"):
+        for name in ("deadband", "elements"):
+            if getattr(rule, name):
+                raise ConfigError(f'{key}.{name}: is for single registers, not for payload = "{rule.payload}"')
 
 
 def _check_external(mqtt: Mqtt) -> None:

@@ -9,7 +9,7 @@ from msgspec import Meta
 from shmio.config.section import Section, Text, Texts
 
 BrokerName = Literal["embedded", "mosquitto", "external"]
-PayloadName = Literal["text", "json", "frames"]
+PayloadName = Literal["text", "json", "structure", "frames"]
 
 
 class MqttTls(Section):

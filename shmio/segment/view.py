@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING, Any
@@ -114,18 +115,16 @@ def reading(block: Block, register: Register, frame: Frame | None) -> Reading:
     if quality is not Quality.BAD and holds_none(value):
         quality, reason = Quality.BAD, f"the bytes are no {register.type}"
     source_time = frame.source_ns / 1e9 if known else None
-    provenance = _provenance(block, register, frame)
+    provenance = Provenance.INJECTED if injected(block, (register,), frame) else frame.provenance
     return Reading(value, quality, reason, str(provenance), source_time, round(frame.age_ns(now_ns) / 1e9, 6))
 
 
-def _provenance(block: Block, register: Register, frame: Frame) -> Provenance:
-    """Where a register's value comes from: some of a frame's may be injected."""
+def injected(block: Block, registers: Sequence[Register], frame: Frame) -> bool:
+    """Whether anything in these registers is injected: some of a frame may be."""
     if frame.effective is None:
-        return frame.provenance
-    for standing in block.standing.read():
-        if standing.direction == "out" and standing.covers(register):
-            return Provenance.INJECTED
-    return frame.provenance
+        return False
+    standing = [one for one in block.standing.read() if one.direction == "out"]
+    return any(one.covers(register) for register in registers for one in standing)
 
 
 def holds_none(value: Value) -> bool:

@@ -39,6 +39,7 @@ class BrokerClient(Client):
     """What TLS said against the connection after it was made, if that is why it has ended."""
 
     def loop_read(self, max_packets: int = 1) -> MQTTErrorCode:
+        """Read so many, if they are there."""
         for _ in range(max_packets):
             if self._sock is None:
                 return MQTTErrorCode.MQTT_ERR_NO_CONN

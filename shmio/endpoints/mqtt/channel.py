@@ -64,8 +64,9 @@ class RegisterChannel:
 
     def __init__(self, showing: Showing, register: Register, topic: str, rule: MqttTopic) -> None:
         self.register = register
+        self.registers = (register,)
         self.topic = topic
-        self.json = rule.payload == "json"
+        self.json = rule.payload != "text"
         self.limited = rule.deadband > 0 or rule.max_rate_hz is not None
         """Whether not each change is published."""
         self._showing = showing
@@ -104,15 +105,8 @@ class RegisterChannel:
         if holds_none(found.value):
             quality, reason = Quality.BAD, reason or found.reason
         self._note(None if quality is Quality.BAD else found.value)
-        fields = {
-            "value": json_value(found.value, self.register.element),
-            "quality": str(quality),
-            "reason": reason,
-            "source_time": found.source_time,
-            "provenance": found.provenance,
-            "sequence": frame.number if frame else 0,
-        }
-        return msgspec.json.encode(fields | {"late": True} if late else fields)
+        value = json_value(found.value, self.register.element)
+        return json_payload(value, quality, reason, found.provenance, frame, late=late)
 
     def _note(self, value: Value) -> None:
         if self.limited:
@@ -167,6 +161,21 @@ class Gone:
     def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  see StatusChannel
         """An empty one."""
         return Message(self.topic, b"", 1, retain=True)
+
+
+def json_payload(
+    value: object, quality: Quality, reason: str, provenance: str, frame: Frame | None, *, late: bool
+) -> bytes:
+    """A value as JSON, with what is known of it."""
+    fields = {
+        "value": value,
+        "quality": str(quality),
+        "reason": reason,
+        "source_time": frame.source_ns / 1e9 if frame and frame.source_ns else None,
+        "provenance": provenance,
+        "sequence": frame.number if frame else 0,
+    }
+    return msgspec.json.encode(fields | {"late": True} if late else fields)
 
 
 def status(topic: str, quality: Quality, reason: str, missed: int, frame: Frame | None = None) -> Message:

@@ -79,7 +79,7 @@ class Commands:
         return feed, look_up(feed.block.layout, topic)
 
     def _is_json(self, feed: Feed, register: Register) -> bool:
-        return self._rules.of(feed.block.source, register.path).payload == "json"
+        return self._rules.of(feed.block.source, register.path).payload != "text"
 
 
 class _Reply:

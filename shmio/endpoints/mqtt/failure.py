@@ -74,12 +74,13 @@ def refusal(code: ReasonCode, dialling: Dialling) -> str:
     return f"it refuses: {code}"
 
 
-def ended(error: ssl.SSLError | None, *, up: bool) -> str:
-    """Why a connection has ended. ``error``: what TLS said; ``up``: the broker had let us in."""
+def ended(error: ssl.SSLError | None, *, up: bool, tls: bool) -> str:
+    """Why a connection has ended. ``error``: what TLS said; ``up``: the broker had let us in; ``tls``: it has TLS."""
     if error is not None:
         return _tls(error)
     lost = "the connection was lost"
-    return lost if up else f"{lost} before it let us in: it is full, or expects TLS there (mqtt.tls), or is no broker"
+    missing = "wants a certificate of ours (mqtt.tls.certificate and key)" if tls else "expects TLS there (mqtt.tls)"
+    return lost if up else f"{lost} before it let us in: it is full, or {missing}, or is no broker"
 
 
 def why(error: Exception, target: Target) -> str:
@@ -103,5 +104,5 @@ def _tls(error: ssl.SSLError) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
         return f"its certificate is not to be trusted ({error.verify_message}): check mqtt.tls.ca, and the host's name"
     if "_ALERT_" in (error.reason or ""):
-        return f"it refuses our TLS ({error.reason}): check mqtt.tls.certificate and key, which it may want"
+        return f"it refuses our TLS ({error.reason}): it may want a certificate of ours (mqtt.tls.certificate and key)"
     return f"no TLS with it ({error.reason or 'it ended the connection'}): check mqtt.tls, and the port"

@@ -12,12 +12,15 @@ from shmio.endpoints.mqtt.frames import Frames
 from shmio.endpoints.mqtt.inlet import Inlet
 from shmio.endpoints.mqtt.outbox import Outbox
 from shmio.endpoints.mqtt.rules import Rules
+from shmio.endpoints.mqtt.structure import StructureChannel
 from shmio.layout.model import Layout, Register
 from shmio.layout.write import elements
 from shmio.segment import Block, Frame, Quality
 from shmio.segment.scan import ChangeScan
 
 log = logging.getLogger("shmio.mqtt")
+
+ValueChannel = RegisterChannel | StructureChannel
 
 NO_DATA: Final = Shown(None, Quality.BAD, "no data yet")
 
@@ -35,23 +38,42 @@ class Feed:
         base = f"{prefix}/{block.source}"
         self.status = StatusChannel(self, f"{base}/status")
         chosen = list(_chosen(block.layout, rules, block.source))
-        self.channels = [
-            RegisterChannel(self, register, f"{base}/{register.path}/out", rule) for register, rule in chosen
-        ]
+        self._of = [*self._channels_of(chosen, rules, base)]
+        """The channel of each register that is published, in the layout's order."""
+        self.channels = list(dict.fromkeys(self._of))
         frames = rules.frames(block.source)
         self.frames = FramesChannel(self, f"{base}/frames", frames) if frames else None
         self.depths = _depths(block.layout)
         """Numbers of segments that paths in this source have."""
         self._json = [channel for channel in self.channels if channel.json]
-        self._injected: frozenset[RegisterChannel] = frozenset()
+        self._injected: frozenset[ValueChannel] = frozenset()
         """Those told, or to be told, as injected."""
         self._covered = self._injected
         self._standing = 0
         """Of which sequence of what stands on the block ``_covered`` is."""
         self._scan = ChangeScan([register for register, _ in chosen])
         self._outbox = outbox
-        self._later: dict[RegisterChannel | FramesChannel, None] = {}
+        self._later: dict[ValueChannel | FramesChannel, None] = {}
         self._coming = Frames(block)
+
+    def _channels_of(
+        self, chosen: Sequence[tuple[Register, MqttTopic]], rules: Rules, base: str
+    ) -> Iterator[ValueChannel]:
+        source = self.block.source
+        paths = [rules.structure(source, part.path) if rule.payload == "structure" else None for part, rule in chosen]
+        parts: dict[str, list[Register]] = {}
+        for (register, _), path in zip(chosen, paths, strict=True):
+            if path is not None:
+                parts.setdefault(path, []).append(register)
+        structures: dict[str, StructureChannel] = {}
+        for (register, rule), path in zip(chosen, paths, strict=True):
+            if path is None:
+                yield RegisterChannel(self, register, f"{base}/{register.path}/out", rule)
+                continue
+            if path not in structures:
+                topic = f"{base}/{path}/out" if path else f"{base}/out"
+                structures[path] = StructureChannel(self, path, parts[path], topic, rule)
+            yield structures[path]
 
     @property
     def missed(self) -> int:
@@ -96,9 +118,9 @@ class Feed:
             if quality is Quality.BAD:
                 return
             old = before.frame
-            changed = self._scan.changed(old.image, frame.image) if old else range(len(self.channels))
+            changed = self._scan.changed(old.image, frame.image) if old else range(len(self._of))
             for index in changed:
-                self._mark(self.channels[index])
+                self._mark(self._of[index])
             if self._json and (frame.effective is not None or self._injected):
                 self._tell_injected(frame)
             if self.frames:
@@ -113,7 +135,7 @@ class Feed:
             self._standing = sequence
             over = [one for one in self.block.standing.read() if one.direction == "out"]
             self._covered = frozenset(
-                channel for channel in self._json if any(one.covers(channel.register) for one in over)
+                channel for channel in self._json if any(one.covers(part) for part in channel.registers for one in over)
             )
         self._injected = frozenset() if frame.effective is None else self._covered
         self._outbox.mark_all(one for one in self._json if (one in before) != (one in self._injected))
@@ -151,7 +173,7 @@ class Feed:
         """All topics of this source."""
         return [self.status, *self.channels, *([self.frames] if self.frames else [])]
 
-    def _mark(self, channel: RegisterChannel | FramesChannel) -> None:
+    def _mark(self, channel: ValueChannel | FramesChannel) -> None:
         if not channel.limited:
             self._outbox.mark(channel)
         elif channel in self._later or channel.due_ns > self.block.now_ns():

@@ -183,8 +183,8 @@ class Link:
     ) -> None:
         if self._client is None or client is not self._client:
             return
-        told = flags.is_disconnect_packet_from_server
-        self.drop(refusal(code, self._dialling) if told else ended(self._client.tls_error, up=self.up))
+        tls, told = self._dialling.settings.tls is not None, flags.is_disconnect_packet_from_server
+        self.drop(refusal(code, self._dialling) if told else ended(self._client.tls_error, up=self.up, tls=tls))
 
     def _acknowledged(
         self, client: Client, _data: Any, mid: int, code: ReasonCode, _properties: Properties | None

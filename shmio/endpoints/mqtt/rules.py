@@ -24,8 +24,19 @@ class Rules:
 
     def of(self, source: str, path: str) -> MqttTopic:
         """The rule of a register."""
-        full = f"{source}/{path}"
-        return next((rule for glob, rule in self._rules if glob.matches(full)), DEFAULT)
+        return self._first(f"{source}/{path}")[1]
+
+    def structure(self, source: str, path: str) -> str | None:
+        """The structure as whose part a register is published, empty for the whole source; None: by itself."""
+        glob, rule = self._first(f"{source}/{path}")
+        if glob is None or rule.payload != "structure":
+            return None
+        names = [source, *path.split("/")]
+        depths = range(1, len(names))
+        return next(("/".join(names[1:n]) for n in depths if glob.matches("/".join(names[:n]))), None)
+
+    def _first(self, full: str) -> tuple[Glob | None, MqttTopic]:
+        return next((found for found in self._rules if found[0].matches(full)), (None, DEFAULT))
 
     def frames(self, source: str) -> MqttTopic | None:
         """The rule by which a source's frames are published as a whole; None: they are not."""

@@ -85,7 +85,12 @@ def test_where_an_external_broker_is(tmp_path: Path, text: str, expected: list[s
         (f"{OWN}[[mqtt.topic]]\n", "mqtt.topic[0].match: this key is needed"),
         (f'{OWN}[[mqtt.topic]]\nmatch = "a"\nqos = 2\n', "mqtt.topic[0].qos"),
         (f'{OWN}[[mqtt.topic]]\nmatch = "a"\nretained = true\n', "unknown key; did you mean retain?"),
-        (f'{OWN}[[mqtt.topic]]\nmatch = "a"\npayload = "xml"\n', "there are: text, json, frames"),
+        (f'{OWN}[[mqtt.topic]]\nmatch = "a"\npayload = "xml"\n', "there are: text, json, structure, frames"),
+        (
+            f'{OWN}[[mqtt.topic]]\nmatch = "a"\npayload = "structure"\ndeadband = 1\n',
+            "mqtt.topic[0].deadband: is for single",
+        ),
+        (f'{OWN}[[mqtt.topic]]\nmatch = "a"\npayload = "frames"\nelements = true\n', "mqtt.topic[0].elements: is for"),
         (EXTERNAL, 'mqtt.host: broker = "external" needs it'),
         (f'{EXTERNAL}host = "b"\n', "b:1883 would be spoken to in plain text over the network"),
         (f'{EXTERNAL}host = ["b", "c:x"]\n{TLS}', "mqtt.host[1]"),

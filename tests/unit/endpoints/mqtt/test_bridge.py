@@ -191,6 +191,37 @@ def test_a_rate_leaves_out_what_is_between_and_never_the_last(segment: Segment, 
     assert len(listener.values("cell/axis/position/out")) <= 2 + passed_s * 5
 
 
+def test_a_structure_is_one_message_for_each_frame_that_changes_it(segment: Segment, broker: Mosquitto) -> None:
+    """Whatever an earlier rule does not take; a register that is named by itself is no structure."""
+    rules = [
+        MqttTopic(match="cell/long", publish=False),
+        MqttTopic(match=["cell/axis", "cell/step"], payload="structure"),
+        MqttTopic(match="cell", payload="structure"),
+    ]
+    writer = segment.writer("cell")
+    writer.publish(image(position=1.5, speed=float("nan"), step=7, inputs=b"\3\4"), cycle=1)
+    with listening(broker.address) as listener, bridge(segment, broker.address, topic=rules) as running:
+        axis = listener.json("cell/axis/out")
+        assert (axis["value"], axis["quality"]) == ({"position": 1.5, "speed": "NaN"}, "good")
+        rest = listener.json("cell/out")["value"]
+        assert set(rest) == {"running", "inputs", "bits", "name", "secret"}
+        assert (rest["inputs"], rest["running"]) == ([3, 4], False)
+        writer.publish(image(position=2.5, speed=3.5, step=8, inputs=b"\3\4"), cycle=2)
+        assert listener.json("cell/axis/out")["value"] == {"position": 2.5, "speed": 3.5}
+        assert listener.json("cell/step/out")["value"] == 8
+        writer.publish(
+            image(position=2.5, speed=3.5, step=8, inputs=b"\3\4"), cycle=3, quality=Quality.BAD, reason="out"
+        )
+        bad = listener.json("cell/axis/out")
+        assert (bad["value"], bad["quality"], bad["reason"]) == ({"position": 2.5, "speed": 3.5}, "bad", "out")
+        assert listener.json("cell/out")["quality"] == "bad"
+        running.until(lambda: not running.bridge.outbox.busy)
+    assert len(listener.values("cell/axis/out")) == 3
+    assert {topic for topic, _ in listener.heard if topic.startswith(f"{PREFIX}/cell/")} == {
+        f"{PREFIX}/cell/{topic}" for topic in ("status", "axis/out", "step/out", "out")
+    }
+
+
 def test_text_that_is_none_and_names_that_need_encoding(segment: Segment, broker: Mosquitto) -> None:
     """A STRING is its text; arrays are JSON; what JSON does not know is text in it."""
     rules = [MqttTopic(match="cell/axis", payload="json")]
