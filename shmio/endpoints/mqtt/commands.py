@@ -22,6 +22,7 @@ from shmio.segment import DONE, EventKind
 
 REPLIES: Final = "shmio/results"
 """Where clients may have results sent, below the prefix: a response topic elsewhere could make us write, or lie."""
+RETAINED: Final = "a retained command is not carried out; publish commands without the retain flag"
 MAX_CORRELATION_BYTES: Final = 1024
 MAX_TOPIC_BYTES: Final = 65535 - len("/result")
 """Of a command: a topic is no longer than 65535 bytes (MQTT 5.0, section 1.5.4), and its result has one, too."""
@@ -58,11 +59,12 @@ class Commands:
         if len(topic.encode()) > MAX_TOPIC_BYTES:
             self.refused += 1
             return
-        if message.retain:  # it was there before we were: nobody knows how old it is
-            self.refused += 1
-            log.warning("%s: a retained command is not carried out; publish commands without the retain flag", topic)
-            return
         tell = _Reply(self._prefix, topic, message, self._answer)
+        if message.retain:  # it may have been there before we were: nobody knows how old it is
+            self.refused += 1
+            log.warning("%s: %s", topic, RETAINED)
+            tell(EventKind.REJECTED, RETAINED)
+            return
         try:
             feed, register = self._find(topic.removeprefix(f"{self._prefix}/"))
             value = _value(bytes(message.payload), register, json=self._is_json(feed, register))

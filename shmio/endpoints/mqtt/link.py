@@ -273,13 +273,16 @@ class Link:
         return any(one is message for one in self._in_flight.values())
 
     def subscribe(self, filters: Sequence[str], *, retained: bool = False) -> None:
-        """Ask for what is sent to these; unless ``retained``, what was there before is not sent, or has its flag."""
+        """Ask for what is sent to these; unless ``retained``, what was there before is not sent, or has its flag.
+
+        So has, with version 5, what comes from another broker that had it before: to ours it is new.
+        """
         client = self._client
         if client is None or not filters:
             return
         if self._protocol == MQTTv5:
             before = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE if retained else SubscribeOptions.RETAIN_DO_NOT_SEND
-            options = partial(SubscribeOptions, 1, noLocal=True, retainHandling=before)
+            options = partial(SubscribeOptions, 1, noLocal=True, retainAsPublished=True, retainHandling=before)
             client.subscribe([(one, options()) for one in filters])
         else:
             client.subscribe([(one, 1) for one in filters])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,6 +17,8 @@ from shmio.endpoints.mqtt.bridge import Bridge
 from shmio.segment import Segment
 from shmio.segment.processes import WRITERS
 from shmio.testing.mosquitto import Mosquitto
+from shmio.testing.ports import reserved_port
+from shmio.testing.proxy import FaultProxy
 from tests.unit.endpoints.harness import image
 from tests.unit.endpoints.mqtt.harness import PREFIX, Listener, bridge, listening
 from tests.unit.endpoints.plant import Plant
@@ -108,8 +111,33 @@ def test_a_command_that_was_there_before_is_not_carried_out(segment: Segment, br
         listener.publish("cell/axis/speed/in", "1.5")
         listener.until("cell/axis/speed/in/result")
         assert len(plant.written) == 1
-        listener.publish("cell/step/in", "6", retain=True)  # this one has only just come
-        assert listener.json("cell/step/in/result")["done"]
+        listener.publish("cell/step/in", "6", retain=True)
+        told = listener.json("cell/step/in/result")
+        assert (told["outcome"], "publish commands without the retain flag" in told["reason"]) == ("rejected", True)
+        assert len(plant.written) == 1
+
+
+def test_what_another_broker_had_before_is_not_carried_out(
+    segment: Segment, make_broker: Callable[..., Mosquitto], tmp_path: Path
+) -> None:
+    """A broker that is joined to ours: each time the way between them is back, ours takes what that retains for new."""
+    (tmp_path / "elsewhere").mkdir()
+    with reserved_port() as address:
+        elsewhere = Mosquitto(tmp_path / "elsewhere", address)
+        elsewhere.start()
+        try:
+            with listening(address, "none") as before, FaultProxy(address, framing=None) as proxy:
+                before.publish("cell/step/in", "5", retain=True)
+                proxy.refuse()
+                join = ("connection plant", f"address {proxy.address}", f"topic {PREFIX}/# both 1", "restart_timeout 1")
+                with running(segment, make_broker("allow_anonymous true", *join)) as (plant, listener):
+                    proxy.admit()
+                    assert listener.json("cell/step/in/result")["outcome"] == "rejected"
+                    before.publish("cell/axis/speed/in", "1.5")
+                    assert listener.json("cell/axis/speed/in/result")["done"]
+                    assert len(plant.written) == 1
+        finally:
+            elsewhere.stop()
 
 
 def test_results_go_where_their_client_wants_them_below_the_prefix(segment: Segment, broker: Mosquitto) -> None:
