@@ -26,6 +26,7 @@ from shmio.errors import ValueRangeError
 from shmio.layout.model import Layout, Register
 from shmio.layout.write import elements
 from shmio.segment import Quality
+from shmio.segment.view import holds_none
 from shmio.wire import sparkplug_b_pb2 as wire
 
 INT32: Final = 3
@@ -111,14 +112,12 @@ class Metric:
         return value - (1 << bits) if self._bits and value >> (bits - 1) else value
 
     def _packed(self, value: Any) -> bytes | None:
-        if value is None:
-            return None
-        flat = np.asarray(value).reshape(-1)
-        if flat.dtype == object:  # an element is no value of its type
+        if holds_none(value):
             return None
         if self.datatype == BOOLEANS:
-            return _COUNT.pack(len(flat)) + np.packbits(flat.astype(bool)).tobytes()
-        return flat.astype(self._element).tobytes()
+            flat = np.array(value, bool).reshape(-1)
+            return _COUNT.pack(len(flat)) + np.packbits(flat).tobytes()
+        return np.array(value, self._element).tobytes()  # by its type at once: no float has all digits of a ULINT
 
     def _unpacked(self, data: bytes) -> list[Any]:
         count = self.register.count

@@ -168,6 +168,17 @@ def test_an_array_with_an_element_that_is_no_value_is_null() -> None:
     assert not found.WhichOneof("value")
 
 
+def test_an_array_of_large_numbers_keeps_all_their_digits() -> None:
+    row = Layout("ROW", None, 24, False, (Register("at", "ULINT", ((0, 2),), 0, None, 24, 3),))
+    edge = EdgeNode("plant", "a50", lambda: NOW_MS)
+    edge.define({"cell": row.registers})
+    (metric,) = edge.metrics["cell"].values()
+    value = [0, 2**64 - 1, 2**53 + 1]
+    (found,) = payload(edge.data("cell", [Sample(metric, value, AT_MS)])).metrics
+    assert found.bytes_value == b"".join(one.to_bytes(8, "little") for one in value)
+    assert metric.take(found) == value
+
+
 def commanded(edge: EdgeNode, device: str = "axis", **fields: Any) -> Command:
     given = wire.Payload(timestamp=NOW_MS, metrics=[wire.Metric(**fields)])
     return edge.command(f"spBv1.0/plant/DCMD/a50/{device}", given.SerializeToString())
