@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from shmio.dump.columns import heading
 from shmio.dump.libraries import library
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ def table(columns: Columns) -> pyarrow.Table:
     """A table: time (UTC, ns), the source's time, number, cycle, quality, provenance, and a column for each register.
 
     Native types; arrays are lists of fixed size, POINTER and ANY bytes. Null: no value of its type, or the source never
-    had an image. MissingLibraryError.
+    had an image. A register that has the name of another column has its source before it. MissingLibraryError.
     """
     arrow = library("pyarrow", REMEDY)
     unknown = columns.source_ns == 0
@@ -35,7 +36,7 @@ def table(columns: Columns) -> pyarrow.Table:
         "provenance": _named(arrow, columns.provenance, ("live", "simulated", "replayed", "injected")),
     }
     for path, values in columns.items():
-        fields[path] = _nested(arrow, values, unknown)
+        fields[heading(columns.source, path)] = _nested(arrow, values, unknown)
     return arrow.Table.from_arrays(list(fields.values()), names=list(fields))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import product
@@ -27,6 +27,8 @@ Array = npt.NDArray[Any]
 
 FIELDS: Final = ("number", "cycle", "source_ns", "quality", "provenance")
 """What a frame's header gives a column of."""
+OF_FRAMES: Final = frozenset({"time", "source_time", "number", "cycle", "quality", "provenance"})
+"""What tables call that, and the times."""
 DECODED_BYTES: Final = 1 << 20
 """So many bytes of frames are decoded at once."""
 
@@ -80,7 +82,16 @@ class Columns(Mapping[str, Array]):
         return polars.DataFrame([time, *(polars.Series(name, values) for name, values in data.items())])
 
     def _flat(self) -> dict[str, Array]:
-        return {name: values for register in self.registers for name, values in flat(register, self[register.path])}
+        return {
+            heading(self.source, name): values
+            for register in self.registers
+            for name, values in flat(register, self[register.path])
+        }
+
+
+def heading(source: str, path: str, taken: Collection[str] = OF_FRAMES) -> str:
+    """What a table calls the column of a register: its path, with its source if the frame's own columns have that."""
+    return f"{source}/{path}" if path in taken else path
 
 
 def flat(register: Register, values: Array) -> Iterator[tuple[str, Array]]:

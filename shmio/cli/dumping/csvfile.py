@@ -10,7 +10,7 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
-from shmio.dump.columns import Columns, flat
+from shmio.dump.columns import Columns, flat, heading
 from shmio.layout.model import Register
 from shmio.segment import Provenance, Quality
 
@@ -40,7 +40,7 @@ class CsvTable:
         unknown = columns.source_ns == 0
         for register in columns.registers:
             for name, column in flat(register, columns[register.path]):
-                names.append(name)
+                names.append(heading(columns.source, name))
                 shown = texts(column)
                 if unknown.any():
                     shown = ["" if hide else text for text, hide in zip(shown, unknown.tolist(), strict=True)]

@@ -14,6 +14,7 @@ from shmio.cli.dumping.moments import iso, local
 from shmio.cli.readings import shown
 from shmio.cli.run import dumps
 from shmio.dump.channels import Channel
+from shmio.dump.columns import heading
 from shmio.dump.encoding import Gap, ProcessChange, StepMark
 from shmio.layout.codec import codec
 from shmio.layout.model import Layout, Register
@@ -178,14 +179,19 @@ class Table:
 class Csv:
     """A row for each (RFC 4180) under one heading, times in UTC.
 
-    A column for each register of any block, with its source if there are several. Arrays are JSON; a value is empty
-    where the source never had any, or it is of another block.
+    A column for each register of any block, with its source if there are several, or if another column has its name.
+    Arrays are JSON; a value is empty where the source never had any, or it is of another block.
     """
+
+    OWN = ("time", "source", "what", "number", "quality", "text")
 
     def __init__(self, views: Sequence[View]) -> None:
         several = len({view.source for view in views}) > 1
         self._names = [
-            [f"{view.source}/{register.path}" if several else register.path for register in view.registers]
+            [
+                f"{view.source}/{register.path}" if several else heading(view.source, register.path, self.OWN)
+                for register in view.registers
+            ]
             for view in views
         ]
         self._columns = {name: place for place, name in enumerate(dict.fromkeys(chain(*self._names)))}
@@ -225,7 +231,7 @@ class Csv:
         writer = csv.writer(lines, lineterminator="\n")
         if not self._begun:
             self._begun = True
-            writer.writerow(["time", "source", "what", "number", "quality", "text", *self._columns])
+            writer.writerow([*self.OWN, *self._columns])
         filled = values or [""] * len(self._columns)
         writer.writerow([iso(time_ns), source, what, number, quality, text, *filled])
         return lines.getvalue().removesuffix("\n")

@@ -16,14 +16,15 @@ from shmio import __version__
 from shmio.cli.dumping.printers import kind_of
 from shmio.cli.dumping.progress import Progress
 from shmio.dump.blocks import DumpBlock
-from shmio.dump.columns import Columns
+from shmio.dump.columns import Columns, heading
 from shmio.dump.dump import Dump
 from shmio.dump.names import Chosen
 from shmio.dump.pieces import pieces
 from shmio.layout.model import Register
 
+FRAME: Final = "frame"
 HEAD: Final = {"number": "integer", "cycle": "integer", "quality": "integer", "provenance": "integer"}
-"""What each frame tells of itself, under ``frame``."""
+"""What each frame tells of itself, under FRAME."""
 _TYPES: Final = {"b": "boolean", "i": "integer", "u": "integer", "f": "number", "m": "integer"}
 _EVENT: Final = {"kind": "string", "text": "string", "quality": "string", "frame": "integer", "command": "integer"}
 
@@ -58,16 +59,16 @@ def _frames(
 ) -> Iterator[_Row]:
     channels: dict[DumpBlock, int] = {}
     for block, columns in pieces(dump, source, chosen, from_ns, to_ns, raw=raw):
-        tree = _tree(columns.registers)
+        tree = _tree(columns.registers, source)
         if block not in channels:
-            schema = {"frame": {"type": "object", "properties": {name: {"type": kind} for name, kind in HEAD.items()}}}
+            schema = {FRAME: {"type": "object", "properties": {name: {"type": kind} for name, kind in HEAD.items()}}}
             schema |= _schema(tree, columns)
             channels[block] = _channel(writer, f"/{source}", f"{source} {block.layout.name}", schema)
         heads = zip(*(getattr(columns, name).tolist() for name in HEAD), strict=True)
         values = zip(*(_plain(columns[register.path]) for register in columns.registers), strict=True)
         rows = zip(columns.time_ns.tolist(), columns.source_ns.tolist(), heads, values, strict=True)
         for log_ns, source_ns, head, row in rows:
-            message = {"frame": dict(zip(HEAD, head, strict=True))}
+            message = {FRAME: dict(zip(HEAD, head, strict=True))}
             if source_ns:  # else it never had any values
                 message |= _filled(tree, row)
             yield _Row(log_ns, channels[block], source_ns if source_ns > 0 else log_ns, msgspec.json.encode(message))
@@ -88,11 +89,15 @@ def _channel(writer: Writer, topic: str, name: str, properties: dict[str, Any]) 
     return writer.register_channel(topic, "json", writer.register_schema(name, "jsonschema", text))
 
 
-def _tree(registers: Sequence[Register]) -> dict[str, Any]:
-    """Registers by the segments of their paths: their places among the registers, or what is below."""
+def _tree(registers: Sequence[Register], source: str) -> dict[str, Any]:
+    """Registers by the segments of their paths: their places among the registers, or what is below.
+
+    One that would be taken for what the frame tells of itself has its source before it.
+    """
     tree: dict[str, Any] = {}
     for place, register in enumerate(registers):
-        *above, name = register.path.split("/")
+        first, *others = register.path.split("/")
+        *above, name = heading(source, first, (FRAME,)), *others
         node = tree
         for segment in above:
             below = node.setdefault(segment, {})

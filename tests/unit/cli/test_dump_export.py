@@ -127,6 +127,38 @@ def test_mcap_for_viewers(capsys: pytest.CaptureFixture[str]) -> None:
     assert (last["Robot"]["speed"], last["clock"]) == (None, None)
 
 
+def test_registers_that_have_the_names_of_other_columns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """None takes the place of a frame's own time, number or quality, nor goes without a column."""
+    names = ("time", "source_time", "number", "cycle", "quality", "provenance", "what", "frame/number")
+    layout = Layout("DB2", 2, 16, False, tuple(Register(n, "INT", (), 2 * i, None, 2, 1) for i, n in enumerate(names)))
+    with build(tmp_path / "names.mem") as work:
+        work.block("cell", layout)
+        work.frame(7, bytes(byte if byte % 2 else 0 for byte in range(16)))
+    values = list(range(1, 16, 2))
+    own = [f"cell/{name}" for name in names[:6]]
+    for form in ("parquet", "csv"):
+        assert main(["export", "names.mem", "-o", f"out.{form}"]) == 0
+    table = parquet.read_table("out.parquet").to_pylist()[0]
+    assert [table[name] for name in (*own, *names[6:])] == values
+    assert (table["number"], table["cycle"], table["quality"], table["provenance"]) == (7, 7, "good", "live")
+    with Path("out.csv").open(newline="", encoding="utf-8") as file:
+        [row] = csv.DictReader(file)
+    assert [row[name] for name in (*own, *names[6:])] == list(map(str, values))
+    assert (row["number"], row["quality"]) == ("7", "good")
+    assert main(["export", "names.mem", "-o", "out.mcap"]) == 0
+    with Path("out.mcap").open("rb") as mcap:
+        [(schema, _, message)] = make_reader(mcap).iter_messages()
+    told = json.loads(message.data)
+    assert (told["frame"]["number"], told["cell/frame"]["number"], told["time"]) == (7, values[7], values[0])
+    assert schema is not None
+    assert set(json.loads(schema.data)["properties"]) == set(told)
+    capsys.readouterr()
+    assert main(["cat", "names.mem", "--csv"]) == 0
+    heading, *_ = csv.reader(capsys.readouterr().out.splitlines())
+    assert heading[:6] == ["time", "source", "what", "number", "quality", "text"]
+    assert len(set(heading)) == len(heading)
+
+
 def test_time_sources_registers_and_originals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     varied(tmp_path / "a.mem")
     some = ["--from", "0.1", "--to", "0.3", "--only", "cell/count", "press/row"]

@@ -363,5 +363,13 @@ def test_pandas_and_polars(tmp_path: Path) -> None:
         names = list(table.columns)
         assert names[-6:] == ["count", "speed", "on", "row/1", "row/2", "row/3"]
         assert np.array_equal(table["row/3"].to_numpy(), columns["row"][:, 2])
+    registers = Register("time", "INT", (), 0, None, 2, 1), Register("number", "INT", (), 2, None, 2, 1)
+    with build(tmp_path / "names.mem") as work:
+        work.block("cell", Layout("DB2", 2, 4, False, registers))
+        work.frame(7, bytes((0, 1, 0, 2)))
+    with shmio.open_dump(tmp_path / "names.mem") as dump:
+        named = dump.columns("cell")
+    for table in (named.to_pandas(), named.to_polars()):
+        assert [table[name].to_numpy()[0] for name in ("number", "cell/number", "cell/time")] == [7, 2, 1]
     assert columns.to_pandas().index[0] == pandas.Timestamp(columns.time_ns[0], tz="UTC")
     assert columns.to_polars()["time"].dtype == polars.Datetime("ns", "UTC")
