@@ -107,10 +107,14 @@ class Output:
             self._piece.clear()
 
     @property
+    def waiting(self) -> int:
+        """Bytes that were given and are not in the file yet."""
+        return self.tell() - self.written
+
+    @property
     def full(self) -> bool:
         """Whether no more should be given: too much waits. It ends when half of it has been written."""
-        waiting = self.tell() - self.written
-        self._full = waiting > (self._limit // 2 if self._full else self._limit)
+        self._full = self.waiting > (self._limit // 2 if self._full else self._limit)
         return self._full
 
     @property

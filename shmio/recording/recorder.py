@@ -110,7 +110,7 @@ class Recorder:
         full = self.output.full
         if self._unaware and not full:
             self._unaware = False
-            entries = [*(entry for entry in entries if not _of_a_process(entry)), *self.tap.standing()]
+            entries = [*(entry for entry in entries if not of_a_process(entry)), *self.tap.standing()]
         for entry in entries:
             if full:
                 self._lose(entry)
@@ -207,7 +207,7 @@ class Recorder:
     # ---- entries -----------------------------------------------------------------------------------------------------
 
     def _write(self, entry: Entry | Aside) -> None:
-        self.empty = self.empty and _of_a_process(entry)
+        self.empty = self.empty and of_a_process(entry)
         if isinstance(entry, Aside):
             self._aside(entry)
             return
@@ -241,7 +241,7 @@ class Recorder:
 
     def _lose(self, entry: Entry | Aside) -> None:
         if isinstance(entry, Aside):
-            self._unaware |= _of_a_process(entry)
+            self._unaware |= of_a_process(entry)
         else:
             self.counters.missed += self._known(entry.follower).lose(entry.item)
 
@@ -253,5 +253,6 @@ class Recorder:
             followed.come_to(gap.what, gap.last, log_ns)
 
 
-def _of_a_process(entry: Entry | Aside) -> bool:
+def of_a_process(entry: Entry | Aside) -> bool:
+    """Whether it is what has happened to a process."""
     return isinstance(entry.item, ProcessChange)

@@ -115,6 +115,11 @@ class Series:
         return self.recorder.output.written
 
     @property
+    def waiting(self) -> int:
+        """Bytes that wait for the disk."""
+        return sum(recorder.output.waiting for recorder in (*self._ending, self.recorder))
+
+    @property
     def problem(self) -> str:
         """What is wrong at present, in words; empty: nothing."""
         return next(filter(None, (recorder.problem for recorder in (*self._ending, self.recorder))), "")

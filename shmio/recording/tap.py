@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from typing import Final, NamedTuple
 
 from shmio.dump.encoding import Place, ProcessChange, Reason, StepMark
 from shmio.recording.follower import Aside, Entry, Follower
 from shmio.recording.processes import Watch
 from shmio.recording.selection import Selection
-from shmio.segment import Segment
+from shmio.segment import Block, Segment
 from shmio.segment.clock import ClockState
 from shmio.segment.events import EVENT_SIZE
 
@@ -49,6 +49,8 @@ class Tap:
         self.done = 0
         """The last step of virtual time of which all has been taken."""
         self._selection = selection or Selection()
+        self._watched: set[str] = set()
+        self._watching: list[Follower] = []
         self._seen: set[int] = set()
         """Sections whose blocks are followed, were, or need not be."""
         self._blocks = 0
@@ -58,10 +60,25 @@ class Tap:
         self._follow(start)
 
     def again(self, start: Start) -> Tap:
-        """Another tap of the same, from elsewhere on."""
+        """Another tap of the same that is to be recorded, from elsewhere on."""
         tap = Tap(self.segment, start, self._selection)
         tap.done = self.done
         return tap
+
+    def watch(self, sources: Collection[str]) -> None:
+        """Take from these sources, too, from now on; of those that are not to be recorded the followers have number 0.
+
+        They are not among :attr:`followers`.
+        """
+        self._watched |= set(sources)
+        followed = {follower.block.section for follower in (*self.followers, *self._watching)}
+        for block in self._known.values():
+            if block.source in self._watched and block.section not in followed:
+                self._watch_block(block)
+
+    def _watch_block(self, block: Block) -> None:
+        place = Place(block.ring.head(), block.events.head())
+        self._watching.append(Follower(block, 0, place, Reason.OVERTAKEN, self.log_time))
 
     def log_time(self, monotonic_ns: int) -> int:
         """Time in a recording, UTC by the instance's start: it goes on evenly whatever is done to the wall clock."""
@@ -80,7 +97,7 @@ class Tap:
             self._follow(FROM_THE_FIRST)
         entries: list[Entry | Aside] = []
         more, most = False, 0
-        for follower in self.followers:
+        for follower in (*self.followers, *self._watching):
             batch = max(16, BATCH_BYTES // (follower.block.layout.size + EVENT_SIZE))
             taken = list(follower.take(batch))
             more |= len(taken) >= batch
@@ -90,6 +107,7 @@ class Tap:
             entries += taken
         self._lively = most > LIVELY
         self.followers = [follower for follower in self.followers if not follower.done]
+        self._watching = [follower for follower in self._watching if not follower.done]
         entries.sort(key=lambda entry: entry.log_ns)  # stable: a block's own order stays
         if state.virtual and state.done > self.done and not more:
             entries += self._step(state)
@@ -114,7 +132,7 @@ class Tap:
     @property
     def pause_s(self) -> float:
         """How long to wait between two turns: far less than any ring holds."""
-        rings = [follower.block.ring for follower in self.followers]
+        rings = [follower.block.ring for follower in (*self.followers, *self._watching)]
         return min(
             [TURN_S / 10 if self._lively else TURN_S, *(ring.slot_count * ring.period_ns / 8e9 for ring in rings)]
         )
@@ -137,6 +155,8 @@ class Tap:
             self._seen.add(block.section)
             part = self._selection.part(block, self._known)
             if part is None:
+                if block.source in self._watched and block not in ended:
+                    self._watch_block(block)
                 continue
             place = start.places.get(block.section)
             reason = start.reason if place or start.first else Reason.OVERTAKEN

@@ -43,7 +43,8 @@ class Trigger:
         self._condition = compile_condition(self.when, {name: block.layout for name, block in blocks.items()})
         self._blocks = blocks
         self._sections = {block.section: name for name, block in blocks.items()}
-        self._sources = {source for source, _ in self._condition.reads}
+        self.sources = {source for source, _ in self._condition.reads}
+        """Which it reads."""
         self._images: dict[str, bytes | None] = {}
         self._memory = Memory()
 
@@ -52,7 +53,7 @@ class Trigger:
         if isinstance(entry, Aside) or not isinstance(entry.item, Frame):
             return False
         source = self._sections.get(entry.follower.block.section, "")
-        if source not in self._sources:
+        if source not in self.sources:
             return False
         frame = entry.item
         known = frame.quality is not Quality.BAD and frame.source_ns != 0

@@ -6,7 +6,6 @@ import logging
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Final
 
 from shmio.config import Recorder as Settings
 from shmio.config import Trigger as TriggerSettings
@@ -14,12 +13,10 @@ from shmio.dump.encoding import Place
 from shmio.errors import RecordingError
 from shmio.recording.attach import Attachments
 from shmio.recording.follower import Aside, Entry
-from shmio.recording.recorder import CLOSE_S, Counters
+from shmio.recording.recorder import CLOSE_S, Counters, of_a_process
 from shmio.recording.series import Series
 from shmio.recording.tap import TURN_S, Tap
 from shmio.recording.trigger import Backlog, Trigger
-
-TURN_NS: Final = round(TURN_S * 1e9)
 
 log = logging.getLogger("shmio.recorder")
 
@@ -37,13 +34,16 @@ class Triggered:
         self._settings = settings
         self._trigger = Trigger(trigger.when, tap.segment.blocks)
         self._times = trigger
+        tap.watch(self._trigger.sources)
         self._by = by
         self._attachments = attachments
         self._series: Series | None = None
         self._ending: list[Series] = []
         self._backlog = self._anew(tap.start.places)
         self._until_ns = 0
+        self._came_s = time.monotonic()
         self._problem = ""
+        self._held = False  # whether no file could be begun for what of others waits
         if going:
             self._begin(tap.now())
 
@@ -51,21 +51,26 @@ class Triggered:
         """Look what has been published, and record what is to be; whether there is more at once. RecordingError."""
         self._trigger.follow(self.tap.segment.blocks)
         entries, more = self.tap.take()
+        if entries:
+            self._came_s = time.monotonic()
         batch: list[Entry | Aside] = []
         for entry in entries:
-            if self._series and entry.log_ns > self._until_ns:
+            if self._series and entry.log_ns > self._until_ns and not of_a_process(entry):
                 self._end(batch)
                 batch = []
             if self._trigger.sees(entry):
                 self._begin(entry.log_ns)
+            if isinstance(entry, Entry) and not entry.follower.number:
+                continue  # it is only watched
             if self._series:
                 batch.append(entry)
             else:
                 self._backlog.add(entry)
         if self._series:
             self._series.put(batch)
-            if not self.tap.segment.clock.read().virtual and self.tap.now() > self._until_ns + TURN_NS:
-                self._end([])  # nothing comes any more that would tell
+            silent_s = time.monotonic() - self._came_s
+            if not self.tap.segment.clock.read().virtual and silent_s > self._times.after_s + TURN_S:
+                self._end([])  # nothing comes any more that would tell; a replay's times are not the host's
         return more
 
     def _begin(self, log_ns: int) -> None:
@@ -73,6 +78,12 @@ class Triggered:
         self._until_ns = log_ns + round(self._times.after_s * 1e9)
         if self._series is not None:
             return
+        if sum(series.waiting for series in self._ending) > self._settings.buffer_bytes:
+            if not self._held:
+                log.error("%s: no file is begun while those before wait for the disk", self._trigger.when)
+            self._held = True
+            return
+        self._held = False
         before = self._backlog.before(log_ns)
         about = {"trigger": self._trigger.when, "triggered_ns": str(log_ns)}
         try:
@@ -91,18 +102,19 @@ class Triggered:
         log.info("%s: recording to %s", self._trigger.when, series.file)
 
     def _end(self, last: Sequence[Entry | Aside]) -> None:
-        series, self._series = self._series, None
-        if series:
+        if series := self._series:
             series.put(last)
             self._backlog = self._anew(series.end())
-            self._ending.append(series)
+            self._ending.append(series)  # before it is the present one no longer: another thread may look
+            self._series = None
 
     def _anew(self, places: Mapping[int, Place]) -> Backlog:
         return Backlog(self._times.before_s, round(self._times.before_mb * 1e6), places)
 
     @property
     def _all(self) -> list[Series]:
-        return [*self._ending, *([self._series] if self._series else [])]
+        present = self._series
+        return [*self._ending, *([present] if present else [])]
 
     def tend(self) -> bool:
         """Look after the files; whether a doubtful one was given up."""

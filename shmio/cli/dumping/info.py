@@ -32,7 +32,6 @@ def _describe(reader: Reader, found: Survey) -> dict[str, Any]:
     duration_s = (found.end_ns - found.begin_ns) / 1e9
     size = reader.records.size
     about = reader.about
-    started_ns = about.get("started_utc_ns", "")
     return {
         "file": str(reader.file),
         "size": size,
@@ -46,7 +45,9 @@ def _describe(reader: Reader, found: Survey) -> dict[str, Any]:
         "version": about.get("version", ""),
         "recorder": about.get("recorder", ""),
         "made_by": about.get("made_by"),
-        "started": iso(int(started_ns)) if started_ns.isdecimal() and len(started_ns) < 20 else None,
+        "trigger": about.get("trigger"),
+        "triggered": _moment(about.get("triggered_ns", "")),
+        "started": _moment(about.get("started_utc_ns", "")),
         "from": iso(found.begin_ns) if found.begin_ns else None,
         "to": iso(found.end_ns) if found.end_ns else None,
         "duration_s": round(duration_s, 3),
@@ -60,6 +61,10 @@ def _describe(reader: Reader, found: Survey) -> dict[str, Any]:
         "gaps": [msgspec.to_builtins(gap) for gap in found.gaps],
         "attachments": {name: entry.size for name, entry in reader.attachments.items()},
     }
+
+
+def _moment(text: str) -> str | None:
+    return iso(int(text)) if text.isdecimal() and len(text) < 20 else None
 
 
 def _missed(found: Survey, what: str) -> int:
@@ -120,6 +125,8 @@ def _lines(found: dict[str, Any]) -> list[str]:
         if found["from"]
         else "  no frames in it",
     ]
+    if found["trigger"]:
+        lines.append(f"  triggered {found['triggered']} by {found['trigger']}")
     if found["doubtful"]:
         where = f"behind byte {found['doubtful_from']} of {found['doubtful']}"
         lines.append(f"  what is {where} may be lost: the disk failed at its fsync")

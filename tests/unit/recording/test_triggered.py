@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,10 +15,12 @@ from shmio.config import Trigger as TriggerSettings
 from shmio.dump.check import check
 from shmio.dump.reader import Reader
 from shmio.errors import ConfigError
+from shmio.recording import output as output_module
 from shmio.recording.attach import no_attachments
+from shmio.recording.selection import Selection
 from shmio.recording.tap import FROM_THE_FIRST, Start, Tap
 from shmio.recording.triggered import Triggered
-from shmio.segment import BlockWriter, Event, EventKind, Quality, Record, Segment
+from shmio.segment import BlockWriter, Event, EventKind, Origin, Quality, Record, Segment, Stamp
 from shmio.testing.cell import kill, until
 from tests.unit.recording.harness import OTHER, RING, Process, gaps, numbers, publish, spec
 from tests.unit.recording.test_rotation import files
@@ -26,14 +31,29 @@ S = 1_000_000_000
 class Bench:
     """A triggered recording of the cell, whose frames come a second apart: the tenth holds a 10, and so on."""
 
-    def __init__(self, segment: Segment, folder: Path, start: Start = FROM_THE_FIRST, **trigger: object) -> None:
+    def __init__(
+        self,
+        segment: Segment,
+        folder: Path,
+        start: Start = FROM_THE_FIRST,
+        *,
+        begin_s: int = 100_000,
+        selection: Selection | None = None,
+        buffer_mb: float = 16,
+        **trigger: object,
+    ) -> None:
+        """``begin_s``: when the frames are, on the host's clock since the instance's start."""
         self.folder = folder
-        self.writer: BlockWriter = segment.writer("cell")
+        self._begin_ns = segment.header.started_ns + begin_s * S
+        self.writer: BlockWriter = segment.writer("cell", Stamp(self._begin_ns, begin_s * S))
         settings = TriggerSettings(**trigger)  # type: ignore[arg-type]
         self.work = Triggered(
-            Tap(segment, start), Settings(directory=str(folder)), settings, "supervised", no_attachments
+            Tap(segment, start, selection),
+            Settings(directory=str(folder), buffer_mb=buffer_mb),
+            settings,
+            "supervised",
+            no_attachments,
         )
-        self._begin_ns = segment.header.started_ns + 100_000 * S  # far ahead: no time passes by itself
         self._next = 1
 
     def publish(self, count: int, **options: object) -> None:
@@ -84,6 +104,33 @@ def test_one_that_comes_meanwhile_prolongs_the_file(segment: Segment, tmp_path: 
     bench = Bench(segment, tmp_path, when="cell/count mod 20 < 3 and cell/count > 18", before_s=2, after_s=4)
     bench.publish(35)
     assert bench.close() == [list(range(18, 27))]
+
+
+def test_the_times_of_frames_need_not_be_the_hosts(instance: str, tmp_path: Path) -> None:
+    """A replay that stood, or plays slowly, is behind by as much."""
+    with Segment.create(instance, [spec("cell")], [], origin=Origin(3_600 * S, 0)) as segment:
+        bench = Bench(segment, tmp_path, when="cell/count = 20", before_s=5, after_s=3, begin_s=0)
+        for _ in range(40):
+            bench.publish(1)
+        assert bench.close() == [list(range(15, 24))]
+        segment.unlink()
+
+
+def test_it_may_be_of_a_source_that_is_not_recorded(segment: Segment, tmp_path: Path) -> None:
+    segment.change(add=[spec("press")], retire=[])
+    bench = Bench(
+        segment, tmp_path, when="press/count = 1 and cell/count = 20", before_s=5, after_s=3,
+        selection=Selection(["cell"]),
+    )  # fmt: skip
+    bench.publish(10)
+    press = segment.writer("press")
+    press.at_ns = bench.writer.at_ns
+    publish(press, 1, first=1)
+    bench.publish(20)
+    assert bench.close() == [list(range(15, 24))]
+    with Reader(files(tmp_path)[0]) as reader:
+        list(reader.messages())
+        assert {channel.source for channel in reader.channels.values() if channel.source} == {"cell"}
 
 
 def test_two_files_do_not_overlap(segment: Segment, tmp_path: Path) -> None:
@@ -154,6 +201,31 @@ def test_without_a_folder_it_says_so_and_goes_on_waiting(segment: Segment, tmp_p
     bench.publish(3)
     assert bench.work.problem == ""
     assert bench.close() == [[1, 2, 3, 4, 5, 6, 7]]
+
+
+def test_while_the_disk_takes_nothing_no_more_waits_than_may(
+    segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Each time has a file of its own; what waits for the disk is of all of them."""
+    full = True
+
+    def pwrite(fd: int, data: bytes, offset: int, write: Callable[[int, bytes, int], int] = os.pwrite) -> int:
+        if full:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(fd, data, offset)
+
+    monkeypatch.setattr(os, "pwrite", pwrite)
+    monkeypatch.setattr(output_module, "RETRY_S", 0.01)
+    bench = Bench(segment, tmp_path, when="cell/count mod 10 = 0", before_s=2, after_s=2, buffer_mb=0.005)
+    for _ in range(20):
+        bench.publish(10)
+    assert 1 < len(list(tmp_path.iterdir())) < 10
+    assert "No space left on device" in bench.work.problem
+    assert caplog.text.count("no file is begun while") == 1
+    full = False
+    until(lambda: all(series.ended for series in bench.work._ending), "what waits is written")
+    bench.publish(10)
+    assert bench.close()[-1] == [208, 209, 210]
 
 
 def test_the_process_says_what_it_waits_for_and_ends_by_itself(segment: Segment, tmp_path: Path) -> None:
