@@ -7,6 +7,7 @@ chunk or attachment that is whole.
 
 from __future__ import annotations
 
+import fcntl
 import os
 import re
 import stat
@@ -259,6 +260,11 @@ class Records:
                 raise RecordingError(f"{self.file}: the chunk at byte {record.at} ends within a record")
             yield opcode, data[at : at + size]
             at += size
+
+    def hold(self) -> None:
+        """Have recorders that delete what is old spare it, as long as it is open; where the file system has locks."""
+        with suppress(OSError):
+            fcntl.flock(self._fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
 
     def close(self) -> None:
         """Close the file."""

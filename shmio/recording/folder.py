@@ -48,7 +48,7 @@ def is_own(status: os.stat_result) -> bool:
 def about_of(file: Path, instance: str, by: str, beat: Callable[[], object] = lambda: None) -> dict[str, str]:
     """What a recorder of this kind (``by``) said of this instance at the beginning of its file; {}: it is no such file.
 
-    OSError, RecordingError: it is not this user's regular file, or no recording.
+    One that was made of others is none. OSError, RecordingError: it is not this user's regular file, or no recording.
     """
     with Reader(file, own=True, beat=beat) as reader:
         for record in reader.records.walk(to=ABOUT_BYTES):
@@ -57,4 +57,5 @@ def about_of(file: Path, instance: str, by: str, beat: Callable[[], object] = la
             if record.opcode == Opcode.CHUNK or reader.about:
                 break
         about = reader.about
-    return about if about.items() >= {"instance": instance, "recorder": by}.items() else {}
+    ours = about.items() >= {"instance": instance, "recorder": by}.items() and "made_by" not in about
+    return about if ours else {}

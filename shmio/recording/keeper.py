@@ -5,7 +5,9 @@ In a thread of its own, so that neither many files nor a slow disk hold up the r
 
 from __future__ import annotations
 
+import fcntl
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -46,7 +48,7 @@ class Keeper:
         self._by = by
         self._present = present
         self._own: dict[_File, bool] = {}
-        """Those that are this recorder's kind's: whether they are closed."""
+        """Those that are this recorder's kind's: whether they are closed; others are looked into again."""
         self._strange: set[_File] = set()
         self._undeletable: set[_File] = set()
         self._stop = threading.Event()
@@ -80,7 +82,7 @@ class Keeper:
         for file in found:
             if self._stop.is_set():
                 return
-            known = file.path in present or file in self._own or file in self._strange
+            known = file.path in present or self._own.get(file) or file in self._strange
             if file.size and not known:  # an empty one has just been made, or nothing ever came of it
                 self._take_in(file)
         self._delete([file for file in found if file.path in present])
@@ -118,7 +120,7 @@ class Keeper:
 
     def _remove(self, file: _File, why: str) -> bool:
         try:
-            if _file(file.path) != file:
+            if _file(file.path) != file or _is_held(file.path):
                 return False
             file.path.unlink()
         except OSError as error:
@@ -129,6 +131,20 @@ class Keeper:
         del self._own[file]
         log.info("%s is deleted: %s", file.path, why)
         return True
+
+
+def _is_held(path: Path) -> bool:
+    """Whether somebody plays it: its processes, started anew, would find nothing."""
+    fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # a file system without locks
+        return False
+    finally:
+        os.close(fd)
+    return False
 
 
 def _file(path: Path) -> _File | None:

@@ -48,6 +48,8 @@ class Recording:
         except OSError as error:
             raise RecordingError(f"{error.filename}: {error.strerror}") from None
         self._file = self._dump.files[0]
+        for reader in self._dump.readers:
+            reader.records.hold()
         try:
             self._measure()
         except BaseException:

@@ -10,7 +10,9 @@ from typing import Any
 
 import pytest
 
+from shmio.cli.dump import main
 from shmio.config import Recorder as Settings
+from shmio.connectors.replay.recording import Recording
 from shmio.dump.check import check
 from shmio.dump.reader import Reader
 from shmio.recording import output as output_module
@@ -220,6 +222,29 @@ def test_by_size_the_oldest_first(segment: Segment, tmp_path: Path) -> None:
     assert keep(segment, tmp_path, files[3], keep_mb=1e-6) == {files[3]}
 
 
+def test_what_is_being_played_is_not_deleted(segment: Segment, tmp_path: Path) -> None:
+    """A source that plays it would find nothing when its process is started anew."""
+    old, older = recorded(segment, tmp_path, 8), recorded(segment, tmp_path, 9)
+    with Recording([old]):
+        assert keep(segment, tmp_path, keep_days=7) == {old}
+    assert not older.exists()
+    assert keep(segment, tmp_path, keep_days=7) == set()
+
+
+def test_one_that_could_not_be_closed_while_it_was_held_is_closed_later(segment: Segment, tmp_path: Path) -> None:
+    whole = recorded(segment, tmp_path, 0)
+    killed = tmp_path / f"{segment.instance}-20200101T000000Z.mem"
+    killed.write_bytes(whole.read_bytes()[:-100])
+    keeper = Keeper(segment.instance, Settings(directory=str(tmp_path)), "supervised", set)
+    with Recording([killed]):
+        keeper.look()
+        with Reader(killed) as reader:
+            assert reader.records.footer() is None
+    keeper.look()
+    with Reader(killed) as reader:
+        assert reader.records.footer() is not None
+
+
 def test_what_is_not_its_own_is_never_deleted(segment: Segment, tmp_path: Path) -> None:
     name = segment.instance
     strange = {recorded(segment, tmp_path, 9, by="shmio-dump")}
@@ -234,7 +259,9 @@ def test_what_is_not_its_own_is_never_deleted(segment: Segment, tmp_path: Path) 
     copy.write_bytes(own.read_bytes())
     longer = tmp_path / f"{name}-test-20200101T000000Z.mem"
     longer.write_bytes(own.read_bytes())
-    strange |= {other, link, nonsense, copy, longer}
+    made = tmp_path / f"{name}-20200101T000004Z.mem"
+    assert main(["cut", str(own), "-o", str(made)]) == 0
+    strange |= {other, link, nonsense, copy, longer, made}
     if os.geteuid() == 0:
         foreign = tmp_path / f"{name}-20200101T000003Z.mem"
         foreign.write_bytes(own.read_bytes())
