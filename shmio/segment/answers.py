@@ -12,6 +12,7 @@ from shmio.segment.segment import Segment
 
 _NOBODY: Final = "no source lives on the instance's clock: steps move none; those with a device go on in real time"
 _REAL: Final = "; a restart of the instance brings real time back"
+_STANDS: Final = f"it stands until it is stepped{_REAL}"
 
 
 class Wait(NamedTuple):
@@ -51,6 +52,11 @@ def silence(segment: Segment, block: Block, hard_ns: int) -> str:
             told = slot.supervised
             return f"{what}: its process does not run ({told.phase}{told.note and f': {told.note}'})"
     return what
+
+
+def taken(participants: Sequence[Block]) -> str:
+    """What is told of time that was real until now."""
+    return _STANDS if participants else f"{_NOBODY}{_REAL}"
 
 
 def standing(segment: Segment, participants: Sequence[Block]) -> str:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from shmio.errors import TimeError, ValueRangeError
-from shmio.segment.answers import Wait, answer, silence, standing
+from shmio.segment.answers import Wait, answer, silence, standing, taken
 from shmio.segment.block import Block
 from shmio.segment.clock import ClockMode, ClockState, time_lock
 from shmio.segment.processes import ProcessSlot
@@ -71,10 +71,11 @@ class Coordinator:
         """The clock page as it is now."""
         return self._segment.clock.read()
 
-    def take_over(self, patience_s: float = 0.0) -> None:
+    def take_over(self, patience_s: float = 0.0, *, steps: bool = False) -> None:
         """From now on only steps move time. TimeError: another living process owns it, and plays, or goes on owning it.
 
-        ``patience_s``: how long to wait for one that does not play.
+        ``patience_s``: how long to wait for one that does not play. ``steps``: the first one follows at once, so that
+        there is nothing to say of time that stands.
         """
         with self._turn:
             if self._owns:
@@ -90,7 +91,7 @@ class Coordinator:
                 # Who free-runs looks at the page before each cycle: none begins after this write, so that none of
                 # theirs is later than the present one, as it is found once more after it.
                 self._write(self._frozen(state))
-                state = self._frozen(state)
+                state = self._frozen(state._replace(note="" if steps else taken(self._participants())))
             self._write(state)
             for slot in self._segment.processes:
                 self._segment.clock.slot_bell(slot.index).ring()
@@ -140,7 +141,7 @@ class Coordinator:
 
         Whoever does not go on to its end has to close it. Nothing else of this coordinator may be called meanwhile.
         """
-        self.take_over()
+        self.take_over(steps=True)
         before = self.read()
         dt_ns = before.step_size_ns if dt_ns is None else dt_ns
         check_step(dt_ns)

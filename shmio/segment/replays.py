@@ -94,7 +94,7 @@ class Replays:
         return self.change(Wanted(change=path, jump=jump))
 
     def to_event(self, kind: str, *, jump: bool = False) -> list[Playing]:
-        """The same with the next event of a kind, such as ``accepted`` or ``noted``, of any source."""
+        """The same with the next event of a kind, such as ``accepted`` or ``noted``, or ``any``, of any source."""
         return self.change(Wanted(event=kind, jump=jump))
 
     def change(self, wanted: Wanted, given_up: Callable[[], bool] = lambda: False) -> list[Playing]:

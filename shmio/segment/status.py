@@ -51,7 +51,8 @@ class SupervisorStatus(msgspec.Struct):
 class ClockStatus(msgspec.Struct):
     """The instance's clock. ``mode``: wall or virtual. ``step``: number of the last one that all have finished.
 
-    ``note``: whom a step waits for, why the last one failed, or what it did not move.
+    ``note``: whom a step waits for, why the last one failed, or what it did not move; before the first
+    one how real time comes back.
     """
 
     mode: str

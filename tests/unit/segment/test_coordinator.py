@@ -98,6 +98,20 @@ def test_a_step_that_moves_nothing_says_so(instance: str) -> None:
         assert coordinator.read().note.endswith("; a restart of the instance brings real time back"), "not cut off"
 
 
+def test_time_that_is_taken_over_says_how_real_time_comes_back(instance: str) -> None:
+    with built(instance, spec("a"), stepped=False) as segment, Participant(instance, "a"):
+        coordinator = Coordinator(segment)
+        coordinator.take_over()
+        told = "it stands until it is stepped; a restart of the instance brings real time back"
+        assert coordinator.read().note == told
+        coordinator.step()
+        assert coordinator.read().note == ""
+    with built(instance, spec("plc", stepped=False), stepped=False) as segment:
+        coordinator = Coordinator(segment)
+        coordinator.take_over()
+        assert coordinator.read().note.startswith("no source lives on the instance's clock")
+
+
 def test_where_real_time_never_was_no_restart_brings_it_back(instance: str) -> None:
     with built(instance, spec("plc", stepped=False), stepped=True) as segment:
         coordinator = Coordinator(segment)
