@@ -26,7 +26,7 @@ _VERBS: Final = {
     "speed": "X: times as fast as the instance's clock, 0.01 to 1000",
     "loop": "on or off: begin anew at the end",
     "to-change": "PATH: play to the next change of a register, and pause",
-    "to-event": "KIND: play to the next event of a kind, such as accepted, quality, injected, and pause",
+    "to-event": "KIND: play to the next event of a kind, such as accepted, quality, injected, or any, and pause",
 }
 _ALONE: Final = ("status", "pause", "play")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Iterable, Sequence
 from typing import Final
 
@@ -12,16 +11,16 @@ from shmio.connectors.desk import CommandDesk
 from shmio.connectors.injector import OwnerOf
 from shmio.connectors.output import Output
 from shmio.connectors.replay.beginning import Beginning, as_others, stamp
+from shmio.connectors.replay.moving import AHEAD_NS, moved
 from shmio.connectors.replay.player import OVER, STOPPED, Player
-from shmio.connectors.replay.recording import MAX_NS
 from shmio.connectors.replay.search import Search
 from shmio.connectors.replay.source import Replay
 from shmio.connectors.stepped import StepClock
 from shmio.connectors.telling import Counters
-from shmio.errors import PathError, SegmentError
+from shmio.errors import PathError, SegmentError, ValueRangeError
 from shmio.layout.write import Write
 from shmio.segment import BlockWriter, EventKind, Record, Stamp
-from shmio.segment.playhead import MAX_SPEED, MIN_SPEED, Find, Found, Move, Play, answered
+from shmio.segment.playhead import Ask, Find, Found, Move, Play, answered
 
 PIECE: Final = 64
 """So many frames and events between two looks at what else there is to do."""
@@ -29,8 +28,10 @@ LATE_NS: Final = 10_000_000_000
 """What is late is caught up with, up to this much of the instance's clock; what is later is left out."""
 ASK_TURN_NS: Final = 1_000_000
 """How often it is looked whether a step is over that a request waits for: its end rings nothing here."""
-AHEAD_NS: Final = 60_000_000_000
-"""A request may be of a moment that is so far ahead, and of any that has passed: this process may have been held up."""
+BEHIND_NS: Final = 3_000_000_000
+"""What was due before a request is played before it is answered, if that takes no longer; else it is left out."""
+
+Asked = tuple[int, Ask | None] | None
 
 log = logging.getLogger("shmio.source")
 
@@ -67,6 +68,7 @@ class ReplayLoop:
         self._player = Player(source.tape, self._output, keep=source.keep)
         self._search: tuple[int, Search] | None = None
         self._play, self._done_ns = beginning
+        self._round_before: Play | None = None
         self.counters = Counters()
 
     @property
@@ -105,6 +107,7 @@ class ReplayLoop:
 
     def _turn(self) -> bool:
         """Play what is due, do what is asked for, then wait for news; True: told to stop."""
+        asked = self._head.asks(self._play.asked)  # before the time is looked at: it tells of a moment before that
         state = self._page.read()
         # In virtual time what is published belongs to the end of the step.
         self._writer.at_ns = self._play.base_ns + self._play.at_ns(state.time_ns) if state.virtual else None
@@ -112,19 +115,19 @@ class ReplayLoop:
         if stepped and state.step != self._play.begun:
             self._keep(self._play._replace(begun=state.step, head=self._writer.block.ring.head()))
         # Before anything is played: a request that waited tells of a moment at which this played as it still does.
-        rounds_ns = None if state.stepping else self._rounds_ns(state.time_ns)
-        more = rounds_ns is not None or (not state.stepping and self._listen(state.time_ns))
-        clock_ns = state.time_ns if rounds_ns is None else rounds_ns
+        before_ns = None if state.stepping else self._before_ns(asked, state.time_ns)
+        more = before_ns is not None or (not state.stepping and self._listen(asked, state.time_ns))
+        clock_ns = state.time_ns if before_ns is None else before_ns
         more |= self.counters.watch(self._clock.now_ns, lambda: self._advance(clock_ns))
         if not more and stepped:
             self._keep(self._play._replace(step=state.step))
             self._writer.block.ring.wake()
-        asked = state.stepping and self._head.asks(self._play.asked) is not None
+        waits = state.stepping and self._head.asks(self._play.asked) is not None
         if self.desk.waiting:
             self.desk.settle()
             self.desk.carry_out(self._refuse)
         self.counters.polls = self._player.published
-        return self._clock.wait_ns(0 if more else ASK_TURN_NS if asked else self._patience_ns(virtual=state.virtual))
+        return self._clock.wait_ns(0 if more else ASK_TURN_NS if waits else self._patience_ns(virtual=state.virtual))
 
     def _patience_ns(self, *, virtual: bool) -> int | None:
         """How long nothing is due; None: until somebody rings."""
@@ -147,8 +150,8 @@ class ReplayLoop:
             self.desk.release(self._writer.cycle)
         settled = play.settled(clock_ns)
         if settled is play:
-            if play.paused and self._player.stopped and not play.over:
-                self._show(play.position_ns)  # it stands again, and no next frame would tell
+            if self._player.stopped and not play.over and (play.paused or self._writer.at_ns is not None):
+                self._show(play.at_ns(clock_ns))  # it stands again, or its time does: no next frame would tell
             return False
         if settled.paused:
             over = settled.position_ns >= settled.end_ns
@@ -157,6 +160,7 @@ class ReplayLoop:
             self._keep(settled._replace(over=over))
             self._writer.block.ring.wake()  # for who waits until it has come there
             return False
+        self._round_before = play
         self._keep(play.next_round())
         self._player.again(play.begin_ns, self._source.tape.block.stale_ns, self._stamp)
         return True
@@ -202,17 +206,22 @@ class ReplayLoop:
 
     # ---- what others ask for -------------------------------------------------------------------------------------
 
-    def _rounds_ns(self, clock_ns: int) -> int | None:
-        """The moment of a request that waits, if rounds of a loop were over by then: they are played before it."""
-        number, ask = self._head.asks(self._play.asked) or (0, None)
-        if not isinstance(ask, Move) or number != self._play.asked + 1:
+    def _is_behind(self, clock_ns: int) -> bool:
+        """Whether something was due by a time of the instance's clock that was not played."""
+        play, next_ns = self._play, self._player.next_ns
+        due_ns = min(play.reach_ns(clock_ns), play.until_ns, play.end_ns - 1)
+        return (next_ns is not None and next_ns <= due_ns) or play.settled(clock_ns) is not play
+
+    def _before_ns(self, asked: Asked, clock_ns: int) -> int | None:
+        """The moment of a request that waits, if what was due by then is to be played first, as it is in time."""
+        number, ask = asked or (0, None)
+        if not isinstance(ask, Move) or number != self._play.asked + 1 or ask.position_ns is not None:
             return None
         moment_ns = min(ask.clock_ns, clock_ns)
-        return moment_ns if self._play.wraps and self._play.settled(moment_ns) is not self._play else None
+        return moment_ns if self._is_behind(moment_ns) and clock_ns - moment_ns < BEHIND_NS else None
 
-    def _listen(self, clock_ns: int) -> bool:
+    def _listen(self, asked: Asked, clock_ns: int) -> bool:
         """Answer a request, or go on with the search for an answer; whether there is more to do."""
-        asked = self._head.asks(self._play.asked)
         if asked is None:
             self._search = None
             return False
@@ -248,49 +257,30 @@ class ReplayLoop:
 
     def _move(self, ask: Move, clock_ns: int) -> Found:
         """Play otherwise from a moment on."""
-        if ask.speed is not None and not (math.isfinite(ask.speed) and MIN_SPEED <= ask.speed <= MAX_SPEED):
-            return Found(f"a speed is from {MIN_SPEED:g} to {MAX_SPEED:g}, not {ask.speed:g}")
-        if not -MAX_NS < ask.clock_ns <= clock_ns + AHEAD_NS:
-            return Found("the request makes no sense")
-        was_ns = self._play.at_ns(clock_ns)
-        play = self._play.anchored(ask.clock_ns)
-        position_ns, paused = ask.position_ns, play.paused if ask.paused is None else ask.paused
-        if position_ns is None and not paused and play.position_ns >= play.end_ns:
-            position_ns = play.begin_ns  # from the end it goes on at the beginning
-        if position_ns is not None and not play.begin_ns <= position_ns <= play.end_ns:
-            return Found(
-                f"that is not within what is played, which is {(play.end_ns - play.begin_ns) / 1e9:.3f} s long"
-            )
-        at_ns = play.position_ns if position_ns is None else position_ns
-        if ask.until_ns is not None and ask.until_ns < at_ns:
-            return Found(f"that is past: it is at {(at_ns - play.begin_ns) / 1e9:.3f} s; seek to before that first")
-        until_ns = play.end_ns if ask.until_ns is None else min(ask.until_ns, play.end_ns)
-        if ask.until_ns is None and position_ns is None and (ask.paused is None or play.until_ns > at_ns):
-            until_ns = play.until_ns  # `pause` and `play` keep one that lies ahead
-        self._keep(
-            play._replace(
-                paused=paused,
-                speed=play.speed if ask.speed is None else ask.speed,
-                loop=play.loop if ask.loop is None else ask.loop,
-                position_ns=at_ns,
-                until_ns=until_ns,
-                over=play.over and position_ns is None,
-            )
-        )
+        play, behind = self._play, self._is_behind(min(ask.clock_ns, clock_ns + AHEAD_NS))
+        before = self._round_before
+        if before and before.anchor_ns <= ask.clock_ns < play.anchor_ns:
+            play, behind = play.moved_as(before), True  # asked just before it began anew
+        was_ns = play.at_ns(clock_ns)
+        try:
+            play, position_ns = moved(play, ask, clock_ns)
+        except ValueRangeError as error:
+            return Found(str(error))
+        self._keep(play)
         if position_ns is not None:
             self._show(position_ns)
-        elif was_ns - self._play.at_ns(clock_ns) > self._source.tape.block.stale_ns:
-            self._show(self._play.at_ns(clock_ns))  # it is asked late to be where it was long ago
+        elif behind or was_ns - play.at_ns(clock_ns) > self._source.tape.block.stale_ns:
+            self._show(play.at_ns(clock_ns))  # or it is asked late to be where it was long ago
         return Found()
 
     def _catch_up(self, clock_ns: int) -> None:
         """Play as others of this recording that have been moved since, for requests were missed."""
-        moved = as_others(self._source, [head for block in self._blocks().values() if (head := block.playhead)])
-        if moved is None or moved.anchor_ns <= self._play.anchor_ns:
+        other = as_others(self._source, [head for block in self._blocks().values() if (head := block.playhead)])
+        if other is None or other.anchor_ns <= self._play.anchor_ns:
             return
-        self._keep(self._play.moved_as(moved))
-        self._show(moved.end_ns - 1 if moved.over else moved.at_ns(clock_ns))
-        if moved.over:
+        self._keep(self._play.moved_as(other))
+        self._show(other.end_ns - 1 if other.over else other.at_ns(clock_ns))
+        if other.over:
             self._end()
 
     def _show(self, position_ns: int) -> None:

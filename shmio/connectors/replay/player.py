@@ -36,6 +36,11 @@ StampOf = Callable[[int, int], Stamp]
 log = logging.getLogger("shmio.source")
 
 
+def is_told(event: Event, *, keep: bool) -> bool:
+    """Whether a recorded event is told again; ``keep``: whether the injections of the recording are seen."""
+    return event.kind not in _OF_PROCESSES and (keep or not (event.kind in _OF_INJECTIONS or event.injection))
+
+
 class Player:
     """The place in a recording, and what is published there; for one thread."""
 
@@ -162,7 +167,7 @@ class Player:
 
     def _happen(self, event: Event, at: Stamp) -> None:
         """Tell a recorded event again: nobody's, so that no client of now takes it for its own."""
-        if event.kind in _OF_PROCESSES or (not self._keep and (event.kind in _OF_INJECTIONS or event.injection)):
+        if not is_told(event, keep=self._keep):
             return
         record = Record(
             cast(EventKind, event.kind),  # or a number that this version does not know

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+from shmio.connectors.replay.player import is_told
 from shmio.connectors.replay.tape import Entry, Tape
 from shmio.errors import PathError
 from shmio.layout.topic import find, shorten
@@ -11,6 +12,8 @@ from shmio.layout.write import bits_of
 from shmio.segment import Event, EventKind, Frame
 from shmio.segment.playhead import Find, Found
 
+ANY = "any"
+"""In place of a kind: whatever event is told."""
 PIECE = 256
 """So many entries between two looks at what else there is to do."""
 
@@ -20,7 +23,7 @@ class Search:
 
     def __init__(self, tape: Tape, find: Find, *, keep: bool) -> None:
         """``keep``: as consumers see the recording. PathError: no such register or kind."""
-        self._matches = _happened(find.event) if find.event else _changed(tape, find, keep=keep)
+        self._matches = _happened(find.event, keep=keep) if find.event else _changed(tape, find, keep=keep)
         self._entries: Iterator[Entry] = tape.entries(find.after_ns + 1)
         self._what = f"event {find.event}" if find.event else f"change of {find.path}"
 
@@ -35,10 +38,12 @@ class Search:
         return None
 
 
-def _happened(name: str) -> Callable[[Entry], bool]:
+def _happened(name: str, *, keep: bool) -> Callable[[Entry], bool]:
     kinds = {str(kind): kind for kind in EventKind}
+    if name == ANY:
+        return lambda entry: isinstance(entry.item, Event) and is_told(entry.item, keep=keep)
     if name not in kinds:
-        raise PathError(f"event {shorten(name, 16)!r} is none of {', '.join(kinds)}")
+        raise PathError(f"event {shorten(name, 16)!r} is none of {', '.join(kinds)}, {ANY}")
     return lambda entry: isinstance(entry.item, Event) and entry.item.kind == kinds[name]
 
 

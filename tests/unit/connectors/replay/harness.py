@@ -87,11 +87,11 @@ def recorded(folder: Path, instance: str, *sources: str, name: str = "") -> Iter
         segment.unlink()
 
 
-def record(folder: Path, instance: str, *sources: str) -> Path:
+def record(folder: Path, instance: str, *sources: str, frames: int = 20) -> Path:
     """A recording of sources that count in step, by default of one; ``other`` is 1 from the tenth frame on."""
     folder.mkdir(exist_ok=True)
     with recorded(folder, instance, *sources) as all_of_them:
-        for number in range(20):
+        for number in range(frames):
             for one in all_of_them:
                 one.frame(BEGIN_NS + number * PERIOD_NS, image(number, number >= 10))
     [file] = folder.glob("*.mem")

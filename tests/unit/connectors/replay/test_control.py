@@ -102,8 +102,27 @@ def test_it_plays_to_the_next_event(tmp_path: Path, instance: str) -> None:
         assert counts(playing.frames()) == list(range(7))
         assert [event.kind for event in playing.happened()] == [EventKind.ACCEPTED]
         assert attachment.replay.status()[0].paused
-        with pytest.raises(CommandError, match=r"event 'none' is none of started, .*, noted$"):
+        with pytest.raises(CommandError, match=r"event 'none' is none of started, .*, noted, any$"):
             attachment.replay.to_event("none")
+
+
+@pytest.mark.parametrize(("injections", "at"), [("keep", 3), ("leave out", 6)])
+def test_it_plays_to_the_next_event_whatever_it_is(tmp_path: Path, instance: str, injections: str, at: int) -> None:
+    """One that is not told again is none."""
+    kinds = {1: EventKind.STARTED, 3: EventKind.INJECTED, 6: EventKind.NOTED}
+    with recorded(tmp_path, instance) as [cell]:
+        for number in range(10):
+            cell.frame(BEGIN_NS + number * PERIOD_NS, image(number))
+            if number in kinds:
+                cell.event(BEGIN_NS + number * PERIOD_NS + MS, Record(kinds[number], "it"))
+    [file] = tmp_path.glob("*.mem")
+    with (
+        built(instance, stepped=False) as segment,
+        Playing(segment, file, paused=True, injections=injections) as playing,
+        attach(instance, writable=True) as attachment,
+    ):
+        attachment.replay.to_event("any", jump=True)
+        assert counts(playing.frames())[-1] == at
 
 
 @pytest.mark.parametrize(
@@ -271,3 +290,67 @@ def test_a_request_that_was_read_late_is_done_as_of_its_moment(here: tuple[Playi
         playing.until(lambda: head.found(number) is not None)
         assert head.found(number) == Found()
     assert playing.next(lambda frame: frame.quality is Quality.BAD).reason == "replay: the recording is over"
+
+
+def test_what_was_due_before_a_request_is_seen_before_its_answer(tmp_path: Path, instance: str) -> None:
+    """Who is told that it stands finds what is there, and nothing comes any more."""
+    file = record(tmp_path, instance, frames=400)
+    with built(instance, stepped=False) as segment, attach(instance, writable=True) as attachment:
+        with Playing(segment, file, paused=True):
+            attachment.replay.seek(0.1)
+        head = segment.blocks["cell"].playhead
+        assert head is not None
+        play, now_ns = head.read(), segment.clock.present_ns()
+        assert play is not None
+        head.write(play._replace(paused=False, anchor_ns=now_ns - 6 * S))
+        with head.held():
+            number = head.ask(Move(now_ns, paused=True))
+        with Playing(segment, file) as cell:
+            cell.until(lambda: head.found(number) is not None)
+            assert counts(cell.frames()) == list(range(6, 306))
+
+
+def test_a_request_of_a_moment_just_behind_a_wrap_is_done_in_the_next_round(tmp_path: Path, instance: str) -> None:
+    """Who asks may have looked at the clock after the source did."""
+    file = record(tmp_path, instance)
+    with (
+        built(instance, stepped=False) as segment,
+        Playing(segment, file, loop=True, speed=0.1) as cell,
+        attach(instance, writable=True) as attachment,
+    ):
+        cell.next()
+        head = cell.block.playhead
+        assert head is not None
+        play = head.read()
+        assert play is not None
+        with head.held():
+            number = head.ask(Move(play.next_round().anchor_ns + 5_000, paused=True))
+            cell.clock.nudge()
+            cell.until(lambda: head.found(number) is not None)
+        [status] = attachment.replay.status()
+        assert (status.paused, status.position_s < 0.001) == (True, True)
+        assert counts(cell.frames())[-1] == 0
+
+
+def test_a_request_of_a_moment_just_before_a_wrap_is_done_in_that_round(tmp_path: Path, instance: str) -> None:
+    """Its source may have begun the next one, others of its recording not."""
+    file = record(tmp_path, instance)
+    with (
+        built(instance, stepped=False) as segment,
+        Playing(segment, file, loop=True, speed=0.1) as cell,
+        attach(instance, writable=True) as attachment,
+    ):
+        attachment.replay.seek(0.38)
+        cell.next(lambda frame: counts([frame]) == [19])
+        assert counts([cell.next()]) == [0]
+        head = cell.block.playhead
+        assert head is not None
+        play = head.read()
+        assert play is not None
+        with head.held():
+            number = head.ask(Move(play.anchor_ns - 5_000, paused=True))
+            cell.clock.nudge()
+            cell.until(lambda: head.found(number) is not None)
+        [status] = attachment.replay.status()
+        assert (status.paused, round(status.position_s, 3)) == (True, 0.4)
+        assert counts(cell.frames())[-1] == 19
