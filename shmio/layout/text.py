@@ -9,8 +9,10 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Callable
 from decimal import Decimal
-from typing import Literal
+from functools import partial
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -48,10 +50,23 @@ def to_text(value: Value, register: Register) -> str:
 
     A scalar of None (bytes that are no value of the type) is the empty text; in an array it is ``null``.
     """
+    return _text(register.element, value)
+
+
+def texts(register: Register) -> Callable[[Value], str]:
+    """Return ``to_text`` of one register, for who needs it often."""
     element = register.element
+    return _real_text if element.base == "REAL" and not register.dims else partial(_text, element)
+
+
+def _text(element: ElementType, value: Value) -> str:
     if isinstance(value, list):
         return msgspec.json.encode(json_value(value, element) if element.base in _FLOATS else value).decode()
     return _scalar_text(value, element)
+
+
+def _real_text(value: Any) -> str:
+    return repr(float(str(np.float32(value)))) if math.isfinite(value) else _non_finite_text(value)
 
 
 def shortest(value: float, element: ElementType) -> float:
@@ -104,8 +119,12 @@ def _scalar_text(value: Scalar, element: ElementType) -> str:
     if isinstance(value, float):
         if math.isfinite(value):
             return repr(shortest(value, element))
-        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+        return _non_finite_text(value)
     return str(value)
+
+
+def _non_finite_text(value: float) -> str:
+    return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
 
 
 def _read(text: str, element: ElementType) -> Scalar:

@@ -10,7 +10,7 @@ import msgspec
 from shmio.config import MqttTopic
 from shmio.layout.codec import Value, codec
 from shmio.layout.model import Register
-from shmio.layout.text import json_value, to_text
+from shmio.layout.text import json_value, texts
 from shmio.segment import Block, Frame, Quality
 from shmio.segment.view import holds_none, reading
 
@@ -73,6 +73,7 @@ class RegisterChannel:
         self._qos, self._retain, self._deadband = rule.qos, rule.retain, rule.deadband
         self._pause_ns = round(1e9 / rule.max_rate_hz) if rule.max_rate_hz else 0
         self._decode = codec(register, showing.block.layout.byte_order).decode
+        self._to_text = texts(register)
         self._sent: Value = None
         self.due_ns = 0
         """By the source's clock: not before then."""
@@ -96,8 +97,9 @@ class RegisterChannel:
             self._note(None)
             return b""
         value = self._decode(frame.image)
-        self._note(value)
-        return to_text(value, self.register).encode()
+        if self.limited:
+            self._note(value)
+        return self._to_text(value).encode()
 
     def _json(self, *, late: bool) -> bytes:
         frame, quality, reason = self._showing.shown

@@ -119,12 +119,12 @@ class Feed:
                 return
             old = before.frame
             changed = self._scan.changed(old.image, frame.image) if old else range(len(self._of))
-            for index in changed:
-                self._mark(self._of[index])
+            channels = dict.fromkeys(self._of[index] for index in changed)
+            self._outbox.mark_all([one for one in channels if not one.limited or self._may(one, frame)])
             if self._json and (frame.effective is not None or self._injected):
                 self._tell_injected(frame)
-            if self.frames:
-                self._mark(self.frames)
+            if self.frames and self._may(self.frames, frame):
+                self._outbox.mark(self.frames)
         if self._later:
             self.settle()
 
@@ -173,13 +173,14 @@ class Feed:
         """All topics of this source."""
         return [self.status, *self.channels, *([self.frames] if self.frames else [])]
 
-    def _mark(self, channel: ValueChannel | FramesChannel) -> None:
+    def _may(self, channel: ValueChannel | FramesChannel, frame: Frame) -> bool:
+        """Whether a change of it is told now; or else later, or not at all."""
         if not channel.limited:
-            self._outbox.mark(channel)
-        elif channel in self._later or channel.due_ns > self.block.now_ns():
+            return True
+        if channel in self._later or channel.due_ns > self.block.now_ns():
             self._later[channel] = None
-        elif self.shown.frame and channel.moved(self.shown.frame.image):
-            self._outbox.mark(channel)
+            return False
+        return channel.moved(frame.image)
 
     def settle(self) -> int | None:
         """Mark what may be told again by now; when the next one may, by the source's clock. None: nothing waits."""

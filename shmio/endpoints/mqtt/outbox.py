@@ -98,6 +98,9 @@ class Outbox:
 
     def mark_all(self, channels: Iterable[Channel]) -> None:
         """Something about all of them is new."""
+        if self._link.up and not self._settling:
+            self._waiting |= dict.fromkeys(channels)
+            return
         for channel in channels:
             self.mark(channel)
 

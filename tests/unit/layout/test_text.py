@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from shmio.errors import ValueRangeError
 from shmio.layout.codec import Value
 from shmio.layout.model import Dims, Register
-from shmio.layout.text import from_text, to_text, wire_type
+from shmio.layout.text import from_text, texts, to_text, wire_type
 
 
 def register(type_: str, dims: Dims = (), count: int = 1) -> Register:
@@ -44,7 +44,7 @@ def register(type_: str, dims: Dims = (), count: int = 1) -> Register:
     ],
 )
 def test_to_text_and_back(value: Value, type_: str, text: str) -> None:
-    assert to_text(value, register(type_)) == text
+    assert to_text(value, register(type_)) == texts(register(type_))(value) == text
     again = from_text(text, register(type_))
     assert type(again) is type(value)
     stored = struct.unpack(">f", struct.pack(">f", again))[0] if type_ == "REAL" else again
@@ -59,6 +59,7 @@ def test_no_value() -> None:
 @given(st.floats(width=32, allow_nan=False))
 def test_real_is_the_shortest_text(value: float) -> None:
     text = to_text(value, register("REAL"))
+    assert texts(register("REAL"))(value) == text
     assert np.float32(float(text)) == np.float32(value)
     if math.isfinite(value):
         digits = len(str(np.float32(value)).partition("e")[0].strip("-").replace(".", "").strip("0"))
@@ -126,9 +127,9 @@ def test_arrays() -> None:
     bits = register("BOOL", ((0, 1),), 2)
     assert to_text([True, False], bits) == "[true,false]"
     assert from_text("[true, false]", bits) == [True, False]
-    texts = register("WSTRING[5]", ((0, 1),), 2)
-    assert to_text(['a"b', "€"], texts) == '["a\\"b","€"]'
-    assert from_text('["a\\"b","\\u20ac"]', texts) == ['a"b', "€"]
+    strings = register("WSTRING[5]", ((0, 1),), 2)
+    assert to_text(['a"b', "€"], strings) == '["a\\"b","€"]'
+    assert from_text('["a\\"b","\\u20ac"]', strings) == ['a"b', "€"]
 
 
 @pytest.mark.parametrize(
