@@ -55,6 +55,8 @@ def brokers(mqtt: Mqtt) -> list[Address]:
     found = []
     for index, host in enumerate(hosts):
         try:
+            if "/" in host or " " in host:
+                raise ConfigError(f"{host!r}: write the host's name or address, or host:port, and nothing else")
             found.append(Address.parse(host if _has_port(host) else f"{host}:{port}"))
         except ConfigError as error:
             key = "mqtt.host" if isinstance(mqtt.host, str) else f"mqtt.host[{index}]"

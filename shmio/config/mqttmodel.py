@@ -47,6 +47,7 @@ class Sparkplug(Section):
     group: Text
     node: Text | None = None
     primary_host: Text | None = None
+    datatypes: bool = False
     match: Text | Texts = "**"
 
     @property

@@ -169,7 +169,11 @@ def _odd(config: Config, layouts: dict[str, Layout]) -> list[str]:
 
 
 def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
-    """Patterns of ``[mqtt]`` that name nothing. ConfigError: one that is none."""
+    """Patterns of ``[mqtt]`` that name nothing, and a broker open to all. ConfigError: a pattern that is none."""
+    mqtt = config.mqtt
+    asked = mqtt and (mqtt.password_file or (mqtt.tls and mqtt.tls.ca))
+    if mqtt and mqtt.listen and not asked and not Address.parse(mqtt.listen).loopback:
+        yield f"mqtt.listen: whoever reaches {mqtt.listen} may publish commands, too: add a password_file"
     for key, pattern, frames in _topics(config):
         if frames:
             if pattern not in layouts:

@@ -101,7 +101,8 @@ class Attempt:
         except ConfigError as error:
             self.problem = str(error)
         except (OSError, ValueError) as error:  # ValueError: a name with an empty part
-            self.problem = f"broker {self.target}: {why(error, self.target)}"
+            tls = self._dialling.settings.tls is not None
+            self.problem = f"broker {self.target}: {why(error, self.target, tls=tls)}"
         if self.problem:
             self._close()
         with self._handing:

@@ -83,8 +83,8 @@ def ended(error: ssl.SSLError | None, *, up: bool, tls: bool) -> str:
     return lost if up else f"{lost} before it let us in: it is full, or {missing}, or is no broker"
 
 
-def why(error: Exception, target: Target) -> str:
-    """Why no connection could be made."""
+def why(error: Exception, target: Target, *, tls: bool) -> str:
+    """Why no connection could be made. ``tls``: with TLS."""
     if isinstance(error, ssl.SSLError):
         return _tls(error)
     if isinstance(error, socket.gaierror):
@@ -96,7 +96,7 @@ def why(error: Exception, target: Target) -> str:
             return "it does not run at present; shmio-supervisor logs broker says why"
         return "nothing listens there"
     if isinstance(error, ConnectionError):
-        return "it closed the connection"
+        return "it closed the connection" + (": it may speak no TLS there (mqtt.tls, and the port)" if tls else "")
     return (error.strerror if isinstance(error, OSError) else None) or str(error)
 
 
@@ -104,5 +104,5 @@ def _tls(error: ssl.SSLError) -> str:
     if isinstance(error, ssl.SSLCertVerificationError):
         return f"its certificate is not to be trusted ({error.verify_message}): check mqtt.tls.ca, and the host's name"
     if "_ALERT_" in (error.reason or ""):
-        return f"it refuses our TLS ({error.reason}): it may want a certificate of ours (mqtt.tls.certificate and key)"
+        return f"it refuses our TLS ({error.reason}): check mqtt.tls.certificate and key: it may want some, or others"
     return f"no TLS with it ({error.reason or 'it ended the connection'}): check mqtt.tls, and the port"

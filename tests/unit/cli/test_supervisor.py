@@ -374,6 +374,17 @@ def test_a_pattern_that_names_nothing_is_odd(
     assert ("usable, with 1 warning\n" in output) is odd
 
 
+@pytest.mark.parametrize(("more", "odd"), [("", True), ('password_file = "accounts"', False)])
+def test_a_broker_that_lets_everybody_in_is_odd(
+    example: Edit, more: str, odd: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "accounts").write_text("anna:secret\n")
+    (tmp_path / "accounts").chmod(0o600)
+    example('listen = "127.0.0.1:1883"', f'listen = "0.0.0.0:1883"\ninsecure = true\n{more}')
+    assert main(["check"]) == 0
+    assert ("whoever reaches 0.0.0.0:1883 may publish commands, too" in capsys.readouterr().out) is odd
+
+
 @pytest.mark.parametrize("key", ["dbNumber = 7", 'block = "db7"'])
 def test_a_block_is_chosen_by_its_number_or_name(example: Edit, key: str, capsys: pytest.CaptureFixture[str]) -> None:
     Path("two.db").write_text(Path("db201.db").read_text() + block("DB7", "Int"))

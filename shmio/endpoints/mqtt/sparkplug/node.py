@@ -49,8 +49,16 @@ class Command(NamedTuple):
 class EdgeNode:
     """One node, through all its sessions; one thread."""
 
-    def __init__(self, group: str, node: str, now_ms: Callable[[], int] = lambda: time.time_ns() // 1_000_000) -> None:
-        self._group, self._node = group, node
+    def __init__(
+        self,
+        group: str,
+        node: str,
+        now_ms: Callable[[], int] = lambda: time.time_ns() // 1_000_000,
+        *,
+        datatypes: bool = False,
+    ) -> None:
+        """``datatypes``: data tell their types, too, as a host needs that does not know them from the births."""
+        self._group, self._node, self._datatypes = group, node, datatypes
         self._now_ms = now_ms
         self._sequence = 0
         # Not from 0 after each restart: a late will of the process before must not be taken for this one's.
@@ -118,6 +126,8 @@ class EdgeNode:
             found = payload.metrics.add(alias=sample.metric.alias)
             if historical:
                 found.is_historical = True
+            if self._datatypes:
+                found.datatype = sample.metric.datatype
             self._fill(found, sample)
         return self._message(payload, "DDATA", device)
 

@@ -53,7 +53,7 @@ class Session:
         wake: Callable[[], object],
     ) -> None:
         """``selector``, ``wake``: as of :class:`Link`. PathError: a pattern is none."""
-        self.node = EdgeNode(sparkplug.group, sparkplug.node or segment.instance)
+        self.node = EdgeNode(sparkplug.group, sparkplug.node or segment.instance, datatypes=sparkplug.datatypes)
         client_id = f"{settings.client_id or f'shmio-{segment.instance}'}-sparkplug"
         # A session begins with its births: the broker is to keep nothing of one before (5.4).
         clean = msgspec.structs.replace(settings, session_expiry_s=0)

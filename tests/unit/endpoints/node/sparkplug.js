@@ -15,7 +15,8 @@ const answers = lines.map((line) => {
   const asked = JSON.parse(line);
   if (asked.decode !== undefined) {
     const { seq, metrics } = decodePayload(Buffer.from(asked.decode, "base64"));
-    return { seq: Number(seq), metrics: metrics.map(plain) };
+    const told = metrics.map((metric) => ({ ...plain(metric), alias: String(metric.alias), at: String(metric.timestamp) }));
+    return { seq: Number(seq), metrics: told };
   }
   return Buffer.from(encodePayload(asked.encode)).toString("base64");
 });

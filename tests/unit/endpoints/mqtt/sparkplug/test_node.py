@@ -53,8 +53,8 @@ LAYOUT = Layout("ALL", None, 512, False, tuple(REGISTERS))
 AXIS = Layout("AXIS", None, 4, False, (Register("position", "REAL", (), 0, None, 4, 1),))
 
 
-def node() -> EdgeNode:
-    edge = EdgeNode("plant", "a50", lambda: NOW_MS)
+def node(*, datatypes: bool = False) -> EdgeNode:
+    edge = EdgeNode("plant", "a50", lambda: NOW_MS, datatypes=datatypes)
     edge.define({name: parts_of(layout, layout.registers) for name, layout in (("cell", LAYOUT), ("axis", AXIS))})
     return edge
 
@@ -248,9 +248,11 @@ def test_texts_of_an_array_are_metrics_of_their_own() -> None:
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs Node")
 def test_another_implementation_reads_it_and_commands_it() -> None:
     assert (NODE / "node_modules").exists(), f"its packages are not installed: npm ci --prefix {NODE}"
-    edge = node()
+    edge = node(datatypes=True)
     edge.will()
+    scalars = [sample for sample in samples(edge) if "row" not in sample.metric.name]
     given = [edge.birth().payload, edge.device_birth("cell", samples(edge)).payload]
+    given.append(edge.data("cell", scalars, historical=True).payload)
     command = {
         "timestamp": NOW_MS,
         "metrics": [
@@ -265,11 +267,14 @@ def test_another_implementation_reads_it_and_commands_it() -> None:
     done = subprocess.run(
         ["node", NODE / "sparkplug.js"], input="\n".join(lines), capture_output=True, text=True, timeout=60, check=True
     )
-    birth, device, encoded = json.loads(done.stdout)
+    birth, device, data, encoded = json.loads(done.stdout)
     assert birth["seq"] == 0
     assert {metric["name"]: metric["value"] for metric in birth["metrics"]}[REBIRTH] is False
     found = {metric["name"]: metric["value"] for metric in device["metrics"] if "row" not in metric["name"]}
     assert found == VALUES | {"ULINT": 18446744073709552000}  # JavaScript's numbers have 53 bits
+    aliases = {metric.alias: name for name, metric in edge.metrics["cell"].items()}
+    assert {aliases[int(metric["alias"])]: metric["value"] for metric in data["metrics"]} == found
+    assert all(metric["isHistorical"] and int(metric["at"]) == AT_MS for metric in data["metrics"])
     assert edge.command("spBv1.0/plant/DCMD/a50/cell", base64.b64decode(encoded)).values == {
         "DINT": -5, "LREAL": 2.25, "STRING[10]": "für", "BOOL": False,
     }  # fmt: skip
