@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from shmio.endpoints.grpc.bells import Bells
+from shmio.endpoints.grpc.bells import Bell, Bells
 from shmio.segment import Segment
 from tests.unit.endpoints.harness import TIMEOUT_S, image
 
@@ -104,5 +104,33 @@ def test_a_bell_rests_while_all_who_listen_have_time(segment: Segment, monkeypat
             while not heard:  # noqa: ASYNC110  another thread's doing
                 await asyncio.sleep(0)
         bells.close()
+
+    asyncio.run(test())
+
+
+def test_a_bell_that_has_rested_rings_for_what_was_left_and_goes_on(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shmio.endpoints.grpc.bells.REST_S", 0.001)
+
+    async def test() -> None:
+        writer, heard = segment.writer("cell"), asyncio.Event()
+        bell = Bell(segment.blocks["cell"].ring, "bell", turn_ns=10**15)
+        bell.listeners[heard.set] = None
+        bell.patient.add(heard.set)
+
+        async def rings() -> None:
+            async with asyncio.timeout(TIMEOUT_S):
+                await heard.wait()
+            heard.clear()
+
+        await rings()
+        bell.rest()
+        await rings()  # though nothing has come since
+        writer.publish(image(), cycle=1)
+        await rings()
+        bell.stop()
+        writer.publish(image(), cycle=2)  # so that its thread looks
+        bell.join()
 
     asyncio.run(test())

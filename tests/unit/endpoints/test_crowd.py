@@ -46,12 +46,12 @@ class Followed:
             StateLane(stream).join(self.feed, STEP)
 
     async def begin(self) -> None:
+        asking = [asyncio.ensure_future(self.next(stream)) for stream in self.streams]  # before anything is passed over
         await self.publish(1)
-        for stream in self.streams:
-            assert await self.next(stream) == 1
+        assert [await value for value in asking] == [1] * len(asking)
 
     async def publish(self, count: int) -> None:
-        """Frames with the next numbers, each shown or passed over before the next one comes."""
+        """Frames with the next numbers, with time between them to be shown or passed over."""
         for _ in range(count):
             self.count += 1
             self._writer.publish(image(step=self.count), cycle=self.count)
@@ -189,6 +189,9 @@ def test_a_stream_of_several_sources_is_given_what_is_newest_of_each_when_it_ask
             for number in range(2, 10):
                 await b.publish(1)
                 await a.publish(1)
+                async with asyncio.timeout(TIMEOUT_S):
+                    while len(stream.refills) < 2:  # noqa: ASYNC110  another thread's doing
+                        await asyncio.sleep(0)
                 assert [await a.next(stream) for _ in range(2)] == [number, number], "of both, one after the other"
         finally:
             a.stop()
