@@ -7,8 +7,10 @@ import os
 import random
 import re
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.opcode import Opcode
@@ -255,6 +257,16 @@ def test_a_full_disk_is_told_with_the_file_and_leaves_none(
     assert not new.exists()
 
 
+@contextmanager
+def heeded(sign: signal.Signals, handler: Any) -> Iterator[None]:
+    """Have a signal do something else meanwhile."""
+    before = signal.signal(sign, handler)
+    try:
+        yield
+    finally:
+        signal.signal(sign, before)
+
+
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 @pytest.mark.parametrize(("verb", "output"), NEW)
 def test_what_is_told_to_end_leaves_nothing(
@@ -276,10 +288,11 @@ def test_what_is_told_to_end_leaves_nothing(
 
     monkeypatch.setattr(Progress, "at", tell)
     monkeypatch.setattr(Path, "unlink", unlink_late)
-    try:
-        status: object = main([verb, str(file), "-o", str(tmp_path / output), *options(verb, output)])
-    except SystemExit as end:
-        status = end.code
+    with heeded(sign, signal.default_int_handler if sign == signal.SIGINT else lambda *_: None):
+        try:
+            status: object = main([verb, str(file), "-o", str(tmp_path / output), *options(verb, output)])
+        except SystemExit as end:
+            status = end.code
     assert (len(made), status) == (1, 128 + sign)
     assert list(tmp_path.iterdir()) == [file]
 
@@ -287,10 +300,7 @@ def test_what_is_told_to_end_leaves_nothing(
 def test_what_is_to_go_on_without_its_terminal_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As nohup has it."""
     file = varied(tmp_path / "a.mem")
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        monkeypatch.setattr(Progress, "at", lambda *_: signal.raise_signal(signal.SIGHUP))
+    monkeypatch.setattr(Progress, "at", lambda *_: signal.raise_signal(signal.SIGHUP))
+    with heeded(signal.SIGHUP, signal.SIG_IGN):
         assert main(["cut", str(file), "-o", "new.mem"]) == 0
-    finally:
-        signal.signal(signal.SIGHUP, before)
     whole(Path("new.mem"))
