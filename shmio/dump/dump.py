@@ -14,7 +14,7 @@ from shmio.dump.blocks import Contents, DumpBlock, contents
 from shmio.dump.changes import Changes
 from shmio.dump.columns import Collector, Columns
 from shmio.dump.encoding import Gap
-from shmio.dump.entries import Entry, latest_of, messages_of
+from shmio.dump.entries import Entry, batches_of, latest_of, messages_of
 from shmio.dump.names import Names
 from shmio.dump.part import MAX_NS, Damaged, Part
 from shmio.dump.reader import Item, Reader
@@ -198,10 +198,12 @@ class Dump:
     ) -> Iterator[tuple[DumpBlock, Batch]]:
         """Frames of a source as arrays, chunk by chunk; PathError.
 
-        Images are what consumers saw; with ``raw`` what the source delivered. Of files that overlap in time the later
-        one gives what comes after the end of the one before.
+        Images are what consumers saw; with ``raw`` what the source delivered.
         """
         name = self._names.one(source)
+        if self._overlap:  # one file may have what another missed
+            yield from batches_of(self.frames(name, from_ns, to_ns), raw=raw)
+            return
         last: dict[DumpBlock, int] = {}
         for part, number, block in self._channels(name, from_ns, to_ns):
             for found in part.batches(number, block.layout.size, from_ns, to_ns, raw=raw):

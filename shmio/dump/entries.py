@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
-from typing import Generic, NamedTuple, TypeVar
+from collections.abc import Collection, Iterable, Iterator
+from itertools import groupby, islice
+from typing import Final, Generic, NamedTuple, TypeVar
 
+import numpy as np
+
+from shmio.dump.batch import HEAD, Batch
 from shmio.dump.blocks import Contents, DumpBlock
-from shmio.dump.encoding import Gap
+from shmio.dump.encoding import Gap, encode_frame
 from shmio.dump.part import Part
 from shmio.dump.reader import Item
 from shmio.segment import Frame
+
+BATCH_FRAMES: Final = 256
 
 ItemT_co = TypeVar("ItemT_co", bound=Item, covariant=True)
 
@@ -33,6 +39,17 @@ def messages_of(
             else within.blocks.get(channel.number)
         )
         yield within, Entry(log_ns, block, item)
+
+
+def batches_of(frames: Iterable[Entry[Frame]], *, raw: bool) -> Iterator[tuple[DumpBlock, Batch]]:
+    """Frames as arrays, some at a time. ``raw``: what the source delivered, not what consumers saw."""
+    for block, of_block in groupby(frames, key=lambda entry: entry.block):
+        while block is not None and (some := list(islice(of_block, BATCH_FRAMES))):
+            items = [entry.item for entry in some]
+            data = b"".join(encode_frame(f)[: HEAD.itemsize] + (f.raw if raw else f.image) for f in items)
+            records = np.frombuffer(data, np.uint8).reshape(len(items), HEAD.itemsize + block.layout.size)
+            times = np.array([entry.time_ns for entry in some], np.int64)
+            yield block, Batch(times, records, [frame.reason for frame in items])
 
 
 def latest_of(part: Part, within: Contents, source: str, time_ns: int) -> Entry[Frame] | None:

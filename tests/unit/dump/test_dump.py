@@ -212,6 +212,19 @@ def test_files_that_run_beside_each_other_are_read_in_the_order_of_time(tmp_path
         assert times == sorted(times)
 
 
+def test_what_one_of_two_recorders_missed_columns_have_from_the_other(tmp_path: Path) -> None:
+    with build(tmp_path / "a.mem") as work:
+        work.block("cell")
+        for number in (*range(1, 150), *range(250, 401)):
+            work.frame(number, image(number), effective=image(-number) if number == 7 else None)
+    with shmio.open_dump([tmp_path / "a.mem", plain(tmp_path / "b.mem", 100, 300)]) as dump:
+        columns = dump.columns("cell/count")
+        assert columns.number.tolist() == [frame.number for _, _, frame in dump.frames()] == list(range(1, 401))
+        assert columns["count"].tolist() == [-7 if number == 7 else number for number in range(1, 401)]
+        assert columns.time_ns.tolist() == [at(number) for number in range(1, 401)]
+        assert dump.columns("cell/count", at(5), at(8), raw=True)["count"].tolist() == [5, 6, 7, 8]
+
+
 def test_files_of_two_runs_are_not_one_dump(tmp_path: Path) -> None:
     with build(tmp_path / "b.mem", epoch="11" * 8) as work:
         work.block("cell")
