@@ -247,7 +247,7 @@ class ReplayLoop:
     def _find(self, number: int, ask: Find) -> bool:
         if self._search is None or self._search[0] != number:
             try:
-                self._search = number, Search(self._source.tape, ask, keep=self._source.keep)
+                self._search = number, Search(self._source.tape, ask, self._play.end_ns, keep=self._source.keep)
             except PathError as error:
                 self._answer(number, Found(str(error)))
                 return True

@@ -21,8 +21,9 @@ PIECE = 256
 class Search:
     """A search under way, in pieces, so that what plays meanwhile goes on."""
 
-    def __init__(self, tape: Tape, find: Find, *, keep: bool) -> None:
-        """``keep``: as consumers see the recording. PathError: no such register or kind."""
+    def __init__(self, tape: Tape, find: Find, end_ns: int, *, keep: bool) -> None:
+        """Up to before ``end_ns``. ``keep``: as consumers see the recording. PathError: no such register or kind."""
+        self._end_ns = end_ns
         self._matches = _happened(find.event, keep=keep) if find.event else _changed(tape, find, keep=keep)
         self._entries: Iterator[Entry] = tape.entries(find.after_ns + 1)
         self._what = f"event {find.event}" if find.event else f"change of {find.path}"
@@ -31,8 +32,8 @@ class Search:
         """Look a piece further; None: it is not over yet."""
         for _ in range(PIECE):
             entry = next(self._entries, None)
-            if entry is None:
-                return Found(f"there is no {self._what} from here to the end of the recording")
+            if entry is None or entry.position_ns >= self._end_ns:
+                return Found(f"there is no {self._what} from here to the end of what is played")
             if self._matches(entry):
                 return Found(position_ns=entry.position_ns)
         return None

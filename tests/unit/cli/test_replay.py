@@ -74,7 +74,7 @@ def test_what_cannot_be_is_one_line(playing: Playing, instance: str, capsys: pyt
     assert replay(instance, "until", "0.1") == 1
     assert capsys.readouterr().err == "cell: that is past: it is at 0.200 s; seek to before that first\n"
     assert replay(instance, "to-event", "accepted") == 1
-    assert capsys.readouterr().err == "there is no event accepted from here to the end of the recording\n"
+    assert capsys.readouterr().err == "there is no event accepted from here to the end of what is played\n"
 
 
 def test_a_step_tells_of_a_replay_that_stands(

@@ -125,6 +125,17 @@ def test_it_plays_to_the_next_event_whatever_it_is(tmp_path: Path, instance: str
         assert counts(playing.frames())[-1] == at
 
 
+def test_what_lies_behind_the_end_of_what_is_played_is_not_found(tmp_path: Path, instance: str) -> None:
+    file = record(tmp_path, instance)
+    with (
+        built(instance, stepped=False) as segment,
+        Playing(segment, file, paused=True, end=0.15),
+        attach(instance, writable=True) as attachment,
+        pytest.raises(CommandError, match=r"there is no change of other from here to the end of what is played"),
+    ):
+        attachment.replay.to_change("cell/other", jump=True)
+
+
 @pytest.mark.parametrize(
     ("what", "error"),
     [
