@@ -48,6 +48,7 @@ class Sparkplug(Section):
     node: Text | None = None
     primary_host: Text | None = None
     datatypes: bool = False
+    max_rate_hz: Annotated[float, Meta(gt=0, le=1e6)] | None = None
     match: Text | Texts = "**"
 
     @property

@@ -141,6 +141,13 @@ def test_streams_are_measured_beside_a_bare_server() -> None:
     assert all(float(latency) > 0 for latency in latencies)
 
 
+@pytest.mark.skipif(bool(missing()) or shutil.which("mosquitto_sub") is None, reason="needs mosquitto and its clients")
+def test_large_cells_by_mqtt_are_measured() -> None:
+    found = re.findall(r"^(20|200) registers, (\S.*?) +\d+ +(\d+) +\d+$", printed("mqtt_cells"), re.MULTILINE)
+    assert len(found) == 12
+    assert all(int(told) > 0 for _, way, told in found if "max_rate_hz" not in way)
+
+
 @pytest.mark.skipif(bool(missing()), reason=missing())
 def test_mqtt_is_measured_beside_a_bare_publisher() -> None:
     found = printed("mqtt")

@@ -69,6 +69,9 @@ class Session:
         self._globs = [Glob(pattern) for pattern in sparkplug.patterns]
         self._devices: dict[str, Device] = {}
         self._waiting: dict[str, dict[int, None]] = {}
+        self._pause_s = 1 / sparkplug.max_rate_hz if sparkplug.max_rate_hz else 0.0
+        self._due_s: dict[str, float] = {}
+        """When the next data of a device may be told."""
         self._backlog = Backlog(round(settings.backlog_mb * 1e6))
         self._keeping = False
         self._room = 0
@@ -146,7 +149,9 @@ class Session:
         self._flush()
         rest_s = self.link.turn()  # behind what it was given, to hear when it takes the rest
         more = self._room <= 0 or self.link.came_up or any(device.behind for device in self._devices.values())
-        return 0.0 if more else rest_s
+        now_s = time.monotonic()
+        due_s = [due_s for name, due_s in self._due_s.items() if due_s > now_s and self._waiting.get(name)]
+        return 0.0 if more else min([rest_s, *(one_s - now_s for one_s in due_s)])
 
     def _wait_for(self, host: PrimaryHost) -> None:
         """Die if it has gone; go to where else it may be, and come back."""
@@ -179,7 +184,7 @@ class Session:
     def _tell(self, name: str, device: Device, kind: Kind, at: Sequence[int]) -> None:
         if not (self.link.up and self.node.alive):
             if self._keeping and kind is not Kind.DEATH:
-                self._backlog.keep(name, device.samples(None if kind is Kind.BIRTH else at))
+                self._keep(name, device, range(len(device.parts)) if kind is Kind.BIRTH else at)
             return
         if kind is Kind.DATA:
             self._waiting[name] |= dict.fromkeys(at)
@@ -190,6 +195,21 @@ class Session:
             self._send(self.node.device_birth(name, device.samples()))
         elif self.node.lives(name):
             self._send(self.node.device_death(name))
+
+    def _keep(self, name: str, device: Device, at: Sequence[int]) -> None:
+        """Keep what has changed, no more often than it would be told."""
+        self._waiting[name] |= dict.fromkeys(at)
+        if self._is_due(name):
+            self._backlog.keep(name, device.samples(list(self._waiting[name])))
+            self._waiting[name].clear()
+
+    def _is_due(self, name: str) -> bool:
+        """Whether data of a device may be told; from now on, not for a while."""
+        now_s = time.monotonic()
+        if now_s < self._due_s.get(name, 0.0):
+            return False
+        self._due_s[name] = now_s + self._pause_s
+        return True
 
     def _lose(self, _unacknowledged: Sequence[Message]) -> None:
         """The connection is gone: keep what waited for it."""
@@ -208,7 +228,7 @@ class Session:
         link, waiting = self.link, self._waiting[name]
         if not self.node.lives(name):
             return
-        if waiting and link.ready:
+        if waiting and link.ready and self._is_due(name):
             self._send(self.node.data(name, device.samples(list(waiting))))
             waiting.clear()
         while self._room > 0 and link.ready and (samples := self._backlog.take(name)):

@@ -196,6 +196,37 @@ def test_what_changed_while_the_broker_was_away_comes_as_history(segment: Segmen
         assert times_ms == sorted(times_ms)
 
 
+def test_a_rate_merges_what_is_between_also_while_the_broker_is_away_and_never_leaves_out_the_last(
+    segment: Segment, broker: Mosquitto
+) -> None:
+    writer = segment.writer("cell")
+    writer.publish(image(step=1), cycle=1)
+    slowly = Sparkplug(group="plant", node="a50", max_rate_hz=2)
+    with (
+        FaultProxy(broker.address, framing=None) as proxy,
+        hosting(broker.address) as host,
+        node(segment, proxy.address, sparkplug=slowly) as running,
+    ):
+        host.until("DBIRTH")
+        begun_s = time.monotonic()
+        for step in range(2, 52):
+            writer.publish(image(step=step), cycle=step)
+        told: list[int] = []
+        while told[-1:] != [51]:
+            told.append(host.until("DDATA").metrics["step"].int_value)
+        assert len(told) <= 2 + 2 * (time.monotonic() - begun_s)
+        proxy.refuse()
+        host.until("NDEATH")
+        running.until(lambda: "Sparkplug" in running.bridge.problem or "nothing listens" in running.bridge.problem)
+        dropped = running.bridge.outbox.backlog
+        for step in range(52, 102):
+            writer.publish(image(step=step), cycle=step)
+        running.until(lambda: running.bridge.outbox.backlog >= dropped + 50)
+        assert running.bridge.counters[4] - running.bridge.outbox.backlog < 25
+        proxy.admit()
+        assert host.until("DBIRTH").metrics["step"].int_value == 101
+
+
 def test_a_flood_of_requests_for_births_is_answered_by_few(segment: Segment, broker: Mosquitto) -> None:
     """Each may be megabytes, and who asks need not read them."""
     segment.writer("cell").publish(image(step=1), cycle=1)
