@@ -12,6 +12,7 @@ from shmio.cli.dumping.complaints import Complaints
 from shmio.cli.dumping.each import not_closed
 from shmio.cli.dumping.moments import span, time_range
 from shmio.cli.dumping.printers import Csv, JsonLines, Printer, Table, View
+from shmio.cli.dumping.progress import Progress
 from shmio.dump.channels import Channel
 from shmio.dump.encoding import EVENT, FRAME, GAP, PROCESS, STEP, ProcessChange, StepMark
 from shmio.dump.reader import Message, Reader
@@ -36,7 +37,10 @@ def execute(arguments: argparse.Namespace) -> int:
     1 if something was damaged: all the rest is printed, and where something is lost is told.
     """
     complaints = Complaints()
-    with Reader(arguments.file) as reader:
+    with (
+        Reader(arguments.file) as reader,
+        Progress(f"reading {arguments.file}", silent=sys.stdout.isatty()) as progress,
+    ):
         found = survey(reader)
         from_ns, to_ns = time_range(arguments, found.begin_ns)
         channels = [track.channel for track in found.tracks.values()]
@@ -54,9 +58,12 @@ def execute(arguments: argparse.Namespace) -> int:
             if c.encoding == GAP or (c.encoding in (STEP, PROCESS) and not arguments.patterns)
         }
         silent = True
+        begin_ns = max(from_ns, found.begin_ns)
+        progress.total = max(1, min(to_ns, found.end_ns) - begin_ns)
         for message in reader.messages(
             lambda channel: channel.number in wanted, from_ns, to_ns, partial(complaints.damage, arguments.file)
         ):
+            progress.at(message.log_ns - begin_ns)
             for line in _lines(message, views, sources, printer):
                 print(line)
                 silent = False

@@ -16,12 +16,13 @@ EACH_S = 0.2
 class Progress:
     """A line on standard error, if that is a terminal; gone when the work is done. A context manager."""
 
-    def __init__(self, what: str) -> None:
+    def __init__(self, what: str, *, silent: bool = False) -> None:
+        """``silent``: something else is shown there."""
         self.total = 0
         """How much there is to do: bytes, or ns of a recording."""
         self._what = what
         self._shown = False
-        self._next_s = time.monotonic() + FIRST_S if sys.stderr.isatty() else float("inf")
+        self._next_s = time.monotonic() + FIRST_S if sys.stderr.isatty() and not silent else float("inf")
 
     def at(self, done: int) -> None:
         """So much is done."""

@@ -5,10 +5,13 @@ from __future__ import annotations
 import io
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
+from shmio.cli.dump import main
 from shmio.cli.dumping import progress
+from tests.unit.dump.build import plain
 
 
 class Terminal(io.StringIO):
@@ -40,3 +43,16 @@ def test_a_file_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
         work.total = 2
         work.at(1)
     assert file.getvalue() == ""
+
+
+@pytest.mark.parametrize("to_a_terminal", [False, True])
+def test_who_prints_to_a_file_sees_how_far_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to_a_terminal: bool
+) -> None:
+    file = plain(tmp_path / "a.mem", 1, 50)
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setattr(sys, "stdout", Terminal() if to_a_terminal else io.StringIO())
+    monkeypatch.setattr(progress, "FIRST_S", -1.0)
+    assert main(["cat", str(file)]) == 0
+    assert ("reading" in terminal.getvalue()) != to_a_terminal
