@@ -229,6 +229,7 @@ class Bridge:
         for feed in self._feeds.values():
             self.link.send(status(feed.status.topic, Quality.BAD, STOPPED, feed.missed))
         self.link.send(Message(self._status, OFFLINE, 1, True))
+        self.link.push()
         self._drain(until_s, lambda: not self.link.in_flight)
         self.link.close()
         if self._sparkplug is not None:

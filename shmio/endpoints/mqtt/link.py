@@ -23,13 +23,11 @@ from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.failure import Complaints, ended, refusal
 from shmio.endpoints.mqtt.limits import Limits
 from shmio.endpoints.mqtt.target import Dialling, Target
+from shmio.endpoints.mqtt.writing import BATCH, take_over, write
 
 STABLE_S: Final = 5.0
 """Who was connected so long has put his failures behind him."""
 WITH_WILL: Final = "Disconnect with will message"
-
-_BEING_SENT: Final = 0
-"""A number that no message has."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -79,17 +77,14 @@ class Link:
         return self.up and self._protocol == MQTTv5
 
     @property
-    def ready(self) -> bool:
-        """Whether it takes a message now, and does not only put it into its memory."""
-        return self.up and len(self._in_flight) < self._limits.in_flight and not self._blocked()
+    def room(self) -> int:
+        """How many messages it takes now, and does not only put into its memory."""
+        return min(BATCH, self._limits.in_flight - len(self._in_flight)) if self.up and not self._writing else 0
 
     @property
     def in_flight(self) -> int:
         """Messages that the broker has not acknowledged."""
         return len(self._in_flight)
-
-    def _blocked(self) -> bool:
-        return self._client is not None and self._client.want_write()
 
     # ---- a turn ------------------------------------------------------------------------------------------------------
 
@@ -115,7 +110,7 @@ class Link:
             self._client.loop_misc()
         if unseen(self._socket):
             self._serve(selectors.EVENT_READ)
-        self._rearm()
+        self.push()
         return 0.0 if unseen(self._socket) else 1.0
 
     def _take(self, attempt: Attempt) -> None:
@@ -132,6 +127,7 @@ class Link:
         client.on_publish = self._acknowledged
         client.on_message = lambda one, _data, message: self.on_message(message) if one is self._client else None
         client.on_subscribe = self._subscribed
+        take_over(client)
         self._client, self._socket, self._writing = client, made, False
         self._selector.register(made, selectors.EVENT_READ, self._serve)
 
@@ -140,21 +136,15 @@ class Link:
         client, made = self._client, self._socket
         if client is None or made is None:
             return
-        code = MQTTErrorCode.MQTT_ERR_SUCCESS
-        if events & selectors.EVENT_WRITE:
-            code = client.loop_write()
-        if events & selectors.EVENT_READ and not code:
-            code = client.loop_read(PACKETS)
+        code = client.loop_read(PACKETS) if events & selectors.EVENT_READ else MQTTErrorCode.MQTT_ERR_SUCCESS
+        if not code and client is self._client and (events & selectors.EVENT_WRITE or not self._writing):
+            code = write(client)
         if code and client is self._client:
             self.drop(str(MQTTErrorCode(code).name).removeprefix("MQTT_ERR_").replace("_", " ").lower())
-        self._rearm()
-
-    def _rearm(self) -> None:
-        """Hear of room for what did not go out at once."""
-        if self._socket is not None and self._writing != self._blocked():
-            self._writing = not self._writing
+        if client is self._client and self._writing != client.want_write():
+            self._writing = not self._writing  # to hear of room for what did not go out at once
             events = selectors.EVENT_READ | (selectors.EVENT_WRITE if self._writing else 0)
-            self._selector.modify(self._socket, events, self._serve)
+            self._selector.modify(made, events, self._serve)
 
     # ---- what the broker says ----------------------------------------------------------------------------------------
 
@@ -213,6 +203,7 @@ class Link:
         if politely and self._client is not None:
             self._client.on_disconnect = None
             self._client.disconnect()
+            self._client.loop_write()
         if self.up:
             lost = list(self._in_flight.values())
             if time.monotonic() - self._up_s >= STABLE_S:
@@ -252,21 +243,25 @@ class Link:
     # ---- what goes out -----------------------------------------------------------------------------------------------
 
     def send(self, message: Message, properties: Properties | None = None) -> None:
-        """Send one, if there is a connection."""
-        client = self._client
+        """Have one ready to go, if there is a connection."""
+        client, limits = self._client, self._limits
         if client is None or not self.up:
             return
-        limits = self._limits
-        if not limits.fit(message):
+        if limits.packet_bytes is not None and not limits.fit(message):
             most = f"takes {limits.packet_bytes} bytes at once"
             self.complaints.refuse(f"broker {self._target} {most}: {message.topic} has more")
             return
-        qos, retain = min(message.qos, limits.qos), message.retain and limits.retain
-        if qos:
-            self._in_flight[_BEING_SENT] = message  # to send it may find the connection gone
+        qos, retain = message.qos and limits.qos, message.retain and limits.retain
         info = client.publish(message.topic, message.payload, qos, retain, properties if self.mqtt5 else None)
-        if self._in_flight.pop(_BEING_SENT, None) is not None:
+        if qos:
             self._in_flight[info.mid] = message
+        else:
+            self.complaints.taken()
+
+    def push(self) -> None:
+        """Have go what is ready."""
+        if self._client is not None and not self._writing and self._client.want_write():
+            self._serve(0)
 
     def owes(self, message: Message) -> bool:
         """Whether this very message was sent, and the broker has not acknowledged it."""
@@ -294,6 +289,7 @@ class Link:
             if self.up:
                 reason = ReasonCode(PacketTypes.DISCONNECT, WITH_WILL) if will and self.mqtt5 else None
                 self._client.disconnect(reason)
+                self._client.loop_write()
         self._close()
         self._retry_s = float("inf")
         if self._attempt is not None:

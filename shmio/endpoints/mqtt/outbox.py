@@ -6,7 +6,8 @@ While the broker is away each change is kept instead, in a bounded store, and se
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from typing import Final, Protocol
 
 from paho.mqtt.packettypes import PacketTypes
@@ -31,11 +32,14 @@ class Sender(Protocol):
         """Whether there is one."""
 
     @property
-    def ready(self) -> bool:
-        """Whether it takes a message now, and does not only put it into its memory."""
+    def room(self) -> int:
+        """How many messages it takes now, and does not only put into its memory."""
 
     def send(self, message: Message, properties: Properties | None = None) -> None:
-        """Send one."""
+        """Have one ready to go."""
+
+    def push(self) -> None:
+        """Have go what is ready."""
 
 
 class Outbox:
@@ -65,7 +69,7 @@ class Outbox:
     @property
     def able(self) -> bool:
         """Whether :meth:`flush` would send something now."""
-        return self.busy and self._link.ready
+        return self.busy and self._link.room > 0
 
     @property
     def waiting(self) -> int:
@@ -136,22 +140,26 @@ class Outbox:
             self._waiting.pop(channel, None)
 
     def flush(self) -> None:
-        """Send as long as the connection takes it: answers, then what was kept, then what is new; so many at once."""
-        link = self._link
-        for _ in range(TURN_MESSAGES):
-            if not self.able:
-                return
-            self.sent += 1
-            if self._answers:
-                link.send(*self._answers.popleft())
-            elif (message := self._kept.pop()) is not None:
-                self._room -= _size(message) // 2
-                link.send(message, _time_of(message))
-            else:
-                channel = next(iter(self._waiting))
-                del self._waiting[channel]
-                link.send(channel.message())
-                self._settling = self._settling and bool(self._waiting)
+        """Send as long as the connection takes it, so many at once, and so many in all."""
+        link, rest = self._link, TURN_MESSAGES
+        while self.busy and (room := min(link.room, rest)) > 0:
+            rest -= room
+            for message, properties in islice(self._due(), room):
+                self.sent += 1
+                link.send(message, properties)
+            link.push()
+
+    def _due(self) -> Iterator[tuple[Message, Properties | None]]:
+        """What is to be sent, each as its turn comes: answers, then what was kept, then what is new."""
+        while self._answers:
+            yield self._answers.popleft()
+        while (message := self._kept.pop()) is not None:
+            self._room -= _size(message) // 2
+            yield message, _time_of(message)
+        for channel in list(islice(self._waiting, TURN_MESSAGES)):
+            del self._waiting[channel]
+            self._settling = self._settling and bool(self._waiting)
+            yield channel.message(), None
 
 
 def _time_of(message: Message) -> Properties | None:

@@ -140,7 +140,7 @@ class Session:
                 self._until_s = time.monotonic() + HOST_S
         if self._host is not None and (self._deserted or not self._host.online):
             self._wait_for(self._host)
-        elif self.link.up and (not self.node.alive or (self._asked and self.link.ready)):
+        elif self.link.up and (not self.node.alive or (self._asked and self.link.room)):
             self._birth()
         self._room = TURN_SAMPLES
         for name, device in self._devices.items():
@@ -228,16 +228,17 @@ class Session:
         link, waiting = self.link, self._waiting[name]
         if not self.node.lives(name):
             return
-        if waiting and link.ready and self._is_due(name):
+        if waiting and link.room and self._is_due(name):
             self._send(self.node.data(name, device.samples(list(waiting))))
             waiting.clear()
-        while self._room > 0 and link.ready and (samples := self._backlog.take(name)):
+        while self._room > 0 and link.room and (samples := self._backlog.take(name)):
             self._room -= len(samples)
             self._send(self.node.data(name, samples, historical=True))
 
     def _send(self, message: Message) -> None:
         self._sent += 1
         self.link.send(message)
+        self.link.push()
 
     # ---- what comes --------------------------------------------------------------------------------------------------
 

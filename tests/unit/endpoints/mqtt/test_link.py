@@ -63,19 +63,34 @@ class Broker:
         self.hear(0x10)
         self.say("20 03 00 00 00", lambda: self.link.up)
 
-    def hear(self, kind: int) -> None:
-        """Take a packet of this kind, and no more."""
-        assert self._socket.recv(1)[0] & 0xF0 == kind
-        length = shift = 0
-        while (byte := self._socket.recv(1)[0]) & 0x80:
-            length, shift = length | (byte & 0x7F) << shift, shift + 7
-        length |= byte << shift
-        while length:
-            length -= len(self._socket.recv(length))
+    def hear(self, kind: int, count: int = 1) -> None:
+        """Take so many packets of this kind, and no more."""
+        for _ in range(count):
+            assert self._socket.recv(1)[0] & 0xF0 == kind
+            length = shift = 0
+            while (byte := self._socket.recv(1)[0]) & 0x80:
+                length, shift = length | (byte & 0x7F) << shift, shift + 7
+            length |= byte << shift
+            while length:
+                length -= len(self._socket.recv(length))
+
+    def put(self, packet: str) -> None:
+        """Send one."""
+        self._socket.sendall(bytes.fromhex(packet))
 
     def say(self, packet: str, until: Callable[[], bool]) -> None:
         """Send one, and turn the link until it has brought something about."""
-        self._socket.sendall(bytes.fromhex(packet))
+        self.put(packet)
+        self.turn_until(until)
+
+    def silent(self) -> None:
+        """Nothing has come."""
+        self._socket.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            self._socket.recv(1)
+        self._socket.settimeout(TIMEOUT_S)
+
+    def turn_until(self, until: Callable[[], bool]) -> None:
         while not until():
             self.link.turn()
             for key, events in self._selector.select(0.1):
@@ -92,6 +107,7 @@ def test_what_a_broker_refuses_is_told_as_long_as_it_does(monkeypatch: pytest.Mo
 
     def publish(topic: str) -> None:
         link.send(Message(topic, b"1", 1, retain=True))
+        link.push()
         broker.hear(0x30)
 
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -109,6 +125,7 @@ def test_what_a_broker_refuses_is_told_as_long_as_it_does(monkeypatch: pytest.Mo
             broker.say("40 02 00 03", lambda: not link.in_flight)
             assert not link.problem
             link.subscribe(["a/in", "b/in"])
+            link.push()
             broker.hear(0x80)
             broker.say("90 05 00 04 00 01 87", lambda: bool(link.problem))
             told = "does not let us subscribe: no command can come: Not authorized"
@@ -116,5 +133,59 @@ def test_what_a_broker_refuses_is_told_as_long_as_it_does(monkeypatch: pytest.Mo
             publish("open")
             broker.say("40 02 00 05", lambda: not link.in_flight)
             assert told in link.problem
+        finally:
+            broker.close()
+
+
+def test_what_is_sent_goes_when_it_is_pushed_and_is_not_lost_with_the_connection() -> None:
+    lost: list[Message] = []
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        broker = Broker(server)
+        link = broker.link
+        link.on_lost = lost.extend
+        try:
+            messages = [Message(f"t{number}", b"1", 1, retain=True) for number in range(5)]
+            for message in messages[:3]:
+                link.send(message)
+            broker.silent()
+            link.push()
+            broker.hear(0x30, 3)
+            broker.say("40 02 00 01", lambda: link.in_flight == 2)
+            for message in messages[3:]:
+                link.send(message)
+            broker.say("e0 00", lambda: not link.up)  # it ends the connection before they go
+            assert lost == messages[1:]
+        finally:
+            broker.close()
+
+
+def test_a_broker_that_does_not_read_is_sent_no_more_until_it_does() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        broker = Broker(server)
+        link = broker.link
+        try:
+            sent = 0
+            while link.room:
+                link.send(Message("large", bytes(500_000), 0, retain=False))
+                link.push()
+                sent += 1
+            assert sent > 1
+            reading = threading.Thread(target=broker.hear, args=[0x30, sent])
+            reading.start()
+            broker.turn_until(lambda: link.room > 0)
+            reading.join()
+        finally:
+            broker.close()
+
+
+@pytest.mark.parametrize("leave", [Link.close, lambda link: link.drop("enough", politely=True)])
+def test_a_broker_hears_that_we_leave_though_what_it_sent_last_is_not_read(leave: Callable[[Link], None]) -> None:
+    """Else it would publish the will: who closes a socket with something to read takes back what has not gone."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        broker = Broker(server)
+        try:
+            broker.put("d0 00" * 100)
+            leave(broker.link)
+            broker.hear(0xE0)
         finally:
             broker.close()

@@ -192,6 +192,7 @@ def test_more_than_may_be_kept_goes_oldest_first_and_is_counted(segment: Segment
         assert f"{dropped} dropped" in running.bridge.problem
         broker.start()
         running.until(lambda: not running.bridge.problem and not running.bridge.outbox.busy)
+        running.until(lambda: not running.bridge.link.in_flight)
         with listening(broker.address, f"{PREFIX}/cell/step/out") as listener:
             assert listener.until("cell/step/out") == b"301"
 

@@ -16,9 +16,8 @@ class Link:
         self.room = 1_000_000
         self.sent: list[str] = []
 
-    @property
-    def ready(self) -> bool:
-        return self.up and self.room > 0
+    def push(self) -> None:
+        pass
 
     def send(self, message: Message, properties: Properties | None = None) -> None:
         self.room -= 1
