@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 import msgspec
 
 from shmio.cli.supervise.recordings import Recordings
-from shmio.config import Config, Source
+from shmio.config import Config, Mqtt, MqttTopic, Source
 from shmio.config.model import NAME_RULE, Replay
 from shmio.config.read import RESERVED_SOURCES, SECTION_PROCESSES, convert
 from shmio.errors import ConfigError, RecordingError
@@ -95,6 +95,7 @@ def replayed(config: Config, keys: Mapping[str, Any], recordings: Recordings) ->
         injection=[] if section.injections == "keep" else config.injection,
         recorder=config.recorder if section.record else None,
         grpc=grpc,
+        mqtt=_mqtt(config, names),
     )
     lead_ns = 0 if config.instance.clock == "stepped" else LEAD_NS
     return Replayed(changed, Origin(max(0, span.begin_ns - lead_ns), recording.utc_ns), notices)
@@ -120,8 +121,36 @@ def _notices(config: Config, section: Replay, names: list[str]) -> Iterator[str]
         )
     if config.grpc and config.grpc.default_source not in (None, *names):
         yield f"grpc.default_source is left out: the recording has no source {config.grpc.default_source}"
+    for index, rule in enumerate(config.mqtt.topic if config.mqtt else ()):
+        for name in _gone(config, rule, names):
+            yield f"mqtt.topic[{index}].match: {name} is left out: the recording has no such source"
     if section.record and config.recorder is None:
         raise ConfigError("replay.record: there is no [recorder] section that says where to")
+    wanted = config.recorder.sources if section.record and config.recorder else []
+    if wanted and not set(wanted) & set(names):
+        raise ConfigError(
+            f"replay.record: nothing would be recorded: the recording has {', '.join(names)}, and recorder.sources "
+            f"{', '.join(wanted)} alone"
+        )
+
+
+def _mqtt(config: Config, names: list[str]) -> Mqtt | None:
+    """Without rules for frames of sources that are left out."""
+    if config.mqtt is None:
+        return None
+    rules = []
+    for rule in config.mqtt.topic:
+        gone = _gone(config, rule, names)
+        match = [pattern for pattern in rule.patterns if pattern not in gone]
+        if match:
+            rules.append(msgspec.structs.replace(rule, match=match) if gone else rule)
+    return msgspec.structs.replace(config.mqtt, topic=rules)
+
+
+def _gone(config: Config, rule: MqttTopic, names: list[str]) -> list[str]:
+    """The sources of the configuration whose frames a rule means, and that the recording has not."""
+    own = {source.name for source in config.source} - set(names)
+    return [pattern for pattern in rule.patterns if rule.payload == "frames" and pattern in own]
 
 
 def _source(name: str, own: Source | None, section: Replay, files: list[str]) -> Source:

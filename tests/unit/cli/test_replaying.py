@@ -74,6 +74,35 @@ def test_its_sources_take_the_places_of_the_configurations(file: Path) -> None:
     assert "grpc.default_source is left out" in notices
 
 
+def test_frames_of_a_source_that_is_left_out_need_not_be_published(file: Path) -> None:
+    config = file.with_name("supervisor.toml")
+    mqtt = '[mqtt]\nlisten = "127.0.0.1:1883"\nprefix = "shmio/test"\n'
+    config.write_text(f"""{CONFIG}{mqtt}
+[[mqtt.topic]]
+match = ["panel", "cell"]
+payload = "frames"
+[[mqtt.topic]]
+match = "panel"
+payload = "frames"
+""")
+    prepared = prepare(config, "replay", {"file": [str(file)]})
+    assert prepared.config.mqtt is not None
+    assert [rule.patterns for rule in prepared.config.mqtt.topic] == [["cell"]]
+    told = "mqtt.topic[1].match: panel is left out: the recording has no such source"
+    assert [told in warning for warning in prepared.plan.warnings].count(True) == 1
+    config.write_text(f'{CONFIG}{mqtt}[[mqtt.topic]]\nmatch = "pannel"\npayload = "frames"\n')
+    with pytest.raises(ConfigError, match="'pannel': frames are those of a whole source"):
+        prepare(config, "replay", {"file": [str(file)]})
+
+
+def test_a_recorder_of_none_of_its_sources_is_refused(file: Path) -> None:
+    config = file.with_name("supervisor.toml")
+    config.write_text(f'{CONFIG}sources = ["panel"]\n')
+    with pytest.raises(ConfigError, match=r"replay.record: nothing would be recorded: the recording has cell, arm"):
+        prepare(config, "replay", {"file": [str(file)], "record": True})
+    assert prepare(config, "replay", {"file": [str(file)]}).plan.jobs
+
+
 def test_what_is_asked_for_is_there(file: Path) -> None:
     keys = {"file": [str(file)], "injections": "leave out", "record": True}
     prepared = prepare(file.with_name("supervisor.toml"), "replay", keys)
