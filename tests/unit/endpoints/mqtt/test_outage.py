@@ -130,6 +130,7 @@ def test_a_broker_that_dies_again_and_again_is_found_again(segment: Segment, bro
                 broker.start()
             load.stop()
             running.until(lambda: running.bridge.link.up and not running.bridge.outbox.busy)
+            running.until(lambda: not running.bridge.link.in_flight)
             assert running.bridge.outbox.dropped == 0
             with listening(broker.address, f"{PREFIX}/cell/step/out") as listener:
                 assert listener.until("cell/step/out") == str(load.last).encode()
