@@ -27,7 +27,7 @@ UNFINISHED: Final = Bound(8 << 20, 64 << 20)
 RETAINED: Final = Bound(8 << 20, 64 << 20)
 SUBSCRIBED_BYTES: Final = 256 << 10
 """Of one client's subscriptions."""
-FILTER_BYTES: Final = 200
+FILTER_BYTES: Final = 300
 """Of a subscription, about, beside its topics."""
 NEVER_RELEASED: Final = (
     "client %s leaves too many messages of QoS 2 unfinished: its connection is ended; have it answer PUBREC with PUBREL"

@@ -13,7 +13,7 @@ MESSAGE_BYTES: Final = 1000
 """Of one in memory, about, beside its payload."""
 EXCHANGE_BYTES: Final = 5000
 """Of a message of QoS 2 that is not finished, about, beside its payload: a task waits with it."""
-TASK_BYTES: Final = 400
+TASK_BYTES: Final = 1000
 """Of a packet that was dealt with, about, as long as an older one is not."""
 UNHANDLED_BYTES: Final = 256 << 10
 """Of what one client has sent, and was not handed on: then no more is read of it."""
