@@ -271,7 +271,7 @@ def test_who_does_not_release_messages_of_qos_2_is_ended_and_those_of_others_com
 def test_all_together_leave_so_much_of_qos_2_unfinished_and_who_leaves_little_is_not_ended(
     segment: Segment, address: Address, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(f"{MODULE}.UNFINISHED", Bound(1 << 30, 300 * EXCHANGE_BYTES))
+    monkeypatch.setattr(f"{MODULE}.UNFINISHED", Bound(1 << 30, 1000 * EXCHANGE_BYTES))
     with (
         serving(segment, address, "embedded") as process,
         listening(address, f"{PREFIX}/mine", protocol=MQTTv311, qos=2) as listener,
@@ -280,11 +280,11 @@ def test_all_together_leave_so_much_of_qos_2_unfinished_and_who_leaves_little_is
         Raw(address, "c") as modest,
     ):
         modest.publish(f"{PREFIX}/theirs", b"", qos=2)
-        for _ in range(200):
+        for _ in range(700):
             first.publish(f"{PREFIX}/theirs", b"", qos=2)
         first.ping()
         with suppress(ConnectionError):
-            for _ in range(200):
+            for _ in range(700):
                 second.publish(f"{PREFIX}/theirs", b"", qos=2)
         assert second.ended()
         process.until_refused(1)
