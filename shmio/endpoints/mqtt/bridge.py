@@ -8,12 +8,15 @@ import selectors
 import time
 from collections.abc import Callable, Container, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from functools import partial
 from typing import Final
 
+from paho.mqtt.client import MQTTMessage
+
 from shmio.config import Mqtt
 from shmio.endpoints.mqtt.channel import Gone, Message, status
-from shmio.endpoints.mqtt.commands import Commands, filters
+from shmio.endpoints.mqtt.commands import OUTPUTS, Commands, filters, outputs
 from shmio.endpoints.mqtt.feed import Feed
 from shmio.endpoints.mqtt.link import Link
 from shmio.endpoints.mqtt.outbox import Outbox
@@ -32,6 +35,8 @@ STOPPED: Final = "the bridge was stopped"
 LEAVE_S: Final = 2.0
 """For the broker to take our leave."""
 TURN_S: Final = 0.2
+MOST_GONE: Final = 20_000
+"""Topics at most that are taken from the broker's memory."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -61,8 +66,10 @@ class Bridge:
         )
         self.outbox = Outbox(self.link, round(settings.backlog_mb * 1e6))
         self._commands = Commands(self.prefix, self._rules, self._feeds, self.outbox.answer)
-        self.link.on_message = self._commands.take
+        self.link.on_message = self._hear
         self.link.on_lost = self.outbox.lose
+        self._recalled: frozenset[str] | None = None
+        """Our topics when the broker was asked what it has of one before us; None: it was not."""
         self._more: set[Feed] = set()
         self._rest_s = 0.0
         """So long there is nothing to do but what comes."""
@@ -144,9 +151,23 @@ class Bridge:
         """A connection was made: take commands, tell that we are there, what was kept, and how everything is now."""
         self.link.subscribe(filters(self.prefix, self._feeds.values()))
         self.link.send(Message(self._status, ONLINE, 1, True))
+        if self._recalled is None:
+            self._recalled = frozenset(channel.topic for feed in self._feeds.values() for channel in feed.all())
+            self.link.recall(outputs(self.prefix, self._feeds.values()))
         for feed in self._feeds.values():
             feed.show()
         self.outbox.show(self._gone.values())
+
+    def _hear(self, message: MQTTMessage) -> None:
+        """A command, or what a bridge before this one has left, by other rules: nobody would ever tell it is old."""
+        self._commands.take(message)
+        if not (message.retain and message.payload and self._recalled is not None) or len(self._gone) >= MOST_GONE:
+            return
+        with suppress(UnicodeDecodeError):
+            topic = message.topic
+            if topic.startswith(f"{self.prefix}/") and topic.endswith(OUTPUTS) and topic not in self._recalled:
+                self._gone[topic] = Gone(topic)
+                self.outbox.mark(self._gone[topic])
 
     def _look(self, feed: Feed) -> None:
         self._more.discard(feed)

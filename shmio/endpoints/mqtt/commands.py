@@ -22,6 +22,7 @@ from shmio.segment import DONE, EventKind
 
 REPLIES: Final = "shmio/results"
 """Where clients may have results sent, below the prefix: a response topic elsewhere could make us write, or lie."""
+OUTPUTS: Final = ("/out", "/frames")
 RETAINED: Final = "a retained command is not carried out; publish commands without the retain flag"
 MAX_CORRELATION_BYTES: Final = 1024
 MAX_TOPIC_BYTES: Final = 65535 - len("/result")
@@ -35,6 +36,14 @@ log = logging.getLogger("shmio.mqtt")
 def filters(prefix: str, feeds: Iterable[Feed]) -> list[str]:
     """What to subscribe to: paths of each depth that a source has, and nothing that we publish ourselves."""
     return [f"{prefix}/{feed.block.source}/{'+/' * depth}in" for feed in feeds for depth in feed.depths]
+
+
+def outputs(prefix: str, feeds: Iterable[Feed]) -> list[str]:
+    """Where a bridge before this one may have published these sources: registers, elements, structures, frames."""
+    deep = [
+        f"{prefix}/{feed.block.source}/{'+/' * depth}out" for feed in feeds for depth in range(max(feed.depths) + 1)
+    ]
+    return deep + [f"{prefix}/{feed.block.source}/frames" for feed in feeds]
 
 
 class Commands:

@@ -6,6 +6,7 @@ import logging
 import socket
 import ssl
 import time
+from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from paho.mqtt.reasoncodes import ReasonCode
@@ -18,6 +19,9 @@ _WHO: Final = frozenset({0x86, 0x87})
 _BUSY: Final = frozenset({0x88, 0x89, 0x97, 0x9F})
 _TAKEN_OVER: Final = 0x8E
 
+OFTEN: Final = 4
+OFTEN_S: Final = 60.0
+"""Who loses so many connections in so long is told what may be behind it: not all brokers say."""
 REFUSED_S: Final = 10.0
 """So long it is told that a broker refuses messages, though it has taken others since."""
 
@@ -34,12 +38,20 @@ class Complaints:
         """Messages that the broker did not take."""
         self._refused_s = 0.0
         self._deaf = ""
+        self._lost_s: deque[float] = deque(maxlen=OFTEN)
 
     def say(self, problem: str) -> None:
         """There is something else wrong now."""
         if problem != self.problem:
             log.warning("%s", problem)
         self.problem = problem
+
+    def lost(self, problem: str, client_id: str) -> str:
+        """A connection that had been made is gone; what is to be said of it."""
+        self._lost_s.append(time.monotonic())
+        if len(self._lost_s) < OFTEN or self._lost_s[-1] - self._lost_s[0] > OFTEN_S:
+            return problem
+        return f"{problem}, again and again; does another client connect as {client_id} (mqtt.client_id)?"
 
     def clear(self) -> None:
         """There is a connection."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 from paho.mqtt.properties import Properties
+from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from shmio.endpoints.mqtt.channel import Message
 
@@ -37,3 +38,9 @@ class Limits(NamedTuple):
         """Whether it is not too large."""
         size = HEAD_BYTES + len(message.topic.encode()) + len(message.payload)
         return self.packet_bytes is None or size <= self.packet_bytes
+
+
+def subscription(*, retained: bool) -> SubscribeOptions:
+    """To what others publish, with its flag; ``retained``: also to what was there before."""
+    before = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE if retained else SubscribeOptions.RETAIN_DO_NOT_SEND
+    return SubscribeOptions(1, noLocal=True, retainAsPublished=True, retainHandling=before)

@@ -8,7 +8,6 @@ import socket
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from functools import partial
 from typing import Any, Final
 
 from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage, MQTTv5, MQTTv311
@@ -16,12 +15,11 @@ from paho.mqtt.enums import MQTTErrorCode
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
-from paho.mqtt.subscribeoptions import SubscribeOptions
 
 from shmio.endpoints.mqtt.attempt import CONNECT_S, PACKETS, SLOW, Attempt, BrokerClient, hang_up, unseen
 from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.failure import Complaints, ended, refusal
-from shmio.endpoints.mqtt.limits import Limits
+from shmio.endpoints.mqtt.limits import Limits, subscription
 from shmio.endpoints.mqtt.target import Dialling, Target
 from shmio.endpoints.mqtt.writing import BATCH, take_over, write
 
@@ -65,6 +63,7 @@ class Link:
         self._new_will: Message | None = None  # that no broker was told yet
         self._in_flight: dict[int, Message] = {}
         self._limits = Limits()
+        self._needed = 0  # the subscription to commands
 
     @property
     def problem(self) -> str:
@@ -179,17 +178,16 @@ class Link:
     def _acknowledged(
         self, client: Client, _data: Any, mid: int, code: ReasonCode, _properties: Properties | None
     ) -> None:
-        if client is not self._client:
-            return
-        if (message := self._in_flight.pop(mid, None)) is not None and code.is_failure:
+        message = self._in_flight.pop(mid, None) if client is self._client else None
+        if message is not None and code.is_failure:
             self.complaints.refuse(f"broker {self._target} refuses messages: {code}: {message.topic}")
         else:
             self.complaints.taken()
 
     def _subscribed(
-        self, client: Client, _data: Any, _mid: int, codes: Sequence[ReasonCode], _properties: Properties | None
+        self, client: Client, _data: Any, mid: int, codes: Sequence[ReasonCode], _properties: Properties | None
     ) -> None:
-        if client is self._client and (refused := [code for code in codes if code.is_failure]):
+        if client is self._client and mid == self._needed and (refused := [code for code in codes if code.is_failure]):
             self.complaints.deaf(f"broker {self._target} does not let us subscribe: no command can come: {refused[0]}")
 
     # ---- its end -----------------------------------------------------------------------------------------------------
@@ -208,7 +206,7 @@ class Link:
             lost = list(self._in_flight.values())
             if time.monotonic() - self._up_s >= STABLE_S:
                 self._dialling.forgive()
-            self._fail(problem)
+            self._fail(self.complaints.lost(problem, self._dialling.client_id))
             self.on_lost(lost)
         elif self._protocol == MQTTv5 and self._until_s is not None:
             self._step_back()  # some brokers that do not know version 5 say nothing
@@ -248,8 +246,7 @@ class Link:
         if client is None or not self.up:
             return
         if limits.packet_bytes is not None and not limits.fit(message):
-            most = f"takes {limits.packet_bytes} bytes at once"
-            self.complaints.refuse(f"broker {self._target} {most}: {message.topic} has more")
+            self.complaints.refuse(f"broker {self._target} takes {limits.packet_bytes} bytes: {message.topic} has more")
             return
         qos, retain = message.qos and limits.qos, message.retain and limits.retain
         info = client.publish(message.topic, message.payload, qos, retain, properties if self.mqtt5 else None)
@@ -275,12 +272,16 @@ class Link:
         client = self._client
         if client is None or not filters:
             return
-        if self._protocol == MQTTv5:
-            before = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE if retained else SubscribeOptions.RETAIN_DO_NOT_SEND
-            options = partial(SubscribeOptions, 1, noLocal=True, retainAsPublished=True, retainHandling=before)
-            client.subscribe([(one, options()) for one in filters])
-        else:
-            client.subscribe([(one, 1) for one in filters])
+        new = self._protocol == MQTTv5
+        options: Any = subscription(retained=retained) if new else 1
+        _, mid = client.subscribe([(one, options) for one in filters])
+        self._needed = self._needed if retained or mid is None else mid
+
+    def recall(self, filters: Sequence[str]) -> None:
+        """Have what is retained on these sent once."""
+        self.subscribe(filters, retained=True)
+        if self._client is not None and filters:
+            self._client.unsubscribe(list(filters))
 
     def close(self, *, will: bool = False) -> None:
         """Take leave; what was sent before is on its way. ``will``: have the will published, as far as that can be."""

@@ -72,6 +72,17 @@ def test_a_retained_command_is_not_carried_out_by_either_version(
             assert not any(json.loads(one)["done"] for one in listener.values("cell/step/in/result"))
 
 
+def test_what_a_bridge_before_has_left_is_forgotten_by_either_version(
+    segment: Segment, address: Address, program: str
+) -> None:
+    with serving(segment, address, program), listening(address, protocol=MQTTv311) as listener:
+        listener.publish("cell/nowhere/out", "1", retain=True)
+        listener.until("cell/nowhere/out", b"1")
+        with bridged(segment):
+            listener.until("cell/nowhere/out", b"")
+            listener.shown("cell/step/out", "7")
+
+
 def test_only_who_has_an_account_gets_in(segment: Segment, address: Address, program: str, tmp_path: Path) -> None:
     accounts = tmp_path / "accounts"
     accounts.write_text("anna:secret\n")

@@ -57,11 +57,20 @@ class Broker:
         self.link = Link(
             Dialling(settings, "test", str), self._selector, lambda: None, lambda: Message("will", b"", 1, retain=True)
         )
+        self.admit()
+
+    def admit(self) -> None:
+        """Take a connection."""
         self.link.turn()
-        self._socket, _ = server.accept()
+        self._socket, _ = self._server.accept()
         self._socket.settimeout(TIMEOUT_S)
         self.hear(0x10)
         self.say("20 03 00 00 00", lambda: self.link.up)
+
+    def hang_up(self) -> None:
+        """End it without a word."""
+        self._socket.close()
+        self.turn_until(lambda: not self.link.up)
 
     def hear(self, kind: int, count: int = 1) -> None:
         """Take so many packets of this kind, and no more."""
@@ -100,6 +109,20 @@ class Broker:
         self.link.close()
         self._socket.close()
         self._selector.close()
+
+
+def test_who_is_thrown_out_again_and_again_is_told_what_may_be_behind_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two clients of one id, and a broker that does not say so."""
+    monkeypatch.setattr("shmio.endpoints.mqtt.target.FIRST_WAIT_S", 0.0)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        broker = Broker(server)
+        try:
+            for losses in range(1, 5):
+                broker.hang_up()
+                assert ("does another client connect as test" in broker.link.problem) is (losses == 4)
+                broker.admit()
+        finally:
+            broker.close()
 
 
 def test_what_a_broker_refuses_is_told_as_long_as_it_does(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,6 +6,7 @@ import threading
 
 import pytest
 
+from shmio.config import MqttTopic
 from shmio.layout.model import Layout, Register
 from shmio.segment import Attributes, BlockSpec, Segment
 from shmio.testing.mosquitto import Mosquitto
@@ -43,6 +44,30 @@ def test_a_source_that_changes_goes_on_and_what_it_no_longer_has_is_forgotten(
             kept = {topic.removeprefix(f"{PREFIX}/") for topic, payload in later.heard if payload}
     registers = {f"{source}/{name}/out" for source in ("cell", "other") for name in ("axis/position", "step")}
     assert kept == registers | {"status", "cell/status", "other/status"}
+
+
+def test_what_a_bridge_before_has_published_by_other_rules_is_forgotten(segment: Segment, broker: Mosquitto) -> None:
+    """A reload of the rules starts a bridge anew: nobody would tell any more that those values are old."""
+    segment.writer("cell").publish(image(step=1), cycle=1)
+    before = [MqttTopic(match="cell/inputs", elements=True), MqttTopic(match="cell", payload="frames")]
+    with bridge(segment, broker.address, topic=before) as running:
+        running.until(lambda: running.bridge.link.up and not running.bridge.outbox.busy)
+    with listening(broker.address) as listener:
+        listener.publish("other/step/out", "1", retain=True)
+        listener.publish("cell/step/note", "1", retain=True)
+    now = [MqttTopic(match="cell/step", publish=False), MqttTopic(match="cell/axis", payload="structure")]
+    with listening(broker.address) as listener, bridge(segment, broker.address, topic=now):
+        for topic in ("cell/inputs/0/out", "cell/inputs/1/out", "cell/frames", "cell/step/out", "cell/axis/speed/out"):
+            listener.shown(topic, "")
+        stay = {
+            f"{PREFIX}/{topic}" for topic in ("other/step/out", "cell/step/note", "cell/inputs/out", "cell/axis/out")
+        }
+        topics: set[str] = set()
+        with listening(broker.address) as later:
+            while not stay <= topics:
+                topics.add(later.message().topic)
+    gone = ("cell/inputs/0/out", "cell/frames", "cell/step/out", "cell/axis/speed/out")
+    assert not topics & {f"{PREFIX}/{topic}" for topic in gone}
 
 
 def test_a_source_that_is_removed_is_forgotten(segment: Segment, broker: Mosquitto) -> None:
