@@ -75,9 +75,21 @@ class Dump:
         self.begin_ns = min((begin for begin, _ in spans), default=0)
         self.end_ns = max((end for _, end in spans), default=0)
         ends = [part.end_ns for part in self._parts]
-        self._overlap = any(
+        self._overlap = self._has_twice() or any(
             part.begin_ns < end - OVERLAP_NS for part, end in zip(self._parts[1:], ends, strict=False) if part.begin_ns
         )
+
+    def _has_twice(self) -> bool:
+        """Whether a file may have frames or events of a block that one before it has."""
+        come_to: dict[tuple[DumpBlock, str], int] = {}
+        for part, within in zip(self._parts, self._contents, strict=True):
+            for number, block in within.blocks.items():
+                key, after = (block, within.kinds[number]), part.reader.channels[number].after
+                if after < come_to.get(key, 0):
+                    return True
+                track = part.found.tracks.get(number)
+                come_to[key] = after + (track.count if track else 0)
+        return False
 
     @property
     def files(self) -> tuple[Path, ...]:

@@ -225,6 +225,17 @@ def test_what_one_of_two_recorders_missed_columns_have_from_the_other(tmp_path: 
         assert dump.columns("cell/count", at(5), at(8), raw=True)["count"].tolist() == [5, 6, 7, 8]
 
 
+def test_files_that_ran_beside_each_other_for_a_moment_only(tmp_path: Path) -> None:
+    with build(tmp_path / "a.mem") as work:
+        work.block("cell")
+        for number in (*range(1, 20), *range(30, 41)):
+            work.frame(number, image(number))
+    with shmio.open_dump([tmp_path / "a.mem", plain(tmp_path / "b.mem", 15, 60)]) as dump:
+        assert [frame.number for _, _, frame in dump.frames()] == list(range(1, 61))
+        assert dump.columns("cell/count").number.tolist() == list(range(1, 61))
+        assert not [entry for entry in dump.items() if isinstance(entry.item, Gap)]
+
+
 def test_files_of_two_runs_are_not_one_dump(tmp_path: Path) -> None:
     with build(tmp_path / "b.mem", epoch="11" * 8) as work:
         work.block("cell")
