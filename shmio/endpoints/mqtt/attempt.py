@@ -11,7 +11,7 @@ from contextlib import suppress
 from typing import Any, Final, cast
 
 from paho.mqtt.client import Client, MQTTv5
-from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode, MQTTProtocolVersion
+from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
@@ -28,27 +28,13 @@ SLOW_S: Final = 15.0
 SLOW: Final = "no answer yet: it is slow, or the name server, or the file system of mqtt.tls or mqtt.password_file"
 MAX_PACKET_BYTES: Final = 1 << 21
 """Of what a broker may send us, as far as it can be told so: with MQTT 5."""
-PACKETS: Final = 100
-"""So many are taken from the broker before what else there is to do has its turn."""
 
 
 class BrokerClient(Client):
-    """Reads no more packets at once than it is told to: paho's reads as many as we have in flight."""
+    """paho's, which tells more of why a connection has ended."""
 
     tls_error: ssl.SSLError | None = None
     """What TLS said against the connection after it was made, if that is why it has ended."""
-
-    def loop_read(self, max_packets: int = 1) -> MQTTErrorCode:
-        """Read so many, if they are there."""
-        for _ in range(max_packets):
-            if self._sock is None:
-                return MQTTErrorCode.MQTT_ERR_NO_CONN
-            code = self._packet_read()
-            if code > 0:
-                return self._loop_rc_handle(code)
-            if code == MQTTErrorCode.MQTT_ERR_AGAIN:
-                break
-        return MQTTErrorCode.MQTT_ERR_SUCCESS
 
 
 class _TlsClient(BrokerClient):
@@ -64,9 +50,17 @@ class Attempt:
     """Begins at once, with the broker whose turn it is."""
 
     def __init__(
-        self, dialling: Dialling, protocol: MQTTProtocolVersion, will: Message, wake: Callable[[], object]
+        self,
+        dialling: Dialling,
+        protocol: MQTTProtocolVersion,
+        will: Message | None,
+        most: int,
+        wake: Callable[[], object],
     ) -> None:
-        """``wake``: called by its thread when it is over, if anybody wants it then."""
+        """``most``: messages that the broker may send us before they are acknowledged, as far as it can be told so.
+
+        ``wake``: called by its thread when it is over, if anybody wants it then.
+        """
         self.target = dialling.next()
         self._begun_s = time.monotonic()
         self.over = False
@@ -78,7 +72,7 @@ class Attempt:
         """Whether a broker may have been told who we are, and our will."""
         self.problem = ""
         """Why there is none."""
-        self._dialling, self._protocol, self._will, self._wake = dialling, protocol, will, wake
+        self._dialling, self._protocol, self._will, self._most, self._wake = dialling, protocol, will, most, wake
         self._handing = threading.Lock()
         self._unwanted = False
         threading.Thread(target=self._run, name="connect", daemon=True).start()
@@ -126,7 +120,8 @@ class Attempt:
         )
         client.connect_timeout = CONNECT_S
         client.max_inflight_messages_set(0)  # we count them ourselves
-        client.will_set(self._will.topic, self._will.payload, self._will.qos, self._will.retain)
+        if self._will is not None:
+            client.will_set(self._will.topic, self._will.payload, self._will.qos, self._will.retain)
         if settings.broker == "external":
             if settings.username is not None:
                 password = read_password(settings.password_file) if settings.password_file else None
@@ -138,7 +133,7 @@ class Attempt:
             properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
             properties.SessionExpiryInterval = settings.session_expiry_s
             properties.MaximumPacketSize = MAX_PACKET_BYTES
-            properties.ReceiveMaximum = PACKETS
+            properties.ReceiveMaximum = self._most
             options = {"properties": properties, "clean_start": not settings.session_expiry_s}
         client.connect(target.host, target.port, settings.keep_alive_s, **options)
         self.offered = True
@@ -158,8 +153,3 @@ def hang_up(client: Client) -> None:
     if made is not None:
         with suppress(OSError):
             made.close()
-
-
-def unseen(made: socket.socket | None) -> bool:
-    """Whether TLS has read from it what was not taken yet: a selector does not see that."""
-    return isinstance(made, ssl.SSLSocket) and made.pending() > 0

@@ -12,12 +12,15 @@ from contextlib import suppress
 from functools import partial
 from typing import Final
 
+import msgspec
 from paho.mqtt.client import MQTTMessage
 
 from shmio.config import Mqtt
 from shmio.endpoints.mqtt.channel import Gone, Message, status
 from shmio.endpoints.mqtt.commands import OUTPUTS, Commands, filters, outputs
 from shmio.endpoints.mqtt.feed import Feed
+from shmio.endpoints.mqtt.intake import Intake
+from shmio.endpoints.mqtt.limits import MOST_IN_FLIGHT
 from shmio.endpoints.mqtt.link import Link
 from shmio.endpoints.mqtt.outbox import Outbox
 from shmio.endpoints.mqtt.place import own_socket
@@ -25,7 +28,7 @@ from shmio.endpoints.mqtt.rules import Rules
 from shmio.endpoints.mqtt.sparkplug.device import Device
 from shmio.endpoints.mqtt.sparkplug.session import Session
 from shmio.endpoints.mqtt.steps import Steps
-from shmio.endpoints.mqtt.target import Dialling
+from shmio.endpoints.mqtt.target import Dialling, targets
 from shmio.segment import ProcessSlot, Quality, Segment
 from shmio.segment.relay import TURN_NS, Relay
 
@@ -58,16 +61,28 @@ class Bridge:
         self._feeds: dict[str, Feed] = {}
         self._relays: dict[int, Relay] = {}
         self._gone: dict[str, Gone] = {}
+        there = targets(settings, own_socket(segment))
+        clean = msgspec.structs.replace(settings, session_expiry_s=0)  # nothing comes that the broker could keep
         self.link = Link(
-            Dialling(settings, client_id, partial(own_socket, segment)),
+            Dialling(clean, client_id, there),
             self._selector,
             self.wake,
             lambda: Message(self._status, OFFLINE, 1, True),
+            MOST_IN_FLIGHT,
         )
-        self.outbox = Outbox(self.link, round(settings.backlog_mb * 1e6))
+        self.intake = Intake(
+            settings,
+            f"{client_id}-commands",
+            self._selector,
+            self.wake,
+            lambda: filters(self.prefix, self._feeds.values()),
+        )
+        self.outbox = Outbox(self.link, self.intake.link, round(settings.backlog_mb * 1e6))
         self._commands = Commands(self.prefix, self._rules, self._feeds, self.outbox.answer)
-        self.link.on_message = self._hear
+        self.intake.link.on_message = self._commands.take
+        self.link.on_message = self._recall
         self.link.on_lost = self.outbox.lose
+        self.link.admit = lambda: self.intake.settled  # who is told that we are there may send commands at once
         self._recalled: frozenset[str] | None = None
         """Our topics when the broker was asked what it has of one before us; None: it was not."""
         self._more: set[Feed] = set()
@@ -90,7 +105,7 @@ class Bridge:
     def counters(self) -> tuple[int, ...]:
         """As the process table names them."""
         commands, outbox = self._commands, self.outbox
-        refused = commands.refused + self.link.complaints.refused
+        refused = commands.refused + self.link.complaints.refused + self.intake.link.complaints.refused
         own = (
             outbox.sent, commands.received, refused, outbox.waiting, outbox.backlog, outbox.dropped, self.link.connects,
             self._missed + sum(feed.missed for feed in self._feeds.values()),
@@ -104,7 +119,7 @@ class Bridge:
         if problem and self.outbox.backlog:
             lost = f", {self.outbox.dropped} dropped" if self.outbox.dropped else ""
             return f"{problem}; {self.outbox.backlog} changes are kept{lost}"
-        return problem or ("" if self._sparkplug is None else self._sparkplug.problem)
+        return problem or self.intake.problem or ("" if self._sparkplug is None else self._sparkplug.problem)
 
     def wake(self) -> None:
         """Have :meth:`turn` return soon; any thread may."""
@@ -138,7 +153,7 @@ class Bridge:
     def _link_turn(self) -> float:
         """In how many seconds it has to be turned again."""
         link = self.link
-        rest_s = link.turn()
+        rest_s = min(self.intake.turn(link.at), link.turn())
         if link.problem and not link.up:
             self.outbox.keeping = True
         if link.came_up:
@@ -148,8 +163,7 @@ class Bridge:
         return rest_s
 
     def _greet(self) -> None:
-        """A connection was made: take commands, tell that we are there, what was kept, and how everything is now."""
-        self.link.subscribe(filters(self.prefix, self._feeds.values()))
+        """A connection was made: tell that we are there, what was kept, and how everything is now."""
         self.link.send(Message(self._status, ONLINE, 1, True))
         if self._recalled is None:
             self._recalled = frozenset(channel.topic for feed in self._feeds.values() for channel in feed.all())
@@ -158,9 +172,8 @@ class Bridge:
             feed.show()
         self.outbox.show(self._gone.values())
 
-    def _hear(self, message: MQTTMessage) -> None:
-        """A command, or what a bridge before this one has left, by other rules: nobody would ever tell it is old."""
-        self._commands.take(message)
+    def _recall(self, message: MQTTMessage) -> None:
+        """What a bridge before this one has left, by other rules: nobody would ever tell it is old."""
         if not (message.retain and message.payload and self._recalled is not None) or len(self._gone) >= MOST_GONE:
             return
         with suppress(UnicodeDecodeError):
@@ -186,6 +199,7 @@ class Bridge:
         if self._reading is not None and self._reading.done():
             reading, self._reading = self._reading, None
             self._adopt(reading.result())
+            self.intake.subscribe()
             if self.link.up:
                 self._greet()
         for feed in [feed for feed in self._feeds.values() if feed.over]:
@@ -251,7 +265,8 @@ class Bridge:
             self.link.send(status(feed.status.topic, Quality.BAD, STOPPED, feed.missed))
         self.link.send(Message(self._status, OFFLINE, 1, True))
         self.link.push()
-        self._drain(until_s, lambda: not self.link.in_flight)
+        self._drain(until_s, lambda: not (self.link.in_flight or self.intake.link.in_flight))
+        self.intake.link.close()
         self.link.close()
         if self._sparkplug is not None:
             self._sparkplug.close()
@@ -269,4 +284,5 @@ class Bridge:
             for key, events in self._selector.select(min(rest_s, TURN_S)):
                 key.data(events)
             self.outbox.flush()
+            self.intake.turn(self.link.at)
             self.link.turn()

@@ -11,6 +11,8 @@ from shmio.endpoints.mqtt.channel import Message
 
 MOST_IN_FLIGHT: Final = 1000
 """Messages that the broker has not acknowledged."""
+FEW_IN_FLIGHT: Final = 4
+"""The same where commands come in, of which each takes its time: as many may be read at once."""
 HEAD_BYTES: Final = 128
 """Of a packet, beside topic and payload, at most."""
 
@@ -24,11 +26,11 @@ class Limits(NamedTuple):
     retain: bool = True
 
     @classmethod
-    def told(cls, properties: Properties | None) -> Limits:
-        """Those of a CONNACK."""
+    def told(cls, properties: Properties | None, most: int) -> Limits:
+        """Those of a CONNACK; ``most``: messages without an acknowledgement that we want."""
         told = vars(properties) if properties is not None else {}
         return cls(
-            min(MOST_IN_FLIGHT, told.get("ReceiveMaximum", MOST_IN_FLIGHT)),
+            min(most, told.get("ReceiveMaximum", most)),
             told.get("MaximumPacketSize"),
             min(1, told.get("MaximumQoS", 1)),
             bool(told.get("RetainAvailable", 1)),

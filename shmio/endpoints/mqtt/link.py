@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import logging
 import selectors
-import socket
 import time
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from typing import Any, Final
 
 from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage, MQTTv5, MQTTv311
-from paho.mqtt.enums import MQTTErrorCode
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
-from shmio.endpoints.mqtt.attempt import CONNECT_S, PACKETS, SLOW, Attempt, BrokerClient, hang_up, unseen
+from shmio.endpoints.mqtt.attempt import CONNECT_S, SLOW, Attempt, BrokerClient
 from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.failure import Complaints, ended, refusal
 from shmio.endpoints.mqtt.limits import Limits, subscription
+from shmio.endpoints.mqtt.pump import Pump
 from shmio.endpoints.mqtt.target import Dialling, Target
-from shmio.endpoints.mqtt.writing import BATCH, take_over, write
+from shmio.endpoints.mqtt.writing import BATCH
 
 STABLE_S: Final = 5.0
 """Who was connected so long has put his failures behind him."""
@@ -38,22 +36,26 @@ class Link:
         dialling: Dialling,
         selector: selectors.BaseSelector,
         wake: Callable[[], object],
-        will: Callable[[], Message],
+        will: Callable[[], Message | None],
+        most: int,
     ) -> None:
-        """``wake``: has the thread turn the link; callable from any thread. ``will``: asked for for each CONNECT."""
+        """``wake``: any thread has it turned so. ``will``: asked for each CONNECT. ``most``: in flight, each way."""
         self.up = False
+        self.admit: Callable[[], bool] = lambda: True
+        """Asked, from when the broker has let us in, until it says so: whether the connection is ``up`` by now."""
         self.came_up = False
         """Set when a connection has been made; who has greeted it takes it back."""
         self.on_lost: Callable[[list[Message]], None] = lambda _: None
         """Called when a connection is gone, with what it has not taken for certain."""
         self.complaints = Complaints()
         self.connects = 0
-        self._dialling, self._selector, self._wake, self._will = dialling, selector, wake, will
+        self.subscribed = False
+        """Whether the broker has answered to what was subscribed to last."""
+        self._dialling, self._selector, self._wake, self._will, self._most = dialling, selector, wake, will, most
         self.on_message: Callable[[MQTTMessage], None] = lambda _: None
         """Called with each message that comes."""
         self._client: BrokerClient | None = None
-        self._socket: socket.socket | None = None
-        self._writing = False
+        self._pump: Pump | None = None
         self._target: Target | None = None
         self._attempt: Attempt | None = None
         self._protocol = MQTTv5
@@ -71,6 +73,11 @@ class Link:
         return self.complaints.problem
 
     @property
+    def at(self) -> Target | None:
+        """The broker that has let us in."""
+        return None if self._client is None or self._until_s is not None else self._target
+
+    @property
     def mqtt5(self) -> bool:
         """Whether the broker speaks version 5."""
         return self.up and self._protocol == MQTTv5
@@ -78,7 +85,8 @@ class Link:
     @property
     def room(self) -> int:
         """How many messages it takes now, and does not only put into its memory."""
-        return min(BATCH, self._limits.in_flight - len(self._in_flight)) if self.up and not self._writing else 0
+        blocked = not self.up or self._pump is None or self._pump.writing
+        return 0 if blocked else min(BATCH, self._limits.in_flight - len(self._in_flight))
 
     @property
     def in_flight(self) -> int:
@@ -96,21 +104,24 @@ class Link:
             if now_s < self._retry_s:
                 return self._retry_s - now_s
             self._new_will = self._new_will or self._will()
-            self._attempt = Attempt(self._dialling, self._protocol, self._new_will, self._wake)
+            self._attempt = Attempt(self._dialling, self._protocol, self._new_will, self._most, self._wake)
             self._target = self._attempt.target
         if self._client is None:
             if self._attempt is not None and self._attempt.slow:
                 self.complaints.say(f"broker {self._target}: {SLOW}")
             return CONNECT_S
-        if self._until_s is not None and now_s >= self._until_s:
-            self.drop("it does not answer")
-        elif self.up and now_s >= self._misc_s:
-            self._misc_s = now_s + 1.0
-            self._client.loop_misc()
-        if unseen(self._socket):
-            self._serve(selectors.EVENT_READ)
-        self.push()
-        return 0.0 if unseen(self._socket) else 1.0
+        if self._until_s is not None:
+            if now_s >= self._until_s:
+                self.drop("it does not answer")
+        else:
+            if not self.up and self.admit():
+                self.complaints.clear()
+                self.up, self.came_up, self._up_s = True, True, now_s
+                self.connects += 1
+            if now_s >= self._misc_s:
+                self._misc_s = now_s + 1.0
+                self._client.loop_misc()
+        return 1.0 if self._pump is None else self._pump.turn()
 
     def _take(self, attempt: Attempt) -> None:
         """A connection was made, or was not."""
@@ -123,27 +134,10 @@ class Link:
         self._until_s = time.monotonic() + CONNECT_S
         client.on_connect = self._connected
         client.on_disconnect = self._disconnected
-        client.on_publish = self._acknowledged
-        client.on_message = lambda one, _data, message: self.on_message(message) if one is self._client else None
         client.on_subscribe = self._subscribed
-        take_over(client)
-        self._client, self._socket, self._writing = client, made, False
-        self._selector.register(made, selectors.EVENT_READ, self._serve)
-
-    def _serve(self, events: int) -> None:
-        """The socket is ready."""
-        client, made = self._client, self._socket
-        if client is None or made is None:
-            return
-        code = client.loop_read(PACKETS) if events & selectors.EVENT_READ else MQTTErrorCode.MQTT_ERR_SUCCESS
-        if not code and client is self._client and (events & selectors.EVENT_WRITE or not self._writing):
-            code = write(client)
-        if code and client is self._client:
-            self.drop(str(MQTTErrorCode(code).name).removeprefix("MQTT_ERR_").replace("_", " ").lower())
-        if client is self._client and self._writing != client.want_write():
-            self._writing = not self._writing  # to hear of room for what did not go out at once
-            events = selectors.EVENT_READ | (selectors.EVENT_WRITE if self._writing else 0)
-            self._selector.modify(made, events, self._serve)
+        self._client, self._pump = client, Pump(client, made, self._selector, self.drop)
+        client.on_publish = self._pump.counting(self._acknowledged)
+        client.on_message = self._pump.counting(self._come)
 
     # ---- what the broker says ----------------------------------------------------------------------------------------
 
@@ -158,14 +152,10 @@ class Link:
             else:
                 self._fail(f"broker {self._target}: {refusal(code, self._dialling)}")
             return
-        self._limits = Limits.told(properties)
-        self._until_s, self._up_s = None, time.monotonic()
-        self._misc_s = self._up_s + 1.0
-        self.up = self.came_up = True
-        self.connects += 1
-        self.complaints.clear()
+        self._limits = Limits.told(properties, self._most)
+        self._until_s, self._misc_s = None, time.monotonic() + 1.0
         version = "5" if self._protocol == MQTTv5 else "3.1.1"
-        log.info("connected to broker %s, MQTT %s", self._target, version)
+        log.info("connected to broker %s as %s, MQTT %s", self._target, self._dialling.client_id, version)
 
     def _disconnected(
         self, client: Client, _data: Any, flags: DisconnectFlags, code: ReasonCode, _properties: Properties | None
@@ -173,7 +163,8 @@ class Link:
         if self._client is None or client is not self._client:
             return
         tls, told = self._dialling.settings.tls is not None, flags.is_disconnect_packet_from_server
-        self.drop(refusal(code, self._dialling) if told else ended(self._client.tls_error, up=self.up, tls=tls))
+        why = ended(self._client.tls_error, up=self.at is not None, tls=tls)
+        self.drop(refusal(code, self._dialling) if told else why)
 
     def _acknowledged(
         self, client: Client, _data: Any, mid: int, code: ReasonCode, _properties: Properties | None
@@ -184,10 +175,17 @@ class Link:
         else:
             self.complaints.taken()
 
+    def _come(self, client: Client, _data: Any, message: MQTTMessage) -> None:
+        if client is self._client:
+            self.on_message(message)
+
     def _subscribed(
         self, client: Client, _data: Any, mid: int, codes: Sequence[ReasonCode], _properties: Properties | None
     ) -> None:
-        if client is self._client and mid == self._needed and (refused := [code for code in codes if code.is_failure]):
+        if client is not self._client or mid != self._needed:
+            return
+        self.subscribed = True
+        if refused := [code for code in codes if code.is_failure]:
             self.complaints.deaf(f"broker {self._target} does not let us subscribe: no command can come: {refused[0]}")
 
     # ---- its end -----------------------------------------------------------------------------------------------------
@@ -228,15 +226,11 @@ class Link:
         self._retry_s = time.monotonic() + self._dialling.wait_s()
 
     def _close(self) -> None:
-        client, self._client = self._client, None
-        if self._socket is not None:
-            with suppress(KeyError, ValueError):
-                self._selector.unregister(self._socket)
-            self._socket = None
-        self.up, self.came_up, self._until_s = False, False, None
+        pump, self._pump, self._client = self._pump, None, None
+        self.up, self.came_up, self.subscribed, self._until_s = False, False, False, None
         self._in_flight = {}
-        if client is not None:
-            hang_up(client)
+        if pump is not None:
+            pump.close()
 
     # ---- what goes out -----------------------------------------------------------------------------------------------
 
@@ -257,8 +251,8 @@ class Link:
 
     def push(self) -> None:
         """Have go what is ready."""
-        if self._client is not None and not self._writing and self._client.want_write():
-            self._serve(0)
+        if self._pump is not None:
+            self._pump.push()
 
     def owes(self, message: Message) -> bool:
         """Whether this very message was sent, and the broker has not acknowledged it."""
@@ -270,6 +264,7 @@ class Link:
         So has, with version 5, what comes from another broker that had it before: to ours it is new.
         """
         client = self._client
+        self.subscribed = not filters
         if client is None or not filters:
             return
         new = self._protocol == MQTTv5
@@ -282,6 +277,11 @@ class Link:
         self.subscribe(filters, retained=True)
         if self._client is not None and filters:
             self._client.unsubscribe(list(filters))
+
+    def open(self) -> None:
+        """Connect, after :meth:`close`."""
+        self._protocol, self._retry_s = MQTTv5, 0.0
+        self.complaints.clear()
 
     def close(self, *, will: bool = False) -> None:
         """Take leave; what was sent before is on its way. ``will``: have the will published, as far as that can be."""

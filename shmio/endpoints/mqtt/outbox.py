@@ -6,7 +6,7 @@ While the broker is away each change is kept instead, in a bounded store, and se
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from typing import Final, Protocol
 
@@ -45,8 +45,9 @@ class Sender(Protocol):
 class Outbox:
     """For the bridge's thread."""
 
-    def __init__(self, link: Sender, backlog_bytes: int) -> None:
-        self._link = link
+    def __init__(self, link: Sender, results: Sender, backlog_bytes: int) -> None:
+        """``link``: for values; ``results``: for what became of commands."""
+        self._link, self._results = link, results
         self._most = backlog_bytes
         self._kept: Store[Message] = Store(backlog_bytes)
         self._waiting: dict[Channel, None] = {}
@@ -69,7 +70,8 @@ class Outbox:
     @property
     def able(self) -> bool:
         """Whether :meth:`flush` would send something now."""
-        return self.busy and self._link.room > 0
+        values, answers = self._waiting or self._kept.count, self._answers
+        return bool((values and self._link.room) or (answers and self._results.room))
 
     @property
     def waiting(self) -> int:
@@ -117,7 +119,7 @@ class Outbox:
 
     def answer(self, message: Message, properties: Properties | None) -> None:
         """Send what became of a command, before values."""
-        if self._link.up:
+        if self._results.up:
             self._unanswered += len(self._answers) == MOST_ANSWERS
             self._answers.append((message, properties))
 
@@ -132,7 +134,6 @@ class Outbox:
                 self._kept.put(message, _size(message))
         self._waiting.clear()
         self._settling = False
-        self._answers.clear()
 
     def forget(self, channels: Iterable[Channel]) -> None:
         """A reload has ended what they tell of."""
@@ -140,19 +141,31 @@ class Outbox:
             self._waiting.pop(channel, None)
 
     def flush(self) -> None:
-        """Send as long as the connection takes it, so many at once, and so many in all."""
-        link, rest = self._link, TURN_MESSAGES
-        while self.busy and (room := min(link.room, rest)) > 0:
+        """Send as long as the connections take it, so many at once, and so many in all by each."""
+        if not self._results.up:
+            self._answers.clear()  # they go with their connection
+        self._pass(self._results, self._answered)
+        self._pass(self._link, self._due)
+
+    def _pass(self, link: Sender, due: Callable[[], Iterator[tuple[Message, Properties | None]]]) -> None:
+        rest = TURN_MESSAGES
+        while (room := min(link.room, rest)) > 0:
             rest -= room
-            for message, properties in islice(self._due(), room):
+            before = self.sent
+            for message, properties in islice(due(), room):
                 self.sent += 1
                 link.send(message, properties)
+            if self.sent == before:
+                return
             link.push()
 
-    def _due(self) -> Iterator[tuple[Message, Properties | None]]:
-        """What is to be sent, each as its turn comes: answers, then what was kept, then what is new."""
+    def _answered(self) -> Iterator[tuple[Message, Properties | None]]:
+        """What became of commands."""
         while self._answers:
             yield self._answers.popleft()
+
+    def _due(self) -> Iterator[tuple[Message, Properties | None]]:
+        """Values, each as its turn comes: what was kept, then what is new."""
         while (message := self._kept.pop()) is not None:
             self._room -= _size(message) // 2
             yield message, _time_of(message)

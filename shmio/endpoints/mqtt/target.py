@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -27,22 +27,32 @@ class Target:
         return self.name
 
 
+def targets(settings: Mqtt, own_socket: str) -> list[Target]:
+    """The brokers, in the order in which they are tried. ``own_socket``: where ours is, if there is no external one."""
+    if settings.broker != "external":
+        return [Target(own_socket, transport="unix", name="of this instance")]
+    return [Target(address.host, address.port, "tcp", str(address)) for address in brokers(settings)]
+
+
 class Dialling:
     """Which broker is tried next, and when."""
 
-    def __init__(self, settings: Mqtt, client_id: str, own_socket: Callable[[], str]) -> None:
-        """``own_socket``: where our own broker is reached, if there is no external one."""
+    def __init__(self, settings: Mqtt, client_id: str, there: Sequence[Target]) -> None:
         self.settings = settings
         self.client_id = client_id
-        self._own_socket = own_socket
-        self._addresses = brokers(settings)
+        self._targets = there
         self._next = 0
         self._failures = 0
 
     @property
     def count(self) -> int:
         """How many brokers there are."""
-        return max(1, len(self._addresses))
+        return len(self._targets)
+
+    def turn_to(self, target: Target) -> None:
+        """From now on this one alone."""
+        self._targets = [target]
+        self.forgive()
 
     def repeat(self) -> None:
         """Try the last one again."""
@@ -50,11 +60,8 @@ class Dialling:
 
     def next(self) -> Target:
         """The next one."""
-        if self.settings.broker != "external":
-            return Target(self._own_socket(), transport="unix", name="of this instance")
-        address = self._addresses[self._next % len(self._addresses)]
         self._next += 1
-        return Target(address.host, address.port, "tcp", str(address))
+        return self._targets[(self._next - 1) % len(self._targets)]
 
     def wait_s(self) -> float:
         """How long to wait after a failure: longer after each."""

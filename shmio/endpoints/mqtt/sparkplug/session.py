@@ -9,7 +9,6 @@ import logging
 import selectors
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Final
 
 import msgspec
@@ -18,13 +17,14 @@ from paho.mqtt.client import MQTTMessage
 from shmio.config import Mqtt, Sparkplug
 from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.feed import Feed
+from shmio.endpoints.mqtt.limits import FEW_IN_FLIGHT
 from shmio.endpoints.mqtt.link import Link
 from shmio.endpoints.mqtt.place import own_socket
 from shmio.endpoints.mqtt.sparkplug.backlog import Backlog
 from shmio.endpoints.mqtt.sparkplug.device import Device, Kind
 from shmio.endpoints.mqtt.sparkplug.node import EdgeNode
 from shmio.endpoints.mqtt.sparkplug.primary import PrimaryHost
-from shmio.endpoints.mqtt.target import Dialling
+from shmio.endpoints.mqtt.target import Dialling, targets
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.glob import Glob
 from shmio.segment import DONE, EventKind, Segment
@@ -57,8 +57,8 @@ class Session:
         client_id = f"{settings.client_id or f'shmio-{segment.instance}'}-sparkplug"
         # A session begins with its births: the broker is to keep nothing of one before (5.4).
         clean = msgspec.structs.replace(settings, session_expiry_s=0)
-        self._dialling = Dialling(clean, client_id, partial(own_socket, segment))
-        self.link = Link(self._dialling, selector, wake, self.node.will)
+        self._dialling = Dialling(clean, client_id, targets(settings, own_socket(segment)))
+        self.link = Link(self._dialling, selector, wake, self.node.will, FEW_IN_FLIGHT)
         self.link.on_message = self._command
         self.link.on_lost = self._lose
         self._host = None if sparkplug.primary_host is None else PrimaryHost(sparkplug.primary_host)

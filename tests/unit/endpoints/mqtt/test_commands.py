@@ -12,8 +12,9 @@ import pytest
 
 from shmio.config import Mqtt, MqttTopic
 from shmio.connectors.injections import Owner
-from shmio.endpoints.mqtt.attempt import PACKETS
 from shmio.endpoints.mqtt.bridge import Bridge
+from shmio.endpoints.mqtt.limits import FEW_IN_FLIGHT
+from shmio.endpoints.mqtt.pump import PACKETS
 from shmio.segment import Segment
 from shmio.segment.processes import WRITERS
 from shmio.testing.mosquitto import Mosquitto
@@ -179,28 +180,27 @@ def test_a_flood_of_commands_is_bounded_and_answered(segment: Segment, broker: M
         assert listener.json("cell/axis/speed/in/result")["done"]
 
 
-def test_commands_are_taken_a_few_at_a_time_however_much_is_in_flight(
-    segment: Segment, make_broker: Callable[..., Mosquitto]
+@pytest.mark.parametrize(("qos", "bound"), [(0, PACKETS), (1, PACKETS + FEW_IN_FLIGHT)])
+def test_commands_are_taken_a_few_at_a_time(
+    segment: Segment, make_broker: Callable[..., Mosquitto], qos: int, bound: int
 ) -> None:
-    """Else a flood of them would hold up the values: those wait for acknowledgements, which come among the commands."""
-    broker = make_broker("allow_anonymous true", "max_inflight_messages 1000")
+    """Also while results wait for acknowledgements; else many of them would hold up what else there is to do."""
+    broker = make_broker("allow_anonymous true", "max_inflight_messages 1000", "max_queued_messages 0")
     writer, slot = segment.writer("cell"), segment.processes.find("mqtt")
     writer.publish(image(), cycle=1)
     assert slot.take()
-    rules = [MqttTopic(match="cell/long", elements=True, qos=1)]
-    bridge = Bridge(segment, slot, Mqtt(broker="external", host=str(broker.address), prefix=PREFIX, topic=rules))
+    bridge = Bridge(segment, slot, Mqtt(broker="external", host=str(broker.address), prefix=PREFIX))
     try:
         while not bridge.link.up or bridge.outbox.busy or bridge.link.in_flight:
             bridge.turn()
         with listening(broker.address, "none") as flooder:
-            writer.publish(image()[:26] + b"\1" * 600 + b"\0\0", cycle=2)
             for _ in range(1000):
-                flooder.client.publish(f"{PREFIX}/cell/nowhere/in", "1", 0)
+                flooder.client.publish(f"{PREFIX}/cell/nowhere/in", "1", qos)
             flooder.publish("cell/nowhere/in", "1")
         most = 0
         while (before := bridge.counters[1]) < 1001:
             bridge.turn()
             most = max(most, bridge.counters[1] - before)
-        assert most <= PACKETS
+        assert most <= bound
     finally:
         bridge.close()

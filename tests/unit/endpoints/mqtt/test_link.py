@@ -13,7 +13,7 @@ import pytest
 from shmio.config import Mqtt
 from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.link import Link
-from shmio.endpoints.mqtt.target import Dialling
+from shmio.endpoints.mqtt.target import Dialling, targets
 
 TIMEOUT_S = 30
 
@@ -34,7 +34,8 @@ def test_a_connection_that_comes_about_after_the_end_is_closed_and_wakes_nobody(
     with socket.create_server(("127.0.0.1", 0)) as server, selectors.DefaultSelector() as selector:
         server.settimeout(TIMEOUT_S)
         settings = Mqtt(broker="external", host=f"127.0.0.1:{server.getsockname()[1]}")
-        link = Link(Dialling(settings, "test", str), selector, woken.set, lambda: Message("will", b"", 1, retain=True))
+        dialling = Dialling(settings, "test", targets(settings, ""))
+        link = Link(dialling, selector, woken.set, lambda: Message("will", b"", 1, retain=True), 1)
         link.turn()
         assert asked.wait(TIMEOUT_S)
         link.close()
@@ -54,9 +55,8 @@ class Broker:
         self._server = server
         self._selector = selectors.DefaultSelector()
         settings = Mqtt(broker="external", host=f"127.0.0.1:{server.getsockname()[1]}")
-        self.link = Link(
-            Dialling(settings, "test", str), self._selector, lambda: None, lambda: Message("will", b"", 1, retain=True)
-        )
+        dialling, will = Dialling(settings, "test", targets(settings, "")), Message("will", b"", 1, retain=True)
+        self.link = Link(dialling, self._selector, lambda: None, lambda: will, 1)
         self.admit()
 
     def admit(self) -> None:

@@ -38,7 +38,7 @@ class Counter:
 
 def test_a_topic_that_waits_keeps_its_place_and_has_its_newest_value() -> None:
     link = Link()
-    outbox, a, b = Outbox(link, 10_000), Counter("a"), Counter("b")
+    outbox, a, b = Outbox(link, link, 10_000), Counter("a"), Counter("b")
     link.room = 0
     for channel in (a, b, a):
         channel.value += 1
@@ -52,7 +52,7 @@ def test_a_topic_that_waits_keeps_its_place_and_has_its_newest_value() -> None:
 
 def test_no_turn_is_longer_than_others_can_wait() -> None:
     link = Link()
-    outbox = Outbox(link, 0)
+    outbox = Outbox(link, link, 0)
     outbox.mark_all(Counter(str(number)) for number in range(2 * TURN_MESSAGES + 1))
     outbox.flush()
     assert len(link.sent) == TURN_MESSAGES
@@ -66,14 +66,14 @@ def test_no_turn_is_longer_than_others_can_wait() -> None:
 def test_nothing_is_kept_before_there_was_anything_to_wait_for() -> None:
     link = Link()
     link.up = False
-    outbox = Outbox(link, 10_000)
+    outbox = Outbox(link, link, 10_000)
     outbox.mark(Counter("a"))
     assert not outbox.busy
 
 
 def test_what_was_lost_and_what_waited_comes_before_what_is_new() -> None:
     link = Link()
-    outbox, a, b, status = Outbox(link, 10_000), Counter("a"), Counter("b"), Counter("s", keep=False)
+    outbox, a, b, status = Outbox(link, link, 10_000), Counter("a"), Counter("b"), Counter("s", keep=False)
     outbox.keeping = True
     link.room = 0
     b.value = 3
@@ -97,7 +97,7 @@ def test_what_was_lost_and_what_waited_comes_before_what_is_new() -> None:
 def test_the_oldest_go_when_there_is_no_room() -> None:
     link = Link()
     link.up = False
-    outbox, a = Outbox(link, 3 * (OVERHEAD_BYTES + 1)), Counter("a")
+    outbox, a = Outbox(link, link, 3 * (OVERHEAD_BYTES + 1)), Counter("a")
     outbox.keeping = True
     for a.value in range(1, 8):
         outbox.mark(a)
@@ -114,7 +114,7 @@ def test_a_store_that_is_full_when_the_broker_is_back_makes_place_for_the_newest
     """What comes then is conflated, not dropped."""
     link = Link()
     link.up = False
-    outbox, a = Outbox(link, OVERHEAD_BYTES + 1), Counter("a")
+    outbox, a = Outbox(link, link, OVERHEAD_BYTES + 1), Counter("a")
     outbox.keeping = True
     a.value = 1
     outbox.mark(a)
@@ -126,26 +126,50 @@ def test_a_store_that_is_full_when_the_broker_is_back_makes_place_for_the_newest
     assert (link.sent, outbox.dropped) == (["a1!", "a3"], 0)
 
 
-def test_results_come_first_and_are_bounded() -> None:
-    link = Link()
-    outbox = Outbox(link, 0)
-    link.room = 0
+def test_results_are_bounded_and_hold_up_no_value() -> None:
+    values, results = Link(), Link()
+    outbox = Outbox(values, results, 0)
+    results.room = 0
     outbox.mark(Counter("a"))
     for number in range(MOST_ANSWERS + 2):
         outbox.answer(Message("r", str(number).encode(), 0, retain=True), None)
     assert outbox.dropped == 2
-    link.room = 1_000_000
+    outbox.flush()
+    assert values.sent == ["a0"]
+    results.room = 1_000_000
     while outbox.able:
         outbox.flush()
-    assert link.sent[0] == "r2"
-    assert link.sent[-1] == "a0"
+    assert results.sent == [f"r{number}" for number in range(2, MOST_ANSWERS + 2)]
+
+
+def test_results_and_values_wait_for_their_own_connection() -> None:
+    values, results = Link(), Link()
+    outbox, a = Outbox(values, results, 0), Counter("a")
+    values.room = results.room = 0
+    outbox.mark(a)
+    outbox.answer(Message("r", b"0", 0, retain=True), None)
+    outbox.flush()
+    assert not outbox.able
+    results.room = 1
+    outbox.flush()
+    assert (values.sent, results.sent) == ([], ["r0"])
+    outbox.answer(Message("r", b"1", 0, retain=True), None)
+    values.room = 1
+    outbox.flush()
+    assert (values.sent, results.sent) == (["a0"], ["r0"])
+    results.up = False
+    outbox.flush()
+    results.up, results.room = True, 1
+    outbox.flush()
+    assert results.sent == ["r0"]
+    assert not outbox.busy
 
 
 def test_a_broker_that_takes_less_than_there_is_comes_back_to_the_present() -> None:
     """Else what changes while the past is told would be put behind it for ever."""
     link = Link()
     link.up = False
-    outbox, topics = Outbox(link, 10_000), [Counter(name) for name in "abc"]
+    outbox, topics = Outbox(link, link, 10_000), [Counter(name) for name in "abc"]
     outbox.keeping = True
     outbox.mark_all(topics)
     link.up, link.room = True, 0
@@ -164,7 +188,7 @@ def test_a_broker_that_takes_less_than_there_is_comes_back_to_the_present() -> N
 def test_what_changes_after_it_was_shown_is_shown_again() -> None:
     """What is kept is sent without the retain flag: the broker would go on telling the value before."""
     link = Link()
-    outbox, a, b = Outbox(link, 10_000), Counter("a"), Counter("b")
+    outbox, a, b = Outbox(link, link, 10_000), Counter("a"), Counter("b")
     link.room = 1
     outbox.show([a, b])
     outbox.flush()
