@@ -165,7 +165,11 @@ class Session:
         self.link.drop(f"the primary host is not there ({host.topic})", politely=True)
 
     def close(self) -> None:
-        """Say that the node dies, and go."""
+        """Say that the node dies, and go.
+
+        With MQTT 5 its will says so, too: the specification demands both (5.5, intentional-disconnect-ndeath, and
+        6.4.25, ndeath-will-message-publisher-disconnect-mqtt50), and has hosts ignore the second, for its bdSeq.
+        """
         alive = self.link.up and self.node.alive
         if alive:
             self.link.send(self.node.death())

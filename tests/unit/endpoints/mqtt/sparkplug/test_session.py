@@ -119,6 +119,20 @@ def test_a_node_is_born_tells_what_changes_and_dies(segment: Segment, broker: Mo
         assert bd_seq(death) == bd_seq(birth)
 
 
+def test_a_polite_end_is_told_by_the_node_and_with_mqtt_5_by_its_will(segment: Segment, broker: Mosquitto) -> None:
+    """Both are demanded, and hosts ignore the second, which has the same bdSeq (Sparkplug 3.0.0, 5.5 and 6.4.25)."""
+    segment.writer("cell").publish(image(), cycle=1)
+    with hosting(broker.address) as host:
+        with node(segment, broker.address):
+            session = bd_seq(host.until("NBIRTH"))
+        deaths = []
+        with node(segment, broker.address):
+            while (heard := host.next()).kind != "NBIRTH":
+                if heard.kind == "NDEATH":
+                    deaths.append(bd_seq(heard))
+        assert deaths == [session, session]
+
+
 def test_a_source_that_is_bad_is_a_device_that_is_dead(segment: Segment, broker: Mosquitto) -> None:
     writer = segment.writer("cell")
     writer.publish(image(), cycle=1, quality=Quality.BAD, reason="cable out")
