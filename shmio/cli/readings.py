@@ -14,7 +14,7 @@ from shmio.layout.model import Register
 from shmio.layout.text import json_value, to_text
 from shmio.layout.topic import parse_topic
 from shmio.logs import printable
-from shmio.segment.frame import Quality
+from shmio.segment.frame import Provenance, Quality
 from shmio.segment.view import Reading
 
 SHOWN_CHARACTERS = 60
@@ -54,9 +54,10 @@ def as_json(reading: Reading, register: Register) -> dict[str, Any]:
 
 
 def as_line(path: str, reading: Reading, register: Register, width: int) -> str:
-    """A reading as a line for people; quality is said unless it is good."""
+    """A reading as a line for people; quality is said unless it is good, and that a value is injected."""
     quality = "" if reading.quality is Quality.GOOD else f"  {reading.quality}: {printable(reading.reason)}"
-    return f"{printable(path):<{width}}  {shown(reading.value, register)}{quality}"
+    injected = f"  ({reading.provenance})" if reading.provenance == str(Provenance.INJECTED) else ""
+    return f"{printable(path):<{width}}  {shown(reading.value, register)}{injected}{quality}"
 
 
 def shown(value: Value, register: Register) -> str:

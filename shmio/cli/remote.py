@@ -38,14 +38,22 @@ from shmio.segment.view import Reading
 def connected(options: argparse.Namespace) -> Iterator[Remote]:
     """The instance that the options name. ConfigError: they name none; OSError: a file cannot be read.
 
-    UnknownClientError: it wants a token; which option gives one.
+    ValueRangeError: the token would go to another host in plain text. UnknownClientError: it wants a token; which
+    option gives one.
     """
     if options.config is not None or options.instance is not None:
         raise ConfigError("--host names the instance already: leave out -c and --instance")
     if not options.host.startswith(UNIX):
         Address.parse(options.host)
     token = options.token_file.read_text().strip() if options.token_file else None
-    with connect(options.host, ca=options.ca, certificate=options.certificate, key=options.key, token=token) as client:
+    with connect(
+        options.host,
+        ca=options.ca,
+        certificate=options.certificate,
+        key=options.key,
+        token=token,
+        token_in_plain_text=options.token_in_plain_text,
+    ) as client:
         try:
             yield Remote(client)
         except UnknownClientError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -29,6 +30,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     def command() -> int:
         verb: Verb = arguments.verb
         if arguments.host is not None:
+            os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # what is wrong it tells us, too
             from shmio.cli.remote import connected  # noqa: PLC0415  gRPC only for those who ask for it
 
             with connected(arguments) as remote:
@@ -51,6 +53,7 @@ def _parser() -> argparse.ArgumentParser:
     common.add_argument("--certificate", type=Path, metavar="FILE", help="our own certificate (PEM), if it asks for it")
     common.add_argument("--key", type=Path, metavar="FILE", help="its key (PEM)")
     common.add_argument("--token-file", type=Path, metavar="FILE", help="what the endpoint knows us by")
+    common.add_argument("--token-in-plain-text", action="store_true", help="send it to another host without TLS, too")
     verbs = parser.add_subparsers(required=True, metavar="VERB")
     modules = {
         "list": registers,

@@ -74,14 +74,16 @@ def connect(
     certificate: _File = None,
     key: _File = None,
     token: str | None = None,
+    token_in_plain_text: bool = False,
     timeout_s: float = 10.0,
 ) -> Client:
     """A client of the endpoint at ``HOST:PORT`` or ``unix:PATH``; the first call connects.
 
     ``ca``: PEM file of the authority to trust, which means TLS; ``certificate``, ``key``: our own. ``token``: what the
-    endpoint knows us by. ``timeout_s``: of calls that are answered at once. OSError: a file cannot be read.
+    endpoint knows us by; it goes to other hosts by TLS, or with ``token_in_plain_text``. ``timeout_s``: of calls that
+    are answered at once. OSError: a file cannot be read. ValueRangeError: the token would go in plain text.
     """
-    return Client(Target(address, _path(ca), _path(certificate), _path(key), token), timeout_s)
+    return Client(Target(address, _path(ca), _path(certificate), _path(key), token, token_in_plain_text), timeout_s)
 
 
 def connect_aio(
@@ -91,10 +93,11 @@ def connect_aio(
     certificate: _File = None,
     key: _File = None,
     token: str | None = None,
+    token_in_plain_text: bool = False,
     timeout_s: float = 10.0,
 ) -> aio.Client:
     """The same for asyncio."""
-    return aio.Client(Target(address, _path(ca), _path(certificate), _path(key), token), timeout_s)
+    return aio.Client(Target(address, _path(ca), _path(certificate), _path(key), token, token_in_plain_text), timeout_s)
 
 
 def _path(file: _File) -> Path | None:

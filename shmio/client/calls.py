@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -50,6 +51,7 @@ class Target:
 
     ``address``: ``HOST:PORT``, or ``unix:PATH``. ``ca``: PEM file of the authority to trust, which means TLS;
     ``certificate``, ``key``: our own, where the endpoint asks for them. ``token``: what it knows us by.
+    ValueRangeError: the token would go to another host in plain text, and ``token_in_plain_text`` does not allow it.
     """
 
     address: str
@@ -57,6 +59,15 @@ class Target:
     certificate: Path | None = None
     key: Path | None = None
     token: str | None = None
+    token_in_plain_text: bool = False
+
+    def __post_init__(self) -> None:
+        if self.token is None or self.ca is not None or self.token_in_plain_text or _is_here(self.address):
+            return
+        raise ValueRangeError(
+            f"{self.address}: a token is not sent to another host in plain text, for all on the network to read: "
+            "name the CA of its certificate (ca, --ca), or allow it (token_in_plain_text, --token-in-plain-text)"
+        )
 
     @property
     def credentials(self) -> grpc.ChannelCredentials | None:
@@ -80,8 +91,15 @@ class Target:
             details = f"too much for one message: give or ask for fewer values at once ({details})"
         if kind := _ERRORS.get(code):
             return kind(details)
-        details = next((plain for words, plain in _PLAIN.items() if words in details), details)
         told = _REMOTE.get(code, RemoteError)
+        if tls := next((meaning for words, meaning in _TLS.items() if words in details), None):
+            return told(f"{self.address}: {tls}")
+        closed = "Socket closed" in details and not self.address.startswith(_UNIX)
+        details = next((plain for words, plain in _PLAIN.items() if words in details), details)
+        if closed and self.ca is None:
+            details += ", or it speaks TLS: then name the CA of its certificate (ca, --ca)"
+        elif closed and self.certificate is None:
+            details += ", or it wants a certificate of ours (certificate and key)"
         return told(f"{self.address}: {_MEANING.get(code, code.name)}{f': {details}' if details else ''}")
 
     def fail(self, error: Any) -> NoReturn:
@@ -101,6 +119,13 @@ _PLAIN: Final = {
     "Socket closed": "the endpoint has stopped",
 }
 """What gRPC says at length."""
+_TLS: Final = {
+    "Hostname Verification": "its certificate does not name this host: use a name or address that it has",
+    "WRONG_VERSION_NUMBER": "it speaks plain text: leave the CA out (ca, --ca)",
+    "CERTIFICATE_VERIFY_FAILED": "its certificate is not of the CA that was named (ca, --ca), or has run out",
+}
+"""The same of TLS."""
+_UNIX: Final = "unix:"
 _MEANING: Final = {
     grpc.StatusCode.UNAVAILABLE: "no instance serves there, or it has ended",
     grpc.StatusCode.DEADLINE_EXCEEDED: "it did not answer in time",
@@ -108,6 +133,14 @@ _MEANING: Final = {
     grpc.StatusCode.PERMISSION_DENIED: "it does not let us",
     grpc.StatusCode.UNIMPLEMENTED: "it does not serve shmio.v1, it is older than this client",
 }
+
+
+def _is_here(address: str) -> bool:
+    host = address.rpartition(":")[0].strip("[]")
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost" or address.startswith(_UNIX)
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,6 +28,8 @@ class Item(NamedTuple):
     """Which of the write's bits are for the device, if injections took others."""
     data: bytes | None = None
     """Its values, if injections have changed some."""
+    changed_by: str = ""
+    """The injection that has."""
 
     @property
     def write(self) -> Write:
@@ -89,9 +91,13 @@ def ends(
     lost = any(isinstance(outcome, Lost) for outcome in outcomes)
     told = [(write, outcome) for write, outcome in zip(writes, outcomes, strict=True) if outcome or lost]
     found = [_end(item.write, told, error) for item in items]
-    for place in superseded:  # what took its place was written, or it was not
-        if found[place][0] is EventKind.WRITTEN:
+    for place, item in enumerate(items):
+        if found[place][0] is not EventKind.WRITTEN:
+            continue
+        if place in superseded:  # what took its place was written
             found[place] = EventKind.WRITTEN, _SUPERSEDED
+        elif item.changed_by:
+            found[place] = EventKind.WRITTEN, f"with what the injection {item.changed_by!r} made of it"
     return found
 
 

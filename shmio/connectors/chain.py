@@ -125,7 +125,8 @@ def meet(
         if not met:
             left.append((Item(command, place), above))
         elif any(bits):
-            left.append((Item(command, place, bits, data), by or above))
+            changed_by = (by.name or str(by.id)) if by and data != write.data else ""
+            left.append((Item(command, place, bits, data, changed_by), by or above))
         else:
             taken.append(Item(command, place))
     return left, taken

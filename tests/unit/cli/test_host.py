@@ -108,7 +108,7 @@ def test_set_and_inject(segment: Segment, capsys: pytest.CaptureFixture[str]) ->
         status, out, _ = remote("inject", "--keep", "--name", "x", "cell/step", "9")
         assert status == 0
         number = out.partition(":")[0]
-        assert remote("get", "cell/step")[1] == "cell/step  9\n"
+        assert remote("get", "cell/step")[1] == "cell/step  9  (injected)\n"
         assert json.loads(remote("get", "--json", "cell/step")[1])["cell/step"]["provenance"] == "injected"
         assert remote("inject")[1] == local("inject")[1]
         assert remote("inject", "--lift", number)[0] == 0

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
+import grpc
 import numpy as np
 import pytest
+import trustme
 
 from shmio.client import Client, Column, Quality, connect, connect_aio
-from shmio.errors import EndpointError, PathError, QualityError, RemoteError, ValueRangeError
+from shmio.errors import EndpointError, LostError, PathError, QualityError, RemoteError, ValueRangeError
 from shmio.segment import Quality as FrameQuality
 from shmio.segment import Segment
 from tests.unit.endpoints.conftest import segment as segment  # noqa: PLC0414  the fixture
@@ -140,6 +144,50 @@ def test_more_than_a_message_holds_is_told_with_what_to_do(segment: Segment) -> 
 def test_nobody_there() -> None:
     with connect("127.0.0.1:1") as cell, pytest.raises(RemoteError, match=r"^127\.0\.0\.1:1: no instance serves there"):
         cell.read("cell")
+
+
+@pytest.mark.parametrize(
+    ("serves", "ca", "told"),
+    [
+        ("tls", None, "or it speaks TLS: then name the CA"),
+        ("mutual", "ca.pem", "or it wants a certificate of ours"),
+        ("plain", "ca.pem", "it speaks plain text: leave the CA out"),
+        ("tls", "other.pem", "its certificate is not of the CA that was named"),
+        ("of another", "ca.pem", "its certificate does not name this host"),
+    ],
+)
+def test_what_is_wrong_with_tls(tmp_path: Path, serves: str, ca: str | None, told: str) -> None:
+    authority = trustme.CA()
+    authority.cert_pem.write_to_path(tmp_path / "ca.pem")
+    trustme.CA().cert_pem.write_to_path(tmp_path / "other.pem")
+    own = authority.issue_cert("elsewhere.example" if serves == "of another" else "localhost")
+    known = [(own.private_key_pem.bytes(), own.cert_chain_pems[0].bytes())]
+    mutual = serves == "mutual"
+    server = grpc.server(ThreadPoolExecutor(1))
+    if serves == "plain":
+        port = server.add_insecure_port("localhost:0")
+    else:
+        asked = authority.cert_pem.bytes() if mutual else None
+        port = server.add_secure_port("localhost:0", grpc.ssl_server_credentials(known, asked, mutual))
+    server.start()
+    address = f"localhost:{port}"
+    try:
+        with (
+            connect(address, ca=ca and tmp_path / ca) as cell,
+            pytest.raises(LostError, match=rf"^{address}: .*{told}"),
+        ):
+            cell.status()
+    finally:
+        server.stop(None).wait()
+
+
+def test_a_token_goes_to_another_host_by_tls() -> None:
+    for connects in (connect, connect_aio):
+        with pytest.raises(ValueRangeError, match=r"^plant\.example:8089: a token is not sent to another host"):
+            connects("plant.example:8089", token="secret")
+    for address in ("127.0.0.2:8089", "[::1]:8089", "localhost:8089", "unix:/run/shmio.sock"):
+        connect(address, token="secret").close()
+    connect("plant.example:8089", token="secret", token_in_plain_text=True).close()
 
 
 def test_status(segment: Segment) -> None:

@@ -349,7 +349,9 @@ def test_what_is_written_reaches_the_device_altered(make: Callable[..., Rig]) ->
         (EventKind.ACCEPTED, number, b"\x2a", injection),
         (EventKind.ACCEPTED, number, b"\x07", 0),
         (EventKind.WRITTEN, number, b"", 0),
+        (EventKind.WRITTEN, number, b"", 0),
     ]
+    assert [event.text for event in events[-2:]] == ["with what the injection 'gain' made of it", ""]
     rig.poll()
     rig.write({"speed": 21})
     rig.poll()
