@@ -6,6 +6,7 @@ import gc
 import os
 import secrets
 import signal
+import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -128,6 +129,13 @@ def _named() -> Iterator[str]:
 def instance() -> Iterator[str]:
     """A name that no other instance has; whatever a failing test leaves of it is cleared."""
     yield from _named()
+
+
+@pytest.fixture
+def runtime() -> Iterator[Path]:
+    """A folder for ``XDG_RUNTIME_DIR``: a socket's path is at most 107 bytes long, and ``tmp_path`` may be longer."""
+    with tempfile.TemporaryDirectory(prefix="shmio-run-") as folder:
+        yield Path(folder)
 
 
 @pytest.fixture(scope="module")

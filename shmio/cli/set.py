@@ -127,7 +127,7 @@ def _literal(text: str, register: Register) -> Value:
     try:
         return parse_literal(text, register)
     except ValueRangeError as error:
-        if register.element.base in _QUOTED:
+        if register.element.base in _QUOTED and "'" not in text and '"' not in text:
             raise ValueRangeError(
                 f"{error}; put text in quotes, and these in quotes for the shell: '\"text\"'"
             ) from None

@@ -152,15 +152,13 @@ def test_of_two_that_take_over_one_wins(cell: Cell) -> None:
 
 
 def test_the_way_to_the_supervisor_is_found_when_its_socket_has_moved(
-    cell: Cell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cell: Cell, runtime: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kill_supervisor(cell)
-    folder = tmp_path / "run"
-    folder.mkdir()
     with Segment.open(cell.instance) as segment:
         old = segment.header.control
     assert os.path.lexists(old)
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(folder))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
     assert cell.supervisor("up", "--detach").returncode == 0
     monkeypatch.delenv("XDG_RUNTIME_DIR")
     assert not os.path.lexists(old)

@@ -7,9 +7,11 @@ sends them with QoS 0 is held back by nobody (MQTT 5.0, section 4.9): values wou
 from __future__ import annotations
 
 import selectors
+import time
 from collections.abc import Callable, Sequence
 
 from shmio.config import Mqtt
+from shmio.endpoints.mqtt.attempt import CONNECT_S
 from shmio.endpoints.mqtt.limits import FEW_IN_FLIGHT
 from shmio.endpoints.mqtt.link import Link
 from shmio.endpoints.mqtt.target import Dialling, Target
@@ -32,6 +34,8 @@ class Intake:
         self.link.close()
         self._filters = filters
         self._at: Target | None = None
+        self._until_s = 0.0
+        """When the broker must have answered to what was subscribed to."""
 
     @property
     def settled(self) -> bool:
@@ -55,10 +59,16 @@ class Intake:
         if self.link.came_up:
             self.link.came_up = False
             self.subscribe()
-        return rest_s
+        if not self.link.up or self.link.subscribed:
+            return rest_s
+        left_s = self._until_s - time.monotonic()
+        if left_s <= 0:  # values wait to hear of it
+            self.link.drop("it does not answer to SUBSCRIBE")
+        return max(0.0, min(rest_s, left_s))
 
     def subscribe(self) -> None:
         """Have commands sent for all that there is now."""
         if self.link.up:
             self.link.subscribe(self._filters())
             self.link.push()
+            self._until_s = time.monotonic() + CONNECT_S

@@ -16,6 +16,8 @@ BRIDGE: Final = "bridge"
 """The address of the UNIX socket's clients, which have none."""
 UNREAD: Final = Bound(8 << 20, 64 << 20)
 """That may wait for clients; for one it is several packets of the largest kind."""
+MAX_CONNECT_BYTES: Final = 5 * (2 + 65535) + 16
+"""Of a CONNECT: five fields (MQTT 3.1.1, section 3.1.3)."""
 MAX_FIELDS: Final = 4096
 """Of one packet: each topic that is subscribed to has three."""
 TOO_LARGE: Final = "client %s: a packet is too large, or of too many topics: its connection is ended; send smaller ones"
@@ -81,15 +83,23 @@ class Reader(StreamReaderAdapter):  # type: ignore[misc]  # the library's classe
 
 
 async def greeted(reader: StreamReader, writer: StreamWriter) -> bytes | None:
-    """What a client begins with; None: it speaks a version that the library takes for garbage, and was told so."""
+    """A client's CONNECT; None: it speaks a version that the library takes for garbage, and was told so.
+
+    OSError: it is too large. What is no CONNECT is returned as it begins: the library refuses it.
+    """
     head = await reader.readexactly(2)
     while head[-1] & 0x80 and len(head) < 5:  # a length of several bytes
         head += await reader.readexactly(1)
+    left = sum((byte & 0x7F) << 7 * place for place, byte in enumerate(head[1:])) - 7
     head += await reader.readexactly(7)
-    if head[0] == _CONNECT and head[-5:-1] == b"MQTT" and head[-1] == 5:
+    if head[0] != _CONNECT or left < 0:
+        return head
+    if head[-5:-1] == b"MQTT" and head[-1] == 5:
         writer.write(_UNSUPPORTED)
         return None
-    return head
+    if left > MAX_CONNECT_BYTES:
+        raise OSError("too large a CONNECT")
+    return head + await reader.readexactly(left)
 
 
 class Writer(StreamWriterAdapter):  # type: ignore[misc]

@@ -158,6 +158,7 @@ def test_a_value_is_json_or_a_literal(path: str, text: str, value: object) -> No
         ("wait", "2147483648", r"out of range -2147483648\.\.2147483647"),
         ("name", "hello", "put text in quotes, and these in quotes for the shell"),
         ("name", "5", "put text in quotes"),
+        ("name", f"'{'x' * 60}'", r"60 characters do not fit\Z"),
         ("wait", "T#1x", "expected a literal"),
         ("row", "[1,2]", "expected all of the array's 3 elements, found 2"),
         ("row", "[1,2,3,4]", "expected all of the array's 3 elements, found 4"),

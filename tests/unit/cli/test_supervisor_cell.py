@@ -36,11 +36,10 @@ def free_port() -> int:
 class Cell:
     """The example in a folder of its own, with an instance name and ports of its own."""
 
-    def __init__(self, folder: Path, instance: str) -> None:
+    def __init__(self, folder: Path, instance: str, runtime: Path) -> None:
         self.folder = folder
         self.instance = instance
-        runtime = folder / "run"
-        runtime.mkdir()
+        self.runtime = runtime
         self.environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_RUNTIME_DIR": str(runtime)}
         self.run("init", status=0)
         file = folder / "supervisor.toml"
@@ -78,8 +77,8 @@ class Cell:
 
 
 @pytest.fixture
-def cell(tmp_path: Path, instance: str) -> Iterator[Cell]:
-    cell = Cell(tmp_path, instance)
+def cell(tmp_path: Path, instance: str, runtime: Path) -> Iterator[Cell]:
+    cell = Cell(tmp_path, instance, runtime)
     yield cell
     if instance in instances():  # a test has failed
         cell.run("down", status=0)
@@ -132,7 +131,7 @@ def test_a_day_in_the_life_of_the_cell(cell: Cell) -> None:
     down = cell.run("down", status=0).stdout
     assert down.splitlines()[-1] == f"{cell.instance} is stopped"
     assert cell.instance not in instances()
-    assert not list((cell.folder / "run" / "shmio").iterdir())
+    assert not list((cell.runtime / "shmio").iterdir())
     assert json.loads(cell.run("status", "--json", status=1).stdout)["state"] == "stopped"
 
 
@@ -158,7 +157,7 @@ def test_what_a_killed_supervisor_left_is_taken_over_or_cleared(cell: Cell) -> N
     for process in processes:
         assert f"stopped {process['name']}, pid {process['pid']}, which had lost its supervisor\n" in lines
     assert cell.instance not in instances()
-    assert not list((cell.folder / "run" / "shmio").iterdir())
+    assert not list((cell.runtime / "shmio").iterdir())
 
 
 def test_a_block_without_a_number_is_played_and_read(cell: Cell) -> None:

@@ -12,10 +12,8 @@ from tests.unit.supervisor.harness import CELL, Job, Launch, Launched
 
 
 @pytest.fixture
-def launch(instance: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Launch]:
+def launch(instance: str, tmp_path: Path, runtime: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Launch]:
     """Start an instance of the jobs given, under the limits given."""
-    runtime = tmp_path / "run"
-    runtime.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
     launched: list[Launched] = []
 

@@ -19,7 +19,7 @@ from shmio.supervisor.plan import Job
 from tests.unit.supervisor.harness import CELL, DEADLINE_S, HERE, ROOT, Launch, until
 
 
-def test_processes_start_in_order_and_stop_in_reverse(launch: Launch, tmp_path: Path) -> None:
+def test_processes_start_in_order_and_stop_in_reverse(launch: Launch, tmp_path: Path, runtime: Path) -> None:
     cell = launch([("grpc", "grpc", ["good"]), ("cell", "source", ["good"]), ("plc", "emulator", ["good"])])
     cell.wait_state("running")
     assert re.findall(r"(\w+) running pid=", cell.log()) == ["plc", "cell", "grpc"]
@@ -27,7 +27,7 @@ def test_processes_start_in_order_and_stop_in_reverse(launch: Launch, tmp_path: 
     assert cell.stop() == 0
     assert (tmp_path / "ends").read_text().split() == ["grpc", "cell", "plc"]
     assert cell.instance not in instances()
-    assert not list((tmp_path / "run" / "shmio").iterdir())
+    assert not list((runtime / "shmio").iterdir())
     assert cell.errors() == ""
 
 
@@ -319,10 +319,10 @@ def test_a_stop_during_the_start_stops_what_has_started(launch: Launch) -> None:
     assert cell.instance not in instances()
 
 
-def test_the_segment_tells_who_supervises(launch: Launch) -> None:
+def test_the_segment_tells_who_supervises(launch: Launch, runtime: Path) -> None:
     cell = launch()
     cell.wait_state("running")
     with Segment.open(cell.instance) as segment:
         assert segment.supervised
         assert segment.supervisor[0] == cell.process.pid
-        assert segment.header.control == str(cell.folder / "run" / "shmio" / f"{cell.instance}.sock")
+        assert segment.header.control == str(runtime / "shmio" / f"{cell.instance}.sock")

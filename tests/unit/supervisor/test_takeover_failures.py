@@ -7,13 +7,13 @@ from pathlib import Path
 from tests.unit.supervisor.harness import CELL, Job, Launch
 
 
-def test_no_place_for_the_control_socket(launch: Launch) -> None:
+def test_no_place_for_the_control_socket(launch: Launch, runtime: Path) -> None:
     cell = launch()
     cell.wait_state("running")
     before = cell.pids()
     cell.process.kill()
     cell.wait_end()
-    socket = cell.folder / "run" / "shmio" / f"{cell.instance}.sock"
+    socket = runtime / "shmio" / f"{cell.instance}.sock"
     socket.unlink()
     socket.touch()
     failing = launch()

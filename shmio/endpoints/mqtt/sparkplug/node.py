@@ -61,8 +61,9 @@ class EdgeNode:
         self._group, self._node, self._datatypes = group, node, datatypes
         self._now_ms = now_ms
         self._sequence = 0
-        # Not from 0 after each restart: a late will of the process before must not be taken for this one's.
-        self._session = now_ms() // 1000 % _SEQUENCE
+        # Not from 0 after each restart: a late will of the process before must not be taken for this one's. In
+        # tenths of a second, which no series of attempts to connect overtakes.
+        self._session = now_ms() // 100 % _SEQUENCE
         self.alive = False
         """Whether it was born in this session, and has not died."""
         self._born: set[str] = set()

@@ -103,10 +103,11 @@ def bridged(segment: Segment) -> Iterator[Running]:
 class Raw:
     """A client that sends what it likes; MQTT 3.1.1."""
 
-    def __init__(self, address: Address, name: str, *, clean: bool = True) -> None:
+    def __init__(self, address: Address, name: str, *, clean: bool = True, account: tuple[str, ...] = ()) -> None:
         self._socket = socket.create_connection((address.host, address.port), TIMEOUT_S)
         self._numbers = 0
-        self.send(0x10, b"\0\4MQTT\4" + bytes([2 * clean]) + b"\0\0" + _text(name))
+        flags = 2 * clean | (0xC0 if account else 0)
+        self.send(0x10, b"\0\4MQTT\4" + bytes([flags]) + b"\0\0" + b"".join(map(_text, (name, *account))))
         kind, told = self.packet()
         assert kind == 0x20
         self.before, self.code = bool(told[0]), told[1]

@@ -19,6 +19,7 @@ from tests.unit.endpoints.harness import image
 from tests.unit.endpoints.mqtt.harness import PREFIX, TIMEOUT_S, bridge, listening
 from tests.unit.endpoints.plant import Plant
 
+CONNACK = b"\x20\x03\0\0\0"
 FLOOD = 20_000
 FRAMES = 20
 IN_FLIGHT = 5
@@ -46,10 +47,11 @@ def flood(address: Address, qos: int) -> None:
 
 
 class Narrow:
-    """A broker that has room for one client, and acknowledges nothing."""
+    """A broker that has room for one client, and acknowledges nothing. ``lets_in``: others, too."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, lets_in: bool = False) -> None:
         self.heard = b""
+        self._lets_in = lets_in
         self._server = socket.create_server(("127.0.0.1", 0))
         self.address = Address("127.0.0.1", self._server.getsockname()[1])
         self._threads = [threading.Thread(target=self._serve)]
@@ -61,7 +63,7 @@ class Narrow:
         self._threads[1].start()
         with one:
             one.recv(1000)
-            one.sendall(b"\x20\x03\0\0\0")
+            one.sendall(CONNACK)
             while data := one.recv(1 << 16):
                 self.heard += data
 
@@ -71,6 +73,10 @@ class Narrow:
             another, _ = self._server.accept()
             with another:
                 data = another.recv(1000)
+                if data and self._lets_in:
+                    another.sendall(CONNACK)
+                    while another.recv(1000):
+                        pass
 
     def close(self) -> None:
         with socket.create_connection((self.address.host, self.address.port)):
@@ -115,6 +121,18 @@ def test_values_come_though_the_broker_takes_no_second_connection(segment: Segme
         running.until(lambda: f"{PREFIX}/cell/secret/out".encode() in broker.heard)
         assert broker.heard.index(b"online") < broker.heard.index(b"cell/step/out")
         assert running.bridge.problem.startswith("commands: broker")
+    broker.close()
+
+
+def test_values_come_though_the_broker_never_answers_to_subscribe(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shmio.endpoints.mqtt.intake.CONNECT_S", 0.1)
+    segment.writer("cell").publish(image(step=1), cycle=1)
+    broker = Narrow(lets_in=True)
+    with bridge(segment, broker.address) as running:
+        running.until(lambda: f"{PREFIX}/cell/secret/out".encode() in broker.heard)
+        running.until(lambda: "it does not answer to SUBSCRIBE" in running.bridge.problem)
     broker.close()
 
 

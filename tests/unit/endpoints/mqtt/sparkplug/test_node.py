@@ -87,6 +87,12 @@ def test_a_session_has_a_will_of_its_number_and_a_birth_first() -> None:
     assert bd_seq(edge.death()) == (bd_seq(first) + 1) % 256
 
 
+def test_a_process_that_is_restarted_soon_has_a_session_of_its_own() -> None:
+    first = EdgeNode("plant", "a50", lambda: NOW_MS)
+    second = EdgeNode("plant", "a50", lambda: NOW_MS + 250)
+    assert bd_seq(first.will()) != bd_seq(second.will())
+
+
 def test_numbers_go_on_through_all_devices_and_begin_anew_at_a_birth() -> None:
     edge = node()
     edge.will()
