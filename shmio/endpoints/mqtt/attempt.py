@@ -18,7 +18,7 @@ from paho.mqtt.properties import Properties
 from shmio.config.accounts import read_password
 from shmio.config.mqtttls import client_context
 from shmio.endpoints.mqtt.channel import Message
-from shmio.endpoints.mqtt.failure import why
+from shmio.endpoints.mqtt.failure import ended, why
 from shmio.endpoints.mqtt.target import Dialling
 from shmio.errors import ConfigError
 
@@ -139,7 +139,7 @@ class Attempt:
         self.offered = True
         self.socket = cast("socket.socket | None", client.socket())
         if self.socket is None:
-            self.problem = f"broker {target}: it closes the connection at once"
+            self.problem = f"broker {target}: {ended(client.tls_error, up=False, tls=settings.tls is not None)}"
 
     def _close(self) -> None:
         if self.client is not None:
