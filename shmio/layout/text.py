@@ -66,12 +66,16 @@ def _text(element: ElementType, value: Value) -> str:
 
 
 def _real_text(value: Any) -> str:
-    return repr(float(str(np.float32(value)))) if math.isfinite(value) else _non_finite_text(value)
+    return repr(_shortest_real(value)) if math.isfinite(value) else _non_finite_text(value)
 
 
 def shortest(value: float, element: ElementType) -> float:
     """Return the float of fewest digits that is the same value in a REAL; of an LREAL, the value itself."""
-    return float(str(np.float32(value))) if element.base == "REAL" and math.isfinite(value) else value
+    return _shortest_real(value) if element.base == "REAL" and math.isfinite(value) else value
+
+
+def _shortest_real(value: float) -> float:
+    return float(str(np.float32(value)))
 
 
 def from_text(text: str, register: Register) -> Value:

@@ -92,7 +92,7 @@ class Hub(Broker):  # type: ignore[misc]  # the library's classes have no types
         name = session.client_id
         if self._sessions.get(name, (None, None))[1] is not handler:  # another connection has it
             return
-        if session.transitions.state == "connected":  # the library forgets who was not let in, or broke a rule
+        if session.transitions.state == "connected":  # the library forgets who broke a rule
             await self._stop_handler(handler)
             session.transitions.disconnect()
         if session.clean_session:
