@@ -12,7 +12,7 @@ from shmio.connectors.replay.player import GOES_ON, OVER, STOPPED
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.segment import EventKind, Quality, Record, Segment, replays
 from shmio.segment.attach import Attachment, attach
-from shmio.segment.playhead import Found, Move
+from shmio.segment.playhead import Found, Move, Playhead
 from tests.unit.connectors.replay.harness import (
     BEGIN_NS,
     MS,
@@ -271,19 +271,24 @@ def test_a_replay_that_stands_is_good_again_when_its_process_is(tmp_path: Path, 
             assert counts(cell.frames()) == [15], "it was told once"
 
 
+def held_up(segment: Segment, for_ns: int) -> tuple[Playhead, int]:
+    """Have it play since so long, and stand from now on: its next process finds both, and answers to the number."""
+    head = segment.blocks["cell"].playhead
+    assert head is not None
+    play, now_ns = head.read(), segment.clock.present_ns()
+    assert play is not None
+    head.write(play._replace(paused=False, anchor_ns=now_ns - for_ns))
+    with head.held():
+        return head, head.ask(Move(now_ns, paused=True))
+
+
 def test_a_request_of_the_next_round_waits_until_this_one_is_played(tmp_path: Path, instance: str) -> None:
     """A source that was held up shows what is at the place where it is to stand, and nothing twice before."""
     file = record(tmp_path, instance)
     with built(instance, stepped=False) as segment, attach(instance, writable=True) as attachment:
         with Playing(segment, file, loop=True, paused=True):
             attachment.replay.seek(0.3)
-        head = segment.blocks["cell"].playhead
-        assert head is not None
-        play, now_ns = head.read(), segment.clock.present_ns()
-        assert play is not None
-        head.write(play._replace(paused=False, anchor_ns=now_ns - 200 * MS))
-        with head.held():
-            head.ask(Move(now_ns, paused=True))
+        held_up(segment, 200 * MS)
         with Playing(segment, file) as cell:
             assert counts([cell.next() for _ in range(10)]) == [16, 17, 18, 19, 0, 1, 2, 3, 4, 5]
             [status] = attachment.replay.seek(0.2)
@@ -309,13 +314,7 @@ def test_what_was_due_before_a_request_is_seen_before_its_answer(tmp_path: Path,
     with built(instance, stepped=False) as segment, attach(instance, writable=True) as attachment:
         with Playing(segment, file, paused=True):
             attachment.replay.seek(0.1)
-        head = segment.blocks["cell"].playhead
-        assert head is not None
-        play, now_ns = head.read(), segment.clock.present_ns()
-        assert play is not None
-        head.write(play._replace(paused=False, anchor_ns=now_ns - 6 * S))
-        with head.held():
-            number = head.ask(Move(now_ns, paused=True))
+        head, number = held_up(segment, 6 * S)
         with Playing(segment, file) as cell:
             cell.until(lambda: head.found(number) is not None)
             assert counts(cell.frames()) == list(range(6, 306))

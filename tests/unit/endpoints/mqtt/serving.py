@@ -11,21 +11,30 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
+
 from shmio.config import Address, Mqtt
 from shmio.endpoints.mqtt import broker
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
+from shmio.testing.ports import reserved_port
 from tests.unit.endpoints.harness import LAYOUT, STALE_NS, WRITABLE, image
 from tests.unit.endpoints.mqtt.harness import PREFIX, TIMEOUT_S, Running
 
 
-@contextmanager
-def broker_segment(instance: str, folder: Path) -> Iterator[Segment]:
+@pytest.fixture
+def segment(instance: str, tmp_path: Path) -> Iterator[Segment]:
     block = BlockSpec("cell", LAYOUT, 20_000_000, STALE_NS, 1 << 20, Attributes("test", WRITABLE))
     processes = [ProcessSpec("cell", "source"), ProcessSpec("broker", "mqtt"), ProcessSpec("mqtt", "mqtt")]
-    with Segment.create(instance, [block], processes, control=str(folder / "a.sock")) as segment:
+    with Segment.create(instance, [block], processes, control=str(tmp_path / "a.sock")) as segment:
         segment.writer("cell").publish(image(step=7), cycle=1)
         yield segment
         segment.unlink()
+
+
+@pytest.fixture
+def address() -> Iterator[Address]:
+    with reserved_port() as address:
+        yield address
 
 
 class Process:

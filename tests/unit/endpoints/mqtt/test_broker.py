@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import socket
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,21 +17,10 @@ from shmio.endpoints.mqtt import mosquitto
 from shmio.endpoints.mqtt.place import folder
 from shmio.errors import ConfigError, EndpointError
 from shmio.segment import Segment
-from shmio.testing.ports import reserved_port
 from tests.unit.endpoints.mqtt.harness import PREFIX, bridge, listening
-from tests.unit.endpoints.mqtt.serving import bridged, broker_segment, serving
-
-
-@pytest.fixture
-def segment(instance: str, tmp_path: Path) -> Iterator[Segment]:
-    with broker_segment(instance, tmp_path) as segment:
-        yield segment
-
-
-@pytest.fixture
-def address() -> Iterator[Address]:
-    with reserved_port() as address:
-        yield address
+from tests.unit.endpoints.mqtt.serving import address as address  # noqa: PLC0414  the fixture
+from tests.unit.endpoints.mqtt.serving import bridged, serving
+from tests.unit.endpoints.mqtt.serving import segment as segment  # noqa: PLC0414  the fixture
 
 
 def test_clients_see_what_the_bridge_publishes(segment: Segment, address: Address, program: str) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import socket
 import threading
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,23 +17,12 @@ from shmio.endpoints.mqtt.hub import FILTER_BYTES, Hub
 from shmio.endpoints.mqtt.shares import EXCHANGE_BYTES, MESSAGE_BYTES, TASK_BYTES, UNHANDLED_BYTES, Bound, Waiting
 from shmio.endpoints.mqtt.streams import MAX_FIELDS
 from shmio.segment import Segment
-from shmio.testing.ports import reserved_port
 from tests.unit.endpoints.mqtt.harness import PREFIX, TIMEOUT_S, Listener, listening
-from tests.unit.endpoints.mqtt.serving import Raw, bridged, broker_segment, serving
+from tests.unit.endpoints.mqtt.serving import Raw, bridged, serving
+from tests.unit.endpoints.mqtt.serving import address as address  # noqa: PLC0414  the fixture
+from tests.unit.endpoints.mqtt.serving import segment as segment  # noqa: PLC0414  the fixture
 
 MODULE = "shmio.endpoints.mqtt.hub"
-
-
-@pytest.fixture
-def segment(instance: str, tmp_path: Path) -> Iterator[Segment]:
-    with broker_segment(instance, tmp_path) as segment:
-        yield segment
-
-
-@pytest.fixture
-def address() -> Iterator[Address]:
-    with reserved_port() as address:
-        yield address
 
 
 @pytest.fixture(autouse=True)
