@@ -53,6 +53,7 @@ class Source(Section):
     period_ms: Annotated[float, Meta(ge=0.1, le=3_600_000)] = 20.0
     stale_ms: Milliseconds | None = None
     writable: list[Text] = []
+    allow_nonfinite: tuple[Text, ...] = ()
     armed: bool = False
     realtime_priority: RealtimePriority | None = None
     options: dict[str, Any] = {}

@@ -26,6 +26,8 @@ from shmio.recording.selection import Selection
 from shmio.supervisor.plan import Plan, make_plan
 
 EMULATOR_KINDS = ("s7",)
+NONFINITE = ("REAL", "LREAL")
+"""The types whose values may be NaN or infinite."""
 
 
 @dataclass(frozen=True)
@@ -154,12 +156,15 @@ def _odd(config: Config, layouts: dict[str, Layout]) -> list[str]:
         key, layout = f"source[{index}]", layouts[source.name]
         if source.connector == "remote" and config.grpc is None:
             odd.append(f"{key}.connector: no model can connect to {source.name}, for there is no [grpc] section")
-        for pattern in source.writable:
-            try:
-                if not _covers(pattern, layout):
-                    odd.append(f"{key}.writable: {pattern!r} names nothing in {layout.name}{_near(pattern, layout)}")
-            except PathError as error:
-                raise ConfigError(f"{key}.writable: {error}") from None
+        for name, patterns in (("writable", source.writable), ("allow_nonfinite", source.allow_nonfinite)):
+            for pattern in patterns:
+                try:
+                    if not _covers(pattern, layout):
+                        odd.append(f"{key}.{name}: {pattern!r} names nothing in {layout.name}{_near(pattern, layout)}")
+                    elif name == "allow_nonfinite" and not _covers(pattern, layout, NONFINITE):
+                        odd.append(f"{key}.{name}: {pattern!r} names no REAL or LREAL in {layout.name}")
+                except PathError as error:
+                    raise ConfigError(f"{key}.{name}: {error}") from None
         number = source.options.get("dbNumber")
         if number is not None and layout.number is not None and number != layout.number:
             odd.append(f"{key}.dbNumber: {number}, but the layout is that of DB{layout.number}")
@@ -232,10 +237,12 @@ def _unread(emulated: dict[str, tuple[Layout, ...]]) -> Iterator[str]:
             yield f"emulator {name!r}: {text}"
 
 
-def _covers(pattern: str, layout: Layout) -> bool:
-    """Whether a pattern names a register, what is above one, or an element."""
+def _covers(pattern: str, layout: Layout, types: Sequence[str] = ()) -> bool:
+    """Whether a pattern names a register, what is above one, or an element; of one of these types, if any are given."""
     glob = Glob(pattern)
     for register in layout.registers:
+        if types and register.type not in types:
+            continue
         if glob.matches(register.path):
             return True
         if register.dims and glob.matches(layout.element(register, tuple(low for low, _ in register.dims)).path):
@@ -243,7 +250,7 @@ def _covers(pattern: str, layout: Layout) -> bool:
     if "*" in pattern:
         return False
     try:
-        find(layout, pattern)
+        found = find(layout, pattern)
     except PathError:
         return False
-    return True
+    return not types or found.type in types

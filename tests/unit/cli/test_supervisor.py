@@ -342,6 +342,9 @@ def test_faults_of_a_layout_have_their_place(example: Edit, capsys: pytest.Captu
 
 
 WRITABLE = '"Outputs"', '"{}"', "source[0].writable: '{}' names nothing in "
+NONFINITE = "period_ms = 20", 'period_ms = 20\nallow_nonfinite = ["{}"]'
+UNKNOWN_NAME = *NONFINITE, "source[0].allow_nonfinite: '{}' names nothing in "
+OTHER_TYPE = *NONFINITE, "source[0].allow_nonfinite: '{}' names no REAL or LREAL in DB201"
 RECORDED = (
     'directory = "dumps"',
     'directory = "dumps"\nregisters = ["{}"]',
@@ -357,6 +360,11 @@ RECORDED = (
         (WRITABLE, "Outputs/5", False),
         (WRITABLE, "Inputs/*", False),
         (WRITABLE, "Robot_800", False),
+        (UNKNOWN_NAME, "Robot_80/Axs1_Pos", True),
+        (OTHER_TYPE, "Outputs", True),
+        (OTHER_TYPE, "Inputs/5", True),
+        (OTHER_TYPE, "Robot_800/Axs1_Pos", False),
+        (OTHER_TYPE, "**", False),
         (RECORDED, "cell/Robot_9/**", True),
         (RECORDED, "cel/Inputs", True),
         (RECORDED, "cell/Robot_*/Axs1_Pos", False),
