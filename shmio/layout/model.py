@@ -26,6 +26,7 @@ MAX_STANDARD_BYTES = 65_536  # what an S7-1500 allows a block with standard acce
 MAX_BLOCK_BYTES = 1 << 20  # any block: optimized ones, and those of other sources
 MAX_REGISTERS = 100_000
 MAX_ELEMENTS = 1 << 20  # of all registers together
+MAX_STRUCTURES = 200_000  # of a block; they count even when they hold no register
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 from shmio.layout import system
 from shmio.layout.constants import BoundFault, Constants
-from shmio.layout.model import MAX_BLOCK_BYTES, MAX_DEPTH, MAX_ELEMENTS, MAX_REGISTERS, Dims, array_size
+from shmio.layout.model import MAX_BLOCK_BYTES, MAX_DEPTH, MAX_ELEMENTS, MAX_REGISTERS, MAX_STRUCTURES, Dims, array_size
 from shmio.layout.placed import Cost, Field, Group, Leaf, Repeat, extent_of, round_up
 from shmio.layout.report import Report
 from shmio.layout.syntax import Array, Bounds, Member, Named, Position, Section, Struct, Type, TypeDeclaration
@@ -36,7 +36,7 @@ class Placer:
         self._global = self._constants = constants
         self._report = report
         self._placed: dict[str, Group | None] = {}
-        self._open: list[str] = []
+        self._open: dict[str, str] = {}  # the types that are being placed, by key: their names
 
     def block(self, struct: Struct, constants: Constants) -> Group | None:
         """Place the body of a block that has constants of its own."""
@@ -97,7 +97,8 @@ class Placer:
             return element
         key = name.name.lower()
         if key in self._open:
-            chain = " → ".join([*self._open[self._open.index(key) :], key])
+            keys = [*self._open]
+            chain = " → ".join([*keys[keys.index(key) :], key])
             self._refuse(name.position, f"the type {name.name!r} contains itself: {chain}")
             return None
         if key not in self._placed:
@@ -116,9 +117,9 @@ class Placer:
         if not declaration.body.members:  # a function block that keeps nothing
             return Group({}, 0, Cost(), 0)
         outside, self._constants = self._constants, Constants(declaration.constants, self._global)
-        self._open.append(key)
+        self._open[key] = declaration.name
         group = self.struct(declaration.body, max(depth, 1))
-        self._open.pop()
+        del self._open[key]
         self._constants = outside
         return group
 
@@ -173,11 +174,13 @@ class Placer:
             ("bytes", size, MAX_BLOCK_BYTES),
             ("registers", cost.registers, MAX_REGISTERS),
             ("elements of arrays", cost.elements, MAX_ELEMENTS),
+            ("structures", cost.structures, MAX_STRUCTURES),
             ("characters of names, comments and values", cost.text, MAX_TEXT),
             ("levels of structures", height, MAX_DEPTH),
         ):
             if value > limit:
-                self._refuse(position, f"expected at most {limit} {what}; up to this member there are {value}")
+                where = f" in the type {[*self._open.values()][-1]!r}" if self._open else ""
+                self._refuse(position, f"expected at most {limit} {what}{where}; up to this member there are {value}")
                 return False
         return True
 

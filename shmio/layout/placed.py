@@ -26,11 +26,12 @@ class Leaf:
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """What an expansion needs: registers, their elements, and the characters of their texts."""
+    """What an expansion needs: registers, their elements, the characters of their texts, and structures."""
 
     registers: int = 0
     elements: int = 0
     text: int = 0
+    structures: int = 0
 
     def plus(self, inner: Cost, times: int, text_each: int) -> Cost:
         """Return the cost with ``times`` the inner one added, each register with so many characters more."""
@@ -38,6 +39,7 @@ class Cost:
             self.registers + times * inner.registers,
             self.elements + times * inner.elements,
             self.text + times * (inner.text + inner.registers * text_each),
+            self.structures + times * inner.structures,
         )
 
 
@@ -88,10 +90,10 @@ def extent_of(placed: Leaf | Group | Repeat) -> Extent:
             return Extent(round_up(placed.size, 2), 2, cost, 0)
         return Extent(placed.size, placed.element.align, cost, 0)
     if isinstance(placed, Group):
-        return Extent(placed.size, 2, placed.cost, placed.height)
+        return Extent(placed.size, 2, Cost(structures=1).plus(placed.cost, 1, 0), placed.height)
     group, count = placed.group, math.prod(high - low + 1 for low, high in placed.dims)
     index_text = sum(1 + max(len(str(low)), len(str(high))) for low, high in placed.dims)
-    cost = Cost(elements=count).plus(group.cost, count, index_text)  # a group may be empty, and its array endless
+    cost = Cost(elements=count, structures=count).plus(group.cost, count, index_text)
     return Extent(count * group.size, 2, cost, group.height)
 
 

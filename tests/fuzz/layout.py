@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import itertools
+import math
 import resource
 import signal
 import sys
@@ -60,13 +62,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the script; return 0 when nothing was found."""
     parser = argparse.ArgumentParser(prog="fuzz-layout", description="Fuzz the layout compiler and codec.")
     parser.add_argument("inputs", nargs="*", type=Path, metavar="INPUT", help="repeat these findings and nothing else")
-    parser.add_argument("--seconds", type=float, default=20.0, help="how long (20)")
-    parser.add_argument("--count", type=int, default=sys.maxsize, help="at most so many inputs")
+    parser.add_argument("--seconds", type=float, help="at most how long (20; with --count: as long as that takes)")
+    parser.add_argument("--count", type=int, help="so many inputs, unless --seconds end it before")
     parser.add_argument("--seed", type=int, default=int(time.time()), help="of the inputs (the time)")
     parser.add_argument("--cpu-s", type=float, default=20.0, help="processor time that one input may take (20)")
     parser.add_argument("--memory-mb", type=int, default=2048, help="address space of the process (2048; 0: no limit)")
     parser.add_argument("--guided", action="store_true", help="by atheris (the extra 'fuzz'), which watches coverage")
     options = parser.parse_args(arguments)
+    if options.seconds is None:
+        options.seconds = 20.0 if options.count is None else math.inf
     if options.guided:
         return guide(options)
     if options.memory_mb:
@@ -79,12 +83,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     started, count, slowest_s = time.monotonic(), 0, 0.0
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with suppress(KeyboardInterrupt):  # Ctrl-C ends it early
-        for data in Mutator(options.seed):
+        for data in itertools.islice(Mutator(options.seed), options.count):
             before = time.process_time()
             run(data)
             slowest_s = max(slowest_s, time.process_time() - before)
             count += 1
-            if count >= options.count or time.monotonic() - started >= options.seconds:
+            if time.monotonic() - started >= options.seconds:
                 break
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
     seed = options.seed
@@ -105,8 +109,9 @@ def guide(options: argparse.Namespace) -> int:
         dictionary = Path(corpus) / "dictionary.txt"
         words = ("".join(f"\\x{byte:02x}" for byte in fragment.encode()) for fragment in FRAGMENTS)
         dictionary.write_text("".join(f'"{word}"\n' for word in words))
-        limits = [f"-max_total_time={int(options.seconds)}", f"-rss_limit_mb={options.memory_mb}"]
-        limits += [f"-runs={options.count}"] if options.count < sys.maxsize else []
+        limits = [f"-rss_limit_mb={options.memory_mb}"]
+        limits += [f"-max_total_time={int(options.seconds)}"] if options.seconds < math.inf else []
+        limits += [f"-runs={options.count}"] if options.count is not None else []
         limits += [f"-max_len={MAX_INPUT}", f"-dict={dictionary}", f"-seed={options.seed}", corpus]
         atheris.Setup(["fuzz-layout", *limits], guarded(check, options.cpu_s))
         atheris.Fuzz()

@@ -125,7 +125,10 @@ class Mutator:
         self._seeds = seeds()
 
     def __iter__(self) -> Iterator[bytes]:
-        ways = (self._values, self._values, self._declarations, self._declarations, self._fragments, self._golden)
+        ways = (
+            *(self._values, self._values, self._declarations, self._declarations, self._fragments, self._golden),
+            *(self._nested, self._blocks),
+        )
         while True:
             data = self._random.choice(ways)()
             if self._random.random() < 0.4:
@@ -165,6 +168,36 @@ class Mutator:
             if rng.random() < 0.6
         )
         return f'\0{KNOWN}FUNCTION_BLOCK "f" {sections} END_FUNCTION_BLOCK DATA_BLOCK "b" "f" {begin}'.encode()
+
+    def _nested(self) -> bytes:
+        """Types that use the next one several times over, as deep as they may be; the last is often empty."""
+        rng = self._random
+        count = rng.randrange(1, 34)
+        text = ""
+        for index in range(count):
+            inner = f'"t{index + 1}"'
+            kinds = rng.choices(
+                (inner, inner, inner, f"Array[1..{rng.choice((0, 1, 2, 9, 999))}] of {inner}", "Int"), k=3
+            )
+            members = "".join(f"{name} : {kind};\n" for name, kind in zip("abc", kinds, strict=True))
+            text += f'TYPE "t{index}" STRUCT {members} END_STRUCT; END_TYPE\n'
+        last = rng.choice(("", "VAR_TEMP i : Bool; END_VAR", "VAR_INPUT v : Variant; END_VAR", "VAR i : Bool; END_VAR"))
+        if rng.random() < 0.2:
+            text += f'TYPE "t{count}" STRUCT END_STRUCT; END_TYPE '
+        else:
+            text += f'FUNCTION_BLOCK "t{count}" {last} BEGIN END_FUNCTION_BLOCK '
+        given = rng.choice(("", "", " := (1)", " := ((), (()))"))
+        first = rng.randrange(count + 1)
+        return f'\0{text}DATA_BLOCK "b" STRUCT a : "t{first}"{given}; END_STRUCT; BEGIN END_DATA_BLOCK'.encode()
+
+    def _blocks(self) -> bytes:
+        """Many blocks of one large type."""
+        rng = self._random
+        count, length = rng.choice(((1, 2000), (3, 250), (30, 60), (120, 1)))
+        text = f'TYPE "t" STRUCT s : Array[1..{length}] of Struct a : Byte; b : "e"; END_STRUCT; END_STRUCT; END_TYPE\n'
+        text += 'FUNCTION_BLOCK "e" BEGIN END_FUNCTION_BLOCK\n'
+        text += "".join(f'DATA_BLOCK DB{number} "t" BEGIN END_DATA_BLOCK\n' for number in range(1, count + 1))
+        return b"\0" + text.encode()
 
     def _fragments(self) -> bytes:
         """Fragments in any order, in a frame that often makes them sensible."""

@@ -164,6 +164,34 @@ def test_endless_arrays_of_nothing_end_in_an_error() -> None:
     assert "expected at most 1048576 elements of arrays" in message
 
 
+def nested(count: int, last: str) -> str:
+    """Types of three members each, all of the next type; the last one is given."""
+    return "".join(
+        f'TYPE "t{i}" STRUCT\n a, b : "t{i + 1}";\n c : "t{i + 1}";\nEND_STRUCT; END_TYPE\n' for i in range(count)
+    ) + last.format(f"t{count}")
+
+
+@pytest.mark.parametrize(
+    "last",
+    [
+        'FUNCTION_BLOCK "{}" VAR_TEMP i : Bool; END_VAR BEGIN END_FUNCTION_BLOCK\n',
+        'TYPE "{}" STRUCT END_STRUCT; END_TYPE\n',
+        'FUNCTION_BLOCK "{}" VAR_INPUT v : Variant; END_VAR BEGIN END_FUNCTION_BLOCK\n',
+    ],
+)
+def test_structures_count_though_they_hold_nothing(last: str) -> None:
+    message = error(nested(29, last) + block('a : "t0";'))
+    assert message.startswith("0.scl:75:")
+    assert "expected at most 200000 structures in the type 't18'; up to this member there are 265719" in message
+
+
+def test_empty_structures_beside_registers_are_left_out() -> None:
+    members = 'a : "t0"; b : Array[0..99] of Int; c : Array[0..999] of Struct x : "t0"; y : Int; END_STRUCT;'
+    layout = layout_of(nested(4, 'FUNCTION_BLOCK "{}" BEGIN END_FUNCTION_BLOCK\n') + block(members))
+    assert layout.size == 200 + 2000
+    assert places(layout)["c/999/y"] == 2198
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
