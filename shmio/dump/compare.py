@@ -11,9 +11,11 @@ from shmio.dump.blocks import DumpBlock
 from shmio.dump.differences import Difference, RegisterDifference, Side, SourceDifference
 from shmio.dump.dump import Dump
 from shmio.dump.entries import Entry
+from shmio.dump.joining import EVENT_FIELDS, Pair, aligned, at_once, joined, one_by_one
 from shmio.errors import PathError
 from shmio.layout.codec import Value, codec
-from shmio.layout.model import Register
+from shmio.layout.model import Layout, Register
+from shmio.layout.write import elements
 from shmio.segment import Event, EventKind, Frame, Provenance
 from shmio.segment.playhead import OWN_WORDS
 from shmio.segment.scan import ChangeScan
@@ -21,7 +23,6 @@ from shmio.segment.scan import ChangeScan
 IGNORABLE: Final = ("times", "cycle", "reason", "events", "ends")
 """``ends``: what one of the two has before the first frame or event of both, or after the last."""
 _OF_PROCESSES: Final = frozenset({EventKind.STARTED, EventKind.STOPPED})
-_EVENT_FIELDS: Final = ("kind", "quality", "text", "offset", "size", "mask", "data")
 
 T = TypeVar("T", Frame, Event)
 _Chosen = tuple[Mapping[DumpBlock, Sequence[Register]], Mapping[DumpBlock, Sequence[Register]]]
@@ -79,68 +80,63 @@ class _Source:
         self._progress = progress
         self._found = SourceDifference(name)
         self._pairs: dict[tuple[DumpBlock, DumpBlock], _Registers] = {}
+        self._common = _Common()
 
     def compare(self) -> SourceDifference:
         found = self._found
-        frames = [_frames(dump, self._name) for dump in self._dumps]
-        self._join(found.frames, frames[0], frames[1], self._frame_key(), self._frames)
+        frames = [one_by_one(_frames(dump, self._name), self._frame_key) for dump in self._dumps]
+        self._compare(found.frames, joined(frames[0], frames[1], zip), self._frames)
         if "events" not in self._how.ignore:
-            events = [_events(dump, self._name) for dump in self._dumps]
-            self._join(found.events, events[0], events[1], None, self._events)
+            events = [at_once(_events(dump, self._name), self._event_key) for dump in self._dumps]
+            self._compare(found.events, joined(events[0], events[1], aligned), self._events)
         found.missing = sorted({path for pair in self._pairs.values() for path in pair.missing})
         return found
 
-    def _frame_key(self) -> Callable[[Frame], int] | None:
+    def _frame_key(self, entry: Entry[Frame]) -> int:
         if "cycle" not in self._how.ignore:
-            return lambda frame: frame.cycle
+            return entry.item.cycle
+        return 0 if "times" in self._how.ignore else entry.item.source_ns
+
+    def _event_key(self, entry: Entry[Event]) -> int:
+        if "cycle" not in self._how.ignore:
+            return entry.item.cycle
         if "times" not in self._how.ignore:
-            return lambda frame: frame.source_ns
-        return None
+            return entry.item.utc_ns
+        return entry.item.frame - (entry.block.after.get("frames", 0) if entry.block else 0)
 
-    def _join(
-        self,
-        side: Side,
-        first: Iterator[Entry[T]],
-        second: Iterator[Entry[T]],
-        key: Callable[[T], int] | None,
-        differs: Callable[[Entry[T], Entry[T]], list[str]],
+    def _compare(
+        self, side: Side, pairs: Iterator[Pair[T]], differs: Callable[[Entry[T], Entry[T]], list[str]]
     ) -> None:
-        one, other = next(first, None), next(second, None)
-        waiting: list[tuple[Entry[T] | None, Entry[T] | None]] = []
-        counts = [0, 0]
-        """What one of the two alone has since both had the same: an end, if nothing of both follows."""
+        since, inside = _Alone(), _Alone()
         begun = False
-        while one is not None or other is not None:
-            order = 0
+        for one, other in pairs:
             if one is None or other is None:
-                order = 1 if one is None else -1
-            elif key is not None:
-                order = (key(one.item) > key(other.item)) - (key(one.item) < key(other.item))
-            if order:
-                alone = (one, None) if order < 0 else (None, other)
-                counts[order > 0] += 1
-                waiting = waiting or [alone]
-            if order == 0 and one is not None and other is not None:
-                self._alone(side, waiting, counts, end=not begun)
-                waiting, counts, begun = [], [0, 0], True
-                side.compared += 1
-                if what := differs(one, other):
-                    side.differing += 1
-                    self._first(side, one, other, what)
-                self._progress(one.time_ns)
-            one = next(first, None) if order <= 0 else one
-            other = next(second, None) if order >= 0 else other
-        self._alone(side, waiting, counts, end=True)
+                since.add(one, other)
+                if self._common.has(one, other):
+                    inside.add(one, other)
+                continue
+            self._alone(side, since if begun else self._of_end(since, inside))
+            since, inside, begun = _Alone(), _Alone(), True
+            side.compared += 1
+            if what := differs(one, other):
+                side.differing += 1
+                self._first(side, one, other, what)
+            self._common.add(one, other)
+            self._progress(one.time_ns)
+        self._alone(side, self._of_end(since, inside))
 
-    def _alone(self, side: Side, waiting: list[Any], counts: list[int], *, end: bool) -> None:
-        if not waiting or (end and "ends" in self._how.ignore):
-            return
-        side.only_first += counts[0]
-        side.only_second += counts[1]
-        one, other = waiting[0]
-        self._first(side, one, other, ["only in the first" if other is None else "only in the second"])
+    def _of_end(self, since: _Alone, inside: _Alone) -> _Alone:
+        """What counts of that which stands before or behind all that both have: events are inside if frames are."""
+        return inside if "ends" in self._how.ignore else since
 
-    def _first(self, side: Side, one: Entry[T] | None, other: Entry[T] | None, what: list[str]) -> None:
+    def _alone(self, side: Side, alone: _Alone) -> None:
+        if alone.first is not None:
+            side.only_first += alone.counts[0]
+            side.only_second += alone.counts[1]
+            one, other = alone.first
+            self._first(side, one, other, ["only in the first" if other is None else "only in the second"])
+
+    def _first(self, side: Side, one: Entry[Any] | None, other: Entry[Any] | None, what: list[str]) -> None:
         if side.first is None:
             side.first = Difference(
                 (one and one.time_ns, other and other.time_ns),
@@ -163,7 +159,7 @@ class _Source:
         registers = self._registers(one.block, other.block)
         if registers is not None:
             for path, values in registers.differing(a, b):
-                what.append(f"{path}: {values[0]} and {values[1]}")
+                what.append(f"{path}: {values[0]} -> {values[1]}")
                 self._register(path, (one.time_ns, other.time_ns), values)
         return what
 
@@ -177,7 +173,7 @@ class _Source:
 
     def _field(self, name: str, one: object, other: object) -> str:
         self._found.fields[name] = self._found.fields.get(name, 0) + 1
-        return f"{name}: {one!s} and {other!s}"
+        return f"{name}: {one!s} -> {other!s}"
 
     def _register(self, path: str, times_ns: tuple[int, int], values: tuple[Value, Value]) -> None:
         found = self._found.registers.get(path)
@@ -191,10 +187,45 @@ class _Source:
 
     def _events(self, one: Entry[Event], other: Entry[Event]) -> list[str]:
         return [
-            f"{name}: {getattr(one.item, name)!s} and {getattr(other.item, name)!s}"
-            for name in _EVENT_FIELDS
+            f"{name}: {getattr(one.item, name)!s} -> {getattr(other.item, name)!s}"
+            for name in EVENT_FIELDS
             if getattr(one.item, name) != getattr(other.item, name)
         ]
+
+
+class _Alone:
+    """What one of the two alone has, since both had the same."""
+
+    def __init__(self) -> None:
+        self.counts = [0, 0]
+        self.first: tuple[Entry[Any] | None, Entry[Any] | None] | None = None
+
+    def add(self, one: Entry[Any] | None, other: Entry[Any] | None) -> None:
+        self.counts[one is None] += 1
+        self.first = self.first or (one, other)
+
+
+class _Common:
+    """The time, in each of the two, from the first to the last that both have."""
+
+    def __init__(self) -> None:
+        self._times: tuple[tuple[int, int], tuple[int, int]] | None = None
+
+    def add(self, one: Entry[Any], other: Entry[Any]) -> None:
+        first, last = self._times or (((one.time_ns, other.time_ns),) * 2)
+        self._times = (
+            (min(first[0], one.time_ns), min(first[1], other.time_ns)),
+            (max(last[0], one.time_ns), max(last[1], other.time_ns)),
+        )
+
+    def has(self, one: Entry[Any] | None, other: Entry[Any] | None) -> bool:
+        """Whether what only one of them has lies within."""
+        if self._times is None:
+            return False
+        first, last = self._times
+        return all(
+            entry is None or first[place] <= entry.time_ns <= last[place] for place, entry in enumerate((one, other))
+        )
 
 
 class _Registers:
@@ -207,19 +238,14 @@ class _Registers:
         )
         both = [path for path in ones if path in others and _kind(ones[path]) == _kind(others[path])]
         self.missing = sorted((ones.keys() | others.keys()) - set(both))
-        self._how = how
-        self._tolerant = how.tolerance > 0 or how.relative > 0
-        self._paths = both
-        orders = first.layout.byte_order, second.layout.byte_order
-        self._codecs = [(codec(ones[path], orders[0]), codec(others[path], orders[1])) for path in both]
-        self._real = [ones[path].element.base in ("REAL", "LREAL") for path in both]
-        alike = first.layout.size == second.layout.size and orders[0] == orders[1]
-        self._scan = None
-        if alike and all(ones[path].offset == others[path].offset for path in both):
-            self._scan = ChangeScan([ones[path] for path in both])
+        self._layouts = first.layout, second.layout
+        alike = first.layout.size == second.layout.size and first.layout.byte_order == second.layout.byte_order
+        alike = alike and all(ones[path].offset == others[path].offset for path in both)
+        self._all = _Places([(ones[path], others[path]) for path in both], self._layouts, how, alike=alike)
+        self._of_array: dict[str, _Places] = {}
 
     def differing(self, one: Frame, other: Frame) -> Iterator[tuple[str, tuple[Value, Value]]]:
-        """Paths and values; of what was delivered, if that alone differs."""
+        """Paths and values, of an array its elements; of what was delivered, if that alone differs."""
         seen = set()
         for path, values in self._images(one.image, other.image):
             seen.add(path)
@@ -230,17 +256,60 @@ class _Registers:
                     yield path, values
 
     def _images(self, one: bytes, other: bytes) -> Iterator[tuple[str, tuple[Value, Value]]]:
+        for pair, values in self._all.differing(one, other):
+            if not pair[0].dims:
+                yield pair[0].path, values
+                continue
+            for element, (a, b) in self._elements(pair).differing(one, other):
+                yield element[0].path, (a, b)
+
+    def _elements(self, pair: tuple[Register, Register]) -> _Places:
+        path = pair[0].path
+        if path not in self._of_array:
+            both = (elements(layout, register) for layout, register in zip(self._layouts, pair, strict=True))
+            self._of_array[path] = self._all.like(list(zip(*both, strict=True)))
+        return self._of_array[path]
+
+
+class _Places:
+    """Registers, or elements of one, where each of two layouts has them."""
+
+    def __init__(
+        self,
+        pairs: Sequence[tuple[Register, Register]],
+        layouts: tuple[Layout, Layout],
+        how: Comparison,
+        *,
+        alike: bool,
+    ) -> None:
+        """``alike``: both layouts have them at the same places, so that bytes can be compared."""
+        self._pairs = pairs
+        self._how = how
+        self._layouts = layouts
+        self._tolerant = how.tolerance > 0 or how.relative > 0
+        self._codecs = [
+            (codec(one, layouts[0].byte_order), codec(other, layouts[1].byte_order)) for one, other in pairs
+        ]
+        self._scan = ChangeScan([one for one, _ in pairs]) if alike else None
+
+    def like(self, pairs: Sequence[tuple[Register, Register]]) -> _Places:
+        """Others of the same layouts."""
+        return _Places(pairs, self._layouts, self._how, alike=self._scan is not None)
+
+    def differing(self, one: bytes, other: bytes) -> Iterator[tuple[tuple[Register, Register], tuple[Value, Value]]]:
+        """Those whose values in two images are not the same."""
         if self._scan is not None and one == other:
             return
-        places = range(len(self._paths)) if self._scan is None else self._scan.changed(one, other)
+        places = range(len(self._pairs)) if self._scan is None else self._scan.changed(one, other)
         for place in places:
             codec_of_one, codec_of_other = self._codecs[place]
             values = codec_of_one.decode(one), codec_of_other.decode(other)
             if self._scan is None and values[0] == values[1]:
                 continue
-            if self._real[place] and (self._scan is None or self._tolerant) and _alike(*values, self._how):
+            real = self._pairs[place][0].element.base in ("REAL", "LREAL")
+            if real and (self._scan is None or self._tolerant) and _alike(*values, self._how):
                 continue
-            yield self._paths[place], values
+            yield self._pairs[place], values
 
 
 def _alike(one: Value, other: Value, how: Comparison) -> bool:

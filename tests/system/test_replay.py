@@ -168,9 +168,12 @@ def test_the_recording_of_a_replay_is_the_recording_and_its_streams_are_the_cell
         until(lambda: over(attached), "the end", PATIENCE_S + playing.length_s)
     replayed.close()
     second = dump(cell, first)
-    found = cell.run("shmio-dump", "diff", "--ignore", "events", "--json", str(first), str(second))
-    assert found.returncode == 0, found.stdout
+    found = cell.run("shmio-dump", "diff", "--json", str(first), str(second))
     [told] = json.loads(found.stdout)["sources"]
+    events = told["events"]
+    assert (events["differing"], events["only_first"], events["only_second"]) == (0, 0, 2), "what the replay refused"
+    assert found.returncode == 1
+    assert (told["frames"]["differing"], told["frames"]["only_first"], told["frames"]["only_second"]) == (0, 0, 0)
     assert told["frames"]["compared"] >= FRAMES
     assert told["timing_ms"]["max"] == 0, "each at its time, to the ns"
     same_events(cell, first, second)

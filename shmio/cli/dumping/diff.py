@@ -17,7 +17,7 @@ from shmio.layout.codec import Value
 from shmio.logs import printable
 
 MAX_SHOWN = 50
-"""Registers, and things of the first difference, that are printed; with --json all."""
+"""Registers and elements, and things of the first difference, that are printed; with --json all."""
 
 
 def execute(arguments: argparse.Namespace) -> int:
@@ -50,14 +50,16 @@ def _lines(found: SourceDifference) -> Iterator[str]:
         if side.first is not None:
             yield f"  first difference: {name} {_where(side.first)}"
             yield from (f"    {text}" for text in side.first.what[:MAX_SHOWN])
+            if len(side.first.what) > MAX_SHOWN:
+                yield f"    and {len(side.first.what) - MAX_SHOWN} more"
     for name, count in found.fields.items():
         yield f"  {name} differs in {count} frames"
     for path, register in list(found.registers.items())[:MAX_SHOWN]:
         most = f", by at most {register.largest:.6g}" if register.largest else ""
-        values = f"{register.values[0]} and {register.values[1]}"
+        values = f"{register.values[0]} -> {register.values[1]}"
         yield f"  {path} differs in {register.count} frames{most}, first at {local(register.first[0])}: {values}"
     if len(found.registers) > MAX_SHOWN:
-        yield f"  and {len(found.registers) - MAX_SHOWN} registers more"
+        yield f"  and {len(found.registers) - MAX_SHOWN} more"
     if found.missing:
         yield f"  only one has, or in another type: {', '.join(found.missing[:MAX_SHOWN])}"
 

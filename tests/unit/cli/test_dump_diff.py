@@ -98,12 +98,12 @@ def test_values_quality_and_times(diff: Diff) -> None:
     frames = found["frames"]
     assert (frames["compared"], frames["differing"], frames["only_first"], frames["only_second"]) == (50, 5, 0, 0)
     assert frames["first"]["numbers"] == [20, 20]
-    assert frames["first"]["what"] == ["speed: 5.0 and 5.5"]
+    assert frames["first"]["what"] == ["speed: 5.0 -> 5.5"]
     assert found["fields"] == {"quality": 1, "reason": 1, "source time": 1}
     assert {path: (r["count"], r["largest"]) for path, r in found["registers"].items()} == {
         "speed": (3, 11.25),
         "count": (2, 45),
-        "row": (2, 0.0),
+        "row/3": (2, 45),
     }
     assert diff("--ignore", "times,reason")[1]["fields"] == {"quality": 1}
     assert diff("--only", "cell/on")[1]["registers"] == {}
@@ -120,7 +120,7 @@ def test_the_tolerance_is_for_floating_point_alone(diff: Diff) -> None:
         return number == 9
 
     counting("b.mem", change)
-    assert set(diff("--tolerance", "5")[1]["registers"]) == {"count", "row"}
+    assert set(diff("--tolerance", "5")[1]["registers"]) == {"count", "row/3"}
 
 
 def test_frames_that_one_does_not_have(diff: Diff) -> None:
@@ -158,8 +158,76 @@ def test_events(diff: Diff) -> None:
             work.frame(1, image(1))
             work.event(1, 1, text)
     status, found = diff()
-    assert (status, found["events"]["first"]["what"]) == (1, ["text: one and other"])
+    assert (status, found["events"]["first"]["what"]) == (1, ["text: one -> other"])
     assert diff("--ignore", "events")[0] == 0
+
+
+def telling(file: str, told: list[tuple[int, str]], first: int = 1, last: int = 40) -> None:
+    """Frames, and events behind some of them."""
+    with build(Path(file), first=first) as work:
+        work.block("cell")
+        for number in range(first, last + 1):
+            work.frame(number, image(number))
+            for text in (text for at, text in told if at == number):
+                work.event(work.events["cell"] + 1, number, text)
+
+
+def test_recordings_of_one_run_that_did_not_begin_at_once_have_the_same_events(diff: Diff) -> None:
+    told = [(2, "early"), (10, "one"), (10, "two"), (20, "three")]
+    telling("a.mem", told)
+    telling("b.mem", told, first=5)
+    assert diff("--ignore", "ends")[0] == 0
+    status, found = diff()
+    events = found["events"]
+    assert (status, events["compared"], events["differing"], events["only_first"]) == (1, 3, 0, 1)
+
+
+def test_an_event_more_is_one_event_more(diff: Diff) -> None:
+    telling("a.mem", [(at, f"event {at}") for at in range(1, 40)])
+    more = [(at, f"event {at}") for at in range(1, 40)]
+    telling("b.mem", [*more[:9], (10, "another"), *more[9:]])
+    for ignored in ([], ["--ignore", "cycle"], ["--ignore", "cycle,times"]):
+        events = diff(*ignored)[1]["events"]
+        counts = tuple(events[name] for name in ("compared", "differing", "only_first", "only_second"))
+        assert counts == (39, 0, 0, 1), ignored
+        assert events["first"]["numbers"] == [None, 10]
+
+
+def test_events_of_one_cycle_are_told_apart_by_what_they_say(diff: Diff) -> None:
+    telling("a.mem", [(5, "one"), (5, "two")])
+    telling("b.mem", [(5, "two"), (5, "one")])
+    assert diff()[0] == 0
+    telling("b.mem", [(5, "two"), (5, "three")])
+    events = diff()[1]["events"]
+    assert (events["compared"], events["differing"], events["first"]["what"]) == (2, 1, ["text: one -> three"])
+
+
+def test_ends_are_what_lies_outside_of_both(diff: Diff) -> None:
+    """An event that only one has while both were recording is no end, though no other event is there."""
+    telling("a.mem", [(3, "before b"), (20, "within both")], last=30)
+    telling("b.mem", [(35, "behind a")], first=10)
+    status, found = diff("--ignore", "ends")
+    events = found["events"]
+    assert (status, events["only_first"], events["only_second"]) == (1, 1, 0)
+    assert events["first"]["numbers"] == [2, None]
+    assert found["frames"] | {"first": None} == {
+        "compared": 21, "differing": 0, "only_first": 0, "only_second": 0, "first": None,
+    }  # fmt: skip
+
+
+def test_elements_that_differ_are_named(capsys: pytest.CaptureFixture[str]) -> None:
+    counting("a.mem")
+
+    def change(work: Build, number: int) -> bool:
+        if number == 7:
+            work.frame(7, image(9, 7 / 4))
+        return number == 7
+
+    counting("b.mem", change)
+    assert main(["diff", "a.mem", "b.mem"]) == 1
+    out = capsys.readouterr().out
+    assert "    row/3: 7 -> 9" in out.splitlines()
+    assert "[1, 2" not in out
 
 
 def test_layouts_that_differ(diff: Diff) -> None:
