@@ -11,7 +11,7 @@ from pathlib import Path
 
 from shmio import __version__
 from shmio.cli.interrupt import undone_by_signals
-from shmio.cli.run import run
+from shmio.cli.run import add_full, run
 
 PROGRAM = "shmio-dump"
 IGNORABLE = ("times", "cycle", "reason", "events", "ends")
@@ -127,6 +127,7 @@ def _parser() -> argparse.ArgumentParser:
     cat.add_argument("file", type=Path, metavar="FILE")
     cat.add_argument("patterns", nargs="*", metavar="PATH", help="register, element, structure or glob (default: all)")
     _times(cat)
+    add_full(cat)
     forms = cat.add_mutually_exclusive_group()
     for form, text in (("json", "print a JSON object a line"), ("csv", "print CSV")):
         forms.add_argument(f"--{form}", dest="form", action="store_const", const=form, default="table", help=text)

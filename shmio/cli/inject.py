@@ -12,8 +12,8 @@ import msgspec
 from shmio.cli.campaign import run_campaign
 from shmio.cli.cell import Cell
 from shmio.cli.interrupt import told_to_stop
-from shmio.cli.run import dumps
-from shmio.cli.set import Pairs, read_value, seconds
+from shmio.cli.run import dumps, seconds
+from shmio.cli.set import Pairs, read_value
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.codec import Value
 from shmio.layout.topic import Topic, look_up, parse_topic

@@ -48,7 +48,8 @@ class Local:
         return self.attachment.block(source).layout
 
     def readings(self, patterns: Sequence[str], chosen: Sequence[Selected]) -> list[Reading]:  # noqa: ARG002
-        """The chosen registers as of now; those of one source from one frame."""
+        """The chosen registers as of now; those of one source from one frame. NotRunningError: it has stopped."""
+        self._check_running()
         blocks = {source: self.attachment.block(source) for source in {one.source for one in chosen}}
         frames = {source: block.latest() for source, block in blocks.items()}
         return [reading(blocks[one.source], one.register, frames[one.source]) for one in chosen]

@@ -10,14 +10,15 @@ from shmio.cli.cell import Cell, Selected
 from shmio.errors import PathError
 from shmio.layout.codec import Value
 from shmio.layout.glob import named
+from shmio.layout.literal import literal_text
 from shmio.layout.model import Register
-from shmio.layout.text import json_value, to_text
+from shmio.layout.text import json_value
 from shmio.layout.topic import parse_topic
 from shmio.logs import printable
 from shmio.segment.frame import Provenance, Quality
 from shmio.segment.view import Reading
 
-SHOWN_CHARACTERS = 60
+CUT = "… (all: --full)"
 
 
 def choose(cell: Cell, patterns: Sequence[str]) -> list[Selected]:
@@ -53,17 +54,20 @@ def as_json(reading: Reading, register: Register) -> dict[str, Any]:
     }
 
 
-def as_line(path: str, reading: Reading, register: Register, width: int) -> str:
+def as_line(path: str, reading: Reading, register: Register, width: int, room: int | None) -> str:
     """A reading as a line for people; quality is said unless it is good, and that a value is injected."""
     quality = "" if reading.quality is Quality.GOOD else f"  {reading.quality}: {printable(reading.reason)}"
     injected = f"  ({reading.provenance})" if reading.provenance == str(Provenance.INJECTED) else ""
-    return f"{printable(path):<{width}}  {shown(reading.value, register)}{injected}{quality}"
+    return f"{printable(path):<{width}}  {shown(reading.value, register, room)}{injected}{quality}"
 
 
-def shown(value: Value, register: Register) -> str:
-    """A value for people: no more than ``SHOWN_CHARACTERS`` of it; ``-`` if there is none, ``""`` if it is empty."""
-    text = "-" if value is None else printable(to_text(value, register)) or '""'
-    return text if len(text) <= SHOWN_CHARACTERS else text[: SHOWN_CHARACTERS - 1] + "…"
+def shown(value: Value, register: Register, room: int | None) -> str:
+    """A value for people; ``-`` if there is none, ``""`` if it is empty.
+
+    With ``room`` for so many characters: no more of it than that, and how to see all.
+    """
+    text = "-" if value is None else printable(literal_text(value, register)) or '""'
+    return text if room is None or len(text) <= room else f"{text[: max(room - len(CUT), 0)]}{CUT}"
 
 
 def _iso(seconds: float) -> str:

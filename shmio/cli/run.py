@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import io
 import json
+import math
 import os
 import sys
 from collections.abc import Callable
@@ -13,6 +14,10 @@ from typing import Any, TextIO
 
 from shmio.errors import ShmioError
 from shmio.logs import printable
+
+MAX_SECONDS = 86_400
+SHOWN_CHARACTERS = 60
+"""Of a value, on a terminal."""
 
 
 def run(program: str, command: Callable[[], int | None]) -> int:
@@ -63,6 +68,27 @@ def at_least(least: int) -> Callable[[str], int]:
         return int(text)
 
     return convert
+
+
+def seconds(text: str) -> float:
+    """An argument's type: a time in s."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0 < seconds <= MAX_SECONDS:
+        raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a number of seconds above 0, at most {MAX_SECONDS}")
+    return seconds
+
+
+def add_full(parser: argparse.ArgumentParser) -> None:
+    """Add ``--full``."""
+    parser.add_argument("--full", action="store_true", help="long arrays and texts whole, on a terminal, too")
+
+
+def room(options: argparse.Namespace) -> int | None:
+    """For how many characters of a value there is room; None, for all: who is no terminal gets it whole."""
+    return None if options.full or not sys.stdout.isatty() else SHOWN_CHARACTERS
 
 
 def dumps(value: Any, indent: int | None = None) -> str:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import re
 import shlex
 from collections.abc import Sequence
 
 from shmio.cli.cell import Cell, Selected
-from shmio.cli.run import dumps
+from shmio.cli.run import dumps, seconds
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.codec import Value
 from shmio.layout.glob import select
@@ -24,7 +23,6 @@ from shmio.segment import EventKind
 from shmio.segment.commander import MIN_PERIODS, TIMEOUT_S, Outcome
 
 HELP = "Write values of registers, and print what became of each."
-MAX_TIMEOUT_S = 86_400
 MATCHES = 3
 """So many of a pattern's registers are named to who meant one of them."""
 
@@ -34,7 +32,9 @@ _QUOTED = frozenset({"CHAR", "WCHAR", "STRING", "WSTRING"})
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the verb's own arguments."""
-    parser.epilog = "VALUE is JSON or an S7 literal: 5, -1.5e-3, true, 16#FF, T#1s, '\"text\"'."
+    parser.epilog = (
+        "VALUE is JSON or an S7 literal: 5, -1.5e-3, true, 16#FF, T#1s500ms, TOD#12:00:00, D#2026-11-22, '\"text\"'."
+    )
     parser.add_argument(
         "--timeout",
         type=seconds,
@@ -172,16 +172,3 @@ def _complaint(path: str, outcome: Outcome) -> str:
     if outcome.kind == EventKind.EXPIRED:
         return f"{path}: not written: {outcome.text}; try again, or with a longer --timeout"
     return f"{path}: {outcome.text}; look with shmio get {shlex.quote(path)} before writing it again"
-
-
-def seconds(text: str) -> float:
-    """An argument's type: a time in s."""
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = math.nan
-    if not 0 < seconds <= MAX_TIMEOUT_S:
-        raise argparse.ArgumentTypeError(
-            f"{text.strip()!r} is not a number of seconds above 0, at most {MAX_TIMEOUT_S}"
-        )
-    return seconds

@@ -1,35 +1,103 @@
-"""``shmio watch``: values as they change."""
+"""``shmio watch``: values as they change, or again and again."""
 
 from __future__ import annotations
 
 import argparse
+import os
+import shutil
+import sys
+import time
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 
-from shmio.cli.cell import Cell
-from shmio.cli.readings import as_json, as_line
-from shmio.cli.run import at_least, dumps
+from shmio.cli.cell import Cell, News
+from shmio.cli.readings import as_json, as_line, choose
+from shmio.cli.run import add_full, at_least, dumps, room, seconds
+from shmio.errors import NotRunningError, PathError
 from shmio.segment import Quality
 from shmio.segment.view import Reading
 
-HELP = "Print the values of registers whenever they change, the present ones first."
+HELP = "Print the values of registers whenever they change, the present ones first; on a terminal a table of them."
+
+TABLE_EVERY_S = 0.2
+CLOCK_CHARACTERS = 12
 
 
 def arguments(parser: argparse.ArgumentParser) -> None:
     """Add the verb's own arguments."""
     parser.add_argument("patterns", nargs="+", metavar="PATH", help="path, array element, structure or glob")
+    parser.add_argument(
+        "--every", dest="every_s", type=seconds, metavar="SECONDS", help="all of them so often, changed or not"
+    )
+    parser.add_argument("--lines", action="store_true", help="on a terminal, too, a line for each change, no table")
     parser.add_argument("-n", dest="count", type=at_least(1), metavar="N", help="stop after N lines")
+    add_full(parser)
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
-    """Print a line for each change until interrupted, or until the instance ends."""
-    for printed, (what, now, width) in enumerate(cell.news(options.patterns), 1):
-        if options.json:
-            print(dumps({"path": what.path, **as_json(now, what.register)}), flush=True)
-        else:
-            print(f"{_clock(now)}  {as_line(what.path, now, what.register, width)}", flush=True)
+    """Print until interrupted, until the instance ends, or until there are so many lines."""
+    lines = options.json or options.lines or options.count is not None
+    if not lines and sys.stdout.isatty() and os.environ.get("TERM", "dumb") != "dumb":
+        return _table(cell, options)
+    if options.every_s is None:
+        news = cell.news(options.patterns)
+    else:
+        news = (one for read in _rounds(cell, options.patterns, options.every_s) for one in read)
+    for printed, one in enumerate(news, 1):
+        print(_object(one) if options.json else _line(one, room(options)), flush=True)
         if options.count is not None and printed >= options.count:
             break
     return 0
+
+
+def _table(cell: Cell, options: argparse.Namespace) -> int:
+    """A line for each register, brought up to date in place."""
+    drawn = 0
+    for read in _rounds(cell, options.patterns, options.every_s or TABLE_EVERY_S):
+        columns, rows = shutil.get_terminal_size()
+        limit = room(options)
+        if limit is not None:
+            limit = min(limit, columns - CLOCK_CHARACTERS - read[0].width - 4)
+        lines = [_line(one, limit) for one in read]
+        if options.full:
+            lines = [line[at : at + columns] for line in lines for at in range(0, len(line), columns)]
+        if len(lines) >= rows:
+            more = f"… and {len(lines) - rows + 2} more lines: a higher window, or --lines, shows them"
+            lines = [*lines[: max(rows - 2, 0)], more]
+        up = f"\x1b[{drawn}F" if drawn else ""
+        text = "".join(f"{line}\x1b[K\n" for line in lines)
+        sys.stdout.write(f"{up}\x1b[?7l{text}\x1b[J\x1b[?7h")  # what is too long for the window is cut by it
+        sys.stdout.flush()
+        drawn = len(lines)
+    return 0
+
+
+def _rounds(cell: Cell, patterns: Sequence[str], every_s: float) -> Iterator[list[News]]:
+    """All that the patterns name, at once and then every so many seconds.
+
+    PathError: they name nothing; NotRunningError: the instance has stopped, or a reload has taken them away.
+    """
+    chosen = choose(cell, patterns)
+    due_s = time.monotonic()
+    while True:
+        width = max(len(one.path) for one in chosen)
+        readings = cell.readings(patterns, chosen)
+        yield [News(one, now, width) for one, now in zip(chosen, readings, strict=True)]
+        due_s = max(due_s + every_s, time.monotonic())
+        time.sleep(max(due_s - time.monotonic(), 0))
+        try:
+            chosen = choose(cell, patterns)
+        except PathError as error:
+            raise NotRunningError(f"{error}: a reload has taken it away") from None
+
+
+def _object(news: News) -> str:
+    return dumps({"path": news.what.path, **as_json(news.now, news.what.register)})
+
+
+def _line(news: News, limit: int | None) -> str:
+    what, now, width = news
+    return f"{_clock(now)}  {as_line(what.path, now, what.register, width, limit)}"
 
 
 def _clock(now: Reading) -> str:
@@ -37,5 +105,5 @@ def _clock(now: Reading) -> str:
     if now.quality is Quality.BAD:
         return datetime.now(UTC).astimezone().strftime("%H:%M:%S.%f")[:-3]
     if now.source_time is None:
-        return "-" * 12
+        return "-" * CLOCK_CHARACTERS
     return datetime.fromtimestamp(now.source_time, UTC).astimezone().strftime("%H:%M:%S.%f")[:-3]

@@ -1,4 +1,4 @@
-"""S7 literals to values: initial values in a source, and what a user types.
+"""S7 literals to values: initial values in a source, and what a user types; times back to what a user reads.
 
 ``16#FF``, ``INT#-5``, ``1.5e3``, ``TRUE``, ``T#1h30m``, ``S5T#10s``, ``D#2024-02-29``, ``TOD#12:00:00``,
 ``DT#2024-02-29-12:00:00``, ``'text$N'``, ``WSTRING#'…'``, and arrays ``[1, 2, 5(0)]`` of any of these.
@@ -18,6 +18,7 @@ from shmio.layout.codec import Value, nest
 from shmio.layout.lists import split_array, split_items
 from shmio.layout.model import ByteOrder, Register
 from shmio.layout.scalar import Scalar, scalar_codec
+from shmio.layout.text import to_text
 from shmio.layout.types import INTEGERS, ElementType
 
 MAX_LITERAL = 100  # characters of anything but text
@@ -80,6 +81,18 @@ _DEFAULTS = {
     "POINTER": "00" * 6,
     "ANY": "00" * 10,
 }
+_WRITTEN = {
+    "TIME": "T",
+    "LTIME": "LT",
+    "S5TIME": "S5T",
+    "TIME_OF_DAY": "TOD",
+    "LTOD": "LTOD",
+    "DATE": "D",
+    "DATE_AND_TIME": "DT",
+    "LDT": "LDT",
+    "DTL": "DTL",
+}
+"""The prefix under which people read a value of these types."""
 
 
 def default_text(element: ElementType) -> str:
@@ -225,3 +238,45 @@ def _text(text: str, element: ElementType) -> str | None:
         return chr(int(match[3], 16))
 
     return _ESCAPE.sub(unescape, text[1:-1])
+
+
+# -- the way back --------------------------------------------------------------------------------------------
+
+
+def literal_text(value: Value, register: Register) -> str:
+    """Return a value as people read it: times and dates as S7 literals, all else as ``to_text`` has it.
+
+    ``T#1s500ms``, ``TOD#12:00:00``, ``D#2026-11-22``. ``parse_literal`` reads them back.
+    """
+    element = register.element
+    return _literal_text(value, element) if element.base in _WRITTEN else to_text(value, register)
+
+
+def _literal_text(value: Value, element: ElementType) -> str:
+    if isinstance(value, list):
+        return f"[{','.join(_literal_text(item, element) or 'null' for item in value)}]"
+    base, text = element.base, ""
+    if value is None:
+        return ""
+    if isinstance(value, str):
+        day, _, clock = value.partition("T")
+        text = f"{day}-{_without_zeros(clock)}" if clock else day
+    elif base in _DURATIONS:
+        text = _duration_text(int(value) * _UNIT_NS[base], "ns" if base == "LTIME" else "ms")
+    else:
+        text = _without_zeros(calendar.format_moment(int(value) * _UNIT_NS[base], 9).partition("T")[2])
+    return f"{_WRITTEN[base]}#{text}"
+
+
+def _without_zeros(clock: str) -> str:
+    """``12:00:00.500`` as ``12:00:00.5``, ``12:00:00.000`` as ``12:00:00``."""
+    return clock.rstrip("0").rstrip(".") if "." in clock else clock
+
+
+def _duration_text(ns: int, finest: str) -> str:
+    rest, parts = abs(ns), []
+    for unit, length_ns in _NS.items():
+        count, rest = divmod(rest, length_ns)
+        if count:
+            parts.append(f"{count}{unit}")
+    return "-" * (ns < 0) + ("".join(parts) or f"0{finest}")

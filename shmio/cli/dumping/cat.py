@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from shmio.cli.dumping.each import not_closed
 from shmio.cli.dumping.moments import span, time_range
 from shmio.cli.dumping.printers import Csv, JsonLines, Printer, Table, View
 from shmio.cli.dumping.progress import Progress
+from shmio.cli.run import room
 from shmio.dump.channels import Channel
 from shmio.dump.encoding import EVENT, FRAME, GAP, PROCESS, STEP, ProcessChange, StepMark
 from shmio.dump.reader import Message, Reader
@@ -23,12 +24,6 @@ from shmio.layout.model import Register
 from shmio.layout.topic import parse_topic
 from shmio.logs import printable
 from shmio.segment import Event, Frame
-
-PRINTERS: dict[str, Callable[[Sequence[View]], Printer]] = {
-    "table": lambda _: Table(),
-    "json": lambda _: JsonLines(),
-    "csv": Csv,
-}
 
 
 def execute(arguments: argparse.Namespace) -> int:
@@ -50,7 +45,7 @@ def execute(arguments: argparse.Namespace) -> int:
             _one_file(arguments.patterns)
             raise
         sources = {view.source for view in views.values()} if arguments.patterns else {c.source for c in channels}
-        printer: Printer = PRINTERS[arguments.form](list(views.values()))
+        printer = _printer(arguments, list(views.values()))
         wanted = {c.number for c in channels if c.number in views or (c.encoding == EVENT and c.source in sources)}
         wanted |= {
             c.number
@@ -73,6 +68,12 @@ def execute(arguments: argparse.Namespace) -> int:
         if not reader.records.closed:
             print(printable(f"{reader.file}: {not_closed(reader.records.damage)}"), file=sys.stderr)
     return int(complaints.any)
+
+
+def _printer(arguments: argparse.Namespace, views: Sequence[View]) -> Printer:
+    if arguments.form == "csv":
+        return Csv(views)
+    return JsonLines() if arguments.form == "json" else Table(room(arguments))
 
 
 def _nothing(found: Survey) -> str:

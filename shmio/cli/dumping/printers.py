@@ -128,7 +128,9 @@ class JsonLines:
 class Table:
     """A line with columns, under headings when the block is another than before."""
 
-    def __init__(self) -> None:
+    def __init__(self, room: int | None) -> None:
+        """``room``: for so many characters of a value; None: for all."""
+        self._room = room
         self._view: View | None = None
         self._widths: list[int] = []
 
@@ -136,7 +138,7 @@ class Table:
         """The values; quality is said unless it is good."""
         known = frame.source_ns != 0
         cells = [
-            shown(decode.decode(frame.image) if known else None, register)
+            shown(decode.decode(frame.image) if known else None, register, self._room)
             for register, decode in zip(view.registers, view.codecs, strict=True)
         ]
         if view is not self._view:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
+import pty
+import re
 import signal
 import subprocess
 import sys
@@ -163,3 +167,115 @@ def test_watch_says_when_a_reload_has_removed_its_source(instance: str, patterns
     assert seen == set(patterns)
     assert (watch.returncode, out) == (1, "")
     assert err == f"{gone} removed from instance {instance!r} by a reload\n"
+
+
+TIMES = Layout(
+    "DB1",
+    1,
+    216,
+    False,
+    (
+        Register("wait", "TIME", (), 0, None, 4, 1),
+        Register("day", "DATE", (), 4, None, 2, 1),
+        Register("noon", "TIME_OF_DAY", (), 6, None, 4, 1),
+        Register("many", "BYTE", ((0, 199),), 16, None, 200, 200),
+    ),
+)
+
+
+@pytest.fixture
+def times(instance: str) -> Iterator[Segment]:
+    with Segment.create(instance, [BlockSpec("cell", TIMES, 20_000_000, 3600 * 10**9, 1 << 16)], []) as segment:
+        publish_times(segment, 1500)
+        yield segment
+        segment.unlink()
+
+
+def publish_times(segment: Segment, wait_ms: int) -> None:
+    image = wait_ms.to_bytes(4) + (10 * 365).to_bytes(2) + (43_200_000).to_bytes(4)
+    segment.writer("cell").publish(image.ljust(216, b"\0"), cycle=1, source_ns=1)
+
+
+def test_times_are_read_as_s7_literals_and_arrays_go_whole_into_a_pipe(
+    times: Segment, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["get", "--instance", times.instance, "cell"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        "cell/wait  T#1s500ms",
+        "cell/day   D#1999-12-30",
+        "cell/noon  TOD#12:00:00",
+        f"cell/many  [{','.join(['0'] * 200)}]",
+    ]
+
+
+def test_watch_every_prints_all_again(times: Segment, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["--instance", times.instance, "--every", "0.01", "-n", "5", "cell/wait", "cell/day"]
+    assert main(["watch", "--json", *words]) == 0
+    told = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [(one["path"], one["value"]) for one in told] == [
+        ("cell/wait", 1500), ("cell/day", "1999-12-30"), ("cell/wait", 1500), ("cell/day", "1999-12-30"),
+        ("cell/wait", 1500),
+    ]  # fmt: skip
+    assert main(["watch", *words]) == 0
+    assert [line.split()[1:] for line in capsys.readouterr().out.splitlines()[:3]] == [
+        ["cell/wait", "T#1s500ms"],
+        ["cell/day", "D#1999-12-30"],
+        ["cell/wait", "T#1s500ms"],
+    ]
+
+
+def test_watch_every_ends_with_the_instance(times: Segment) -> None:
+    with watching("--instance", times.instance, "--every", "0.01", "cell/wait") as watch:
+        assert watch.stdout is not None
+        assert "T#1s500ms" in watch.stdout.readline()
+        times.unlink()
+        _, err = watch.communicate(timeout=60)
+    assert (watch.returncode, err) == (1, f"instance {times.instance!r} has stopped\n")
+
+
+class Terminal:
+    """A command on a terminal of 80 times 6 characters."""
+
+    def __init__(self, *words: str) -> None:
+        self._master, slave = pty.openpty()
+        program = "import sys; from shmio.cli.user import main; sys.exit(main())"
+        environment = os.environ | {"TERM": "xterm", "COLUMNS": "80", "LINES": "6"}
+        self.process = subprocess.Popen(
+            [sys.executable, "-P", "-c", program, *words], stdin=slave, stdout=slave, stderr=slave, env=environment
+        )
+        os.close(slave)
+        self._data = b""
+
+    def until(self, pattern: str) -> str:
+        """What it shows up to there; all of it if it never shows that."""
+        while not (found := re.search(pattern, text := self._data.decode(errors="ignore"), re.DOTALL)):
+            try:
+                self._data += os.read(self._master, 65536)
+            except OSError:  # it has ended
+                raise AssertionError(f"no {pattern!r} in {text!r}") from None
+        self._data = text[found.end() :].encode()
+        return text[: found.end()]
+
+    def __enter__(self) -> Terminal:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
+        os.close(self._master)
+
+
+def test_on_a_terminal_watch_is_a_table_that_is_brought_up_to_date_in_place(times: Segment) -> None:
+    with Terminal("watch", "--instance", times.instance, "--every", "0.02", "cell/wait", "cell/many") as terminal:
+        first = terminal.until(r"\(all: --full\)")
+        assert "cell/wait  T#1s500ms" in first
+        assert first.splitlines()[-1].count("0,") == 19, "the mark is still in the window"
+        assert "\x1b[2F" in terminal.until("cell/wait"), "it goes back up over both lines"
+        publish_times(times, 7)
+        terminal.until("cell/wait  T#7ms")
+        terminal.process.send_signal(signal.SIGINT)
+        assert terminal.process.wait(60) == 130
+    with Terminal("watch", "--instance", times.instance, "cell/many/0..8") as terminal:
+        terminal.until(r"cell/many/3.*… and 5 more lines: a higher window, or --lines, shows them")
+    with Terminal("watch", "--lines", "--full", "--instance", times.instance, "cell/many") as terminal:
+        assert "\x1b" not in terminal.until(r"(0,){199}0\]\s")

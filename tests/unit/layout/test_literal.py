@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from shmio.errors import ValueRangeError
 from shmio.layout.codec import Value
 from shmio.layout.lists import split_array
-from shmio.layout.literal import default_text, parse_literal, scalar_literal
+from shmio.layout.literal import default_text, literal_text, parse_literal, scalar_literal
 from shmio.layout.model import Dims, Register
 from shmio.layout.scalar import scalar_codec
 from shmio.layout.types import element_type
@@ -197,3 +197,36 @@ def test_every_type_has_a_default(type_: str) -> None:
 def test_a_bool_says_what_it_takes() -> None:
     with pytest.raises(ValueRangeError, match="BOOL: expected TRUE, FALSE, 1 or 0, found"):
         parse_literal("yes", Register("run", "BOOL", (), 0, 0, 1, 1))
+
+
+@pytest.mark.parametrize(
+    ("value", "type_", "text"),
+    [
+        (1500, "TIME", "T#1s500ms"),
+        (-90_061_001, "TIME", "T#-1d1h1m1s1ms"),
+        (0, "TIME", "T#0ms"),
+        (10_000, "S5TIME", "S5T#10s"),
+        (0, "LTIME", "LT#0ns"),
+        (1_000_002_003, "LTIME", "LT#1s2us3ns"),
+        (43_200_000, "TIME_OF_DAY", "TOD#12:00:00"),
+        (86_399_990, "TIME_OF_DAY", "TOD#23:59:59.99"),
+        (1, "LTOD", "LTOD#00:00:00.000000001"),
+        ("2026-11-22", "DATE", "D#2026-11-22"),
+        ("2026-11-22T00:00:00.000", "DATE_AND_TIME", "DT#2026-11-22-00:00:00"),
+        ("2026-11-22T10:20:30.100000000", "DTL", "DTL#2026-11-22-10:20:30.1"),
+        ("2026-11-22T10:20:30.000000001", "LDT", "LDT#2026-11-22-10:20:30.000000001"),
+    ],
+)
+def test_times_as_people_read_them_are_read_back(value: Value, type_: str, text: str) -> None:
+    register = Register("r", type_, (), 0, None, 0, 1)
+    assert literal_text(value, register) == text
+    assert parse_literal(text, register) == value
+    row = array(type_, ((0, 1),), 2)
+    assert literal_text([value, value], row) == f"[{text},{text}]"
+    assert parse_literal(f"[{text},{text}]", row) == [value, value]
+
+
+def test_what_is_no_time_is_read_as_ever() -> None:
+    assert literal_text(0.1, Register("r", "REAL", (), 0, None, 0, 1)) == "0.1"
+    assert literal_text(None, Register("r", "DATE", (), 0, None, 0, 1)) == ""
+    assert literal_text([None, "2026-11-22"], array("DATE", ((0, 1),), 2)) == "[null,D#2026-11-22]"
