@@ -8,6 +8,7 @@
     ├── ValueRangeError    a value does not fit its register's type
     ├── PathError          no such source or register
     ├── ConflictError      a name is in use for something else
+    ├── WrongInstanceError the running instance of this name was started from another configuration file
     ├── SegmentError       the shared memory cannot be used
     │   ├── NotRunningError      no running instance of that name
     │   │   └── UnfinishedError      its segment is just being made, or its maker died
@@ -72,6 +73,10 @@ class PathError(ShmioError, LookupError):
 
 class ConflictError(ShmioError):
     """A name, such as a shadow's path, is in use for something else."""
+
+
+class WrongInstanceError(ShmioError):
+    """An instance of this name runs, but not from the given configuration file; the message has both paths."""
 
 
 class SegmentError(ShmioError):

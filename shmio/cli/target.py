@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,21 +25,45 @@ def config_file(arguments: argparse.Namespace) -> Path:
     return arguments.config or DEFAULT_CONFIG
 
 
-def instance_name(arguments: argparse.Namespace) -> str:
+@dataclass(frozen=True, slots=True)
+class Target:
+    """The instance that a verb acts on. ``file``: the configuration that names it; None: it was named by itself."""
+
+    name: str
+    file: Path | None = None
+
+    def open(self, *, writable: bool = False) -> Segment:
+        """Its segment. WrongInstanceError: it was not started from the file that names it; else as Segment.open."""
+        return Segment.open(self.name, writable=writable, config=self.file)
+
+    def open_supervised(self) -> Segment:
+        """Its segment, if it has a living supervisor; NotRunningError otherwise."""
+        segment = self.open()
+        if not segment.supervised:
+            segment.close()
+            raise NotRunningError(
+                f"the supervisor of instance {self.name!r} is dead: shmio-supervisor up takes over what it left, "
+                f"shmio-supervisor down --instance {self.name} clears it"
+            )
+        return segment
+
+
+def target(arguments: argparse.Namespace) -> Target:
     """The instance: as asked, else of the configuration asked for or here, else the only running one.
 
     ConfigError: not a name, or none in the file; NotRunningError: none runs; ControlError: several do.
     """
     if arguments.instance is not None:
-        return _checked("--instance", arguments.instance)
+        return Target(_checked("--instance", arguments.instance))
     if arguments.config is not None or DEFAULT_CONFIG.exists():
-        return _named_in(config_file(arguments))
+        file = config_file(arguments)
+        return Target(_named_in(file), file)
     running = running_instances()
     if not running:
         raise NotRunningError("no instance is running, and there is no supervisor.toml here")
     if len(running) > 1:
         raise ControlError(f"several instances are running: choose one by --instance ({', '.join(running)})")
-    return running[0]
+    return Target(running[0])
 
 
 def config_option(arguments: argparse.Namespace) -> str | None:
@@ -56,18 +81,6 @@ def config_option(arguments: argparse.Namespace) -> str | None:
 def option_for(file: Path) -> str:
     """What names this configuration on a command line; empty for the one that is taken anyway."""
     return "" if file == DEFAULT_CONFIG else f"-c {shlex.quote(str(file))}"
-
-
-def open_supervised(name: str) -> Segment:
-    """Open the segment of an instance that has a living supervisor; NotRunningError otherwise."""
-    segment = Segment.open(name)
-    if not segment.supervised:
-        segment.close()
-        raise NotRunningError(
-            f"the supervisor of instance {name!r} is dead: shmio-supervisor up takes over what it left, "
-            f"shmio-supervisor down --instance {name} clears it"
-        )
-    return segment
 
 
 def ask(segment: Segment, request: control.Request, timeout_s: float) -> dict[str, Any]:

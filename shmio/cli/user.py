@@ -14,8 +14,8 @@ from shmio.cli import set as set_verb
 from shmio.cli.cell import Cell
 from shmio.cli.local import Local
 from shmio.cli.run import run
-from shmio.cli.target import instance_name
-from shmio.segment.attach import attach
+from shmio.cli.target import target
+from shmio.segment.attach import Attachment
 
 PROGRAM = "shmio"
 
@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
             with connected(arguments) as remote:
                 return verb(remote, arguments)
-        with attach(instance_name(arguments), writable=arguments.writable) as attachment:
+        with Attachment(target(arguments).open(writable=arguments.writable)) as attachment:
             return verb(Local(attachment), arguments)
 
     return run(PROGRAM, command)

@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import msgspec
 
@@ -150,6 +151,7 @@ def build_segment(
     mode: str,
     control: str,
     *,
+    config: Path | None = None,
     stepped: bool,
     origin: Origin | None = None,
 ) -> None:
@@ -174,6 +176,8 @@ def build_segment(
             control=control,
         )
         head.write(memory)
+        if config:
+            header.write_config(memory, config)
         ProcessTable.write(memory, head, processes)
         header.write_supervisor(memory, os.getpid(), State.STARTING)
         if origin:

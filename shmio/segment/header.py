@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from pathlib import Path
 from typing import Final
 
 from shmio import __version__
@@ -27,6 +29,8 @@ CONTROL_SIZE: Final = 256
 SUPERVISED_SINCE_OFFSET: Final = 496
 HEARTBEAT_OFFSET: Final = 504
 SUPERVISOR_CELL: Final = 512
+CONFIG_OFFSET: Final = 1024
+CONFIG_SIZE: Final = 3072
 
 _HEADER: Final = struct.Struct("<QIIQQqqII QII QIII 4x 16s64s32s256s")
 _SECTION: Final = struct.Struct("<IIQQII64s32s")
@@ -196,6 +200,26 @@ def finish(memory: memoryview) -> None:
 def write_control(memory: memoryview, path: str) -> None:
     """Tell where the control socket is by now."""
     memory[CONTROL_OFFSET : CONTROL_OFFSET + CONTROL_SIZE] = path.encode().ljust(CONTROL_SIZE, b"\0")
+
+
+def write_config(memory: memoryview, file: Path) -> None:
+    """Tell from which configuration file the instance was started."""
+    memory[CONFIG_OFFSET : CONFIG_OFFSET + CONFIG_SIZE] = _config_field(file)
+
+
+def read_config(memory: memoryview) -> Path | None:
+    """The configuration file that the instance was started from; None: it does not tell."""
+    path = bytes(memory[CONFIG_OFFSET : CONFIG_OFFSET + CONFIG_SIZE]).split(b"\0", 1)[0]
+    return Path(os.fsdecode(path)) if path else None
+
+
+def has_config(memory: memoryview, file: Path) -> bool:
+    """Whether this is the configuration file that the instance was started from."""
+    return memory[CONFIG_OFFSET : CONFIG_OFFSET + CONFIG_SIZE] == _config_field(file)
+
+
+def _config_field(file: Path) -> bytes:
+    return os.fsencode(file)[: CONFIG_SIZE - 1].ljust(CONFIG_SIZE, b"\0")
 
 
 def write_supervised_since(memory: memoryview, since_ns: int) -> None:

@@ -6,8 +6,9 @@ import threading
 import time
 from collections.abc import Collection, Sequence
 from contextlib import suppress
+from pathlib import Path
 
-from shmio.errors import AlreadyRunningError, NotRunningError, SegmentError, UnfinishedError
+from shmio.errors import AlreadyRunningError, NotRunningError, SegmentError, UnfinishedError, WrongInstanceError
 from shmio.segment import _atomics, header, shm
 from shmio.segment.block import Block, BlockWriter, Stamp
 from shmio.segment.build import SECTIONS_PER_BLOCK, BlockSpec, Origin, align, build_segment, wake, write_blocks
@@ -46,12 +47,14 @@ class Segment:
         *,
         mode: str = "live",
         control: str = "",
+        config: Path | None = None,
         group: str | None = None,
         stepped: bool = False,
         origin: Origin | None = None,
     ) -> Segment:
         """Build a new segment and hold its supervisor's lock. ``stepped``: time stands until somebody steps.
 
+        ``config``: the resolved path of the configuration file that it is started from.
         ``origin``: the time of a recording; default: the clock begins at 0, now.
 
         AlreadyRunningError: there is a segment of this name, with or without a living supervisor (see
@@ -68,7 +71,9 @@ class Segment:
             if not shared.try_lock(SUPERVISOR_LOCK) or not shared.current():
                 raise AlreadyRunningError(f"another supervisor is just starting instance {instance}")
             try:
-                build_segment(shared, instance, blocks, processes, mode, control, stepped=stepped, origin=origin)
+                build_segment(
+                    shared, instance, blocks, processes, mode, control, config=config, stepped=stepped, origin=origin
+                )
                 return cls(shared, instance)
             except BaseException:
                 shm.unlink(name)
@@ -78,8 +83,11 @@ class Segment:
             raise
 
     @classmethod
-    def open(cls, instance: str, *, writable: bool = False) -> Segment:
-        """Open a running instance's segment; NotRunningError, FormatError, SegmentError (permission)."""
+    def open(cls, instance: str, *, writable: bool = False, config: Path | None = None) -> Segment:
+        """Open a running instance's segment; NotRunningError, FormatError, SegmentError (permission).
+
+        ``config``: the file that it must have been started from, see :meth:`require_config`; None: any.
+        """
         name = PREFIX + instance
         try:
             shared = SharedObject.open(name, writable=writable)
@@ -92,10 +100,32 @@ class Segment:
         try:
             if shared.size < HEADER_SIZE:
                 raise UnfinishedError(f"instance {instance!r} is just starting, or died while it did")
-            return cls(shared, instance)
+            segment = cls(shared, instance)
+            if config is not None:
+                segment.require_config(config)
         except BaseException:
             shared.close()
             raise
+        return segment
+
+    @property
+    def config(self) -> Path | None:
+        """The configuration file that the instance was started from; None: it does not tell."""
+        return header.read_config(self.memory)
+
+    def require_config(self, file: Path) -> None:
+        """Make sure that the instance was started from this file; WrongInstanceError.
+
+        Two folders may well have configurations with one ``instance.name``, and only one of them can run. What counts
+        is the path, with links resolved: the file may have been edited since.
+        """
+        if header.has_config(self.memory, file.resolve()):
+            return
+        used = "an unknown file, by a shmio that does not tell which" if self.config is None else self.config
+        raise WrongInstanceError(
+            f"the running instance {self.instance!r} was started from {used}, not from {file.resolve()}: "
+            f"to act on it all the same, name it: --instance {self.instance}"
+        )
 
     def _find_blocks(self) -> dict[str, Block]:
         self._entries = entries = self._sections()
@@ -233,13 +263,14 @@ class Segment:
         header.write_supervisor(self.memory, pid, state)
         supervisor_beat(self.memory)
 
-    def lead_to(self, control: str) -> None:
-        """Tell that another supervisor begins, and the path of its control socket; its alone.
+    def lead_to(self, control: str, config: Path) -> None:
+        """Tell that another supervisor begins, the path of its control socket, and its configuration; its alone.
 
         Who has opened the segment before keeps the old path.
         """
         header.write_supervised_since(self.memory, time.monotonic_ns())
         header.write_control(self.memory, control)
+        header.write_config(self.memory, config)
         self.header = Header.read(self.memory, self.shared.name)
 
     def unlink(self) -> None:

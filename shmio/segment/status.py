@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 import msgspec
 
@@ -83,16 +84,17 @@ class InstanceStatus(msgspec.Struct):
         return self.state != str(InstanceState.STOPPED)
 
 
-def read_status(instance: str, config: str | None = None) -> InstanceStatus:
+def read_status(instance: str, config: str | None = None, file: Path | None = None) -> InstanceStatus:
     """The status of an instance, running or not. SegmentError: a segment that may not be read.
 
+    ``file``: the configuration that it must have been started from, if any; WrongInstanceError.
     ``config``: what a command line has to say to name its configuration, such as ``-c plc.toml``; empty if nothing,
     None if that is not known.
     """
     up = " ".join(("shmio-supervisor up", "-c FILE" if config is None else config)).rstrip()
     down = " ".join(("shmio-supervisor down", f"--instance {instance}" if config is None else config)).rstrip()
     try:
-        segment = Segment.open(instance)
+        segment = Segment.open(instance, config=file)
     except NotRunningError:
         running = ", ".join(running_instances()) or "none"
         return InstanceStatus(instance, note=f"it is not running (running: {running}); start it with {up}")

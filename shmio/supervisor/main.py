@@ -127,6 +127,7 @@ class Supervisor:
             plan.processes,
             mode=plan.mode,
             control=path,
+            config=plan.config_file,
             group=plan.group,
             stepped=plan.stepped,
             origin=plan.origin,

@@ -30,7 +30,7 @@ def take_over(plan: Plan, control: str, limits: Limits) -> tuple[Found | None, l
 
     ``control``: path of the new control socket, to which the segment leads from now on.
     AlreadyRunningError: a supervisor is alive. SegmentError: no permission, or a process cannot be identified or
-    does not end.
+    does not end. WrongInstanceError: what lives was started from another configuration file.
     """
     shared = leftover.claim(plan.instance)
     if shared is None:
@@ -41,7 +41,7 @@ def take_over(plan: Plan, control: str, limits: Limits) -> tuple[Found | None, l
             children, lines = _sort(segment, shared, limits)
             if segment.header.control != control:
                 remove_socket(segment.header.control)
-            segment.lead_to(control)
+            segment.lead_to(control, plan.config_file)
             segment.end_replaced()
             return Found(segment, children), [*done, *lines]
         done += leftover.clear_claimed(shared, plan.instance)
@@ -60,6 +60,7 @@ def _fitting(shared: SharedObject, plan: Plan) -> tuple[Segment | None, list[str
         return None, []
     if not any(slot.alive() for slot in segment.processes):
         return None, []
+    segment.require_config(plan.config_file)
     if segment.header.mode != plan.mode:
         return None, [f"{plan.instance} ran in mode {segment.header.mode}, not {plan.mode}: it starts anew"]
     if plan.stepped != segment.clock.stepped:

@@ -6,11 +6,11 @@ import argparse
 from contextlib import suppress
 from pathlib import Path
 
-from shmio.cli.target import instance_name
+from shmio.cli.target import target
 from shmio.config import load
 from shmio.errors import ConfigError, ControlError
 from shmio.segment import Segment
-from shmio.segment.attach import attach
+from shmio.segment.attach import Attachment
 from shmio.supervisor import control
 
 WHERE_S = 2.0
@@ -18,9 +18,8 @@ WHERE_S = 2.0
 
 def execute(arguments: argparse.Namespace) -> int:
     """Send the note, and wait until it is there."""
-    name = instance_name(arguments)
-    source = arguments.source if arguments.source is not None else _default_source(name)
-    with attach(name, writable=True) as cell:
+    with Attachment(target(arguments).open(writable=True)) as cell:
+        source = arguments.source if arguments.source is not None else _default_source(cell.instance)
         cell.note(arguments.text, source if source in cell.sources or arguments.source is not None else None)
     return 0
 

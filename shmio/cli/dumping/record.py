@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from shmio.cli.interrupt import told_to_stop
-from shmio.cli.target import instance_name
+from shmio.cli.target import target
 from shmio.config import Recorder as Settings
 from shmio.config import Trigger
 from shmio.errors import ControlError, PathError, RecordingError
@@ -33,7 +33,7 @@ LOOK_S = 0.5
 def execute(arguments: argparse.Namespace) -> int:
     """Record until Ctrl-C, the time is over, or the instance ends."""
     logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
-    with Segment.open(instance_name(arguments)) as segment, told_to_stop() as stopping:
+    with target(arguments).open() as segment, told_to_stop() as stopping:
         sources = arguments.sources
         selection = Selection(sources, arguments.registers or ())
         for missing in selection.nothing({name: block.layout for name, block in segment.blocks.items()}):

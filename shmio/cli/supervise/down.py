@@ -7,7 +7,7 @@ import os
 import select
 from contextlib import suppress
 
-from shmio.cli.target import ask, instance_name
+from shmio.cli.target import ask, target
 from shmio.errors import FormatError, NotRunningError, UnfinishedError
 from shmio.segment import Segment, instances, leftover
 from shmio.supervisor import control
@@ -19,13 +19,18 @@ EXIT_S = 5.0
 
 def execute(arguments: argparse.Namespace) -> int:
     """Ask the supervisor to stop; clear what is there if it is dead."""
-    name = instance_name(arguments)
+    wanted = target(arguments)
+    name = wanted.name
     if name not in instances():
         raise NotRunningError(f"no instance {name!r} is running: there is nothing to stop")
-    with suppress(UnfinishedError, FormatError), Segment.open(name) as segment:
-        if segment.supervised:
-            _stop(segment)
-            return 0
+    try:
+        with suppress(UnfinishedError), wanted.open() as segment:
+            if segment.supervised:
+                _stop(segment)
+                return 0
+    except FormatError as error:  # nobody can tell from which file it was started
+        if wanted.file is not None:
+            raise FormatError(f"{error}; down --instance {name} clears it if its supervisor is dead") from None
     print(f"{name}: its supervisor is dead; clearing what it left")
     for line in leftover.clear(name, forget_control=lambda path: _forget(path, name)):
         print(line)

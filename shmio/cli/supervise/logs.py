@@ -9,11 +9,10 @@ from contextlib import suppress
 from pathlib import Path
 
 from shmio.cli.supervise.tail import Follower, last_lines
-from shmio.cli.target import DEFAULT_CONFIG, ask, config_file, instance_name, open_supervised
+from shmio.cli.target import Target, ask, target
 from shmio.config import load
 from shmio.errors import ConfigError, SegmentError
 from shmio.logs import printable
-from shmio.segment import Segment
 from shmio.supervisor import control
 from shmio.supervisor.plan import process_names
 
@@ -46,16 +45,17 @@ def _where(arguments: argparse.Namespace) -> tuple[Path, list[str]]:
 
     What runs and is in no file, as a replay's sources may be, is known too.
     """
-    if arguments.instance is None and (arguments.config is not None or DEFAULT_CONFIG.exists()):
-        config = load(config_file(arguments))
-        return config.log_dir, list(dict.fromkeys([*process_names(config), *_running(config.instance.name)]))
-    with open_supervised(instance_name(arguments)) as segment:
+    wanted = target(arguments)
+    if wanted.file is not None:
+        config = load(wanted.file)
+        return config.log_dir, list(dict.fromkeys([*process_names(config), *_running(wanted)]))
+    with wanted.open_supervised() as segment:
         names = [slot.name for slot in segment.processes]
         return Path(ask(segment, control.Where(), WHERE_S)["log_dir"]), names
 
 
-def _running(instance: str) -> list[str]:
-    with suppress(SegmentError), Segment.open(instance) as segment:
+def _running(wanted: Target) -> list[str]:
+    with suppress(SegmentError), wanted.open() as segment:
         return [slot.name for slot in segment.processes]
     return []
 

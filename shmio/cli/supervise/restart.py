@@ -6,7 +6,7 @@ import argparse
 from contextlib import suppress
 from pathlib import Path
 
-from shmio.cli.target import ask, instance_name, open_supervised
+from shmio.cli.target import ask, target
 from shmio.supervisor import control
 
 RESTART_S = 40.0
@@ -15,7 +15,7 @@ WHERE_S = 5.0
 
 def execute(arguments: argparse.Namespace) -> int:
     """Return when the process runs again."""
-    with open_supervised(instance_name(arguments)) as segment:
+    with target(arguments).open_supervised() as segment:
         ask(segment, control.Restart(arguments.name), RESTART_S)
         print(f"{arguments.name} runs again")
         where = ask(segment, control.Where(), WHERE_S)

@@ -19,16 +19,12 @@ from shmio.cli.supervise import logdir
 from shmio.cli.supervise.ports import check_ports
 from shmio.cli.supervise.prepare import Prepared, peer, prepare
 from shmio.cli.supervise.up import Configured, Failed, Started, Told, headline
-from shmio.cli.target import ask
 from shmio.errors import AlreadyRunningError, ShmioError
 from shmio.logs import printable
 from shmio.segment import Segment, State, instances, leftover
 from shmio.segment.segment import refuse_second
-from shmio.supervisor import control
 from shmio.supervisor.main import Supervisor
 from shmio.supervisor.plan import BROKER, Job, Plan
-
-WHERE_S = 5.0
 
 
 def foreground(file: Path, mode: str, keys: Mapping[str, Any]) -> int:
@@ -113,9 +109,8 @@ def _whose(plan: Plan) -> str:
     """From which file the running instance of this name was started, and what to do about it."""
     down = f"shmio-supervisor down --instance {plan.instance} stops it"
     with suppress(ShmioError), Segment.open(plan.instance) as segment:
-        file = ask(segment, control.Where(), WHERE_S)["config"]
-        if file != str(plan.config_file):
-            return f", started from {file}: {down}; or give this one another instance.name"
+        if segment.config not in (None, plan.config_file):
+            return f", started from {segment.config}: {down}; or give this one another instance.name"
     return f"; {down}"
 
 

@@ -7,7 +7,7 @@ import sys
 
 import msgspec
 
-from shmio.cli.target import config_option, instance_name
+from shmio.cli.target import config_option, target
 from shmio.errors import NotRunningError
 from shmio.logs import printable
 from shmio.segment.status import ClockStatus, InstanceStatus, ProcessStatus, SourceStatus, read_status
@@ -18,7 +18,8 @@ _HEADINGS = ("NAME", "KIND", "STATE", "PID", "RESTARTS", "UPTIME", "")
 def execute(arguments: argparse.Namespace) -> int:
     """Print the status; 1 when nothing runs."""
     try:
-        status = read_status(instance_name(arguments), config_option(arguments))
+        wanted = target(arguments)
+        status = read_status(wanted.name, config_option(arguments), wanted.file)
     except NotRunningError as error:
         status = InstanceStatus(None, note=str(error))
     if arguments.json:

@@ -108,7 +108,7 @@ def test_a_supervisor_that_took_over_is_as_old_as_it_is(
     cell.segment.set_state(os.getpid(), State.RUNNING)
     with monkeypatch.context() as later:
         later.setattr("time.monotonic_ns", lambda now=time.monotonic_ns: now() + hour_ns)
-        cell.segment.lead_to("/run/other.sock")
+        cell.segment.lead_to("/run/other.sock", Path("/plant/supervisor.toml"))
     monkeypatch.setattr("time.monotonic_ns", lambda now=time.monotonic_ns: now() + hour_ns + 10**9)
     supervisor = read_status(instance).supervisor
     assert supervisor is not None
