@@ -121,7 +121,11 @@ def test_down_clears_another_versions_instance(cell: Cell) -> None:
     kill_supervisor(cell)
     with Segment.open(cell.instance, writable=True) as segment:
         segment.memory[8:12] = (7).to_bytes(4, "little")
-    down = cell.supervisor("down")
+    refused = cell.supervisor("down")
+    assert refused.returncode == 1
+    name = f"--instance {cell.instance}"
+    assert f"down {name} clears it" in refused.stderr, "nobody can tell from which file it was started"
+    down = cell.supervisor("down", *name.split())
     assert down.returncode == 0, down.stderr
     assert all(gone(pid) for pid in before.values())
     assert cell.instance not in instances()

@@ -130,7 +130,8 @@ def test_what_runs_and_is_in_no_file_has_logs_too(
     (instance_logs / "arm.log").write_text(stamped(3, "arm plays"))
     assert main(["logs", "arm"]) == 1
     assert capsys.readouterr().err.startswith("no process 'arm'; ")
-    with Segment.create(instance, [], [ProcessSpec("cell", "source"), ProcessSpec("arm", "source")]) as segment:
+    processes, file = [ProcessSpec("cell", "source"), ProcessSpec("arm", "source")], Path("supervisor.toml").resolve()
+    with Segment.create(instance, [], processes, config=file) as segment:
         try:
             assert main(["logs", "arm"]) == 0
             assert capsys.readouterr().out == stamped(3, "arm plays")

@@ -31,7 +31,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def running(instance: str) -> Iterator[str]:
     blocks = [BlockSpec("cell", LAYOUT, 20_000_000, 3600 * 10**9, 1 << 16)]
-    with Segment.create(instance, blocks, []) as segment:
+    with Segment.create(instance, blocks, [], config=Path("supervisor.toml").resolve()) as segment:
         segment.writer("cell").publish(b"\0\7", cycle=1, source_ns=1)
         yield instance
         segment.unlink()
@@ -41,6 +41,18 @@ def test_the_instance_is_that_of_the_file_here_even_if_spoilt(running: str, caps
     Path("supervisor.toml").write_text(f'wings = 2\n[instance]\nname = "{running}"\n')
     assert main(["get", "cell/a"]) == 0
     assert capsys.readouterr().out == "cell/a  7\n"
+
+
+def test_an_instance_that_does_not_tell_its_file_is_reached_by_its_name_alone(
+    instance: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As one of a shmio that did not tell it yet."""
+    Path("supervisor.toml").write_text(f'[instance]\nname = "{instance}"\n')
+    with Segment.create(instance, [], []) as segment:
+        assert main(["list"]) == 1
+        assert "was started from an unknown file" in capsys.readouterr().err
+        assert main(["list", "--instance", instance]) == 0
+        segment.unlink()
 
 
 def test_an_empty_text_is_seen(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
