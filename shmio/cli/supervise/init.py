@@ -12,6 +12,7 @@ from importlib import resources
 from itertools import islice
 from pathlib import Path
 
+from shmio.cli.supervise import naming
 from shmio.cli.supervise.layouts import compile_files, summarize
 from shmio.cli.supervise.ports import in_use
 from shmio.cli.target import config_file, option_for
@@ -22,6 +23,7 @@ from shmio.layout.model import Layout
 from shmio.logs import printable
 
 EXAMPLE = ("supervisor.toml", "db201.db")
+EXAMPLE_NAME = "a50"
 SOURCES = (".db", ".udt", ".scl", ".awl")
 GRPC_PORTS = range(8089, 8189)
 S7_PORTS = range(1102, 1202)
@@ -35,9 +37,14 @@ def execute(arguments: argparse.Namespace) -> int:
     _refuse_present(file)
     text, missing = _own(file, arguments.files, emulated=arguments.emulated) if arguments.files else (None, [])
     written = _example(file) if text is None else {file: text}
+    other = naming.vacant(EXAMPLE_NAME, file) if text is None else EXAMPLE_NAME  # before it is taken by this one
     _write(written)
     for path in written:
         print(printable(f"wrote {path}"))
+    if other != EXAMPLE_NAME:
+        print(
+            f"an instance or a configuration nearby is called {EXAMPLE_NAME}, too: to run both, call this one {other}"
+        )
     first = f"fill in {' and '.join(missing)} in {file}, then " if missing else ""
     check, up = (f"shmio-supervisor {verb} {option_for(file)}".rstrip() for verb in ("check", "up"))
     print(printable(f"next: {first}{check}, then {up}"))
@@ -82,7 +89,7 @@ def _own(file: Path, files: Sequence[Path], *, emulated: bool) -> tuple[str, lis
         writable = "[]                         # nothing is writable unless named"
     lines = [
         "[instance]",
-        f"name = {_toml(_instance(block))}",
+        f"name = {_toml(naming.vacant(_instance(block), file))}",
         "",
         "[[source]]",
         'name = "cell"',

@@ -211,6 +211,38 @@ def test_an_idle_emulator_needs_a_number_for_each_block(example: Edit, capsys: p
     assert main(["check"]) == 0
 
 
+def test_init_takes_a_name_that_is_free(instance: str) -> None:
+    """No instance has it, and no configuration in the same folder, beside it, or above."""
+    file = Path("plants/new/supervisor.toml")
+    for folder in (file.parent, Path("plants/old")):
+        folder.mkdir(parents=True)
+    Path("cell.db").write_text(block(f'"{instance}"', "Int"))
+    Path("plants/spoilt.toml").write_text("[instance")
+    Path("plants/new/odd.toml").write_text("instance = 3")
+
+    def proposed() -> str:
+        assert main(["init", "cell.db", "-c", str(file)]) == 0
+        name = load(file).instance.name
+        file.unlink()
+        return name
+
+    taken = instance
+    for number, place in enumerate(("new/b.toml", "old/supervisor.toml", "c.toml"), 2):
+        assert proposed() == taken
+        Path("plants", place).write_text(f'[instance]\nname = "{taken}"\n')
+        taken = f"{instance}-{number}"
+    with Segment.create(taken, [], []) as segment:
+        assert proposed() == f"{instance}-5"
+        segment.unlink()
+
+
+def test_init_of_the_example_says_whose_name_it_has(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("new").mkdir()
+    assert main(["init"]) == 0
+    assert main(["init", "-c", "new/supervisor.toml"]) == 0
+    assert "is called a50, too: to run both, call this one a50-" in capsys.readouterr().out
+
+
 def test_init_of_several_blocks_takes_the_one_of_the_number(capsys: pytest.CaptureFixture[str]) -> None:
     Path("two.db").write_text(block('"One"', "Int") + block("DB7", "DInt"))
     Path("plc.ini").write_text("host=10.76.0.12\ndbNumber=7\n")
