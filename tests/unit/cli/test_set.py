@@ -92,12 +92,13 @@ class Device:
 @pytest.fixture
 def device(instance: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> Iterator[Device]:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "supervisor.toml").write_text(f'[instance]\nname = "{instance}"\n')
+    file = tmp_path / "supervisor.toml"
+    file.write_text(f'[instance]\nname = "{instance}"\n')
     blocks = [
         BlockSpec(name, LAYOUT, 20_000_000, 3600 * 10**9, 1 << 16, Attributes("test", WRITABLE))
         for name in ("cell", "other")
     ]
-    with Segment.create(instance, blocks, []) as segment:
+    with Segment.create(instance, blocks, [], config=file.resolve()) as segment:
         device = Device(segment.writer("cell"))
         segment.writer("other")
         yield device
