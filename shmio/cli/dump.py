@@ -11,7 +11,7 @@ from pathlib import Path
 
 from shmio import __version__
 from shmio.cli.interrupt import undone_by_signals
-from shmio.cli.run import add_full, run
+from shmio.cli.run import add_full, add_json, run, wants_error_json
 
 PROGRAM = "shmio-dump"
 IGNORABLE = ("times", "cycle", "reason", "events", "ends")
@@ -37,7 +37,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return status
 
     with undone_by_signals():  # a file that is being made is removed again
-        return run(PROGRAM, command)
+        return run(PROGRAM, command, error_json=wants_error_json(arguments))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -67,6 +67,8 @@ def _parser() -> argparse.ArgumentParser:
             help=f"with --when: so much {what} (default 10)",
         )  # fmt: skip
 
+    add_json(record, "print what goes on as a JSON object a line")
+
     note = verb("note", "put a note into the events of a running instance, and so into its recordings")
     note.add_argument("text", metavar="TEXT")
     note.add_argument("-c", dest="config", type=Path, metavar="FILE", help="the instance of this supervisor.toml")
@@ -92,6 +94,7 @@ def _parser() -> argparse.ArgumentParser:
     _output(cut, "the new file")
     _times(cut)
     _some(cut)
+    add_json(cut)
 
     export = verb("export", "write values for other programs: Parquet, CSV, or MCAP for viewers")
     export.add_argument("files", nargs="+", type=Path, metavar="FILE")
@@ -102,6 +105,8 @@ def _parser() -> argparse.ArgumentParser:
     _times(export)
     _some(export)
     export.add_argument("--raw", action="store_true", help="what sources delivered, without what was injected")
+
+    add_json(export)
 
     diff = verb("diff", "tell where two recordings differ; exit status 1 if they do")
     diff.add_argument("files", nargs=2, type=Path, metavar="FILE")

@@ -20,10 +20,11 @@ SHOWN_CHARACTERS = 60
 """Of a value, on a terminal."""
 
 
-def run(program: str, command: Callable[[], int | None]) -> int:
+def run(program: str, command: Callable[[], int | None], *, error_json: bool = False) -> int:
     """Run a command: 0 done, 1 failed with one line on standard error, 128 + n ended by signal n as shells have it.
 
-    Wrong usage is argparse's, which exits with 2.
+    Wrong usage is argparse's, which exits with 2. ``error_json``: a failure is told on standard output, too, as
+    ``{"error": "…"}``.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a terminal that is not UTF-8
@@ -31,7 +32,7 @@ def run(program: str, command: Callable[[], int | None]) -> int:
         status = command() or 0
         sys.stdout.flush()
     except ShmioError as error:
-        sys.stderr.write(f"{printable(str(error))}\n")
+        _tell(str(error), error_json=error_json)
         return 1
     except KeyboardInterrupt:
         return 130
@@ -39,7 +40,7 @@ def run(program: str, command: Callable[[], int | None]) -> int:
         _give_up_output()  # who read it went away (`| head`)
         return 141
     except OSError as error:
-        sys.stderr.write(f"{printable(str(error.filename or program))}: {error.strerror}\n")
+        _tell(f"{error.filename or program}: {error.strerror}", error_json=error_json)
         _give_up_output()
         return 1
     return status
@@ -49,6 +50,18 @@ def say(line: str, stream: TextIO | None = None) -> None:
     """Print a line at once; a terminal that has gone away must not stop what runs."""
     with suppress(OSError):
         print(printable(line), file=stream or sys.stdout, flush=True)
+
+
+def say_json(value: Any) -> None:
+    """Print an object as a line at once, as ``say`` a text."""
+    with suppress(OSError):
+        print(dumps(value), flush=True)
+
+
+def _tell(error: str, *, error_json: bool) -> None:
+    sys.stderr.write(f"{printable(error)}\n")
+    if error_json:
+        say_json({"error": error})
 
 
 def _give_up_output() -> None:
@@ -79,6 +92,17 @@ def seconds(text: str) -> float:
     if not 0 < seconds <= MAX_SECONDS:
         raise argparse.ArgumentTypeError(f"{text.strip()!r} is not a number of seconds above 0, at most {MAX_SECONDS}")
     return seconds
+
+
+def add_json(parser: argparse.ArgumentParser, text: str = "print one JSON object") -> None:
+    """Add ``--json``, also for errors: see :func:`wants_error_json`."""
+    parser.add_argument("--json", action="store_true", help=f"{text}; an error, too")
+    parser.set_defaults(error_json=True)
+
+
+def wants_error_json(options: argparse.Namespace) -> bool:
+    """Whether an error is told as JSON, too."""
+    return getattr(options, "error_json", False) and options.json
 
 
 def add_full(parser: argparse.ArgumentParser) -> None:

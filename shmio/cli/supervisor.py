@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from shmio import __version__
-from shmio.cli.run import at_least, run
+from shmio.cli.run import add_json, at_least, run, wants_error_json
 from shmio.cli.supervise.replaying import add_arguments
 
 PROGRAM = "shmio-supervisor"
@@ -25,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         status: int = verb.execute(arguments)
         return status
 
-    return run(PROGRAM, command)
+    return run(PROGRAM, command, error_json=wants_error_json(arguments))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -54,15 +54,16 @@ def _parser() -> argparse.ArgumentParser:
     verb("down", "stop the instance", target)
     status = verb("status", "tell how the instance and its processes are", target)
     status.add_argument("--json", action="store_true", help="print one JSON object")
-    verb("reload", "take what has changed in the configuration; leave alone what has not", target)
+    add_json(verb("reload", "take what has changed in the configuration; leave alone what has not", target))
     verb("restart", "restart one process, as it was configured at the start or the last reload", target).add_argument(
         "name", metavar="NAME"
     )
-    verb("check", "validate the configuration and its layouts; start nothing", file)
+    add_json(verb("check", "validate the configuration and its layouts; start nothing", file))
     logs = verb("logs", "print the end of the log files", target)
     logs.add_argument("name", metavar="NAME", nargs="?", help="a process, or supervisor (default: all)")
     logs.add_argument("-f", "--follow", action="store_true", help="go on with what is added")
     logs.add_argument("-n", "--lines", type=at_least(0), default=20, metavar="LINES", help="default: 20")
+    add_json(logs, "print a JSON object a line")
     init = verb("init", "write a configuration: the A50 example, or one for the files given", file)
     init.usage = f"{PROGRAM} init [-h] [-c FILE] [--emulated] [plc.ini] [FILE.db [FILE.udt ...]]"
     init.add_argument(

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from shmio.dump.columns import heading
-from shmio.dump.libraries import library
+from shmio.dump.libraries import ANALYSIS, library
 
 if TYPE_CHECKING:
     import pyarrow
 
     from shmio.dump.columns import Columns
-
-REMEDY: Final = "pip install 'shmio[parquet]'"
 
 
 def table(columns: Columns) -> pyarrow.Table:
@@ -24,7 +22,7 @@ def table(columns: Columns) -> pyarrow.Table:
     Native types; arrays are lists of fixed size, POINTER and ANY bytes. Null: no value of its type, or the source never
     had an image. A register that has the name of another column has its source before it. MissingLibraryError.
     """
-    arrow = library("pyarrow", REMEDY)
+    arrow = library("pyarrow", ANALYSIS)
     unknown = columns.source_ns == 0
     time = arrow.timestamp("ns", "UTC")
     fields = {

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from shmio.dump.batch import HEAD, Batch
 from shmio.dump.blocks import DumpBlock
-from shmio.dump.libraries import library
+from shmio.dump.libraries import ANALYSIS, library
 from shmio.errors import RecordingError
 from shmio.layout.framecodec import FrameCodec
 from shmio.layout.model import ByteOrder, Layout, Register
@@ -70,13 +70,13 @@ class Columns(Mapping[str, Array]):
 
     def to_pandas(self) -> pandas.DataFrame:
         """A frame indexed by time, a column for each register and each element of an array. MissingLibraryError."""
-        pandas = library("pandas", "pip install pandas")
+        pandas = library("pandas", ANALYSIS)
         data = {"number": self.number, "cycle": self.cycle, "quality": self.quality, **self._flat()}
         return pandas.DataFrame(data, index=pandas.to_datetime(self.time_ns, utc=True).rename("time"))
 
     def to_polars(self) -> polars.DataFrame:
         """The same, with ``time`` as its first column. MissingLibraryError."""
-        polars = library("polars", "pip install polars")
+        polars = library("polars", ANALYSIS)
         time = polars.Series("time", self.time_ns).cast(polars.Datetime("ns", "UTC"))
         data = {"number": self.number, "cycle": self.cycle, "quality": self.quality, **self._flat()}
         return polars.DataFrame([time, *(polars.Series(name, values) for name, values in data.items())])

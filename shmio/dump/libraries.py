@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from typing import Any, Final
 
 from shmio.errors import MissingLibraryError
+
+ANALYSIS: Final = "pip install 'shmio[analysis]'"
+"""The extra with all that tables of recordings need."""
 
 
 def library(name: str, remedy: str) -> Any:

@@ -62,14 +62,18 @@ def test_log_mode_records_a_cell_through_a_killed_recorder(make_cell: Callable[.
 
 
 def test_a_live_cell_is_recorded_from_outside(cell: Cell) -> None:
-    done = cell.run("shmio-dump", "record", "--for", "2")
-    assert done.returncode == 0, done.stderr
+    done = cell.run("shmio-dump", "record", "--for", "2", "--json")
+    assert (done.returncode, done.stderr) == (0, "")
     [file] = (cell.folder / "dumps").iterdir()
+    begun, ended = (json.loads(line) for line in done.stdout.splitlines())
+    name = f"dumps/{file.name}"
+    assert begun == {"what": "recording", "instance": cell.instance, "sources": ["cell"], "file": name}
+    assert (ended["what"], ended["file"], ended["missed"], ended["whole"]) == ("ended", name, 0, True)
     found = info(cell, file)
     assert (found["closed"], found["missed_frames"], found["recorder"]) == (True, 0, "shmio-dump")
     assert "config/supervisor.toml" in found["attachments"], done.stderr
     [block] = found["blocks"]
-    assert block["frames"] == block["last_frame"] - block["first_frame"] + 1 > 1
+    assert block["frames"] == block["last_frame"] - block["first_frame"] + 1 == ended["frames"] > 1
     assert len({line["values"][AXIS.removeprefix("cell/")] for line in values(cell, file)}) > 1
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 
@@ -116,6 +117,11 @@ def test_what_is_odd_is_told_as_check_tells_it(cell: Cell) -> None:
     assert (done.returncode, done.stderr) == (0, f"{warning}\n")
     assert "cell: restarted" in done.stdout
     assert warning in cell.supervisor("check", "-c", str(file)).stdout.splitlines()
+    found = json.loads(cell.supervisor("reload", "--json").stdout)
+    kept = sorted(cell.processes())
+    assert {**found, "kept": sorted(found["kept"])} == {
+        "instance": cell.instance, "done": [], "kept": kept, "warnings": [warning], "problems": []
+    }  # fmt: skip
 
 
 def test_an_error_in_the_configuration_changes_nothing(cell: Cell) -> None:
@@ -125,6 +131,7 @@ def test_an_error_in_the_configuration_changes_nothing(cell: Cell) -> None:
     assert (done.returncode, done.stdout) == (1, "")
     (line,) = done.stderr.splitlines()
     assert "period_ms" in line
+    assert json.loads(cell.supervisor("reload", "--json").stdout) == {"error": line}
     edit(cell, "period_ms = -1", "period_ms = 20")
     edit(cell, "[grpc]", f'[recorder]\ndirectory = "{"x" * 300}"\n\n[grpc]')
     done = cell.supervisor("reload")

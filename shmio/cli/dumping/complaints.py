@@ -16,7 +16,12 @@ class Complaints:
     """Tells on standard error."""
 
     def __init__(self) -> None:
-        self.any = False
+        self.texts: list[str] = []
+
+    @property
+    def any(self) -> bool:
+        """Whether there was anything to tell."""
+        return bool(self.texts)
 
     def open(self, files: Sequence[Path]) -> Dump:
         """Open a recording of which what cannot be read is told. OSError, RecordingError as ``open_dump``."""
@@ -31,6 +36,6 @@ class Complaints:
 
     def say(self, text: str) -> None:
         """One line; the exit status will be 1."""
-        self.any = True
+        self.texts.append(text)
         sys.stdout.flush()
         print(printable(text), file=sys.stderr, flush=True)

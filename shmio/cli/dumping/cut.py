@@ -9,7 +9,7 @@ from shmio.cli.dumping.complaints import Complaints
 from shmio.cli.dumping.moments import span, time_range
 from shmio.cli.dumping.parts import Parts
 from shmio.cli.dumping.rewriting import rewrite, verified
-from shmio.cli.run import say
+from shmio.cli.run import dumps, say
 from shmio.dump.dump import Dump
 from shmio.dump.entries import Entry
 from shmio.dump.reader import Item
@@ -25,7 +25,11 @@ def execute(arguments: argparse.Namespace) -> int:
         work = rewrite(
             dump, arguments.output, "shmio-dump cut", _entries(dump, arguments, parts, from_ns, to_ns), whole=False
         )
-    for line in verified(arguments.output):
+    verified_lines = verified(arguments.output)
+    if arguments.json:
+        print(dumps({"file": str(arguments.output), **work.counts, "damage": complaints.texts}, indent=2))
+        return int(complaints.any)
+    for line in verified_lines:
         say(line)
     say(f"  {work.counts['frames']} frames and {work.counts['events']} events")
     return int(complaints.any)

@@ -15,7 +15,7 @@ from shmio.cli.dumping.parquet import ParquetTable
 from shmio.cli.dumping.progress import Progress
 from shmio.cli.dumping.rewriting import new_file
 from shmio.cli.dumping.viewer import export_mcap
-from shmio.cli.run import say
+from shmio.cli.run import dumps, say
 from shmio.dump.blocks import DumpBlock
 from shmio.dump.columns import Columns
 from shmio.dump.dump import Dump
@@ -39,6 +39,11 @@ class Table(Protocol):
 
 TABLES: dict[str, Callable[[IO[bytes], Sequence[Register]], Table]] = {"parquet": ParquetTable, "csv": CsvTable}
 FORMATS: Final = (*TABLES, "mcap")
+SHEETS: Final = frozenset({"ods", "xls", "xlsx"})
+OTHERS: Final = frozenset(
+    {"arrow", "db", "duckdb", "feather", "h5", "hdf5", "json", "jsonl", "mat", "mem", "tsv", "txt"}
+)
+"""A folder with such a name is not meant."""
 
 
 def execute(arguments: argparse.Namespace) -> int:
@@ -58,8 +63,7 @@ def execute(arguments: argparse.Namespace) -> int:
             progress.total = dump.end_ns - dump.begin_ns
             with new_file(arguments.output) as stream:
                 counts = export_mcap(dump, chosen, stream, from_ns, to_ns, raw=arguments.raw, progress=progress)
-            say(f"{arguments.output}: {counts} messages")
-            return int(complaints.any)
+            return _told(arguments, complaints, [(arguments.output, counts)], "messages")
         progress.total = len(sources) * (dump.end_ns - dump.begin_ns)
         with ExitStack() as stack:
             if named:
@@ -74,19 +78,39 @@ def execute(arguments: argparse.Namespace) -> int:
             raise RecordingError(
                 f"no frames of {dump.files[0]} are in that time; it goes {span(dump.begin_ns, dump.end_ns)}"
             )
-    for path, rows in tables.files:
-        say(f"{path}: {rows} rows")
+    return _told(arguments, complaints, tables.files, "rows")
+
+
+def _told(arguments: argparse.Namespace, complaints: Complaints, files: Sequence[tuple[Path, int]], what: str) -> int:
+    """Print what was made, as lines or an object; 1 if something was damaged."""
+    if arguments.json:
+        made = [{"file": str(path), what: count} for path, count in files]
+        print(dumps({"files": made, "damage": complaints.texts}, indent=2))
+    else:
+        for path, count in files:
+            say(f"{path}: {count} {what}")
     return int(complaints.any)
 
 
 def _form(output: Path, asked: str | None) -> tuple[bool, str]:
-    """(whether the name is that of a file of some format, the format); RecordingError: another one is asked for."""
+    """(whether the name is that of a file of some format, the format); RecordingError: it is of another."""
     suffix = output.suffix.lower().removeprefix(".")
+    if suffix in SHEETS | OTHERS and not output.is_dir():
+        raise RecordingError(f"{output}: export does not write .{suffix}; {_remedy(output, suffix)}")
     if suffix not in FORMATS or output.is_dir():
         return False, asked or "parquet"
     if asked not in (None, suffix):
         raise RecordingError(f"{output}: as its name ends it is not --format {asked}; leave out one of them")
     return True, suffix
+
+
+def _remedy(output: Path, suffix: str) -> str:
+    if suffix in SHEETS:
+        return f"-o {output.with_suffix('.csv')} makes a file that Excel and LibreOffice open"
+    if suffix == "mem":
+        return f"shmio-dump cut FILE… -o {output} writes a part of a recording to a new one"
+    formats = ", ".join(f".{form}" for form in FORMATS)
+    return f"it writes {formats}, by the end of the name, or into a folder by --format"
 
 
 def _within(block: DumpBlock, from_ns: int, to_ns: int) -> bool:

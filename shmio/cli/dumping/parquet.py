@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import IO, Any
 
-from shmio.dump.arrow import REMEDY
 from shmio.dump.columns import Columns
-from shmio.dump.libraries import library
+from shmio.dump.libraries import ANALYSIS, library
 from shmio.layout.model import Register
 
 
@@ -17,8 +16,8 @@ class ParquetTable:
     def __init__(self, stream: IO[bytes], registers: Sequence[Register]) -> None:  # noqa: ARG002  as all tables
         """MissingLibraryError."""
         self.rows = 0
-        library("pyarrow", REMEDY)
-        self._parquet = library("pyarrow.parquet", REMEDY)
+        library("pyarrow", ANALYSIS)
+        self._parquet = library("pyarrow.parquet", ANALYSIS)
         self._stream = stream
         self._writer: Any = None
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
+from shmio.cli.run import dumps
 from shmio.cli.supervise.prepare import peer, prepare
 from shmio.cli.target import config_file
 from shmio.logs import printable
@@ -15,30 +17,56 @@ def execute(arguments: argparse.Namespace) -> int:
     file = config_file(arguments)
     prepared = prepare(file)
     plan = prepared.plan
-    print(f"{file}: instance {plan.instance}, {len(plan.jobs)} processes")
-    for source, block in zip(prepared.config.source, plan.blocks, strict=True):
-        print(printable(f"  {_describe(block, peer(source))}"))
-    for text in prepared.injections:
-        print(printable(f"  {text}"))
-    warnings = [*plan.warnings]
+    found: dict[str, Any] = {
+        "config": str(file),
+        "instance": plan.instance,
+        "processes": [job.name for job in plan.jobs],
+        "sources": [
+            _described(block, peer(source)) for source, block in zip(prepared.config.source, plan.blocks, strict=True)
+        ],
+        "injections": list(prepared.injections),
+        "replay": [],
+        "segment": f"{PREFIX}{plan.instance}",
+        "segment_bytes": plan.segment_bytes,
+        "warnings": list(plan.warnings),
+    }
     if prepared.config.replay and prepared.config.replay.file:
         replay = prepare(file, "replay").plan
-        for block in replay.blocks:
-            print(printable(f"  with --mode replay: {_describe(block, '')}"))
-        warnings += [warning for warning in replay.warnings if warning not in warnings]
-    print(f"  segment {PREFIX}{plan.instance}: {plan.segment_bytes / 1e6:.2f} MB of shared memory")
-    for warning in warnings:
-        print(printable(warning))
-    count = len(warnings)
-    print(f"usable, with {count} warning{'s' * (count != 1)}" if count else "no faults found")
+        found["replay"] = [_described(block, "") for block in replay.blocks]
+        found["warnings"] += [warning for warning in replay.warnings if warning not in plan.warnings]
+    print(dumps(found, indent=2) if arguments.json else "\n".join(map(printable, _lines(found))))
     return 0
 
 
-def _describe(block: BlockSpec, peer: str) -> str:
-    layout = block.layout
-    held_s = block.slots * block.period_ns / 1e9
-    at = f" at {peer}" if peer else ""
+def _lines(found: dict[str, Any]) -> list[str]:
+    count = len(found["warnings"])
+    return [
+        f"{found['config']}: instance {found['instance']}, {len(found['processes'])} processes",
+        *(f"  {_line(source)}" for source in found["sources"]),
+        *(f"  {text}" for text in found["injections"]),
+        *(f"  with --mode replay: {_line(source)}" for source in found["replay"]),
+        f"  segment {found['segment']}: {found['segment_bytes'] / 1e6:.2f} MB of shared memory",
+        *found["warnings"],
+        f"usable, with {count} warning{'s' * (count != 1)}" if count else "no faults found",
+    ]
+
+
+def _described(block: BlockSpec, peer: str) -> dict[str, Any]:
+    return {
+        "source": block.source,
+        "peer": peer or None,
+        "block": block.layout.name,
+        "registers": len(block.layout.registers),
+        "bytes": block.layout.size,
+        "ring_frames": block.slots,
+        "ring_s": block.slots * block.period_ns / 1e9,
+        "ring_bytes": block.size,
+    }
+
+
+def _line(source: dict[str, Any]) -> str:
+    at = f" at {source['peer']}" if source["peer"] else ""
     return (
-        f"source {block.source}{at}: {layout.name}, {len(layout.registers)} registers, {layout.size} bytes; "
-        f"ring of {block.slots} frames, {held_s:.1f} s, {block.size / 1e6:.2f} MB"
+        f"source {source['source']}{at}: {source['block']}, {source['registers']} registers, {source['bytes']} bytes; "
+        f"ring of {source['ring_frames']} frames, {source['ring_s']:.1f} s, {source['ring_bytes'] / 1e6:.2f} MB"
     )

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
+from shmio.cli.run import dumps
 from shmio.cli.supervise.tail import Follower, last_lines
 from shmio.cli.target import Target, ask, target
 from shmio.config import load
@@ -18,6 +21,11 @@ from shmio.supervisor.plan import process_names
 
 WHERE_S = 5.0
 SUPERVISOR = "supervisor"
+
+_LINE = re.compile(
+    r"(?P<time>[0-9T:.-]+Z) (?P<level>[A-Z]+) +(?P<process>.+?)\[(?P<pid>[0-9]{1,10})\] (?P<text>.*)", re.DOTALL
+)
+"""As shmio.logs writes it."""
 
 
 def execute(arguments: argparse.Namespace) -> int:
@@ -32,12 +40,12 @@ def execute(arguments: argparse.Namespace) -> int:
     if not any(file.exists() for file in files):
         raise ConfigError(f"no log file in {folder} yet")
     if not arguments.follow:
-        _print(last_lines(files, arguments.lines))
+        _print(last_lines(files, arguments.lines), as_json=arguments.json)
         return 0
     with Follower(files) as follower:
-        _print(last_lines(files, arguments.lines))
+        _print(last_lines(files, arguments.lines), as_json=arguments.json)
         while True:
-            _print(follower.wait())
+            _print(follower.wait(), as_json=arguments.json)
 
 
 def _where(arguments: argparse.Namespace) -> tuple[Path, list[str]]:
@@ -60,7 +68,16 @@ def _running(wanted: Target) -> list[str]:
     return []
 
 
-def _print(lines: Iterable[bytes]) -> None:
+def _print(lines: Iterable[bytes], *, as_json: bool) -> None:
     for line in lines:
-        print(printable(line.decode(errors="replace")))
+        text = line.decode(errors="replace")
+        print(dumps(_parsed(text)) if as_json else printable(text))
     sys.stdout.flush()
+
+
+def _parsed(line: str) -> dict[str, Any]:
+    """A line's parts; all but its text are None where it goes on with the one before, as those of a traceback."""
+    found = _LINE.fullmatch(line)
+    if found is None:
+        return {"time": None, "level": None, "process": None, "pid": None, "text": line}
+    return {**found.groupdict(), "pid": int(found["pid"])}

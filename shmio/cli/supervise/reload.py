@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 
+from shmio.cli.run import dumps
 from shmio.cli.target import ask, target
 from shmio.logs import printable
 from shmio.supervisor import control
@@ -16,6 +17,10 @@ def execute(arguments: argparse.Namespace) -> int:
     """Print what the supervisor did; 1 when something new does not run."""
     with target(arguments).open_supervised() as segment:
         answer = ask(segment, control.Reload(), RELOAD_S)
+        if arguments.json:
+            told = {key: answer[key] for key in ("done", "kept", "warnings", "problems")}
+            print(dumps({"instance": segment.instance, **told}, indent=2))
+            return 1 if answer["problems"] else 0
         for line in answer["warnings"]:
             print(printable(line), file=sys.stderr)
         for line in answer["done"]:

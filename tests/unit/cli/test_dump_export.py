@@ -201,7 +201,7 @@ def test_what_is_refused_leaves_nothing(
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     assert main(["export", "kinds.mem", "-o", "more"]) == 1
-    assert capsys.readouterr().err == "pyarrow is not installed: pip install 'shmio[parquet]'\n"
+    assert capsys.readouterr().err == "pyarrow is not installed: pip install 'shmio[analysis]'\n"
     assert not Path("more").exists()
 
 
@@ -252,6 +252,38 @@ def test_a_name_that_fits_not_is_refused(tmp_path: Path, capsys: pytest.CaptureF
     assert capsys.readouterr().err == "x.csv holds one block, and there are 2 (cell, press): name a folder\n"
     assert not Path("x.csv").exists()
     assert main(["export", "a.mem", "-o", "x.csv", "--source", "press"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "remedy"),
+    [
+        ("x.xlsx", "-o x.csv makes a file that Excel and LibreOffice open"),
+        ("run.1.ODS", "-o run.1.csv makes a file that Excel and LibreOffice open"),
+        ("x.mem", "shmio-dump cut FILE… -o x.mem writes a part of a recording to a new one"),
+        ("x.h5", "it writes .parquet, .csv, .mcap, by the end of the name, or into a folder by --format"),
+    ],
+)
+@pytest.mark.parametrize("asked", [(), ("--format", "csv")])
+def test_what_ends_as_other_formats_do_is_refused(
+    name: str, remedy: str, asked: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["export", "kinds.mem", "-o", name, *asked]) == 1
+    suffix = Path(name).suffix.lower()
+    assert capsys.readouterr().err == f"{name}: export does not write {suffix}; {remedy}\n"
+    assert not Path(name).exists()
+
+
+def test_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    for name, what in (("out", "rows"), ("x.mcap", "messages")):
+        form = ["--format", "csv"] if name == "out" else []
+        assert main(["export", "--json", "kinds.mem", "-o", name, *form]) == 0
+        file = "out/cell.csv" if name == "out" else name
+        assert json.loads(capsys.readouterr().out) == {"files": [{"file": file, what: 3}], "damage": []}
+    assert main(["export", "--json", "kinds.mem", "-o", "x.xlsx"]) == 1
+    out, err = capsys.readouterr()
+    assert json.loads(out) == {"error": err.rstrip()}
+    assert main(["export", "--json", "no.mem", "-o", "x.csv"]) == 1
+    assert json.loads(capsys.readouterr().out) == {"error": "no.mem: No such file or directory"}
 
 
 def test_a_file_is_of_the_one_block_that_has_frames_then(capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import random
 import re
@@ -75,6 +76,17 @@ def test_cut_by_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert main(["cut", str(file), "-o", "none.mem", "--from", "100"]) == 1
     assert re.fullmatch(r"nothing of \S+ is in that time; it goes from .* to .*\n", capsys.readouterr().err)
     assert not Path("none.mem").exists()
+
+
+def test_cut_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    varied(tmp_path / "a.mem")
+    words = ["cut", "--json", "a.mem", "-o", "part.mem", "--from", "0.3", "--to", "0.78"]
+    assert main(words) == 0
+    assert json.loads(capsys.readouterr().out) == {"file": "part.mem", "frames": 47, "events": 1, "damage": []}
+    assert main(words) == 1
+    out, err = capsys.readouterr()
+    assert json.loads(out) == {"error": "part.mem is there already: nothing is ever overwritten"}
+    assert err == "part.mem is there already: nothing is ever overwritten\n"
 
 
 def test_cut_by_source_and_register(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

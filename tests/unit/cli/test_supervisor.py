@@ -270,6 +270,32 @@ def test_check_tells_what_the_instance_takes(example: Edit, instance: str, capsy
     assert instance not in instances()
 
 
+def test_check_as_json(example: Edit, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
+    example('name = "a50"', f'name = "{instance}"')
+    example("writable = [", 'writable = ["Outpts", ')
+    assert main(["check", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found.pop("segment_bytes") > 1_000_000
+    [source] = found.pop("sources")
+    assert source.pop("ring_bytes") > 1_000_000
+    assert source.pop("ring_s") == pytest.approx(10.24)
+    assert source == {
+        "source": "cell", "peer": "127.0.0.1:1102", "block": "DB201", "registers": 22, "bytes": 2180,
+        "ring_frames": 512,
+    }  # fmt: skip
+    [warning] = found.pop("warnings")
+    assert "'Outpts' names nothing" in warning
+    assert found == {
+        "config": "supervisor.toml", "instance": instance, "injections": [], "replay": [],
+        "processes": ["plc", "cell", "grpc", "broker", "mqtt", "recorder"], "segment": f"shmio-{instance}",
+    }  # fmt: skip
+    example("period_ms = 20", "period_ms = -1")
+    assert main(["check", "--json"]) == 1
+    out, err = capsys.readouterr()
+    assert "period_ms" in err
+    assert json.loads(out) == {"error": err.rstrip("\n")}
+
+
 def test_check_says_that_a_priority_is_not_allowed(
     example: Edit, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

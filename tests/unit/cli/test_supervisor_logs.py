@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -101,6 +102,18 @@ def test_logs_of_all_and_of_one(instance_logs: Path, capsys: pytest.CaptureFixtu
     assert output == stamped(1, "cell running") + stamped(2, "connected \\x1b[31mred"), "nothing moves the cursor"
     assert main(["logs", "supervisor", "-n", "1"]) == 0
     assert capsys.readouterr().out == stamped(1, "cell running")
+
+
+def test_logs_as_json(instance_logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    stamp = "2026-11-21T05:20:03.000000Z"
+    (instance_logs / "cell.log").write_text(f"{stamp} WARNING cell[12] lost [a] source=cell\n    Traceback\n")
+    assert main(["logs", "cell", "--json"]) == 0
+    assert [json.loads(line) for line in capsys.readouterr().out.splitlines()] == [
+        {"time": stamp, "level": "WARNING", "process": "cell", "pid": 12, "text": "lost [a] source=cell"},
+        {"time": None, "level": None, "process": None, "pid": None, "text": "    Traceback"},
+    ]
+    assert main(["logs", "cel", "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["error"].startswith("no process 'cel'; there are: ")
 
 
 def test_logs_of_an_unknown_process_names_those_there_are(

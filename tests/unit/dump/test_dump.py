@@ -371,9 +371,9 @@ def test_tables_of_other_libraries(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     for name in ("pandas", "polars", "pyarrow"):
         monkeypatch.setitem(__import__("sys").modules, name, None)
     for convert, remedy in (
-        (columns.to_pandas, "pandas is not installed: pip install pandas"),
-        (columns.to_polars, "polars is not installed: pip install polars"),
-        (columns.to_arrow, r"pyarrow is not installed: pip install 'shmio\[parquet\]'"),
+        (columns.to_pandas, r"pandas is not installed: pip install 'shmio\[analysis\]'"),
+        (columns.to_polars, r"polars is not installed: pip install 'shmio\[analysis\]'"),
+        (columns.to_arrow, r"pyarrow is not installed: pip install 'shmio\[analysis\]'"),
     ):
         with pytest.raises(MissingLibraryError, match=remedy):
             convert()
