@@ -46,13 +46,15 @@ class Cursor(Generic[Entry]):
     def poll(self) -> Entry | None:
         """The next entry if there is one; never waits."""
         ring = self._ring
+        margin = 0
         while ring.head() > self._last:
             fields = ring.read(self._last + 1)
             if fields is not None:
                 self._last += 1
                 return self._decode(fields)
-            # Lapped. The oldest entries are about to go too: resume a quarter of the ring further on.
-            resume = max(self._last + 1, ring.head() - ring.slot_count * 3 // 4)
+            # Lapped. Resume with the oldest entry that there is, and further on each time that the writer is faster.
+            resume = max(self._last + 1, ring.head() - ring.slot_count + margin)
+            margin = min(2 * margin + 1, ring.slot_count // 2)
             self.missed += resume - self._last
             self._last = resume
         return None

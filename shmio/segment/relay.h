@@ -37,13 +37,15 @@ static inline void relay_run(relay *shared, const a32 *word, int descriptor, int
     }
 }
 
+/* Changes the state, unless the thread is to end: that is final. */
 static inline void relay_free(relay *shared, uint32_t state)
 {
-    if (atomic_exchange(&shared->state, state) == RELAY_HELD)
-        syscall(SYS_futex, &shared->state, FUTEX_WAKE, 1, NULL, NULL, 0);
+    uint32_t before = atomic_load(&shared->state);
+    while (before != RELAY_STOPPED && !atomic_compare_exchange_weak(&shared->state, &before, state)) {}
+    if (before == RELAY_HELD) syscall(SYS_futex, &shared->state, FUTEX_WAKE, 1, NULL, NULL, 0);
 }
 
-/* The loop's, before it looks at what the doorbell rings for. */
+/* The loop's, before it looks at what the doorbell rings for. Not after relay_stop: the descriptor may be another's. */
 static inline void relay_heard(relay *shared, int descriptor)
 {
     uint64_t count;
@@ -51,7 +53,8 @@ static inline void relay_heard(relay *shared, int descriptor)
     relay_free(shared, RELAY_HEARD);
 }
 
-/* Has the thread return: at once, or, if it is just about to wait, within its `turn_ns`. It tells nothing more. */
+/* Has the thread return: at once, or, if it is just about to wait, within its `turn_ns` or by another relay_stop. It
+ * tells nothing more. */
 static inline void relay_stop(relay *shared)
 {
     relay_free(shared, RELAY_STOPPED);

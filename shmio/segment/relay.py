@@ -10,6 +10,8 @@ from shmio.segment import _atomics
 
 TURN_NS: Final = 200_000_000
 """Longest time between two tellings: who listens looks at the age of what there is, and at what rings no bell."""
+AGAIN_S: Final = 0.01
+"""So often a thread is told to stop until it has ended: one that is just about to wait does not notice."""
 
 
 class Word(Protocol):
@@ -30,6 +32,7 @@ class Relay:
         self._shared = bytearray(_atomics.RELAY_SIZE)
         self._word = word
         self._turn_ns = turn_ns
+        self._stopped = False
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
@@ -40,15 +43,19 @@ class Relay:
 
     def heard(self) -> None:
         """To be called when the descriptor is readable, before looking: what comes from then on is told again."""
-        _atomics.relay_heard(self._shared, self.descriptor)
+        if not self._stopped:  # the descriptor's number may be another's by now
+            _atomics.relay_heard(self._shared, self.descriptor)
 
     def stop(self) -> None:
         """Tell no more. The thread ends soon, within ``turn_ns``, and the descriptor with it."""
+        self._stopped = True
         _atomics.relay_stop(self._shared)
 
     def join(self) -> None:
-        """Wait until it has ended."""
-        self._thread.join()
+        """Stop, and wait until the thread has ended; that takes no ``turn_ns``."""
+        while self._thread.is_alive():
+            self.stop()
+            self._thread.join(AGAIN_S)
 
     def _run(self) -> None:
         try:

@@ -1,4 +1,4 @@
-"""The C core under the sanitizers: many threads on one ring, two on one queue."""
+"""The C core under the sanitizers, many threads on one ring, two on one queue; and its relay in all interleavings."""
 
 from __future__ import annotations
 
@@ -21,5 +21,13 @@ def test_no_sanitizer_finds_anything(name: str, sanitizers: str, tmp_path: Path)
         command.append("-Wno-tsan")
     command += [f"-fsanitize={sanitizers}", "-fno-sanitize-recover=all", str(source), "-o", str(program)]
     subprocess.run(command, check=True, capture_output=True, text=True)
+    run = subprocess.run([program], capture_output=True, text=True, timeout=100, check=False)
+    assert (run.returncode, run.stderr) == (0, "")
+
+
+def test_no_interleaving_loses_a_ring_or_keeps_a_relay_that_was_stopped(tmp_path: Path) -> None:
+    source, program = Path(__file__).with_name("relay_model.c"), tmp_path / "relay_model"
+    command = [COMPILER, "-std=gnu11", "-D_GNU_SOURCE", "-O1", "-Wall", "-Wextra", "-Werror", str(source)]
+    subprocess.run([*command, "-o", str(program)], check=True, capture_output=True, text=True)
     run = subprocess.run([program], capture_output=True, text=True, timeout=100, check=False)
     assert (run.returncode, run.stderr) == (0, "")

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from shmio.layout.model import Layout, Register
-from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
+from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment, _atomics
 from shmio.segment.relay import Relay
 
 LAYOUT = Layout("DB1", 1, 4, False, (Register("count", "UDINT", (), 0, None, 4, 1),))
@@ -70,7 +70,6 @@ def test_no_ring_is_lost_however_busy_the_loop_is(segment: Segment, instance: st
             told += 1
             seen = block.ring.head()
         publishing.join()
-        assert told <= last + 1
         relay.stop()
         relay.join()
 
@@ -97,3 +96,46 @@ def test_one_that_is_stopped_ends_with_its_descriptor_whatever_it_waits_for(segm
     assert not relay.alive
     with pytest.raises(OSError, match="Bad file descriptor"):
         os.fstat(relay.descriptor)
+
+
+def test_one_that_is_stopped_before_it_runs_or_heard_after_that_does_not_run(segment: Segment) -> None:
+    shared = bytearray(_atomics.RELAY_SIZE)
+    descriptor = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
+    _atomics.relay_stop(shared)
+    _atomics.relay_heard(shared, descriptor)
+    segment.clock.bell.relay(shared, descriptor, LONG_NS)
+    assert not select.select([descriptor], [], [], 0)[0]
+    os.close(descriptor)
+
+
+def test_whoever_waits_for_the_end_stops_it_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread that is just about to wait does not notice that it is woken."""
+    stops = threading.Semaphore(0)
+
+    class JustAboutToWait:
+        def relay(self, shared: bytearray, descriptor: int, turn_ns: int, /) -> None:
+            for _ in range(2):
+                assert stops.acquire(timeout=GIVE_UP_MS / 1000)
+
+    monkeypatch.setattr(_atomics, "relay_stop", lambda _: stops.release())
+    relay = Relay(JustAboutToWait(), "relay", LONG_NS)
+    relay.stop()
+    relay.join()
+    assert not relay.alive
+
+
+def test_what_is_told_after_the_stop_is_not_heard(segment: Segment) -> None:
+    """The descriptor's number may be that of another file by then."""
+    relay = Relay(segment.clock.bell, "relay", LONG_NS)
+    ear = Ear(relay)
+    assert ear.told()
+    relay.stop()
+    relay.join()
+    reading, writing = os.pipe()
+    if reading != relay.descriptor:
+        os.dup2(reading, relay.descriptor)
+    os.write(writing, bytes(8))
+    relay.heard()
+    assert os.read(reading, 8) == bytes(8)
+    for descriptor in {reading, writing, relay.descriptor}:
+        os.close(descriptor)

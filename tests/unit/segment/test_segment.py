@@ -6,6 +6,7 @@ import errno
 import os
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -26,6 +27,7 @@ from shmio.segment import (
     instances,
     segment_size,
 )
+from shmio.segment.cursor import Cursor
 from shmio.segment.header import GENERATION_OFFSET, HEADER_SIZE
 
 LAYOUT = Layout(
@@ -195,8 +197,26 @@ def test_a_slow_stream_reader_is_told_exactly_what_it_missed(instance: str) -> N
         while (frame := cursor.poll()) is not None:
             seen.append(frame.cycle)
         assert seen == list(range(seen[0], total))
-        assert cursor.missed == total - len(seen) == seen[0]
+        assert cursor.missed == total - len(seen) == seen[0] == total - slots
         segment.unlink()
+
+
+def test_a_reader_that_the_writer_laps_again_and_again_comes_to_a_frame_all_the_same() -> None:
+    class Fast:
+        slot_count = 64
+        written = 1000
+
+        def head(self) -> int:
+            return self.written
+
+        def read(self, number: int) -> int | None:
+            self.written += 3  # and has begun with the next
+            return number if number > self.written - self.slot_count + 1 else None
+
+    ring: Any = Fast()
+    cursor: Cursor[Any] = Cursor(ring, lambda fields: fields, 0, lambda: False)
+    assert cursor.poll() == cursor.last == cursor.missed + 1
+    assert cursor.behind < ring.slot_count
 
 
 def test_a_successor_goes_on_with_the_numbers_and_has_its_own_incarnation(instance: str) -> None:

@@ -1,0 +1,75 @@
+"""What is broken, and the tests that should notice."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+
+@dataclass(frozen=True)
+class Group:
+    """A part of the core. All paths are globs from the project's root; a test file may stand in several groups."""
+
+    sources: tuple[str, ...]
+    tests: tuple[str, ...]
+
+
+GROUPS: Final = {
+    "segment": Group(
+        ("shmio/segment/*.py", "shmio/segment/*.h", "shmio/segment/_atomics.c"),
+        ("tests/unit/segment", "tests/native"),
+    ),
+    "s7": Group(
+        ("shmio/connectors/s7/*.py",),
+        ("tests/unit/connectors/s7", "tests/conformance/test_s7.py"),
+    ),
+    "commands": Group(
+        (
+            "shmio/connectors/base.py",
+            "shmio/connectors/batch.py",
+            "shmio/connectors/chain.py",
+            "shmio/connectors/desk.py",
+            "shmio/connectors/injections.py",
+            "shmio/connectors/injector.py",
+            "shmio/connectors/loop.py",
+            "shmio/connectors/output.py",
+            "shmio/layout/write.py",
+            "shmio/segment/answers.py",
+            "shmio/segment/commander.py",
+            "shmio/segment/commands.py",
+        ),
+        (
+            "tests/unit/connectors/test_*.py",
+            "tests/unit/layout/test_write.py",
+            "tests/unit/segment/test_command*.py",
+            "tests/unit/segment/test_change.py",
+        ),
+    ),
+    "streams": Group(
+        (
+            "shmio/endpoints/grpc/bells.py",
+            "shmio/endpoints/grpc/feed*.py",
+            "shmio/endpoints/grpc/followers.py",
+            "shmio/endpoints/grpc/outbox*.py",
+            "shmio/endpoints/grpc/pace.py",
+            "shmio/endpoints/grpc/publish.py",
+            "shmio/endpoints/grpc/subscribers.py",
+        ),
+        ("tests/unit/endpoints/test_*.py",),
+    ),
+    "recorder": Group(
+        ("shmio/recording/*.py",),
+        ("tests/unit/recording",),
+    ),
+}
+
+
+def expand(root: Path, patterns: tuple[str, ...]) -> Iterator[Path]:
+    """The files that the globs name; SystemExit if one names none."""
+    for pattern in patterns:
+        found = sorted(root.glob(pattern))
+        if not found:
+            raise SystemExit(f"{pattern} names nothing: correct tests/mutants/groups.py")
+        yield from found

@@ -1,0 +1,315 @@
+"""Which tests notice a fault: runs them in forks of one process that has collected them, or in new processes."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import resource
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from tests.mutants.functions import Change, change, watch
+from tests.mutants.mutations import Mutant
+
+MEMORY_BYTES: Final = 8 << 30
+"""Of the address space of each process: a fault may ask for any amount."""
+SLOWEST_S: Final = 20.0
+"""So long each test may take, and ten times what it takes without a fault."""
+PR_SET_PDEATHSIG: Final = 1
+STARTS: Final = {"subprocess.Popen", "os.posix_spawn", "os.fork", "os.exec"}
+
+
+@dataclass
+class Known:
+    """What a run without a fault told of one test."""
+
+    took_s: float = 0.0
+    passed: bool = True
+    starts_processes: bool = False
+    calls: set[tuple[str, int]] = field(default_factory=set)
+    """File and first line of all code of the core that it called."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of one mutant. ``caught_by``: the test that failed twice, or empty."""
+
+    mutant: Mutant
+    caught_by: str
+    tests: int
+    took_s: float
+
+
+class Judge:
+    """Breaks the copy of the project in the current folder, and runs its tests. One at a time."""
+
+    def __init__(self, original: Path, limit_s: float) -> None:
+        self._original = original
+        self._tree = Path.cwd()
+        self._limit_s = limit_s
+        self._items: dict[str, pytest.Item] = {}
+        self._known: dict[str, Known] = {}
+
+    def learn(self, items: Sequence[pytest.Item], sources: Iterable[Path]) -> list[str]:
+        """Run all tests once without a fault; the names of those that fail, and will be left out."""
+        self._items = {item.nodeid: item for item in items}
+        files = [self._tree / source for source in sources if source.suffix == ".py"]
+        log = self._forked(list(self._items), lambda: None, 3600.0, files)
+        for name in self._items:
+            self._known[name] = Known(passed=False)
+        name = ""
+        for line in log:
+            kind, _, rest = line.partition(" ")
+            if kind == "begin":
+                name = rest
+                self._known[name] = Known()
+            elif kind == "call":
+                file, _, first = rest.rpartition(":")
+                self._known[name].calls.add((file, int(first)))
+            elif kind == "starts":
+                self._known[name].starts_processes = True
+            elif kind == "fail":
+                self._known[name].passed = False
+            elif kind == "took":
+                self._known[name].took_s = float(rest)
+        return [name for name, known in self._known.items() if not known.passed]
+
+    def judge(self, mutant: Mutant) -> Verdict | None:
+        """Run the tests on a mutant; None if it is none: the compiler refuses it."""
+        begun_s = time.monotonic()
+        broken = self._tree / mutant.path
+        broken.write_text(mutant.source)
+        try:
+            if mutant.path.suffix != ".py" and not self._build():
+                return None
+            changed = None
+            if mutant.path.suffix == ".py":
+                original = self._original / mutant.path
+                changed = change(original.read_text(), mutant.source, broken)
+            names, run = self._plan(changed, broken)
+            suspect = self._first_failure(run(names, self._limit_s))
+            caught = suspect if suspect and self._first_failure(run([suspect], self._limit_s)) else ""
+            if suspect and not caught:  # that one may fail by chance: the others decide
+                names = names[names.index(suspect) + 1 :]
+                suspect = self._first_failure(run(names, self._limit_s))
+                caught = suspect if suspect and self._first_failure(run([suspect], self._limit_s)) else ""
+        finally:
+            shutil.copy2(self._original / mutant.path, broken)
+            if mutant.path.suffix != ".py":
+                self._restore_build()
+        return Verdict(mutant, caught, len(names), time.monotonic() - begun_s)
+
+    def _plan(self, changed: Change | None, broken: Path) -> tuple[list[str], Callable[[list[str], float], list[str]]]:
+        """The tests, those first that end soonest, and what runs them."""
+        usable = sorted((name for name in self._known if self._known[name].passed), key=lambda n: self._known[n].took_s)
+        if changed is None:
+            return usable, self._anew
+        lines = changed.lines
+        covering = [
+            name
+            for name in usable
+            if any(file == str(broken) and first in lines for file, first in self._known[name].calls)
+        ]
+        if not covering:  # called while a module is imported, or in other processes only
+            return usable, self._anew
+        beyond = [name for name in usable if self._known[name].starts_processes and name not in covering]
+
+        def run(names: list[str], limit_s: float) -> list[str]:
+            def apply() -> None:
+                if not changed.apply(broken):
+                    raise RuntimeError(f"{changed.old.co_qualname} of {broken} is nowhere")
+
+            return self._forked(names, apply, limit_s, ())
+
+        return covering + beyond, run
+
+    @staticmethod
+    def _first_failure(log: Iterable[str]) -> str:
+        """The test that failed, or did not end."""
+        begun = ""
+        for line in log:
+            kind, _, name = line.partition(" ")
+            if kind == "begin":
+                begun = name
+            elif kind == "fail":
+                return name
+            elif kind == "end":
+                return ""
+        return begun
+
+    # -- in a fork -----------------------------------------------------------------------------------------------------
+
+    def _forked(self, names: list[str], apply: Callable[[], None], limit_s: float, traced: Sequence[Path]) -> list[str]:
+        log = self._tree / "log"
+        log.write_text("")
+        pid = os.fork()
+        if pid == 0:
+            status = 1
+            try:
+                apply()
+                self._run(names, log, traced)
+                status = 0
+            except BaseException as error:  # noqa: BLE001 - told by the parent
+                with log.open("a") as lines:
+                    lines.write(f"broken {error!r}\n")
+            finally:
+                os._exit(status)
+        _wait(pid, limit_s)
+        _end_all()
+        told = log.read_text().splitlines()
+        if broken := [line for line in told if line.startswith("broken ")]:
+            raise RuntimeError(broken[0])
+        return told
+
+    def _run(self, names: list[str], log: Path, traced: Sequence[Path]) -> None:
+        """The tests, in the child, until one fails; all of them, and what they call, if ``traced``."""
+        os.setsid()
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+        items = [self._items[name] for name in names]
+        with log.open("a", buffering=1) as lines:
+            plugins = items[0].config.pluginmanager if items else None
+            if plugins is not None:
+                plugins.unregister(plugins.get_plugin("terminalreporter"))
+            told = _Told(lines.write)
+            called = watch(traced) if traced else set()
+            if traced:
+                sys.addaudithook(told.audit)
+            for number, item in enumerate(items):
+                following = items[number + 1] if number + 1 < len(items) else None
+                took_s = self._known[item.nodeid].took_s if self._known else SLOWEST_S
+                item.add_marker(pytest.mark.timeout(max(SLOWEST_S, 10 * took_s)), append=False)
+                told.begin(item.nodeid)
+                if number == 0:
+                    item.config.pluginmanager.register(told)
+                begun_s = time.monotonic()
+                item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+                lines.write(f"took {time.monotonic() - begun_s:.3f}\n")
+                lines.writelines(f"call {file}:{first}\n" for file, first in tuple(called))
+                called.clear()
+                told.flush()
+                if told.failed and not traced:
+                    return
+            lines.write("end\n")
+
+    # -- in a new process ----------------------------------------------------------------------------------------------
+
+    def _anew(self, names: list[str], limit_s: float) -> list[str]:
+        """What is done while modules are imported, and C, need a new process."""
+        arguments = self._tree / "names"
+        arguments.write_text("\n".join(names))
+        command = [sys.executable, "-m", "pytest", "-x", "-v", "--tb=no", "-p", "no:cacheprovider", "--numprocesses=0"]
+        command += [f"--timeout={SLOWEST_S:g}", f"--basetemp={self._tree / 'anew'}", f"@{arguments}"]
+        popen = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
+        )
+        timer = threading.Timer(limit_s, popen.kill)
+        timer.start()
+        output = popen.communicate()[0]
+        timer.cancel()
+        timer.join()
+        _end_all()
+        log = []
+        for line in output.splitlines():
+            if match := re.match(r"(tests/\S+::.*?) (PASSED|FAILED|ERROR|SKIPPED)?(\s|$)", line):
+                log.append(f"begin {match[1]}")
+                if match[2] in {"FAILED", "ERROR"}:
+                    log.append(f"fail {match[1]}")
+        if popen.returncode == 0:
+            log.append("end")
+        elif not log:
+            log.append(f"begin {names[0]}")  # not even collected
+        return log
+
+    # -- the C extension -----------------------------------------------------------------------------------------------
+
+    def _build(self) -> bool:
+        command = [
+            sys.executable,
+            "setup.py",
+            "-q",
+            "build_ext",
+            "--force",
+            "--build-temp",
+            "temp",
+            "--build-lib",
+            "lib",
+        ]
+        if subprocess.run(command, capture_output=True, check=False).returncode:
+            return False
+        for built in (self._tree / "lib").rglob("_atomics*.so"):
+            built.replace(self._tree / "shmio/segment" / built.name)
+        return True
+
+    def _restore_build(self) -> None:
+        for built in (self._original / "shmio/segment").glob("_atomics*.so"):
+            shutil.copy2(built, self._tree / "whole.so")
+            (self._tree / "whole.so").replace(self._tree / "shmio/segment" / built.name)
+
+
+class _Told:
+    """A plugin that writes down which test fails, and in the log what else is known of it."""
+
+    def __init__(self, write: Callable[[str], object]) -> None:
+        self._write = write
+        self._name = ""
+        self.failed = False
+        self._starts = False
+
+    def begin(self, name: str) -> None:
+        self._name = name
+        self._write(f"begin {name}\n")
+
+    def audit(self, event: str, _arguments: object) -> None:
+        """Something has happened in the interpreter."""
+        self._starts |= event in STARTS
+
+    def flush(self) -> None:
+        """The test is over."""
+        if self._starts:
+            self._starts = False
+            self._write("starts\n")
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """One of its phases is over."""
+        if report.failed:
+            self.failed = True
+            self._write(f"fail {self._name}\n")
+
+
+def _wait(pid: int, limit_s: float) -> None:
+    """Until it ends, or its time is over."""
+    descriptor = os.pidfd_open(pid)
+    try:
+        if not select.select([descriptor], [], [], limit_s)[0]:
+            signal.pidfd_send_signal(descriptor, signal.SIGKILL)
+            os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+    finally:
+        os.close(descriptor)
+    os.waitpid(pid, 0)
+
+
+def _end_all() -> None:
+    """What a test left running is ours, for orphans come to us: :func:`adopt`. Its segments go, too."""
+    while True:
+        found = [int(pid) for path in Path("/proc/self/task").glob("*/children") for pid in path.read_text().split()]
+        if not found:
+            break
+        for pid in found:
+            try:
+                os.kill(pid, signal.SIGKILL)
+                os.waitpid(pid, 0)
+            except (ProcessLookupError, ChildProcessError):
+                continue
