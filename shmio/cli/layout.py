@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from shmio import __version__
 from shmio.cli.run import dumps, run
-from shmio.errors import LayoutError
-from shmio.layout.compiler import Source, compile_sources
+from shmio.errors import ConfigError, LayoutError
+from shmio.layout.compiler import Program, Source
 from shmio.layout.document import describe
 from shmio.layout.image import complaints
 from shmio.layout.lexer import MAX_SOURCE_BYTES
-from shmio.layout.model import Layout, Register
+from shmio.layout.model import MAX_BLOCK_BYTES, Layout, Register
 from shmio.logs import printable
 
 _HEADINGS = ("offset", "size", "type", "path", "initial", "comment")
@@ -34,19 +34,45 @@ def main(arguments: Sequence[str] | None = None) -> int:
         nargs="*",
         help="further sources, with the PLC data types, function blocks and constants it uses",
     )
+    parser.add_argument(
+        "--block", metavar="NAME", help="this data block alone; what is wrong with others does not count"
+    )
+    parser.add_argument(
+        "--type-bytes",
+        metavar="TYPE=BYTES",
+        type=_size,
+        action="append",
+        default=[],
+        help="the size of a type whose members are not known; it becomes bytes without meaning",
+    )
     parser.add_argument("--json", action="store_true", help="print JSON: one object, or a list for several blocks")
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")
     options = parser.parse_intermixed_args(arguments)
-    return run(parser.prog, lambda: _compile([options.file, *options.types], as_json=options.json))
+    names, sizes = [options.file, *options.types], dict(options.type_bytes)
+    return run(parser.prog, lambda: _compile(names, options.block, sizes, as_json=options.json))
 
 
-def _compile(names: Sequence[str], *, as_json: bool) -> int:
+def _size(text: str) -> tuple[str, int]:
+    name, _, number = text.rpartition("=")
+    size = int(number) if number.isascii() and number.isdecimal() and len(number) < 8 else 0
+    if not name or not 1 <= size <= MAX_BLOCK_BYTES:
+        raise argparse.ArgumentTypeError(f"{text!r}: expected a type and its bytes, such as TON_TIME=16")
+    return name.strip('"'), size
+
+
+def _compile(names: Sequence[str], block: str | None, sizes: Mapping[str, int], *, as_json: bool) -> int:
     try:
-        compiled = compile_sources([_read(name) for name in names])
+        program = Program([_read(name) for name in names])
+        if block is not None and block.lower() not in {held.name.lower() for held in program.blocks}:
+            program.compile(())  # which says so if the sources are damaged
+            held = ", ".join(held.name for held in program.blocks)
+            raise ConfigError(f"--block: no data block {block!r}; there are: {held}")
+        compiled = program.compile(None if block is None else (block,), sizes)
     except LayoutError as error:
         _complain(error.diagnostics)
         return 1
     _complain(compiled.warnings)
+    _complain(f"warning: --type-bytes: nothing is of the type {name!r}" for name in compiled.unused)
     for layout in compiled.layouts:
         _complain(_unread(layout))
     _print(compiled.layouts, as_json=as_json)

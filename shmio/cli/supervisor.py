@@ -65,10 +65,11 @@ def _parser() -> argparse.ArgumentParser:
     logs.add_argument("-n", "--lines", type=at_least(0), default=20, metavar="LINES", help="default: 20")
     add_json(logs, "print a JSON object a line")
     init = verb("init", "write a configuration: the A50 example, or one for the files given", file)
-    init.usage = f"{PROGRAM} init [-h] [-c FILE] [--emulated] [plc.ini] [FILE.db [FILE.udt ...]]"
+    init.usage = f"{PROGRAM} init [-h] [-c FILE] [--emulated] [--block NAME] [plc.ini] [FILE.db [FILE.udt ...]]"
     init.add_argument(
         "--emulated", action="store_true", help="with an emulated PLC that holds the block, in place of the real one"
     )
+    init.add_argument("--block", metavar="NAME", help="this data block alone (default: a source for each)")
     init.add_argument(
         "files", metavar="FILE", nargs="*", type=Path, help="the block's sources (.db, .udt, .scl), and a plc.ini"
     )

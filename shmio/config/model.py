@@ -21,6 +21,8 @@ ClockName = Literal["wall", "stepped"]
 ReplayedInjections = Literal["keep", "leave out"]
 DistributionName = Literal["uniform", "gaussian"]
 OperationName = Literal["set", "offset", "scale", "clamp", "noise", "random", "freeze", "delay", "drop", "flip"]
+TypeBytes = Annotated[dict[Text, Annotated[int, Meta(ge=1, le=1 << 20)]], Meta(max_length=1000)]
+"""Sizes of types whose members are not known, by their names."""
 RealtimePriority = Annotated[int, Meta(ge=1, le=99)]
 """Of SCHED_FIFO, sched(7)."""
 
@@ -49,6 +51,7 @@ class Source(Section):
     connector: Text
     layout: Text | Texts | None = None
     block: Text | None = None
+    type_bytes: TypeBytes = {}
     properties: Text | None = None
     period_ms: Annotated[float, Meta(ge=0.1, le=3_600_000)] = 20.0
     stale_ms: Milliseconds | None = None
@@ -79,6 +82,7 @@ class Emulator(Section):
     listen: Text
     program: Text = "idle"
     block: Text | None = None
+    type_bytes: TypeBytes = {}
     dbNumber: DbNumber | None = None  # noqa: N815 - named as the source's
     insecure: bool = False
     realtime_priority: RealtimePriority | None = None

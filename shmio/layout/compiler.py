@@ -6,25 +6,30 @@ STEP 7 classic (``.awl``), given together when one uses types, function blocks o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
 from shmio.layout import emit, lexer, parser, tags
 from shmio.layout.constants import Constants
 from shmio.layout.encoding import decode
+from shmio.layout.foreign import foreign
 from shmio.layout.model import MAX_BLOCK_BYTES, MAX_STANDARD_BYTES, Diagnostic, Layout
 from shmio.layout.place import MAX_TEXT, Placer
-from shmio.layout.placed import Group
+from shmio.layout.placed import Cost, Group
 from shmio.layout.report import Report, TooManyErrors
 from shmio.layout.syntax import Array, BlockDeclaration, ConstantDeclaration, Named, Struct, TypeDeclaration, Unit
+
+MAX_ALL_REGISTERS = 500_000
+MAX_ALL_STRUCTURES = 500_000
+"""Of all blocks that are compiled together; a small source can have many large ones."""
 
 _Declaration = TypeVar("_Declaration", TypeDeclaration, BlockDeclaration, ConstantDeclaration)
 
 _OPTIMIZED = (
     "the block {name} has optimized access: its values have no fixed addresses and the classic S7 protocol cannot "
-    "read it; switch off 'Optimized block access' in the block's properties, or use OPC UA. "
+    "read it; switch off 'Optimized block access' in the block's properties, and compile and load the block. "
     "The offsets are those it would have with standard access"
 )
 
@@ -39,53 +44,164 @@ class Source:
 
 @dataclass(frozen=True)
 class Compiled:
-    """The layouts of all data blocks, in source order."""
+    """The layouts of all data blocks, in source order. ``unused``: types whose size was given, and nothing is of."""
 
     layouts: tuple[Layout, ...]
     warnings: tuple[Diagnostic, ...]
+    unused: tuple[str, ...] = ()
 
 
-def compile_sources(sources: Sequence[Source]) -> Compiled:
+@dataclass(frozen=True, slots=True)
+class Held:
+    """A data block that the sources hold."""
+
+    name: str
+    number: int | None
+
+
+def compile_sources(
+    sources: Sequence[Source], *, blocks: Collection[str] | None = None, type_bytes: Mapping[str, int] | None = None
+) -> Compiled:
     """Compile the data blocks of one or several files that may use each other's types, or a tag table (``.toml``).
 
-    Raises LayoutError: ``diagnostics`` has everything found, errors first.
+    Args:
+        sources: The files.
+        blocks: Names of the data blocks wanted, in any case; what is wrong with others does not count. None: all.
+        type_bytes: Sizes of types whose members are not known, by their names in any case.
+
+    Raises:
+        LayoutError: ``diagnostics`` has everything found, errors first.
+
     """
-    report = Report([source.file for source in sources])
-    for source in sources:
-        if source.file.endswith(tags.SUFFIX):
-            if len(sources) == 1:
-                return Compiled((tags.compile_tags(source.file, source.text, report),), tuple(report.warnings))
-            report.add(Diagnostic(source.file, 1, 1, "a tag table stands alone, not together with other files"))
-            report.raise_errors()
-    layouts: list[Layout] = []
-    with suppress(TooManyErrors):
-        units = [_read(source, report) for source in sources]
-        types = _by_name([declaration for unit in units for declaration in unit.types], report)
-        given = _by_name([declaration for unit in units for declaration in unit.constants], report)
-        constants = Constants(given.values())
-        placer = Placer(types, constants, report)
-        for declaration in types.values():
-            if not declaration.is_function_block:
-                placer.named(Named(declaration.name, True, declaration.position))
-        blocks = [declaration for unit in units for declaration in unit.blocks]
-        if not blocks and not report.errors:
+    return Program(sources).compile(blocks, type_bytes)
+
+
+class Program:
+    """Sources that have been read: which data blocks they hold is known, and each can be compiled by itself."""
+
+    def __init__(self, sources: Sequence[Source]) -> None:
+        """Read them. LayoutError: a tag table that is none."""
+        self._files = [source.file for source in sources]
+        self._general = Report(self._files)
+        self._table: Layout | None = None
+        self._units: list[Unit] = []
+        self._types: dict[str, TypeDeclaration] = {}
+        self._constants: dict[str, ConstantDeclaration] = {}
+        self._doubles: list[Diagnostic] = []
+        self.blocks: tuple[Held, ...] = ()
+        with suppress(TooManyErrors):
+            self._read(sources)
+
+    def _read(self, sources: Sequence[Source]) -> None:
+        report = self._general
+        for source in sources:
+            if source.file.endswith(tags.SUFFIX):
+                if len(sources) == 1:
+                    self._table = tags.compile_tags(source.file, source.text, report)
+                    self.blocks = (Held(self._table.name, None),)
+                    return
+                report.add(Diagnostic(source.file, 1, 1, "a tag table stands alone, not together with other files"))
+                report.raise_errors()
+        for source in sources:
+            self._units.append(_read(source, report))
+        types, doubles = self._by_name([declaration for unit in self._units for declaration in unit.types])
+        self._types = types | {
+            key: replace(types[key], faults=(*types[key].faults, fault)) for key, fault in doubles.items()
+        }
+        self._constants, _ = self._by_name([declaration for unit in self._units for declaration in unit.constants])
+        blocks = [declaration for unit in self._units for declaration in unit.blocks]
+        self._by_name(blocks)
+        self.blocks = tuple(Held(block.name, block.number) for block in blocks)
+        if not blocks and not report.errors and not any(fault.severity == "error" for fault in self._faults()):
             file = sources[0].file if sources else "<none>"
             report.add(Diagnostic(file, 1, 1, "expected a DATA_BLOCK, found none"))
-        _by_name(blocks, report)
-        for block in blocks:
-            optimized = block.optimized
-            if isinstance(block.body, Named) and (instance_of := types.get(block.body.name.lower())):
-                optimized |= instance_of.optimized
-            layout = _layout(block, optimized, Constants(block.constants, constants), placer, report)
-            if layout is not None:
-                layouts.append(layout)
-    report.raise_errors()
-    return Compiled(tuple(layouts), tuple(report.warnings))
+
+    def _by_name(self, declarations: Sequence[_Declaration]) -> tuple[dict[str, _Declaration], dict[str, Diagnostic]]:
+        """The declarations by their names in lower case, and what is wrong with names that are there twice."""
+        found: dict[str, _Declaration] = {}
+        doubles: dict[str, Diagnostic] = {}
+        for declaration in declarations:
+            key = declaration.name.lower()
+            first = found.setdefault(key, declaration)
+            if first is not declaration and key not in doubles:
+                doubles[key] = _double(first, declaration)
+        self._doubles += doubles.values()
+        return found, doubles
+
+    def _faults(self) -> Iterator[Diagnostic]:
+        """What is wrong with all declarations, and odd; of a function block it counts only where that is used."""
+        for unit in self._units:
+            declarations: list[TypeDeclaration | BlockDeclaration] = [*unit.types, *unit.blocks]
+            for declaration in sorted(declarations, key=lambda one: (one.position.line, one.position.column)):
+                if not (isinstance(declaration, TypeDeclaration) and declaration.is_function_block):
+                    yield from declaration.faults
+        yield from self._doubles
+
+    def compile(self, blocks: Collection[str] | None = None, type_bytes: Mapping[str, int] | None = None) -> Compiled:
+        """Compile all data blocks, or those of these names; LayoutError. See :func:`compile_sources`."""
+        if self._table is not None:
+            return Compiled((self._table,), tuple(self._general.warnings))
+        report = Report(self._files)
+        layouts: list[Layout] = []
+        with suppress(TooManyErrors):
+            report.extend((*self._general.errors, *self._general.warnings))
+            constants = Constants(self._constants.values())
+            placer = Placer(self._types, constants, report, type_bytes or {})
+            wanted = [block for unit in self._units for block in unit.blocks]
+            if blocks is None:
+                report.extend(self._faults())
+                for declaration in self._types.values():
+                    if not declaration.is_function_block:
+                        placer.named(Named(declaration.name, True, declaration.position))
+            else:
+                names = {name.lower() for name in blocks}
+                wanted = [block for block in wanted if block.name.lower() in names]
+                self._report_chosen(wanted, report)
+            spent = Cost()
+            for block in wanted:
+                own = Constants(block.constants, constants)
+                group = _body(block, own, placer, report)
+                if group is None:
+                    continue
+                spent = spent.plus(group.cost, 1, 0)
+                if spent.registers > MAX_ALL_REGISTERS or spent.structures > MAX_ALL_STRUCTURES:
+                    most = (
+                        f"{MAX_ALL_REGISTERS} registers and {MAX_ALL_STRUCTURES} structures in all data blocks together"
+                    )
+                    report.add(block.position.error(f"expected at most {most}, found more up to this one: choose one"))
+                    break
+                layout = _layout(block, group, self._is_optimized(block), own, report)
+                if layout is not None:
+                    layouts.append(layout)
+        report.raise_errors()
+        unused = tuple(name for name in type_bytes or () if name.lower() not in placer.placed)
+        return Compiled(tuple(layouts), tuple(report.warnings), unused)
+
+    def _report_chosen(self, wanted: Sequence[BlockDeclaration], report: Report) -> None:
+        """Report what is wrong with these blocks alone."""
+        names: dict[str, BlockDeclaration] = {}
+        for block in wanted:
+            report.extend(block.faults)
+            first = names.setdefault(block.name.lower(), block)
+            if first is not block:
+                report.add(_double(first, block))
+
+    def _is_optimized(self, block: BlockDeclaration) -> bool:
+        instance_of = self._types.get(block.body.name.lower()) if isinstance(block.body, Named) else None
+        return block.optimized or (instance_of is not None and instance_of.optimized)
+
+
+def _double(first: _Declaration, second: _Declaration) -> Diagnostic:
+    where = f"{first.position.file}:{first.position.line}"
+    return second.position.error(f"{second.name!r} is declared already, in {where}")
 
 
 def _read(source: Source, report: Report) -> Unit:
     if len(source.text) > lexer.MAX_SOURCE_BYTES:
         report.add(Diagnostic(source.file, 1, 1, f"the file is larger than {lexer.MAX_SOURCE_BYTES} bytes"))
+        return Unit()
+    if what := foreign(source.file, source.text):
+        report.add(Diagnostic(source.file, 1, 1, what))
         return Unit()
     decoded = decode(source.text)
     if decoded.problem:
@@ -96,22 +212,9 @@ def _read(source: Source, report: Report) -> Unit:
     return parser.parse(source.file, decoded.text, lexer.tokenize(decoded.text), report)
 
 
-def _by_name(declarations: Sequence[_Declaration], report: Report) -> dict[str, _Declaration]:
-    found: dict[str, _Declaration] = {}
-    for declaration in declarations:
-        first = found.setdefault(declaration.name.lower(), declaration)
-        if first is not declaration:
-            where = f"{first.position.file}:{first.position.line}"
-            report.add(declaration.position.error(f"{declaration.name!r} is declared already, in {where}"))
-    return found
-
-
 def _layout(
-    block: BlockDeclaration, optimized: bool, constants: Constants, placer: Placer, report: Report
+    block: BlockDeclaration, group: Group, optimized: bool, constants: Constants, report: Report
 ) -> Layout | None:
-    group = _body(block, constants, placer, report)
-    if group is None:
-        return None
     limit = MAX_BLOCK_BYTES if optimized else MAX_STANDARD_BYTES
     if group.size > limit:
         report.add(block.position.error(f"expected at most {limit} bytes, found a block of {group.size}"))

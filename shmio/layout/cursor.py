@@ -83,6 +83,12 @@ class Cursor:
             self._absent.add(word)
         return False
 
+    def skip_to_any(self, *words: str) -> None:
+        """Go to the next of these keywords, or to the end, without a word about faults on the way."""
+        while self._tokens[self.index].kind is not Kind.END and not self._tokens[self.index].is_word(*words):
+            self.index += 1
+        self.rewind(self.index)
+
     def _pass_faults(self) -> None:
         while (token := self._tokens[self.index]).kind is Kind.FAULT:
             self.report.add(self.at(token).error(token.text))

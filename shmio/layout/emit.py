@@ -112,6 +112,10 @@ def assign(
     texts: dict[int, InitialTexts] = {}
     for assignment in assignments:
         target = _target(group, assignment)
+        if target is None:
+            what = "the value is not read: the members of its type are not known"
+            report.add(assignment.position.warning(what))
+            continue
         if isinstance(target, str):
             report.add(assignment.position.error(target))
             continue
@@ -135,8 +139,8 @@ class _Target:
     part: str = ""  # of a DTL, which TIA Portal also assigns member by member
 
 
-def _target(group: Group, assignment: Assignment) -> _Target | str:
-    """Return the register that is assigned; or what is wrong."""
+def _target(group: Group, assignment: Assignment) -> _Target | str | None:
+    """Return the register that is assigned, or what is wrong; None: the members of its type are not known."""
     path = ""
     element: tuple[int, ...] = ()
     place: Leaf | Group | Repeat = group
@@ -148,6 +152,8 @@ def _target(group: Group, assignment: Assignment) -> _Target | str:
                 return _expected_index(place.dims, part)
             path, place = f"{path}/{'/'.join(map(str, part))}", place.group
             continue
+        if place.opaque:
+            return None
         field = place.fields.get(part.lower()) if isinstance(part, str) else None
         if field is None:
             return f"expected a member of this block, found {_written(part)}"

@@ -6,14 +6,15 @@ A syntax error is reported and the parser goes on at the next ``;`` or ``END_…
 from __future__ import annotations
 
 import re
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 from shmio.layout.cursor import Cursor, SyntaxFault
 from shmio.layout.declarations import BLOCK_SECTIONS, SECTIONS, TOP, Declarations
 from shmio.layout.expression import integer
 from shmio.layout.lexer import Kind, Token
-from shmio.layout.report import Report, TooManyErrors
+from shmio.layout.report import MAX_ERRORS, Report, TooManyErrors
 from shmio.layout.syntax import Assignment, BlockDeclaration, ConstantDeclaration, Struct, Type, TypeDeclaration, Unit
 
 _HEADER = (
@@ -65,74 +66,92 @@ class _Parser:
                     raise self.at.expected("DATA_BLOCK, TYPE or FUNCTION_BLOCK")
             except SyntaxFault as fault:
                 self.at.report.add(fault.diagnostic)
-                while not self.at.at_end() and not self.at.token.is_word(*TOP):
-                    self.at.advance()
+                self.resume()
         return unit
+
+    def resume(self) -> None:
+        """Go to where the next declaration begins."""
+        while not self.at.at_end() and not self.at.token.is_word(*TOP):
+            self.at.advance()
+
+    @contextmanager
+    def collecting(self, *, resume: bool = True) -> Iterator[Report]:
+        """Collect what is wrong with one declaration: not every one is used. ``resume`` after it, if it is broken."""
+        outer, inner = self.at.report, Report([self.at.file])
+        self.at.report = inner
+        with suppress(TooManyErrors):
+            try:
+                yield inner
+            except SyntaxFault as fault:
+                inner.add(fault.diagnostic)
+                if resume:
+                    self.resume()
+        if resume and len(inner.errors) >= MAX_ERRORS:
+            self.at.skip_to_any(*TOP)
+        self.at.report = outer
 
     def block(self) -> BlockDeclaration:
         position = self.at.position
         name, quoted = self.block_name("the block's name")
         match = None if quoted else _DB_NUMBER.fullmatch(name)
         number = int(match[1]) if match and int(match[1]) <= 65_535 else None
-        header = self.header()
-        if header.protected and self.at.token.is_word("BEGIN", "END_DATA_BLOCK"):
-            raise SyntaxFault(position.error(_PROTECTED.format(name)))
-        body: Type
+        header = _Header()
+        body: Type = Struct((), position)
         constants: tuple[ConstantDeclaration, ...] = ()
-        if self.at.token.is_word("STRUCT", *BLOCK_SECTIONS):
-            body, constants = self.declare.sections()
-        else:
-            body = self.declare.body_type()
-            header = self.header(header)  # STEP 7 takes it on either side of the type's name
-        self.at.accept(";")
         assignments: list[Assignment] = []
-        if self.at.accept_word("BEGIN"):
-            while not self.at.token.is_word("END_DATA_BLOCK", *TOP) and self.at.token.kind is not Kind.END:
-                self.declare.recovering(lambda: self.assignment(assignments))
-        self.at.expect_word("END_DATA_BLOCK")
-        return BlockDeclaration(name, number, header.optimized, body, constants, tuple(assignments), position)
+        with self.collecting() as found:
+            header = self.header()
+            if header.protected and self.at.token.is_word("BEGIN", "END_DATA_BLOCK"):
+                raise SyntaxFault(position.error(_PROTECTED.format(name)))
+            if self.at.token.is_word("STRUCT", *BLOCK_SECTIONS):
+                body, constants = self.declare.sections()
+            else:
+                body = self.declare.body_type()
+                header = self.header(header)  # STEP 7 takes it on either side of the type's name
+            self.at.accept(";")
+            if self.at.accept_word("BEGIN"):
+                while not self.at.token.is_word("END_DATA_BLOCK", *TOP) and self.at.token.kind is not Kind.END:
+                    self.declare.recovering(lambda: self.assignment(assignments))
+            self.at.expect_word("END_DATA_BLOCK")
+        faults = (*found.errors, *found.warnings)
+        return BlockDeclaration(name, number, header.optimized, body, constants, tuple(assignments), position, faults)
 
     def type_declaration(self) -> TypeDeclaration:
         position = self.at.position
         name, _ = self.block_name("the type's name")
-        header = self.header()
-        if header.protected and self.at.token.is_word("END_TYPE"):
-            raise SyntaxFault(position.error(_PROTECTED.format(name)))
-        if not self.at.token.is_word("STRUCT"):
-            raise self.at.expected("STRUCT")
-        errors = len(self.at.report.errors)
-        body, _ = self.declare.sections()
-        if not body.members and len(self.at.report.errors) == errors:
-            self.at.report.add(position.error(f"expected at least one member in the type {name!r}"))
-        self.at.accept(";")
-        self.at.expect_word("END_TYPE")
-        return TypeDeclaration(name, body, position)
+        body = Struct((), position)
+        with self.collecting() as found:
+            header = self.header()
+            if header.protected and self.at.token.is_word("END_TYPE"):
+                raise SyntaxFault(position.error(_PROTECTED.format(name)))
+            if not self.at.token.is_word("STRUCT"):
+                raise self.at.expected("STRUCT")
+            body, _ = self.declare.sections()
+            if not body.members and not found.errors:
+                found.add(position.error(f"expected at least one member in the type {name!r}"))
+            self.at.accept(";")
+            self.at.expect_word("END_TYPE")
+        return TypeDeclaration(name, body, position, faults=(*found.errors, *found.warnings))
 
     def function_block(self) -> TypeDeclaration:
-        """Read the interface; the code is passed over. Faults go with the declaration: not every one is used."""
+        """Read the interface; the code is passed over."""
         position = self.at.position
         name, _ = self.block_name("the function block's name")
-        outer, inner = self.at.report, Report([self.at.file])
-        self.at.report, self.declare.interface = inner, True
         body, header = Struct((), position), _Header()
         constants: tuple[ConstantDeclaration, ...] = ()
-        try:
-            with suppress(TooManyErrors):
-                header = self.header()
-                if header.protected and self.at.token.is_word("BEGIN", "END_FUNCTION_BLOCK"):
-                    raise SyntaxFault(position.error(_PROTECTED.format(name)))
-                body, constants = self.declare.sections()
-                if self.at.token.kind is Kind.PUNCT and self.at.token.text not in "#;":  # no statement begins so
-                    raise self.at.expected("a section of variables or BEGIN")
-        except SyntaxFault as fault:
-            with suppress(TooManyErrors):
-                inner.add(fault.diagnostic)
-        self.at.report, self.declare.interface = outer, False
+        self.declare.interface = True
+        with self.collecting(resume=False) as found:
+            header = self.header()
+            if header.protected and self.at.token.is_word("BEGIN", "END_FUNCTION_BLOCK"):
+                raise SyntaxFault(position.error(_PROTECTED.format(name)))
+            body, constants = self.declare.sections()
+            if self.at.token.kind is Kind.PUNCT and self.at.token.text not in "#;":  # no statement begins so
+                raise self.at.expected("a section of variables or BEGIN")
+        self.declare.interface = False
         if not self.at.skip_to("END_FUNCTION_BLOCK"):
             raise SyntaxFault(position.error(f"the function block {name!r} has no END_FUNCTION_BLOCK"))
         self.at.advance()
-        faults = tuple(inner.errors)
-        return TypeDeclaration(name, body, position, constants, True, header.optimized, faults)
+        return TypeDeclaration(name, body, position, constants, True, header.optimized, tuple(found.errors))
 
     def code_block(self) -> None:
         start = self.at.advance()

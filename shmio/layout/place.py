@@ -22,20 +22,35 @@ from shmio.layout.placed import Cost, Field, Group, Leaf, Repeat, extent_of, rou
 from shmio.layout.report import Report
 from shmio.layout.syntax import Array, Bounds, Member, Named, Position, Section, Struct, Type, TypeDeclaration
 from shmio.layout.topic import encode_segment
-from shmio.layout.types import POINTER, STRUCTURED, ElementType, element_type, string_limit
+from shmio.layout.types import BYTE, POINTER, STRUCTURED, ElementType, element_type, string_limit
 
 MAX_NAME = 128  # characters, as in TIA Portal
 MAX_TEXT = 32 << 20  # characters of all expanded paths, comments and initial values together
 
 
+_OPAQUE = (
+    "the system type '{name}' is kept as {size} bytes without meaning, for the places of its members are not public; "
+    'if you know them, give it as a PLC data type: TYPE "{name}" STRUCT … END_STRUCT; END_TYPE'
+)
+_SIZE = 'type_bytes = {{ "{name}" = … }} in the configuration, --type-bytes "{name}=…" of shmio-layout'
+
+
 class Placer:
     """Places structures; types of users are looked up by name and placed at first use."""
 
-    def __init__(self, types: Mapping[str, TypeDeclaration], constants: Constants, report: Report) -> None:
+    def __init__(
+        self,
+        types: Mapping[str, TypeDeclaration],
+        constants: Constants,
+        report: Report,
+        type_bytes: Mapping[str, int] | None = None,
+    ) -> None:
         self._types = types
+        self._type_bytes = {name.lower(): size for name, size in (type_bytes or {}).items()}
         self._global = self._constants = constants
         self._report = report
-        self._placed: dict[str, Group | None] = {}
+        self.placed: dict[str, Group | None] = {}
+        """What became of each type, by its name in lower case."""
         self._open: dict[str, str] = {}  # the types that are being placed, by key: their names
 
     def block(self, struct: Struct, constants: Constants) -> Group | None:
@@ -96,23 +111,29 @@ class Placer:
         if not name.quoted and (element := self._elementary(name)):
             return element
         key = name.name.lower()
+        if key not in self.placed and key in self._type_bytes:
+            self.placed[key] = opaque(name, self._type_bytes[key])
         if key in self._open:
             keys = [*self._open]
             chain = " → ".join([*keys[keys.index(key) :], key])
             self._refuse(name.position, f"the type {name.name!r} contains itself: {chain}")
             return None
-        if key not in self._placed:
+        if key not in self.placed:
             declaration = self._types.get(key) or system.declarations().get(key)
-            if declaration is None:
+            if declaration is not None:
+                self.placed[key] = self._declared(key, declaration, depth)
+            elif size := system.length(name.name):
+                self._report.add(name.position.warning(_OPAQUE.format(name=name.name, size=size)))
+                self.placed[key] = opaque(name, size)
+            else:
                 self._refuse(name.position, self._unknown(name))
                 return None
-            self._placed[key] = self._declared(key, declaration, depth)
-        return self._placed[key]
+        return self.placed[key]
 
     def _declared(self, key: str, declaration: TypeDeclaration, depth: int) -> Group | None:
         for fault in declaration.faults:
             self._report.add(fault)
-        if declaration.faults:
+        if declaration.faults and declaration.is_function_block:
             return None
         if not declaration.body.members:  # a function block that keeps nothing
             return Group({}, 0, Cost(), 0)
@@ -188,16 +209,27 @@ class Placer:
         if reason := system.refusal(name.name):
             return (
                 f"the system type {name.name} is not supported: {reason}; if you know its members, give it as a PLC "
-                f'data type: TYPE "{name.name}" STRUCT … END_STRUCT; END_TYPE'
+                f'data type: TYPE "{name.name}" STRUCT … END_STRUCT; END_TYPE; if you know its size alone, declare '
+                f"that: {_SIZE.format(name=name.name)}"
             )
         return (
             f"expected a known type, found {name.name!r}; if it is a PLC data type or a function block, name its "
-            "source (.udt, .scl, .awl) as well"
+            "source (.udt, .scl, .awl) as well; if you know its size alone, declare that: "
+            + _SIZE.format(name=name.name)
         )
 
     def _refuse(self, position: Position, message: str) -> None:
         """Report an error."""
         self._report.add(position.error(message))
+
+
+def opaque(name: Named, size: int) -> Group:
+    """A structure of which the size alone is known."""
+    at = name.position
+    member = Member("bytes", Array(((0, size - 1),), Named("BYTE", False, at), at), "", None, at)
+    leaf = Leaf(BYTE, ((0, size - 1),), size)
+    cost = Cost().plus(extent_of(leaf).cost, 1, len(member.name) + 1)
+    return Group({member.name: Field(member.name, member, leaf, 0, None)}, round_up(size, 2), cost, 1, opaque=True)
 
 
 def _is_structured(type_: Type) -> bool:

@@ -45,12 +45,13 @@ class Cost:
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """A placed structure. ``size`` is in bytes, even."""
+    """A placed structure. ``size`` is in bytes, even. ``opaque``: what its members are is not known."""
 
     fields: dict[str, Field]  # by name in lower case: Siemens' names differ by more than case
     size: int
     cost: Cost
     height: int
+    opaque: bool = False
 
 
 @dataclass(frozen=True, slots=True)

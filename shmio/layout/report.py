@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from shmio.errors import LayoutError, ShmioError
 from shmio.layout.model import Diagnostic
@@ -20,14 +20,18 @@ class Report:
 
     def __init__(self, files: Sequence[str]) -> None:
         self._order = {file: position for position, file in enumerate(files)}
+        self._seen: set[Diagnostic] = set()
         self.errors: list[Diagnostic] = []
         self.warnings: list[Diagnostic] = []
 
     def add(self, diagnostic: Diagnostic) -> None:
-        """Keep a diagnostic, unless the last error was at the same place: then it is a consequence of that.
+        """Keep a diagnostic, unless it is there, or the last error was at the same place: then it follows from that.
 
         Raises TooManyErrors: this was the last error there is room for.
         """
+        if diagnostic in self._seen:
+            return
+        self._seen.add(diagnostic)
         if diagnostic.severity == "error":
             if self.errors and _place(self.errors[-1]) == _place(diagnostic):
                 return
@@ -36,6 +40,11 @@ class Report:
                 raise TooManyErrors
         elif len(self.warnings) < MAX_WARNINGS:
             self.warnings.append(diagnostic)
+
+    def extend(self, diagnostics: Iterable[Diagnostic]) -> None:
+        """Keep several, as :meth:`add` does."""
+        for diagnostic in diagnostics:
+            self.add(diagnostic)
 
     def raise_errors(self) -> None:
         """Raise LayoutError with all that was found, in source order, if any of it is an error."""

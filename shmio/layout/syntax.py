@@ -119,7 +119,7 @@ class Assignment:
 class TypeDeclaration:
     """TYPE … END_TYPE, or the interface of a FUNCTION_BLOCK.
 
-    ``faults`` is what is wrong with a function block: it matters only if there is an instance of it.
+    ``faults`` is what is wrong with it: that matters only where the type is used.
     """
 
     name: str
@@ -133,7 +133,10 @@ class TypeDeclaration:
 
 @dataclass(frozen=True, slots=True)
 class BlockDeclaration:
-    """DATA_BLOCK … END_DATA_BLOCK; the body of an instance or of a block of a UDT is that type's name."""
+    """DATA_BLOCK … END_DATA_BLOCK; the body of an instance or of a block of a UDT is that type's name.
+
+    ``faults`` is what is wrong with it, and what is odd: that matters only if the block is asked for.
+    """
 
     name: str
     number: int | None
@@ -142,6 +145,7 @@ class BlockDeclaration:
     constants: tuple[ConstantDeclaration, ...]
     assignments: tuple[Assignment, ...]
     position: Position
+    faults: tuple[Diagnostic, ...] = ()
 
 
 @dataclass(slots=True)

@@ -8,7 +8,8 @@ these agree with the length or the addresses that its source states. ``docs/refe
 - SSL_HEADER: Siemens' help on RDSYSST, length in the one on system data types.
 - SFB 0 to 5: the interfaces as the simulator awlsim has them; its tests state the addresses of SFB 0.
 
-The rest is refused. Of IEC_TIMER and its like the lengths are public, but not where in them the members are.
+Of IEC_TIMER and its like the lengths are public, but not where in them the members are: they are bytes without meaning.
+The rest is refused, unless the configuration has its size.
 """
 
 from __future__ import annotations
@@ -58,13 +59,14 @@ _COUNTERS = (
 _TIMERS = ("SFB3", "TP", "SFB4", "TON", "SFB5", "TOF")
 
 _NO_SOURCE = "its placement in a block with standard access has no public source"
-_LENGTH_ONLY = "its length is public, the places of its members are not"
+_LENGTHS = {
+    "IEC_TIMER": 16, "IEC_LTIMER": 32, "IEC_SCOUNTER": 3, "IEC_USCOUNTER": 3, "IEC_COUNTER": 6, "IEC_UCOUNTER": 6,
+    "IEC_DCOUNTER": 12, "IEC_UDCOUNTER": 12, "IEC_LCOUNTER": 24, "IEC_ULCOUNTER": 24, "VREF": 12, "CONDITIONS": 52,
+    "HSC_PERIOD": 12,
+}  # fmt: skip
+"""In bytes, from Siemens' help on system data types; a structure of odd length is padded as any other."""
 # fmt: off
 _REFUSED = {
-    **dict.fromkeys((
-        "IEC_TIMER", "IEC_LTIMER", "IEC_SCOUNTER", "IEC_USCOUNTER", "IEC_COUNTER", "IEC_UCOUNTER", "IEC_DCOUNTER",
-        "IEC_UDCOUNTER", "IEC_LCOUNTER", "IEC_ULCOUNTER", "VREF", "CONDITIONS", "HSC_PERIOD", "ASSOCVALUES",
-    ), _LENGTH_ONLY),
     **dict.fromkeys((
         "TON_TIME", "TOF_TIME", "TP_TIME", "TONR_TIME", "TON_LTIME", "TOF_LTIME", "TP_LTIME", "TONR_LTIME",
         *(f"{kind}_{count}" for kind in ("CTU", "CTD", "CTUD")
@@ -74,6 +76,7 @@ _REFUSED = {
         "TCON", "TDISCON", "TSEND", "TRCV", "TSEND_C", "TRCV_C", "TUSEND", "TURCV", "GET", "PUT", "USEND", "URCV",
         "BSEND", "BRCV", "MB_CLIENT", "MB_SERVER", "RDREC", "WRREC", "RALRM", "PID_COMPACT", "PID_3STEP",
         "C_ALARM", "C_ALARM_8", "C_ALARM_8P", "C_AR_SEND", "C_NOTIFY", "C_NOTIFY_8P",
+        "ASSOCVALUES",
     ), _NO_SOURCE),
     "TCON_IP_V4": "Siemens' help gives it 14 bytes in one place and 16 in another",
     "VARIANT": "it is a reference, and takes no room in a data block",
@@ -91,6 +94,11 @@ def declarations() -> Mapping[str, TypeDeclaration]:
     text, report = "\n".join(texts), Report(["system types"])
     unit = parser.parse("system types", text, lexer.tokenize(text), report)
     return {declaration.name.lower(): declaration for declaration in unit.types}
+
+
+def length(name: str) -> int:
+    """Return the bytes of a type whose members are not public; 0 if it is none of these."""
+    return _LENGTHS.get(name.upper(), 0)
 
 
 def refusal(name: str) -> str:

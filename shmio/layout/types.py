@@ -74,6 +74,7 @@ ALIASES = {
     "DATE_AND_LTIME": "LDT",
     **{alias: name for name, aliases in _NAMING.items() for alias in aliases},
 }
+BYTE = _FIXED["BYTE"]
 POINTER = _FIXED["POINTER"]
 STRUCTURED = frozenset({"STRING", "WSTRING", "DATE_AND_TIME", "DTL"})  # made of several values, as Siemens sees it
 INTEGERS = frozenset(

@@ -18,52 +18,78 @@ _QUOTED = re.compile(r"'[^']*'")
 
 
 class LayoutFiles:
-    """Compiles each set of files once."""
+    """Reads each set of files once, and compiles each data block of them once."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
-        self._compiled: dict[tuple[Path, ...], tuple[Layout, ...]] = {}
+        self._programs: dict[tuple[Path, ...], compiler.Program] = {}
+        self._compiled: dict[object, compiler.Compiled] = {}
         self.warnings: list[str] = []
+        self.odd: list[str] = []
+        """What is odd about the sections' keys, each beginning with the key."""
 
     def get(self, key: str, section: Source | Emulator, number: int | None) -> Layout:
         """The data block of a section; if its files hold several, the one of its ``block`` or of this number.
 
-        ConfigError: no such file or block, or none is chosen; LayoutError.
+        What is wrong with other blocks does not count then. ConfigError: no such file or block, or none is chosen;
+        LayoutError.
         """
-        return _choose(key, section, self.all(key, section), number)
+        paths, program = self._program(key, section)
+        if section.block is None and len(program.blocks) <= 1:
+            return self._compile(key, section, paths, program, None)[0]
+        try:
+            block = _choose(key, section, program.blocks, number)
+        except ConfigError:
+            program.compile(())  # which says so if the sources are damaged: that comes first
+            raise
+        return self._compile(key, section, paths, program, block.name)[0]
 
     def all(self, key: str, section: Source | Emulator) -> tuple[Layout, ...]:
         """Every data block of a section's files; ConfigError: no such file; LayoutError."""
+        return self._compile(key, section, *self._program(key, section), None)
+
+    def _program(self, key: str, section: Source | Emulator) -> tuple[tuple[Path, ...], compiler.Program]:
         if section.layout is None:
             raise ConfigError(f"{key}.layout: this key is needed: the data block's source (.db), and its UDTs")
         names = [section.layout] if isinstance(section.layout, str) else section.layout
         paths = tuple(self._config.path(name) for name in names)
-        if paths not in self._compiled:
-            compiled = compile_files(paths, f"{key}.layout: ")
-            self._compiled[paths] = compiled.layouts
+        if paths not in self._programs:
+            self._programs[paths] = read_program(paths, f"{key}.layout: ")
+        return paths, self._programs[paths]
+
+    def _compile(
+        self, key: str, section: Source | Emulator, paths: object, program: compiler.Program, block: str | None
+    ) -> tuple[Layout, ...]:
+        """Compile one block, or all."""
+        sizes = section.type_bytes
+        which = paths, block and block.lower(), tuple(sorted(sizes.items()))
+        if which not in self._compiled:
+            compiled = self._compiled[which] = program.compile(None if block is None else (block,), sizes)
             self.warnings += [line for line in summarize(compiled.warnings) if line not in self.warnings]
-        return self._compiled[paths]
+        compiled = self._compiled[which]
+        held = ", ".join(layout.name for layout in compiled.layouts)
+        self.odd += [f"{key}.type_bytes: nothing in {held} is of the type {name!r}" for name in compiled.unused]
+        return compiled.layouts
 
 
-def _choose(key: str, section: Source | Emulator, layouts: Sequence[Layout], number: int | None) -> Layout:
-    held = ", ".join(layout.name for layout in layouts)
+def _choose(key: str, section: Source | Emulator, blocks: Sequence[compiler.Held], number: int | None) -> compiler.Held:
+    held = ", ".join(block.name for block in blocks)
     if section.block is not None:
-        for layout in layouts:
-            if layout.name.lower() == section.block.lower():
-                return layout
+        for block in blocks:
+            if block.name.lower() == section.block.lower():
+                return block
         raise ConfigError(f"{key}.block: no data block {section.block!r}; there are: {held}")
-    if len(layouts) > 1:
-        layouts = [layout for layout in layouts if layout.number is not None and layout.number == number]
-    if len(layouts) != 1:
+    found = [block for block in blocks if block.number is not None and block.number == number]
+    if len(found) != 1:
         if number is not None:
             raise ConfigError(f"{key}.dbNumber: no data block has the number {number} ({held}); choose one by block")
         raise ConfigError(f"{key}.layout: it holds several data blocks ({held}); choose one by block or dbNumber")
-    return layouts[0]
+    return found[0]
 
 
-def compile_files(paths: Iterable[Path], key: str = "") -> compiler.Compiled:
-    """Read and compile files that may use each other's types; ConfigError beginning with ``key``, LayoutError."""
-    return compiler.compile_sources([_read(path, key) for path in paths])
+def read_program(paths: Iterable[Path], key: str = "") -> compiler.Program:
+    """Read files that may use each other's types; ConfigError beginning with ``key``, LayoutError."""
+    return compiler.Program([_read(path, key) for path in paths])
 
 
 def _read(path: Path, key: str) -> compiler.Source:

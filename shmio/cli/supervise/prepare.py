@@ -71,6 +71,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
             _check_trigger(config.recorder.trigger.when, layouts)
         odd = [
             *notices,
+            *files.odd,
             *_odd(config, layouts),
             *_odd_topics(config, layouts),
             *_odd_recorder(config, layouts),

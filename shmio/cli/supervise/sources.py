@@ -100,8 +100,8 @@ def _recorded(key: str, source: Source, config: Config, recordings: Recordings) 
     """The layout of a replay: that of the recording, which has its period and its age, too."""
     from shmio.connectors.replay.source import Replay, chosen, files  # noqa: PLC0415
 
-    for name in ("layout", "block", "properties"):
-        if getattr(source, name) is not None:
+    for name in ("layout", "block", "type_bytes", "properties"):
+        if getattr(source, name):
             raise ConfigError(f"{key}.{name}: a replay has none: its registers are those of the recording")
     options = msgspec.convert(source.options, Replay.Options)
     source.options["file"] = [str(config.path(file)) for file in files(options)]

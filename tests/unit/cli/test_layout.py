@@ -138,3 +138,28 @@ def test_it_tells_its_version(capsys: pytest.CaptureFixture[str]) -> None:
         main(["--version"])
     assert stop.value.code == 0
     assert capsys.readouterr().out == f"shmio {__version__}\n"
+
+
+def test_one_block_of_several(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "a.db"
+    path.write_text(
+        'DATA_BLOCK "Timers" STRUCT t : TON_TIME; END_STRUCT; BEGIN END_DATA_BLOCK\n'
+        'DATA_BLOCK "Plain" STRUCT a : Array[0..99] of Int; END_STRUCT; BEGIN END_DATA_BLOCK\n'
+    )
+    assert main([str(path)]) == 1
+    assert 'type_bytes = { "TON_TIME" = … } in the configuration' in capsys.readouterr().err
+    assert main([str(path), "--block", "plain", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["size"] == 200
+    assert main([str(path), "--type-bytes", "TON_TIME=18", "--type-bytes", "Nope=2"]) == 0
+    captured = capsys.readouterr()
+    assert "Timers: 18 bytes" in captured.out
+    assert captured.err == "warning: --type-bytes: nothing is of the type 'Nope'\n"
+    assert main([str(path), "--block", "other"]) == 1
+    assert "--block: no data block 'other'; there are: Timers, Plain" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("size", ["TON_TIME", "=1", "TON_TIME=0", "TON_TIME=9999999", "TON_TIME=x"])
+def test_a_size_that_is_none_is_wrong_usage(size: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["a.db", "--type-bytes", size])
+    assert "expected a type and its bytes" in capsys.readouterr().err

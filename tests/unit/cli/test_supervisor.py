@@ -148,10 +148,10 @@ def test_a_block_without_a_number_in_its_name(capsys: pytest.CaptureFixture[str]
     ("files", "number"),
     [
         (["cell.db"], 1),
-        (["two.db"], 7),
+        (["--block", "db7", "two.db"], 7),
         (["two.db", "plc.ini"], 9),
         (["cell.db", "plc.ini"], 9),
-        (["by.ini", "two.db"], 7),
+        (["--block", "DB9", "by.ini", "two.db"], 9),
     ],
 )
 def test_init_with_an_emulated_controller_can_be_started_as_it_is(
@@ -250,6 +250,86 @@ def test_init_of_several_blocks_takes_the_one_of_the_number(capsys: pytest.Captu
     assert load(Path("supervisor.toml")).source[0].block == "DB7"
     assert main(["check"]) == 0
     assert "DB7, 1 registers, 4 bytes" in capsys.readouterr().out
+
+
+SEVERAL = [
+    block('"Grip left"', "Array[0..99] of Int"),
+    block("DB9", "Array[0..199] of DInt"),
+    block('"Model"', "Array[1..40] of Real"),
+]
+
+
+def test_init_of_several_blocks_makes_a_source_of_each(capsys: pytest.CaptureFixture[str]) -> None:
+    timers = block('"Timers"', "TON_TIME")
+    Path("all.db").write_text("".join(SEVERAL) + timers)
+    assert main(["init", "all.db"]) == 0
+    captured = capsys.readouterr()
+    assert "left out: all.db:" in captured.err
+    assert "TON_TIME" in captured.err
+    assert "next: fill in host and dbNumber in supervisor.toml" in captured.out
+    config = load(Path("supervisor.toml"))
+    assert [(one.name, one.block) for one in config.source] == [
+        ("grip-left", "Grip left"),
+        ("db9", "DB9"),
+        ("model-2", "Model"),
+    ]
+    text = Path("supervisor.toml").read_text()
+    Path("supervisor.toml").write_text(
+        text.replace('# host = ""', 'host = "plc"').replace("# dbNumber =", "dbNumber = 5")
+    )
+    assert main(["check"]) == 0
+    assert "source db9 at plc:102: DB9, 1 registers, 800 bytes" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("numbered", [True, False])
+def test_init_of_several_blocks_with_emulated_controllers(numbered: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    blocks = [block("DB7", "Array[0..99] of Int"), SEVERAL[1]] if numbered else SEVERAL
+    Path("all.db").write_text("".join(blocks))
+    assert main(["init", "--emulated", "all.db"]) == 0
+    assert main(["check"]) == 0
+    assert "no faults found" in capsys.readouterr().out
+    emulators = prepare(Path("supervisor.toml")).emulated
+    assert [len(served) for served in emulators.values()] == ([2] if numbered else [1, 1, 1])
+
+
+@pytest.mark.parametrize("choice", [["--block", "nope"], []])
+def test_init_asks_which_of_many_blocks(choice: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    Path("all.db").write_text("".join(block(f"DB{number}", "Int") for number in range(1, 61)))
+    assert main(["init", "all.db", *choice]) == 1
+    assert re.search(r"--block: no data block 'nope'" if choice else "choose one by --block", capsys.readouterr().err)
+    assert main(["init", "all.db", "--block", "db44"]) == 0
+    assert [source.block for source in load(Path("supervisor.toml")).source] == ["DB44"]
+
+
+@pytest.mark.parametrize("name", ["cell.xml", "cell.db", "plc.ini"])
+def test_init_says_what_to_do_with_xml(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path(name).write_text('<?xml version="1.0"?>\n<Document></Document>\n')
+    Path("good.db").write_text(block("DB1", "Int"))
+    assert main(["init", name, "good.db"]) == 1
+    error = capsys.readouterr().err
+    assert "this is XML, as TIA Portal Openness exports blocks" in error
+    assert error.count("\n") == 1
+
+
+def test_what_is_wrong_with_other_blocks_does_not_count(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    both = Path("db201.db").read_text() + block('"Timers"', "TON_TIME")
+    Path("db201.db").write_text(both)
+    example('layout = "db201.db"\nhost', 'layout = "db201.db"\nblock = "DB201"\nhost')
+    example('layout = "db201.db"\nprogram', 'layout = "db201.db"\ndbNumber = 201\nprogram')
+    assert main(["check"]) == 0
+    assert ": DB201, 22 registers, 2180 bytes" in capsys.readouterr().out
+    example('block = "DB201"\n', 'block = "Timers"\n')
+    assert main(["check"]) == 1
+    assert "the system type TON_TIME is not supported" in capsys.readouterr().err
+    example('block = "Timers"\n', 'block = "Timers"\ndbNumber = 5\ntype_bytes = { TON_TIME = 16, Nope = 2 }\n')
+    example('writable = ["Outputs", "Robot_*/*"]', "")
+    assert main(["check"]) == 0
+    out = capsys.readouterr().out
+    assert "Timers, 1 registers, 16 bytes" in out
+    assert "source[0].type_bytes: nothing in Timers is of the type 'Nope'" in out
+    example("TON_TIME = 16", "TON_TIME = 0")
+    assert main(["check"]) == 1
+    assert "source[0].type_bytes" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("files", [["plc.ini"], ["a.db", "b.db"], ["plc.ini", "x.ini", "a.db"], ["no.db"]])
@@ -466,7 +546,7 @@ def test_a_block_is_chosen_by_its_number_or_name(example: Edit, key: str, capsys
 
 def test_help_tells_what_init_takes_and_which_modes_there_are(capsys: pytest.CaptureFixture[str]) -> None:
     for verb, said in (
-        ("init", "init [-h] [-c FILE] [--emulated] [plc.ini] [FILE.db [FILE.udt ...]]"),
+        ("init", "init [-h] [-c FILE] [--emulated] [--block NAME] [plc.ini] [FILE.db [FILE.udt ...]]"),
         ("up", "replay: play a recording in place of the sources"),
     ):
         with pytest.raises(SystemExit):

@@ -272,7 +272,7 @@ def test_begin_assigns_the_members_of_a_dtl() -> None:
         ("a : Int := [1, 2;", "4:17: error: expected the bracket that closes the value, found ';'"),
         ("a : Nope;", "4:5: error: expected a known type, found 'Nope'"),
         ('a : "Int";', "4:5: error: expected a known type, found 'Int'"),
-        ("a : IEC_TIMER;", "4:5: error: the system type IEC_TIMER is not supported"),
+        ("a : TON_TIME;", "4:5: error: the system type TON_TIME is not supported"),
         ("a : Int;\n  A : Bool;", "5:3: error: expected a new name, found 'A' again (line 4)"),
         ("a : Array[2..1] of Int;", "4:11: error: expected a lower bound not above the upper, found 2..1"),
         ("a : Array[0..99999999999999999999] of Int;", "within 32 bits"),

@@ -443,9 +443,7 @@ def test_types_that_name_something_are_numbers(name: str, type_: str, size: int)
     assert (register.type, register.size) == (type_, size)
 
 
-@pytest.mark.parametrize(
-    "name", ["IEC_TIMER", "TON_TIME", "CTU_INT", "IEC_LTIMER", "TCON_IP_v4", "R_TRIG", "VARIANT", "TCON"]
-)
+@pytest.mark.parametrize("name", ["TON_TIME", "CTU_INT", "TON_LTIME", "TCON_IP_v4", "R_TRIG", "VARIANT", "TCON"])
 def test_system_types_without_a_public_placement_are_refused_with_the_remedy(name: str) -> None:
     message = error(block(f"a : {name};"))
     assert f"the system type {name} is not supported" in message
@@ -455,3 +453,105 @@ def test_system_types_without_a_public_placement_are_refused_with_the_remedy(nam
 def test_a_given_type_replaces_the_refusal_and_what_is_known() -> None:
     given = 'TYPE "IEC_TIMER" STRUCT x : DInt; END_STRUCT; END_TYPE TYPE CREF STRUCT y : Byte; END_STRUCT; END_TYPE '
     assert places(layout_of(given + block("a : IEC_TIMER; b : CREF;"))) == {"a/x": 0, "b/y": 4}
+
+
+# -- types of which the size alone is known --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "size"),
+    [("IEC_TIMER", 16), ("IEC_LTIMER", 32), ("IEC_COUNTER", 6), ("IEC_ULCOUNTER", 24), ("IEC_SCOUNTER", 3)],
+)
+def test_a_system_type_of_public_length_is_bytes_without_meaning(name: str, size: int) -> None:
+    members = f"before : Array[0..98] of Byte; a : {name}; b : Bool; many : Array[1..3] of {name}; after : Int;"
+    compiled = compile_text(block(members))
+    (layout,) = compiled.layouts
+    [warning] = compiled.warnings
+    assert f"the system type '{name}' is kept as {size} bytes without meaning" in warning.message
+    even = size + size % 2
+    assert places(layout) == {
+        "before": 0,
+        "a/bytes": 100,
+        "b": 100 + even,
+        "many/1/bytes": 102 + even,
+        "many/2/bytes": 102 + 2 * even,
+        "many/3/bytes": 102 + 3 * even,
+        "after": 102 + 4 * even,
+    }
+    assert layout.registers[1].size == size
+    assert layout.registers[1].type == "BYTE"
+
+
+def test_a_block_that_is_a_timer_with_values_that_nobody_can_place() -> None:
+    compiled = compile_text(f'DATA_BLOCK "T1" NON_RETAIN IEC_TIMER BEGIN PT := T#5s; {END}')
+    assert places(compiled.layouts[0]) == {"bytes": 0}
+    assert "the value is not read" in compiled.warnings[1].message
+    declared = 'TYPE "IEC_TIMER" STRUCT PT : Time; END_STRUCT; END_TYPE '
+    assert places(layout_of(declared, block("a : IEC_TIMER;"))) == {"a/PT": 0}
+
+
+def test_the_size_of_any_other_type_can_be_declared() -> None:
+    text = block('big : Array[0..99] of Real; a : TON_TIME; b : "My FB"; c : Array[0..1] of "Axis";')
+    given = 'TYPE "Axis" STRUCT x : Nope; END_STRUCT; END_TYPE '
+    sources = [Source("x.db", (given + text).encode())]
+    sizes = {"ton_time": 16, "My FB": 7, "Axis": 10, "Other": 4}
+    with pytest.raises(LayoutError, match="TON_TIME"):
+        compile_sources(sources, blocks=["b"])
+    compiled = compile_sources(sources, blocks=["b"], type_bytes=sizes)
+    assert places(compiled.layouts[0]) == {
+        "big": 0,
+        "a/bytes": 400,
+        "b/bytes": 416,
+        "c/0/bytes": 424,
+        "c/1/bytes": 434,
+    }
+    assert compiled.unused == ("Other",)
+    assert not compiled.warnings
+
+
+# -- one block of several --------------------------------------------------------------------------------------
+
+OTHERS = """
+TYPE "broken" STRUCT a : ; END_STRUCT; END_TYPE
+TYPE "unknown" STRUCT a : "Nope"; END_STRUCT; END_TYPE
+DATA_BLOCK "Timers" STRUCT t : TON_TIME; END_STRUCT; BEGIN END_DATA_BLOCK
+DATA_BLOCK "Torn" STRUCT a : Int
+END_STRUCT; BEGIN x ! y; END_DATA_BLOCK
+DATA_BLOCK "Odd" STRUCT a b : Int; END_STRUCT; BEGIN a b := 1; END_DATA_BLOCK
+DATA_BLOCK "Twice" STRUCT a : Int; END_STRUCT; BEGIN END_DATA_BLOCK
+DATA_BLOCK "Twice" STRUCT a : Int; END_STRUCT; BEGIN END_DATA_BLOCK
+"""
+
+
+@pytest.mark.parametrize("text", [OTHERS + "{}", "{}" + OTHERS], ids=["behind", "before"])
+def test_what_is_wrong_with_other_blocks_does_not_count(text: str) -> None:
+    plain = (
+        'DATA_BLOCK "Plain" STRUCT a : Array[0..199] of Int; b : Bool; END_STRUCT; BEGIN b := TRUE; END_DATA_BLOCK\n'
+    )
+    sources = [Source("x.db", text.format(plain).encode())]
+    compiled = compile_sources(sources, blocks=["PLAIN"])
+    assert places(compiled.layouts[0]) == {"a": 0, "b": 400}
+    assert not compiled.warnings
+    with pytest.raises(LayoutError) as caught:
+        compile_sources(sources)
+    found = "\n".join(map(str, caught.value.diagnostics))
+    for what in ("TON_TIME", "'Nope'", "expected a type", "';' at the end", "'Twice' is declared already"):
+        assert what in found
+    for name, what in (("Timers", "TON_TIME"), ("Torn", "';' at the end"), ("Twice", "is declared already")):
+        with pytest.raises(LayoutError, match=what) as caught:
+            compile_sources(sources, blocks=[name])
+        assert len({error.line for error in caught.value.diagnostics}) == 1
+
+
+def test_a_type_that_the_block_uses_counts() -> None:
+    text = OTHERS + 'DATA_BLOCK "Uses" STRUCT a : "broken"; END_STRUCT; BEGIN END_DATA_BLOCK\n'
+    with pytest.raises(LayoutError, match="2:26: error: expected a type"):
+        compile_sources([Source("x.db", text.encode())], blocks=["Uses"])
+
+
+def test_many_large_blocks_of_a_small_source_are_bounded_together() -> None:
+    text = 'TYPE "t" STRUCT a : Array[1..30000] of Struct b : Byte; END_STRUCT; END_STRUCT; END_TYPE\n'
+    text += "".join(f'DATA_BLOCK DB{number} "t" BEGIN END_DATA_BLOCK\n' for number in range(1, 200))
+    message = error(text)
+    assert message.startswith("0.scl:18:12: error: expected at most 500000 registers")
+    assert len(compile_sources([Source("x.db", text.encode())], blocks=["DB199"]).layouts[0].registers) == 30_000
