@@ -5,13 +5,15 @@ from __future__ import annotations
 import asyncio
 import grp
 import logging
+import os
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, NoReturn
 
 import msgspec
 
 from shmio import worker
 from shmio.config import Address, Grpc, load
+from shmio.endpoints.grpc import memory
 from shmio.endpoints.grpc.bells import Bells
 from shmio.endpoints.grpc.doors import Doors
 from shmio.endpoints.grpc.feeds import Feeds
@@ -24,16 +26,21 @@ from shmio.ration import Ration
 from shmio.worker import BEAT_S, Worker
 
 CALLS_S: Final = 1.0
+FOREIGN_LOGGERS: Final = ("asyncio", "grpc._cython.cygrpc")
+"""Loggers of others that clients can have write."""
 
 
 def run(worker: Worker) -> None:
     """Serve until told to stop."""
-    log, ration = logging.getLogger("shmio.grpc"), Ration()
-    log.addFilter(ration)
+    memory.limit_arenas()
+    rations = {name: Ration(one_kind=name != "shmio.grpc") for name in ("shmio.grpc", *FOREIGN_LOGGERS)}
+    for name, ration in rations.items():
+        logging.getLogger(name).addFilter(ration)
     try:
         asyncio.run(_serve(worker))
     finally:
-        log.removeFilter(ration)
+        for name, ration in rations.items():
+            logging.getLogger(name).removeFilter(ration)
 
 
 async def _serve(worker: Worker) -> None:
@@ -62,6 +69,7 @@ async def _serve(worker: Worker) -> None:
         tasks.add(task)
         task.add_done_callback(tasks.discard)
 
+    trimmer = memory.Trimmer()
     hold = Hold()
     bells = Bells()
     feeds = Feeds(worker.segment, writer, bells, on_quality, hold)
@@ -88,8 +96,11 @@ async def _serve(worker: Worker) -> None:
                 worker.log.info("a reload added, changed or ended %s", ", ".join(changed))
                 services.move(changed)
             reading = None
-        if not (feeds.alive and services.stepper.alive and server.alive):
+        if not server.alive:
+            _end_now(worker)
+        if not (feeds.alive and services.stepper.alive):
             raise RuntimeError("something ended that should not have; the endpoint starts anew")
+        trimmer.look(server.unknown)
         services.stepper.timeline.look()
         streams, dropped, published, refused = services.counters
         worker.report((streams, feeds.messages + services.updates, dropped, published, refused))
@@ -104,6 +115,13 @@ async def _serve(worker: Worker) -> None:
     await server.stop()
     await _calls_end()
     bells.close()
+
+
+def _end_now(worker: Worker) -> NoReturn:
+    """End the process, as gRPC serves no more. No cleaning up: it would free what gRPC's threads still write to."""
+    worker.log.error("gRPC stopped serving; this process ends, and the supervisor starts another")
+    logging.shutdown()
+    os._exit(1)
 
 
 async def _calls_end() -> None:

@@ -7,8 +7,8 @@ from typing import Final
 
 OWN: Final = 256
 """What the process needs beside connections, and far more."""
-EACH: Final = 2
-"""Descriptors set aside for a connection: an address that had to listen anew may have those of before as well."""
+EACH: Final = 1
+"""Descriptors set aside for a connection."""
 
 
 def room(wanted: int) -> int:

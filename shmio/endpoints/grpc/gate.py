@@ -154,15 +154,12 @@ class Gate(grpc.aio.ServerInterceptor):
         self._handlers: dict[str, Handler] = {}
 
     async def intercept_service(
-        self, continuation: Callable[[Any], Awaitable[Handler | None]], handler_call_details: Any
-    ) -> Handler | None:
-        """The call's handler, behind the gate; None: there is no such call."""
+        self, continuation: Callable[[Any], Awaitable[Handler]], handler_call_details: Any
+    ) -> Handler:
+        """The call's handler, behind the gate."""
         method: str = handler_call_details.method
         if method not in self._handlers:
-            handler = await continuation(handler_call_details)
-            if handler is None:
-                return None
-            self._handlers[method] = self._guarded(method, handler)
+            self._handlers[method] = self._guarded(method, await continuation(handler_call_details))
         return self._handlers[method]
 
     def _guarded(self, method: str, handler: Handler) -> Handler:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from typing import Any
 
 import grpc
 
@@ -54,9 +55,9 @@ class Services:
         )
 
     @property
-    def names(self) -> list[str]:
-        """Full names of the services."""
-        return [service.name for service in self._services]
+    def calls(self) -> dict[str, dict[str, grpc.RpcMethodHandler[Any, Any]]]:
+        """The calls of each service, by its full name, for a server."""
+        return {service.name: service.handlers() for service in self._services}
 
     @property
     def counters(self) -> tuple[int, int, int, int]:
@@ -73,10 +74,6 @@ class Services:
     def waiting_bytes(self) -> int:
         """Of all messages that wait to be read by clients."""
         return self._outboxes.waiting_bytes
-
-    def handlers(self) -> list[grpc.GenericRpcHandler]:
-        """The services' calls, for a server."""
-        return [service.handlers() for service in self._services]
 
     def move(self, sources: Collection[str]) -> None:
         """Have the streams of these sources go over to the feeds that there are by now."""

@@ -51,7 +51,7 @@ class SimlogV1:
         self._stepper = stepper
         self._streams: dict[Outbox, str] = {}  # and their source
 
-    def handlers(self) -> grpc.GenericRpcHandler:
+    def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
         """The service's calls, for a server."""
         unary = grpc.unary_unary_rpc_method_handler
         decode = wire.TopicDescriptor.FromString
@@ -65,7 +65,7 @@ class SimlogV1:
             # No deserializer either: bytes that are no message must not end the stream.
             "Publish": grpc.stream_unary_rpc_method_handler(self.publish, None, Empty.SerializeToString),
         }
-        return grpc.method_handlers_generic_handler(SERVICE, calls)
+        return calls
 
     async def set_step_size(self, request: wire.StepSizeRequest, context: Context) -> Empty:
         """How far a step moves time, in ms; from now on only steps do.

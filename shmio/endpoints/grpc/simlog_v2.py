@@ -53,7 +53,7 @@ class SimlogV2:
         self._shadows = shadows
         self._subscribers = Subscribers(topics, shadows, marks)
 
-    def handlers(self) -> grpc.GenericRpcHandler:
+    def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
         """The service's calls, for a server. Values are serialised where they are made, and once."""
         unary = grpc.unary_unary_rpc_method_handler
         empty = Empty.SerializeToString
@@ -72,7 +72,7 @@ class SimlogV2:
             "PublishSynch": write,
             "Read": unary(self.read, wire.ReadRequest.FromString),
         }
-        return grpc.method_handlers_generic_handler(SERVICE, calls)
+        return calls
 
     async def get_topic_info(self, request: wire.TopicInfoRequest, _: Context) -> wire.TopicInfo:
         """Tell what a topic is; ``exists`` is false, and no more said, for what does not exist."""

@@ -38,7 +38,7 @@ class SimServer:
         self._lanes: dict[StateLane, None] = {}  # of those who follow the status
         stepper.timeline.watch(self._tell)
 
-    def handlers(self) -> grpc.GenericRpcHandler:
+    def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
         """The service's calls, for a server."""
         unary = grpc.unary_unary_rpc_method_handler
         status = wire.SimStatus.SerializeToString
@@ -49,7 +49,7 @@ class SimServer:
             "pause": unary(self.pause, Empty.FromString, status),
             "subscribe": grpc.unary_stream_rpc_method_handler(self.subscribe, Empty.FromString),
         }
-        return grpc.method_handlers_generic_handler(SERVICE, calls)
+        return calls
 
     async def step(self, request: wire.StepRequest, context: Context) -> wire.SimStatus:
         """Move time on; answered when all streams have taken the step.

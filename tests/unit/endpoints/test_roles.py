@@ -27,7 +27,7 @@ def test_every_call_that_is_served_has_its_role(segment: Segment) -> None:
     names: list[str] = []
 
     async def test(served: Endpoint) -> None:
-        names.extend(served.service.names)
+        names.extend(served.service.calls)
 
     serve(segment, test)
     own = set().union(*(calls(pool.FindServiceByName(name)) for name in names))

@@ -74,7 +74,7 @@ class NativeService:
         """Updates sent on them since the start."""
         return self._ended_updates + sum(subscription.updates for subscription in self._open)
 
-    def handlers(self) -> grpc.GenericRpcHandler:
+    def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
         """The service's calls, for a server. Values are serialised where they are made, and once."""
         unary, streaming = grpc.unary_unary_rpc_method_handler, grpc.unary_stream_rpc_method_handler
         calls: dict[str, grpc.RpcMethodHandler[Any, Any]] = {
@@ -87,7 +87,7 @@ class NativeService:
         }
         for part in (self._orders, self._simulations, self._clocks, self._moves):
             calls |= part.handlers()
-        return grpc.method_handlers_generic_handler(SERVICE, calls)
+        return calls
 
     async def get_layouts(self, request: wire.GetLayoutsRequest, context: Context) -> AsyncIterator[wire.LayoutPart]:
         """The layouts of these sources, or of all. NOT_FOUND: no such source."""

@@ -1,0 +1,132 @@
+"""A flood of gRPC calls whose names nobody serves, as raw HTTP/2: clients' libraries refuse to send some of them."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from typing import Final
+
+NOT_UTF8: Final = b"/x\xff\xfe/y"
+UNKNOWN: Final = b"/shmio.v1.Shmio/NoSuchCall"
+WINDOW: Final = 64
+"""So few calls under way on a connection are not refused for their number."""
+
+_PREFACE: Final = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes((0, 0, 0, 4, 0, 0, 0, 0, 0))
+_FIELDS: Final = {
+    b":method": b"POST",
+    b":scheme": b"http",
+    b":authority": b"x",
+    b"te": b"trailers",
+    b"content-type": b"application/grpc",
+}
+_HEADERS, _END_STREAM, _END_HEADERS = 1, 1, 4
+_LAST_STREAM: Final = 1 << 30
+PATIENCE_S: Final = 60.0
+
+
+class Flood:
+    """Threads that send such calls as fast as they are answered, each over connections of its own."""
+
+    def __init__(self, names: Sequence[bytes] = (NOT_UTF8, UNKNOWN), window: int = WINDOW) -> None:
+        """``window``: most calls of a connection that are not answered yet."""
+        self.answered = 0
+        """Calls that have got their status."""
+        self.lost = 0
+        """Connections that the server ended."""
+        self._names = names
+        self._window = window
+        self._connections: set[socket.socket] = set()
+        self._over = threading.Event()
+        self._lock = threading.Lock()
+
+    @contextmanager
+    def upon(
+        self, target: tuple[str, int] | str, tls: ssl.SSLContext | None = None, threads: int = 2
+    ) -> Iterator[None]:
+        """Flood this address (a string: a UNIX socket) as long as the context lasts."""
+        workers = [threading.Thread(target=self._run, args=(target, tls)) for _ in range(threads)]
+        for worker in workers:
+            worker.start()
+        try:
+            yield
+        finally:
+            self._over.set()
+            with self._lock:
+                for connection in self._connections:
+                    _end(connection)  # else who waits for answers would hold up an event loop that is to give them
+            for worker in workers:
+                worker.join()
+
+    def _run(self, target: tuple[str, int] | str, tls: ssl.SSLContext | None) -> None:
+        while not self._over.is_set():
+            try:
+                with connect(target, tls) as connection:
+                    self._send(connection)
+            except OSError:
+                with self._lock:
+                    self.lost += not self._over.is_set()
+                self._over.wait(0.01)
+
+    def _send(self, connection: socket.socket) -> None:
+        with self._lock:
+            self._connections = {other for other in self._connections if other.fileno() >= 0} | {connection}
+        connection.sendall(_PREFACE)
+        stream, open_calls = 1, 0
+        frames = _frames(connection)
+        while not self._over.is_set() and stream < _LAST_STREAM:
+            calls = bytearray()
+            while open_calls < self._window:
+                calls += request(self._names[stream // 2 % len(self._names)], stream)
+                stream, open_calls = stream + 2, open_calls + 1
+            connection.sendall(calls)
+            while open_calls > self._window // 2:
+                kind, flags = next(frames)
+                if kind == _HEADERS and flags & _END_STREAM:
+                    open_calls -= 1
+                    with self._lock:
+                        self.answered += 1
+
+
+def request(name: bytes, stream: int) -> bytes:
+    """The headers of a call without messages, uncompressed (RFC 7541, 6.2.2)."""
+    block = b"".join(
+        b"\0" + bytes((len(field),)) + field + bytes((len(value),)) + value
+        for field, value in (_FIELDS | {b":path": name}).items()
+    )
+    head = len(block).to_bytes(3, "big") + bytes((_HEADERS, _END_HEADERS | _END_STREAM))
+    return head + stream.to_bytes(4, "big") + block
+
+
+@contextmanager
+def connect(target: tuple[str, int] | str, tls: ssl.SSLContext | None = None) -> Iterator[socket.socket]:
+    """Connected, by TLS if there is a context for it."""
+    if isinstance(target, str):
+        plain = socket.socket(socket.AF_UNIX)
+        plain.settimeout(PATIENCE_S)
+        plain.connect(target)
+    else:
+        plain = socket.create_connection(target, PATIENCE_S)
+    with plain if tls is None else tls.wrap_socket(plain, server_hostname="localhost") as connection:
+        yield connection
+
+
+def _end(connection: socket.socket) -> None:
+    """Have who reads from it see the end; what TLS has to say before is no matter of another thread."""
+    with suppress(OSError):
+        socket.socket.shutdown(connection, socket.SHUT_RDWR)
+
+
+def _frames(connection: socket.socket) -> Iterator[tuple[int, int]]:
+    """Kind and flags of each; OSError at the end."""
+    received = bytearray()
+    while True:
+        while len(received) < 9 or len(received) < 9 + int.from_bytes(received[:3], "big"):
+            if not (data := connection.recv(1 << 16)):
+                raise ConnectionResetError("the server ended the connection")
+            received += data
+        kind, flags = received[3], received[4]
+        del received[: 9 + int.from_bytes(received[:3], "big")]
+        yield kind, flags
