@@ -61,7 +61,7 @@ class Reload(_Request, tag="reload"):
 
 
 class Where(_Request, tag="where"):
-    """Tell which configuration the instance follows, since when (ns since 1970), and where it logs."""
+    """Tell which configuration the instance follows, since when (ns since 1970), where it logs, and listens."""
 
 
 Request = Stop | Restart | Reload | Where

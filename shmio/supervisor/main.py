@@ -30,6 +30,8 @@ from shmio.supervisor.takeover import take_over
 
 START_TICK_S: Final = 0.01
 """How often it is looked while a process starts: its report has no bell to ring."""
+MAX_ADDRESSES: Final = 16
+"""Of more that one process listens on, a request is told these."""
 NAME_S: Final = 1.0
 """How often it is made sure that the segment can still be found."""
 
@@ -162,7 +164,8 @@ class Supervisor:
             self._reload(answer)
         else:
             plan, read_ns = self._changer.plan, self._changer.read_ns
-            answer.ok(config=str(plan.config_file), read_ns=read_ns, log_dir=str(plan.log_dir))
+            listen = {job.name: told for job in plan.jobs if (told := job.listening[:MAX_ADDRESSES])}
+            answer.ok(config=str(plan.config_file), read_ns=read_ns, log_dir=str(plan.log_dir), listen=listen)
 
     def _busy(self) -> str | None:
         """Why no request that changes something can be taken at present."""

@@ -64,6 +64,13 @@ class Job:
         """Place in the order of start."""
         return rank(self.name, self.kind)
 
+    @property
+    def listening(self) -> list[str]:
+        """The addresses on which it listens, as the configuration has them."""
+        listen = self.config.get("listen") or ()
+        texts = [listen] if isinstance(listen, str) else [*listen]
+        return [*texts, *(address["listen"] for address in self.config.get("address", ()))]
+
     def describe(self, instance: str, epoch: int) -> bytes:
         """The JSON object that the process reads from its standard input."""
         return self._json(instance, epoch, self.config | (self.rules or {}))

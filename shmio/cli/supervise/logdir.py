@@ -8,14 +8,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from shmio.errors import ConfigError
+from shmio.errors import AlreadyRunningError, ConfigError
 
 LOCK_NAME = ".instance"
 
 
 @contextmanager
 def held(folder: Path, instance: str) -> Iterator[None]:
-    """Hold a folder, which is made, as long as the supervisor lives; ConfigError when another instance has it."""
+    """Hold a folder, which is made, as long as the supervisor lives.
+
+    ConfigError: another instance has it; AlreadyRunningError: the instance itself, which another process has begun.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # It is truncated: not what a link put there by somebody leads to.
@@ -26,11 +29,13 @@ def held(folder: Path, instance: str) -> Iterator[None]:
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
+            if (other := file.read(64).strip()) == instance:
+                raise AlreadyRunningError(f"instance {instance!r} is already running, or just starting") from None
             raise ConfigError(
-                f"instance.log_dir: instance {file.read(64).strip()!r} writes its logs to {folder}: give each "
-                "instance a folder of its own"
+                f"instance.log_dir: instance {other!r} writes its logs to {folder}: give each instance a folder of "
+                "its own"
             ) from None
-        file.truncate(0)
-        file.write(f"{instance}\n")
-        file.flush()
+        line = f"{instance}\n".encode()
+        os.pwrite(fd, line, 0)  # before what was there is cut off: who looks meanwhile sees a name
+        os.ftruncate(fd, len(line))
         yield

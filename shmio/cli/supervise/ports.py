@@ -56,10 +56,7 @@ def check_ports(plan: Plan) -> None:
     Whatever else may be wrong with an address is for its process to find.
     """
     for job in plan.jobs:
-        listen = job.config.get("listen", ())
-        texts = [listen] if isinstance(listen, str) else [*listen]
-        texts += [address["listen"] for address in job.config.get("address", ())]
-        for text in texts:
+        for text in job.listening:
             address = parse_address(text)
             if isinstance(address, UnixAddress):
                 if reason := obstacle(address.path):

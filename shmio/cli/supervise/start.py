@@ -19,7 +19,7 @@ from shmio.cli.supervise import logdir
 from shmio.cli.supervise.ports import check_ports
 from shmio.cli.supervise.prepare import Prepared, peer, prepare
 from shmio.cli.supervise.up import Configured, Failed, Started, Told, headline
-from shmio.errors import AlreadyRunningError, ShmioError
+from shmio.errors import AlreadyRunningError, EndpointError, ShmioError
 from shmio.logs import printable
 from shmio.segment import Segment, State, instances, leftover
 from shmio.segment.segment import refuse_second
@@ -97,12 +97,20 @@ def _log_file(plan: Plan) -> Path:
 
 def _refuse(plan: Plan) -> None:
     """AlreadyRunningError; EndpointError when a port is taken, which those that a dead supervisor left may well be."""
+    _refuse_second(plan)
+    if not leftover.living(plan.instance):
+        try:
+            check_ports(plan)
+        except EndpointError:
+            _refuse_second(plan)  # one that began meanwhile may have them
+            raise
+
+
+def _refuse_second(plan: Plan) -> None:
     try:
         refuse_second(plan.instance)
     except AlreadyRunningError as error:
         raise AlreadyRunningError(f"{error}{_whose(plan)}") from None
-    if not leftover.living(plan.instance):
-        check_ports(plan)
 
 
 def _whose(plan: Plan) -> str:
