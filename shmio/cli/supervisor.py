@@ -54,9 +54,8 @@ def _parser() -> argparse.ArgumentParser:
     verb("down", "stop the instance", target)
     status = verb("status", "tell how the instance and its processes are", target)
     status.add_argument("--json", action="store_true", help="print one JSON object")
-    listing = argparse.ArgumentParser(add_help=False)
-    listing.add_argument("--json", action="store_true", help="print a JSON list")
-    verb("list", "tell which instances run on this host, from which files, and where they listen", listing)
+    text = "tell which instances run on this host, from which files, and where they listen"
+    add_json(verb("list", text, argparse.ArgumentParser(add_help=False)), "print a JSON list")
     add_json(verb("reload", "take what has changed in the configuration; leave alone what has not", target))
     verb("restart", "restart one process, as it was configured at the start or the last reload", target).add_argument(
         "name", metavar="NAME"
