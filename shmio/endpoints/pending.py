@@ -17,7 +17,7 @@ MAX_OPEN: Final = 512
 End = tuple[EventKind, str]
 """What became of an item, one of ``ENDS`` or, if that is waited for, ACCEPTED; and the reason, if there is one."""
 Done = Callable[[Sequence[End]], None]
-"""Called once with the ends of a command's items."""
+"""Called once with the ends of a command's values."""
 
 
 def worst(ends: Sequence[End]) -> End:
@@ -46,7 +46,7 @@ class Cost(NamedTuple):
 
 @dataclass(slots=True)
 class Pending:
-    """``items``: how many it has; ``accepted``: called once, if the source accepts it.
+    """``values``: the items of each of its values; ``accepted``: called once, if the source accepts it.
 
     ``until_accepted``: to be accepted is the end.
     """
@@ -54,7 +54,7 @@ class Pending:
     incarnation: int
     until_ns: int
     cost: Cost
-    items: int
+    values: Sequence[range]
     done: Done
     accepted: Callable[[], None] | None = None
     until_accepted: bool = False
@@ -63,6 +63,11 @@ class Pending:
     open_events: int = 0
     """At most so many are still to come."""
     _ends: dict[int, End] = field(default_factory=dict)
+
+    @property
+    def items(self) -> int:
+        """How many it has."""
+        return self.values[-1].stop
 
     def hear(self, event: Event) -> bool:
         """Take in what an event says; whether the end of all is known by now."""
@@ -81,7 +86,7 @@ class Pending:
     def finish(self, missing: str = "") -> None:
         """Tell the ends; ``missing``: why that of some items is not known."""
         unknown = EventKind.UNKNOWN, missing
-        self.done([self._ends.get(item, unknown) for item in range(self.items)])
+        self.done([worst([self._ends.get(item, unknown) for item in items]) for items in self.values])
 
 
 class Pendings:
@@ -114,7 +119,7 @@ class Pendings:
     ) -> None:
         """Follow one that was sent."""
         self._by_number[ticket.number] = Pending(
-            ticket.incarnation, ticket.until_ns, cost, len(ticket.paths), done, accepted, until_accepted,
+            ticket.incarnation, ticket.until_ns, cost, [items for _, items in ticket.values], done, accepted, until_accepted,
             open_events=cost.events,
         )  # fmt: skip
         self.untaken_bytes += cost.record_bytes

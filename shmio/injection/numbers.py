@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from shmio.layout.model import ByteOrder, Register, element_position
+from shmio.layout.model import ByteOrder, Register, bit_positions
 from shmio.layout.scalar import REAL_MAX, scalar_codec
 from shmio.layout.types import ElementType
 
@@ -86,12 +86,10 @@ def places(registers: Iterable[Register], byte_order: ByteOrder) -> list[Places]
         if count > MAX_ELEMENTS:
             raise ValueError(f"more than {MAX_ELEMENTS} single values: name fewer")
         element, into = register.element, found.setdefault(register.element, [])
-        if not register.dims:
-            into.append((register.offset, register.bit or 0))
-            continue
-        for flat in range(register.count):
-            byte, bit = element_position(element, register.shape, flat)
-            into.append((register.offset + byte, bit or 0))
+        if element.base == "BOOL":
+            into += [(register.offset + byte, bit) for byte, bit in bit_positions(register)]
+        else:
+            into += [(register.offset + flat * element.stride, 0) for flat in range(register.count)]
     groups = []
     first = 0
     for element, at in found.items():

@@ -13,7 +13,7 @@ from typing import Protocol
 
 from shmio.errors import ValueRangeError
 from shmio.layout.checks import brief, to_bool
-from shmio.layout.model import ByteOrder, Register, element_position
+from shmio.layout.model import ByteOrder, Register, bit_positions
 from shmio.layout.moment import Buffer
 from shmio.layout.scalar import Scalar, scalar_codec
 
@@ -110,8 +110,7 @@ class _BoolArray:
     def __init__(self, register: Register) -> None:
         self._name, self._shape = register.path, register.shape
         self._offset, self._stop = register.offset, register.offset + register.size
-        places = (element_position(register.element, register.shape, flat) for flat in range(register.count))
-        self._places = [(byte, 1 << (bit or 0)) for byte, bit in places]
+        self._places = [(byte, 1 << bit) for byte, bit in bit_positions(register)]
 
     def decode(self, data: Buffer) -> list[Value]:
         image = bytes(data[self._offset : self._stop])

@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from shmio.layout.calendar import DATE_EPOCH_DAYS, FIRST_DT_NS, LAST_DT_NS, NS_PER_DAY, NS_PER_MS, NS_PER_SECOND
-from shmio.layout.model import Layout, Register, element_position
+from shmio.layout.model import Layout, Register, bit_positions
 from shmio.layout.scalar import MAX_LTOD_NS, MAX_TOD_MS
 from shmio.layout.types import ElementType
 
@@ -136,7 +136,7 @@ def _decoder(register: Register, order: str) -> Callable[[Bytes], Array]:
     """Return what takes (n, size) frames to (n, *shape) values of one register."""
     element, shape = register.element, register.shape
     if element.base == "BOOL":
-        places = [element_position(element, shape, flat) for flat in range(register.count)]
+        places = bit_positions(register)
         where = np.array([register.offset + byte for byte, _ in places], dtype=np.intp)
         shifts = np.array([bit for _, bit in places], dtype=np.uint8)
         return lambda raw: (raw[:, where] >> shifts & 1).astype(bool).reshape(-1, *shape)

@@ -12,12 +12,11 @@ from collections.abc import Iterable
 
 from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
-from shmio.layout.topic import Topic, canonical_path, decode_segment, encode_segment, look_up, shorten
+from shmio.layout.topic import Topic, canonical_path, decode_segment, encode_segment, look_up_each, shorten
 
 MAX_PATTERN = 1024
 
 _PIECES = re.compile(r"\*+|[^*]+")
-_SLICE = re.compile(r"(-?[0-9]{1,10})\.\.(-?[0-9]{1,10})")
 
 
 class Glob:
@@ -127,20 +126,12 @@ def select(layout: Layout, patterns: Iterable[str]) -> tuple[int, ...]:
 def named(layout: Layout, topic: Topic) -> list[Register]:
     """Return the registers that a topic's path names, of whatever form; for a pattern there may be none.
 
-    A register, an array's element, a slice of an array as its elements (``Inputs/3..7``), a structure, a glob; all
-    registers for an empty path. Raises PathError: no such register, or a malformed pattern.
+    A register, an array's element, a slice of an array as its elements (``Inputs/3..7``), a bit or another part of an
+    integer, a structure, a glob; all registers for an empty path. Raises PathError: no such register, or a malformed
+    pattern.
     """
     if not topic.path:
         return list(layout.registers)
     if "*" in topic.path or layout.members(topic.path):
         return [layout.registers[index] for index in select(layout, [topic.path])]
-    head, _, last = topic.path.rpartition("/")
-    if (bounds := _SLICE.fullmatch(last)) and head in layout.by_path:
-        array = layout.registers[layout.by_path[head]]
-        low, high = int(bounds[1]), int(bounds[2])
-        if low > high:
-            raise PathError(f"{shorten(topic.path)}: the slice ends before it begins")
-        for index in (low, high):
-            layout.element(array, (index,))
-        return [layout.element(array, (index,)) for index in range(low, high + 1)]
-    return [look_up(layout, topic)]
+    return look_up_each(layout, topic)

@@ -53,6 +53,7 @@ class Register:
     ``offset``: first byte in the block. ``bit``: 0-7 for BOOL, else None.
     ``size``: bytes from the first to the last that holds data, without trailing padding. ``count``: elements.
     ``initial``: the source's text of the initial value.
+    ``partial``: a slice of a row of bits, which begins at ``bit``; others' bits may be in its first and last byte.
     """
 
     path: str
@@ -64,6 +65,7 @@ class Register:
     count: int
     comment: str = ""
     initial: str | None = None
+    partial: bool = False
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -187,6 +189,15 @@ class _Sorted:
             if at < len(self._paths) and f"{self._paths[at]}/".startswith(f"{path}/"):
                 return self._indices[at]
         return None
+
+
+def bit_positions(register: Register) -> list[tuple[int, int]]:
+    """Return (byte, bit) of each element of a BOOL register, relative to its first byte; the last index runs fastest."""
+    if not register.dims or register.partial:
+        return [divmod((register.bit or 0) + flat, 8) for flat in range(register.count)]
+    row = range(register.shape[-1])
+    rows = range(0, register.size, -(-len(row) // 8))
+    return [(start + column // 8, column % 8) for start in rows for column in row]
 
 
 def element_position(element: ElementType, shape: tuple[int, ...], flat: int) -> tuple[int, int | None]:

@@ -1,6 +1,8 @@
 """Topic paths: how a register is named from outside.
 
-``<source>/<member>/…[/<index>…]`` and then, if given, ``/in`` or ``/out``. A leading slash is accepted, and so
+``<source>/<member>/…[/<index>…]`` and then, if given, ``/in`` or ``/out``. Before these, a path may end in a part of
+a register: a slice in place of the last index (``Inputs/2..5``), or a bit or another part of an integer
+(``Inputs/8.%X0``), as ``parts.py`` has them. A leading slash is accepted, and so
 is ``<SCHEME>://``, whose scheme is a source's name in any case. In a member's name ``/ % + #`` are
 percent-encoded, and so is the first letter of a member named exactly ``in`` or ``out``.
 """
@@ -9,15 +11,18 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
-from typing import Literal, cast
+from typing import Literal, TypeVar, cast
 
 from shmio.config import RESERVED_SOURCES
 from shmio.errors import PathError
 from shmio.layout.model import MAX_DEPTH, MAX_DIMENSIONS, Layout, Register
+from shmio.layout.parts import PART, RANGE, part_of, slice_of
 
 Direction = Literal["in", "out"]
+
+_Found = TypeVar("_Found")
 
 MAX_TOPIC = 16_384
 MAX_SEGMENTS = MAX_DEPTH * (1 + MAX_DIMENSIONS)  # names, each with its indices
@@ -28,7 +33,6 @@ _SOURCES_SHOWN = 4
 _SCHEME = re.compile(r"([^/:]+)://")
 _INDEX = re.compile(r"0|-?[1-9][0-9]{0,9}")
 _ESCAPE = re.compile(r"%([0-9A-Fa-f]{2})?")
-_PART = re.compile(r"(.+)\.%[XBWD][0-9]{1,3}")
 _RESERVED = re.compile(r"[/%+#]")
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
@@ -64,10 +68,9 @@ def decode_segment(segment: str) -> str:
     """
     if "%" not in segment:
         return segment
-    if part := _PART.fullmatch(segment):  # none is a name: not one of them decodes
+    if PART.fullmatch(segment):  # none is a name: not one of them decodes
         raise PathError(
-            f"{shorten(segment)}: a bit or another part of a register is only for what is declared, as by "
-            f"shmio inject --file; name the register, {shorten(part[1])}"
+            f"{shorten(segment)}: a bit or another part of a register ends the path of one register, and is not here"
         )
     data = bytearray()
     position = 0
@@ -84,8 +87,8 @@ def decode_segment(segment: str) -> str:
         raise PathError(f"{shorten(segment)}: the percent-encoded bytes are not UTF-8") from None
 
 
-def canonical_path(path: str) -> str:
-    """Return a path with each segment in its one canonical encoding.
+def canonical_path(path: str, *, parts: bool = False) -> str:
+    """Return a path with each segment in its one canonical encoding; ``parts``: it may end in a part of an integer.
 
     Raises PathError: an empty segment, a wrong percent-encoding, control characters, which no name has, or more
     segments than the deepest layout has.
@@ -95,7 +98,10 @@ def canonical_path(path: str) -> str:
         raise PathError(f"{shorten(path)}: a path has at most {MAX_SEGMENTS} segments")
     if "" in segments:
         raise PathError(f"{shorten(path)}: empty segment in the path")
-    canonical = "/".join(encode_segment(decode_segment(segment)) for segment in segments)
+    suffix = ""
+    if parts and (part := PART.fullmatch(segments[-1])):
+        segments[-1], suffix = part["head"], f".%{part['kind']}{int(part['number'])}"
+    canonical = "/".join(encode_segment(decode_segment(segment)) for segment in segments) + suffix
     if _CONTROL.search(canonical):
         raise PathError(f"{shorten(path)!r}: a path must not hold control characters")
     return canonical
@@ -129,7 +135,7 @@ def parse_topic(text: str, sources: Collection[str], default: str | None) -> Top
     if last in ("in", "out"):
         direction, rest = cast(Direction, last), head
     if rest:
-        return Topic(source, canonical_path(rest), direction, named)
+        return Topic(source, canonical_path(rest, parts=True), direction, named)
     if not named:
         raise PathError(f"{shorten(text)!r}: the path names no register")
     return Topic(source, "", direction)
@@ -155,8 +161,17 @@ def _which(first: str, sources: Collection[str]) -> str:
 
 def look_up(layout: Layout, topic: Topic) -> Register:
     """As :func:`find`; the PathError names the source, and says so if the topic did not."""
+    return _told(layout, topic, find)
+
+
+def look_up_each(layout: Layout, topic: Topic) -> list[Register]:
+    """As :func:`find_each`, with the errors of :func:`look_up`."""
+    return _told(layout, topic, lambda layout, path: list(find_each(layout, path)))
+
+
+def _told(layout: Layout, topic: Topic, search: Callable[[Layout, str], _Found]) -> _Found:
     try:
-        return find(layout, topic.path)
+        return search(layout, topic.path)
     except PathError as error:
         if topic.named and topic.path:
             raise PathError(f"{topic.source}/{error}") from None
@@ -166,23 +181,55 @@ def look_up(layout: Layout, topic: Topic) -> Register:
 
 
 def find(layout: Layout, path: str) -> Register:
-    """Return the register of a canonical path, or an array's element when it ends in indices.
+    """Return the register of a canonical path, or what the path names of one: an element, a slice, a bit.
 
     Raises PathError: there is none; the message has near names.
     """
     index = layout.by_path.get(path)
     if index is not None:
         return layout.registers[index]
-    head, indices = path, list[int]()
-    while "/" in head and len(indices) < 6:
-        head, _, last = head.rpartition("/")
-        if not _INDEX.fullmatch(last):
-            break
-        indices.insert(0, int(last))
-        array = layout.by_path.get(head)
-        if array is not None:
-            return layout.element(layout.registers[array], tuple(indices))
+    head, _, last = path.rpartition("/")
+    if part := PART.fullmatch(last):
+        whole = find(layout, path[: -len(last) + part.end("head")])
+        return part_of(layout, whole, part["kind"], int(part["number"]))
+    if bounds := RANGE.fullmatch(last):
+        if (found := _array(layout, head)) is None:
+            raise PathError(f"{shorten(path)}: a range stands in place of an array's last index")
+        return slice_of(layout, *found, int(bounds["low"]), int(bounds["high"]))
+    if found := _array(layout, head):
+        array, indices = found
+        if _INDEX.fullmatch(last):
+            return layout.element(array, (*indices, int(last)))
     raise PathError(_unknown(layout, path))
+
+
+def names_part(path: str) -> bool:
+    """Whether a path ends as that of a slice, or of a bit or another part of an integer."""
+    last = path.rpartition("/")[2]
+    return bool(PART.fullmatch(last) or RANGE.fullmatch(last))
+
+
+def find_each(layout: Layout, path: str) -> Iterator[Register]:
+    """As :func:`find`; of a slice the elements."""
+    register = find(layout, path)
+    head, _, last = path.rpartition("/")
+    if path in layout.by_path or not RANGE.fullmatch(last):
+        yield register
+        return
+    ((low, high),) = register.dims
+    for index in range(low, high + 1):
+        yield find(layout, f"{head}/{index}")
+
+
+def _array(layout: Layout, path: str) -> tuple[Register, tuple[int, ...]] | None:
+    """The register, an array in a sound path, that a path is or lies below by indices; and these."""
+    indices: tuple[int, ...] = ()
+    while (index := layout.by_path.get(path)) is None:
+        path, _, last = path.rpartition("/")
+        if len(indices) == MAX_DIMENSIONS or not _INDEX.fullmatch(last):
+            return None
+        indices = (int(last), *indices)
+    return layout.registers[index], indices
 
 
 def _unknown(layout: Layout, path: str) -> str:

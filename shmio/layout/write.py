@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 from shmio.errors import PathError
 from shmio.layout.codec import codec
 from shmio.layout.glob import Glob
 from shmio.layout.model import ByteOrder, Layout, Register, element_position
-from shmio.layout.topic import find
+from shmio.layout.topic import find_each, names_part
 
 
 class Write(NamedTuple):
@@ -24,15 +25,23 @@ class Write(NamedTuple):
     data: bytes
 
 
-def encode(register: Register, value: object, byte_order: ByteOrder = "big") -> Write:
-    """The write that gives a register, an array or an element this value; ValueRangeError.
+def encode(register: Register, value: object, byte_order: ByteOrder = "big") -> list[Write]:
+    """The writes that give a register, an array or a part of one this value: one but for a slice of bits.
 
-    An array of bits is whole bytes: what fills up a row's last byte belongs to nobody.
+    ValueRangeError. An array of bits is whole bytes: what fills up a row's last byte belongs to nobody.
     """
-    image = bytearray(register.offset + register.size)
-    codec(register, byte_order).encode_into(value, image)
+    image = bytearray(register.size)
+    codec(replace(register, offset=0), byte_order).encode_into(value, image)  # so that where it lies costs nothing
+    if register.partial:
+        writes = merge(image, bits_of(register), [(0, register.size)])
+        return [write._replace(offset=register.offset + write.offset) for write in writes]
     mask = 0 if register.bit is None or register.dims else 1 << register.bit
-    return Write(register.offset, mask, bytes(image[register.offset :]))
+    return [Write(register.offset, mask, bytes(image))]
+
+
+def sizes(register: Register) -> list[int]:
+    """Bytes of each of the writes that :func:`encode` makes of a value, at the most."""
+    return [register.size] + [1] * 14 if register.partial else [register.size]
 
 
 def apply(write: Write, image: bytearray | memoryview) -> None:
@@ -46,6 +55,9 @@ def apply(write: Write, image: bytearray | memoryview) -> None:
 
 def bits_of(register: Register) -> bytes:
     """A mask of ``size`` bytes in which the bits that the register's :func:`encode` writes are set."""
+    if register.partial:
+        bits = (1 << register.count) - 1 << (register.bit or 0)
+        return bits.to_bytes(register.size, "little")
     if register.bit is None or register.dims:
         return b"\xff" * register.size
     return bytes([1 << register.bit])
@@ -71,14 +83,20 @@ def cover(layout: Layout, patterns: Iterable[str]) -> bytes:
 
 
 def chosen(layout: Layout, pattern: str) -> Iterator[Register]:
-    """The registers, and of arrays the elements, that a path, a structure's or a pattern names; PathError."""
+    """The registers, and of arrays the elements, that a path, a structure's or a pattern names; PathError.
+
+    Of a slice the elements.
+    """
     if "*" not in pattern:
+        registers = find_each(layout, pattern)
         try:
-            register = find(layout, pattern)
+            first = next(registers)
         except PathError:  # a structure: what is below it
-            pass
+            if names_part(pattern) and not layout.members(pattern):
+                raise
         else:
-            yield register
+            yield first
+            yield from registers
             return
     glob = Glob(pattern)
     for register in layout.registers:

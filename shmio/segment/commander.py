@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
 from typing import TYPE_CHECKING, Final, Unpack
 
 import msgspec
@@ -55,10 +56,20 @@ class Ticket:
 
     number: int
     paths: tuple[str, ...]
-    """What each item of the command writes."""
+    """What each item of the command writes; neighbours with one path are one value's."""
     incarnation: int
     until_ns: int
     events: Cursor[Event]
+
+    @property
+    def values(self) -> list[tuple[str, range]]:
+        """Of each value its path, and its items."""
+        values, first = [], 0
+        for path, group in groupby(self.paths):
+            stop = first + len(list(group))
+            values.append((path, range(first, stop)))
+            first = stop
+        return values
 
 
 class Commander:
@@ -93,31 +104,26 @@ class Commander:
         All or none is accepted by the source. PathError: no such register; CommandError: not writable, or the source
         takes nothing; ValueRangeError: a value does not fit. Nothing has been sent then. Never waits.
         """
-        writes = [self._encode(self._register(path), path, value) for path, value in values.items()]
-        return self._send(tuple(values), writes, timeout_s)
+        return self._send_values({path: (self._register(path), value) for path, value in values.items()}, timeout_s)
 
     def shadow(self, injection: int, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
         """Give values as an injection's: to consumers if it lies over ``/out``, toward the device if over ``/in``.
 
         PathError, ValueRangeError, CommandError: nothing has been sent.
         """
-        writes = [self._encode(find(self.block.layout, path), path, value) for path, value in values.items()]
-        return self.outcomes(self._send(tuple(values), writes, timeout_s, CommandKind.SHADOW, injection))
+        found = {path: (find(self.block.layout, path), value) for path, value in values.items()}
+        return self.outcomes(self._send_values(found, timeout_s, CommandKind.SHADOW, injection))
 
     def joined(self, values: Mapping[str, object], raw: Iterable[Write] = ()) -> list[Write]:
         """The writes of values and of ``raw`` bytes, neighbours as one. PathError, ValueRangeError."""
         image, bits = bytearray(self.block.layout.size), bytearray(self.block.layout.size)
         ranges = []
         writes = list(raw)
-        covers = [write._replace(data=b"\xff" * len(write.data)) for write in writes]
         for path, value in values.items():
-            register = find(self.block.layout, path)
-            write = self._encode(register, path, value)
-            writes.append(write)
-            covers.append(write._replace(data=bits_of(register)))
-        for write, covered in zip(writes, covers, strict=True):
+            writes += self._encode(find(self.block.layout, path), path, value)
+        for write in writes:
             apply(write, image)
-            apply(covered, bits)
+            apply(write._replace(data=b"\xff" * len(write.data)), bits)
             ranges.append((write.offset, write.offset + len(write.data)))
         return merge(image, bits, ranges)
 
@@ -186,11 +192,25 @@ class Commander:
         if outcome.kind is not kind:
             raise CommandError(f"{self.block.source}: {outcome.text}")
 
-    def _encode(self, register: Register, path: str, value: object) -> Write:
+    def _encode(self, register: Register, path: str, value: object) -> list[Write]:
         try:
             return encode(register, value, self.block.layout.byte_order)
         except ValueRangeError as error:
             raise ValueRangeError(f"{self.block.source}/{path}: {error}") from None
+
+    def _send_values(
+        self,
+        values: Mapping[str, tuple[Register, object]],
+        timeout_s: float | None,
+        kind: CommandKind = CommandKind.WRITE,
+        injection: int = 0,
+    ) -> Ticket:
+        paths, writes = list[str](), list[Write]()
+        for path, (register, value) in values.items():
+            items = self._encode(register, path, value)
+            writes += items
+            paths += [path] * len(items)
+        return self._send(tuple(paths), writes, timeout_s, kind, injection)
 
     def _send(
         self,
@@ -213,12 +233,16 @@ class Commander:
         ends: dict[int, Event] = {}
         while open_items and (event := self._next(ticket)) is not None:
             if event.kind == EventKind.REJECTED:
-                return [Outcome(path, EventKind.REJECTED, event.text) for path in ticket.paths]
+                return [Outcome(path, EventKind.REJECTED, event.text) for path in dict.fromkeys(ticket.paths)]
             if event.kind in ENDS:
                 ended = open_items.intersection(range(event.item, event.item + event.items))
                 open_items -= ended
                 ends |= dict.fromkeys(ended, event)
-        return [self._outcome(ticket, place, path, ends) for place, path in enumerate(ticket.paths)]
+        outcomes = []
+        for path, items in ticket.values:
+            told = [self._outcome(ticket, place, path, ends) for place in items]
+            outcomes.append(next((outcome for outcome in told if not outcome.done), told[0]))
+        return outcomes
 
     def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
         """:meth:`submit` and wait for the :meth:`outcomes`."""

@@ -10,6 +10,7 @@ import struct
 from collections.abc import Iterable, Iterator, Sequence
 
 from shmio.layout.model import Register
+from shmio.layout.write import bits_of
 from shmio.segment import _atomics
 
 _ENTRY = struct.Struct("=IIII")  # offset, size, mask, index: scan_entry in _atomics.c
@@ -44,7 +45,14 @@ def entries(registers: Iterable[Register], index: int) -> bytes:
 def runs(register: Register) -> Iterator[tuple[int, int, int]]:
     """(offset, size, mask) of the bytes that hold the register's data; mask 0: whole bytes."""
     offset, element = register.offset, register.element
-    if register.bit is not None:
+    if register.partial:
+        first, *rest = bits_of(register)
+        yield offset, 1, first
+        if rest:
+            if len(rest) > 1:
+                yield offset + 1, len(rest) - 1, 0
+            yield offset + len(rest), 1, rest[-1]
+    elif register.bit is not None:
         # A row of bits begins at a byte; its last byte may be padded.
         bits = register.shape[-1] if register.dims else 1
         first = 0 if register.dims else register.bit

@@ -21,7 +21,7 @@ from shmio.errors import ConfigError, PathError
 from shmio.layout.glob import Glob
 from shmio.layout.image import complaints
 from shmio.layout.model import Layout
-from shmio.layout.topic import find, near
+from shmio.layout.topic import find, names_part, near
 from shmio.recording.selection import Selection
 from shmio.supervisor.plan import Plan, make_plan
 
@@ -239,7 +239,9 @@ def _unread(emulated: dict[str, tuple[Layout, ...]]) -> Iterator[str]:
 
 
 def _covers(pattern: str, layout: Layout, types: Sequence[str] = ()) -> bool:
-    """Whether a pattern names a register, what is above one, or an element; of one of these types, if any are given."""
+    """Whether a pattern names a register, what is above one, or a part; of one of these types, if any; PathError."""
+    if names_part(pattern):
+        return any(not types or register.type in types for register in chosen(layout, pattern))
     glob = Glob(pattern)
     for register in layout.registers:
         if types and register.type not in types:

@@ -169,8 +169,8 @@ class Injection(Follower):
 
     def _show_gifts(self, values: Mapping[str, object]) -> None:
         layout = self.feed.block.layout
-        writes = (encode(find(layout, path), value, layout.byte_order) for path, value in values.items())
-        apply(self._gifts, writes)
+        for path, value in values.items():
+            apply(self._gifts, encode(find(layout, path), value, layout.byte_order))
         if self._given and (now := self.feed.present() or self.feed.block.latest()):
             self._given.show(Shown(now.number, now.clock_ns, bytes(self._gifts)))
 

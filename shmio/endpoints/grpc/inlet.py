@@ -19,7 +19,7 @@ from shmio.endpoints.pending import MAX_OPEN, Cost, Done, Pendings
 from shmio.errors import CommandError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
-from shmio.layout.write import Write, merge
+from shmio.layout.write import Write, merge, sizes
 from shmio.segment import Block, Event, EventKind
 from shmio.segment.commander import RETIRED, Commander, Ticket
 from shmio.segment.commands import Laid
@@ -184,7 +184,7 @@ class Inlet:
 
     def _cost(self, values: Collection[str]) -> Cost:
         """What a command with these costs; PathError."""
-        return Cost.of([find(self.block.layout, path).size for path in values])
+        return Cost.of([size for path in values for size in sizes(find(self.block.layout, path))])
 
     def _has_room(self, cost: Cost) -> bool:
         pending = self._pending

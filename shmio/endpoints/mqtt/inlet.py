@@ -8,6 +8,7 @@ from functools import partial
 from shmio.endpoints.pending import MAX_OPEN, Cost, End, Pendings, worst
 from shmio.errors import CommandError
 from shmio.layout.model import Register
+from shmio.layout.write import sizes
 from shmio.segment import DONE, Block, EventKind
 from shmio.segment.commander import REPLACED, RETIRED, Commander
 
@@ -28,7 +29,7 @@ class Inlet:
 
     def send(self, register: Register, value: object, done: Done) -> None:
         """Send a value of a register, an array or an element. CommandError, ValueRangeError: it was not sent."""
-        cost = Cost.of([register.size])
+        cost = Cost.of(sizes(register))
         if self._pending and self._pending.open_events + cost.events > MAX_OPEN:
             raise CommandError(f"{self.block.source}: too many commands are under way; wait for their results")
         if self.block.retired:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from shmio.errors import PathError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Layout, Register
-from shmio.layout.topic import MAX_TOPIC, Topic, decode_segment, encode_segment, find, look_up, parse_topic
+from shmio.layout.topic import MAX_TOPIC, Topic, canonical_path, decode_segment, encode_segment, find, look_up, parse_topic
 
 SOURCES = ("cell", "sim", "Robot")
 
@@ -78,11 +78,14 @@ def test_malformed(text: str) -> None:
 
 
 @pytest.mark.parametrize("part", ["%X0", "%B1", "%W0", "%D0", "%X31"])
-def test_a_part_of_a_register_is_no_register(part: str) -> None:
-    with pytest.raises(
-        PathError, match=rf"^8\.{part}: a bit or another part .* shmio inject --file; name the register, 8$"
-    ):
-        parse_topic(f"cell/a/8.{part}", SOURCES, "cell")
+def test_a_path_may_end_in_a_part_of_a_register(part: str) -> None:
+    topic = parse_topic(f"cell/a b/8.{part}/in", SOURCES, "cell")
+    assert (topic.path, topic.direction) == (f"a b/8.{part}", "in")
+    with pytest.raises(PathError, match=rf"^8\.{part}: a bit or another part of a register ends the path"):
+        parse_topic(f"cell/a/8.{part}/b", SOURCES, "cell")
+    with pytest.raises(PathError, match="ends the path"):
+        canonical_path(f"a/8.{part}")  # as of a register in a layout
+    assert parse_topic("cell/8.%X07", SOURCES, "cell").path == "8.%X7"
 
 
 def test_without_default_the_source_must_be_named() -> None:

@@ -50,6 +50,12 @@ def apply(image: bytes, *writes: Write) -> bytes:
             ("bits/9", True),
             ("axes/1/counts", [1, -2, 3, -4]),
             ("axes/1/counts/2", -1),
+            ("axes/1/counts/1..2", [-1, 7]),
+            ("axes/1/counts/3.%X15", True),
+            ("axes/1/counts/3.%B0", 0xA5),
+            ("bits/2..3", [True, False]),
+            ("bits/4..11", [True, False] * 4),
+            ("bits/1..8", [False] * 8),
             ("axes/1/name", "ab"),
         ]
     ),
@@ -57,7 +63,7 @@ def apply(image: bytes, *writes: Write) -> bytes:
 def test_the_register_has_the_value_and_nothing_else_moved(before: bytes, case: tuple[str, object]) -> None:
     path, value = case
     register = find(LAYOUT, path)
-    after = apply(before, encode(register, value))
+    after = apply(before, *encode(register, value))
     assert codec(register).decode(after) == value
     reference = bytearray(before)
     codec(register).encode_into(value, reference)
@@ -67,10 +73,10 @@ def test_the_register_has_the_value_and_nothing_else_moved(before: bytes, case: 
 
 
 def test_a_bit_is_a_write_of_one_bit_and_whole_bytes_are_one_write() -> None:
-    assert encode(find(LAYOUT, "on"), value=True) == Write(4, 8, b"\x08")
-    assert encode(find(LAYOUT, "bits/9"), value=True) == Write(7, 1, b"\x01")
-    assert encode(find(LAYOUT, "axes/1/counts"), [1, 2, 3, 4]) == Write(8, 0, bytes([0, 1, 0, 2, 0, 3, 0, 4]))
-    assert encode(find(LAYOUT, "bits"), [True] * 11) == Write(6, 0, b"\xff\x07")
+    assert encode(find(LAYOUT, "on"), value=True) == [Write(4, 8, b"\x08")]
+    assert encode(find(LAYOUT, "bits/9"), value=True) == [Write(7, 1, b"\x01")]
+    assert encode(find(LAYOUT, "axes/1/counts"), [1, 2, 3, 4]) == [Write(8, 0, bytes([0, 1, 0, 2, 0, 3, 0, 4]))]
+    assert encode(find(LAYOUT, "bits"), [True] * 11) == [Write(6, 0, b"\xff\x07")]
 
 
 def test_a_value_that_does_not_fit_is_refused() -> None:

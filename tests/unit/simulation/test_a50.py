@@ -61,21 +61,22 @@ def test_hold_is_obeyed_and_taken_back(db201: Layout) -> None:
         return position
 
     moving = run(1, 161)
-    assert runner.write([encode(hold, 1, "big")]) == [""]
+    assert runner.write(encode(hold, 1, "big")) == [""]
     assert run(161, 200) == pytest.approx(moving)
     assert value(runner, "Outputs/13") == 1
-    runner.write([encode(hold, 0, "big")])
+    runner.write(encode(hold, 0, "big"))
     assert run(200, 220) != pytest.approx(moving, abs=1)
 
 
 def test_what_it_does_not_drive_is_as_it_was_written(db201: Layout) -> None:
     runner = ModelRunner(A50Cell, db201)
-    writes = [encode(find(db201, path), 0xA5, "big") for path in ("Inputs/0", "Inputs/20", "Outputs/0", "Outputs/18")]
+    paths = ("Inputs/0", "Inputs/20", "Outputs/0", "Outputs/18")
+    writes = [write for path in paths for write in encode(find(db201, path), 0xA5, "big")]
     assert runner.write(writes) == [""] * 4
     runner.step(STEP_NS, STEP_NS)
     assert [value(runner, path) for path in ("Inputs/20", "Outputs/18")] == [0xA5] * 2
     assert 0xA5 not in [value(runner, path) for path in ("Inputs/0", "Outputs/0")]
-    assert runner.write([encode(find(db201, AXIS), 0.0, "big")]) == [
+    assert runner.write(encode(find(db201, AXIS), 0.0, "big")) == [
         "the model computes Robot_825/Axs1_Pos: it is an output, which nobody writes; shmio inject shows others"
     ]
 

@@ -23,7 +23,7 @@ def test_what_is_written_comes_out_at_the_next_step(path: str, new: float) -> No
     register = find(runner.layout, path)
     read = codec(register, "little").decode
     before = runner.step(50_000_000, 50_000_000)
-    assert runner.write([encode(register, new, "little")]) == [""]
+    assert runner.write(encode(register, new, "little")) == [""]
     assert runner.image == before
     assert read(before) == 0
     after = runner.step(100_000_000, 50_000_000)

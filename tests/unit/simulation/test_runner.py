@@ -26,7 +26,7 @@ def value(runner: ModelRunner, path: str, image: bytes | None = None) -> Any:
 
 
 def set_to(runner: ModelRunner, path: str, new: object) -> str:
-    (said,) = runner.write([encode(find(runner.layout, path), new, runner.layout.byte_order)])
+    (said,) = runner.write(encode(find(runner.layout, path), new, runner.layout.byte_order))
     return said
 
 

@@ -12,7 +12,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from shmio.endpoints.grpc.encoding import field
-from shmio.layout.model import ByteOrder, Register, element_position
+from shmio.layout.model import ByteOrder, Register, bit_positions
 from shmio.layout.moment import Buffer
 from shmio.layout.scalar import Scalar, scalar_codec
 from shmio.layout.types import ElementType
@@ -287,12 +287,6 @@ def _numbers(registers: Sequence[Register], code: str, order: ByteOrder, slots: 
 
 def _bits(registers: Sequence[Register]) -> tuple[Array, Array]:
     """Byte and shift of each bit."""
-    places = []
-    for register in registers:
-        if register.dims:
-            found = (element_position(register.element, register.shape, flat) for flat in range(register.count))
-            places += [(register.offset + byte, bit or 0) for byte, bit in found]
-        else:
-            places.append((register.offset, register.bit or 0))
+    places = [(register.offset + byte, bit) for register in registers for byte, bit in bit_positions(register)]
     where, shifts = zip(*places, strict=True)
     return np.array(where, np.intp), np.array(shifts, np.uint8)

@@ -1,0 +1,134 @@
+"""Slices of arrays, and bits, bytes and words of integers: where they lie, against plain arithmetic."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmio.errors import PathError
+from shmio.layout.codec import codec
+from shmio.layout.model import ByteOrder, Layout, Register, array_size
+from shmio.layout.topic import find
+from shmio.layout.types import INTEGERS, element_type
+from shmio.layout.write import apply, bits_of, encode
+from shmio.segment.scan import ChangeScan
+
+ORDERS: st.SearchStrategy[ByteOrder] = st.sampled_from(["big", "little"])
+WIDTHS = {"X": 1, "B": 8, "W": 16, "D": 32}
+
+
+def integer(type_: str) -> Register:
+    element = element_type(type_)
+    assert element is not None
+    return Register("a", type_, (), 3, None, element.size, 1)
+
+
+def array(type_: str, low: int, count: int) -> Register:
+    element = element_type(type_)
+    assert element is not None
+    bit = 0 if type_ == "BOOL" else None
+    return Register("a", type_, ((low, low + count - 1),), 3, bit, array_size(element, (count,)), count)
+
+
+def layout_of(register: Register, order: ByteOrder = "big") -> Layout:
+    return Layout("DB1", 1, register.offset + register.size + 3, False, (register,), order)
+
+
+@given(st.sampled_from(sorted(INTEGERS)), ORDERS, st.sampled_from("XBWD"), st.integers(0, 7), st.binary(min_size=14))
+def test_a_part_is_these_bits_of_the_number(type_: str, order: ByteOrder, kind: str, number: int, data: bytes) -> None:
+    register = integer(type_)
+    layout = layout_of(register, order)
+    width = WIDTHS[kind]
+    if kind == "X":
+        number = number * register.size + register.size - 1
+    elif width >= 8 * register.size or (number + 1) * width > 8 * register.size:
+        with pytest.raises(PathError, match="has no such part; it has %X0 to"):
+            find(layout, f"a.%{kind}{number}")
+        return
+    part = find(layout, f"a.%{kind}{number}")
+    assert part.path == f"a.%{kind}{number}"
+    image = bytearray(data[: layout.size].ljust(layout.size, b"\0"))
+    whole = codec(register, order).decode(image)
+    assert isinstance(whole, int)
+    value = codec(part, order).decode(image)
+    assert value == whole >> number * width & (1 << width) - 1
+    changed = int(value) ^ (1 << width) - 1
+    for write in encode(part, bool(changed) if kind == "X" else changed, order):
+        apply(write, image)
+    after = codec(register, order).decode(image)
+    assert isinstance(after, int)
+    mask = (1 << 8 * register.size) - 1
+    assert (after ^ whole) & mask == (1 << width) - 1 << number * width, "no neighbour was changed"
+
+
+@given(
+    st.sampled_from(["BOOL", "BYTE", "INT", "REAL", "STRING[3]"]),
+    st.integers(-3, 3), st.integers(1, 40), st.data(), st.binary(min_size=300, max_size=300),
+)  # fmt: skip
+def test_a_slice_is_these_elements(type_: str, low: int, count: int, data: st.DataObject, image: bytes) -> None:
+    register = array(type_, low, count)
+    layout = layout_of(register)
+    first = data.draw(st.integers(low, low + count - 1))
+    last = data.draw(st.integers(first, low + count - 1))
+    part = find(layout, f"a/{first}..{last}")
+    before = bytearray(image[: layout.size])
+    elements = [find(layout, f"a/{index}") for index in range(first, last + 1)]
+    assert repr(codec(part).decode(before)) == repr([codec(element).decode(before) for element in elements])
+
+    own = bytearray(layout.size)
+    for element in elements:
+        for at, bits in enumerate(bits_of(element), element.offset):
+            own[at] |= bits
+    if type_ != "STRING[3]":  # which has a byte of padding between two
+        covered = bytes(part.offset) + bits_of(part)
+        assert covered.ljust(layout.size, b"\0") == bytes(own)
+
+    new = {"BOOL": [True], "REAL": [1.5], "STRING[3]": ["xy"]}.get(type_, [7]) * len(elements)
+    after = bytearray(before)
+    for write in encode(part, new):
+        apply(write, after)
+    assert codec(part).decode(after) == new
+    for index in set(range(low, low + count)) - set(range(first, last + 1)):
+        other = find(layout, f"a/{index}")
+        assert repr(codec(other).decode(after)) == repr(codec(other).decode(before)), "no neighbour was changed"
+
+
+@given(st.integers(0, 39), st.integers(1, 40), st.integers(0, 39))
+def test_a_slice_of_bits_has_changed_when_one_of_its_bits_has(first: int, count: int, flipped: int) -> None:
+    layout = layout_of(array("BOOL", 0, 40))
+    last = min(39, first + count - 1)
+    scan = ChangeScan([find(layout, f"a/{first}..{last}")])
+    image = bytearray(layout.size)
+    image[3 + flipped // 8] ^= 1 << flipped % 8
+    assert scan.changed(bytes(layout.size), bytes(image)) == ([0] if first <= flipped <= last else [])
+
+
+@pytest.mark.parametrize(
+    ("type_", "path", "message"),
+    [
+        ("REAL", "a.%X0", "REAL has no such part: bits, bytes and words are of one integer"),
+        ("TIME", "a.%X0", "TIME has no such part"),
+        ("BOOL", "a.%X0", "BOOL has no such part"),
+        ("BYTE", "a.%X8", "BYTE has bits 0 to 7"),
+        ("BYTE", "a.%B0", r"BYTE has no such part; it has %X0 to %X7$"),
+        ("DWORD", "a.%W2", r"DWORD has no such part; it has %X0 to %X31, %B0 to %B3, %W0 to %W1$"),
+        ("DWORD", "a.%X0.%X0", "BOOL has no such part"),
+        ("DWORD", "a/0..1", "a range stands in place of an array's last index"),
+        ("DWORD", "b.%X0", "b: no such register"),
+    ],
+)
+def test_what_is_no_part(type_: str, path: str, message: str) -> None:
+    register = Register("a", "BOOL", (), 3, 0, 1, 1) if type_ == "BOOL" else Register("a", type_, (), 3, None, 4, 1)
+    if type_ == "BYTE":
+        register = integer(type_)
+    with pytest.raises(PathError, match=message):
+        find(layout_of(register), path)
+
+
+def test_a_part_of_an_array_is_one_of_an_element() -> None:
+    layout = layout_of(array("WORD", 0, 4))
+    assert find(layout, "a/2.%X3").offset == 3 + 2 * 2 + 1
+    for path in ("a.%X0", "a/0..1.%X0"):
+        with pytest.raises(PathError, match="an array has no such part"):
+            find(layout, path)
