@@ -16,7 +16,9 @@ from shmio.cli.run import dumps, seconds
 from shmio.cli.set import Pairs, read_value
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.codec import Value
+from shmio.layout.naming import paths_of
 from shmio.layout.topic import Topic, look_up, parse_topic
+from shmio.layout.write import Write
 from shmio.logs import printable
 
 HELP = "Have consumers, or with /in the device, get other values than they would, until Ctrl-C."
@@ -118,7 +120,8 @@ def _list(cell: Cell, *, as_json: bool) -> None:
     for source, standing in cell.injections().items():
         layout = cell.layout(source)
         for one in standing:
-            over = [f"{source}/{register.path}" for register in layout.registers if one.reaches(register)]
+            bits = (Write(offset, mask, bytes(size)) for offset, size, mask in one.ranges)
+            over = [f"{source}/{path}" for path in paths_of(layout, bits)]
             fields = msgspec.to_builtins(one)
             found.append({"source": source, **{k: v for k, v in fields.items() if k != "ranges"}, "registers": over})
     if as_json:

@@ -119,8 +119,8 @@ class Pendings:
     ) -> None:
         """Follow one that was sent."""
         self._by_number[ticket.number] = Pending(
-            ticket.incarnation, ticket.until_ns, cost, [items for _, items in ticket.values], done, accepted, until_accepted,
-            open_events=cost.events,
+            ticket.incarnation, ticket.until_ns, cost, [items for _, items in ticket.values], done, accepted,
+            until_accepted, open_events=cost.events,
         )  # fmt: skip
         self.untaken_bytes += cost.record_bytes
         self.open_events += cost.events

@@ -192,7 +192,7 @@ class _Sorted:
 
 
 def bit_positions(register: Register) -> list[tuple[int, int]]:
-    """Return (byte, bit) of each element of a BOOL register, relative to its first byte; the last index runs fastest."""
+    """Return (byte, bit) of each element of a BOOL register, from its first byte on; the last index runs fastest."""
     if not register.dims or register.partial:
         return [divmod((register.bit or 0) + flat, 8) for flat in range(register.count)]
     row = range(register.shape[-1])

@@ -209,6 +209,21 @@ def names_part(path: str) -> bool:
     return bool(PART.fullmatch(last) or RANGE.fullmatch(last))
 
 
+def holders(path: str) -> Iterator[str]:
+    """A canonical path, and those of what it may be a part of: elements, arrays, structures."""
+    yield path
+    if part := PART.fullmatch(path):
+        path = part["head"]
+        yield path
+    while path := path.rpartition("/")[0]:
+        yield path
+
+
+def holder(layout: Layout, register: Register) -> str:
+    """The path of the register of a layout that this one, which :func:`find` has found, is or is a part of."""
+    return next(path for path in holders(register.path) if path in layout.by_path)
+
+
 def find_each(layout: Layout, path: str) -> Iterator[Register]:
     """As :func:`find`; of a slice the elements."""
     register = find(layout, path)

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from shmio.errors import PathError
-from shmio.layout.model import Layout, Register
-from shmio.layout.topic import parse_topic
+from shmio.layout.model import Layout
+from shmio.layout.topic import holder, parse_topic
 from shmio.layout.write import chosen, covering
 from shmio.segment import Block, Frame
 
@@ -76,14 +76,6 @@ def _paths(pattern: str, source: str, layout: Layout, sources: Collection[str]) 
         topic = parse_topic(pattern, sources, next(iter(sources)) if len(sources) == 1 else None)
         if topic.source != source or topic.direction == "in":
             return set()
-        return {whole_path(layout, register) for register in chosen(layout, topic.path or "**")}
+        return {holder(layout, register) for register in chosen(layout, topic.path or "**")}
     except PathError:
         return set()
-
-
-def whole_path(layout: Layout, register: Register) -> str:
-    """The path of a register, or of the array of which it is an element."""
-    path = register.path
-    while path not in layout.by_path:
-        path, _, _ = path.rpartition("/")
-    return path

@@ -46,12 +46,12 @@ def runs(register: Register) -> Iterator[tuple[int, int, int]]:
     """(offset, size, mask) of the bytes that hold the register's data; mask 0: whole bytes."""
     offset, element = register.offset, register.element
     if register.partial:
-        first, *rest = bits_of(register)
-        yield offset, 1, first
-        if rest:
-            if len(rest) > 1:
-                yield offset + 1, len(rest) - 1, 0
-            yield offset + len(rest), 1, rest[-1]
+        masks = bits_of(register)
+        yield offset, 1, masks[0]
+        if len(masks) > 2:
+            yield offset + 1, len(masks) - 2, 0
+        if len(masks) > 1:
+            yield offset + len(masks) - 1, 1, masks[-1]
     elif register.bit is not None:
         # A row of bits begins at a byte; its last byte may be padded.
         bits = register.shape[-1] if register.dims else 1

@@ -75,8 +75,13 @@ class Standing(msgspec.Struct, frozen=True, omit_defaults=True):
 
     def reaches(self, register: Register) -> bool:
         """Whether it stands over any bit of a register."""
-        start, stop, own = register.offset, register.offset + register.size, bits_of(register)[0]
-        return any(start < at + count and at < stop and bits & own for at, count, bits in self.ranges)
+        start, stop = register.offset, register.offset + register.size
+        own = bits_of(register)
+        shared = (
+            (own[max(at - start, 0) : min(at + count, stop) - start], bits) for at, count, bits in self.ranges
+            if start < at + count and at < stop
+        )  # fmt: skip
+        return any(bits & mine for part, bits in shared for mine in (part if register.partial else part[:1]))
 
 
 # As in layout/document.py: built before there are threads.

@@ -12,8 +12,9 @@ from shmio.dump.dump import Dump
 from shmio.dump.entries import Entry
 from shmio.dump.reader import Item
 from shmio.layout.model import Register
+from shmio.layout.topic import holder
 from shmio.layout.write import covering
-from shmio.recording.selection import Part, whole_path
+from shmio.recording.selection import Part
 from shmio.segment import Frame
 
 
@@ -42,7 +43,7 @@ class Parts:
 
 def _part(block: DumpBlock, registers: Sequence[Register]) -> tuple[DumpBlock, Part]:
     """The block with these registers alone, and what makes its frames."""
-    paths = {whole_path(block.layout, register) for register in registers}
+    paths = {holder(block.layout, register) for register in registers}
     whole = tuple(register for register in block.layout.registers if register.path in paths)
     layout = replace(block.layout, registers=whole)
     part = Part(layout, np.frombuffer(covering(whole, layout.size), np.uint8))

@@ -21,7 +21,8 @@ from shmio.errors import ConfigError, PathError
 from shmio.layout.glob import Glob
 from shmio.layout.image import complaints
 from shmio.layout.model import Layout
-from shmio.layout.topic import find, names_part, near
+from shmio.layout.topic import find, look_up, names_part, near, parse_topic
+from shmio.layout.write import chosen
 from shmio.recording.selection import Selection
 from shmio.supervisor.plan import Plan, make_plan
 
@@ -186,12 +187,21 @@ def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
                 raise ConfigError(f"{key}: {pattern!r}: frames are those of a whole source, so name one")
             continue
         try:
+            if names_part(pattern) and key.startswith("mqtt.topic"):
+                _check_part(pattern, layouts)
+                continue
             glob = Glob(pattern)
         except PathError as error:
             raise ConfigError(f"{key}: {error}") from None
         paths = (f"{source}/{register.path}" for source, layout in layouts.items() for register in layout.registers)
         if not any(map(glob.matches, paths)):
             yield f"{key}: {pattern!r} names no register; the path of one begins with its source"
+
+
+def _check_part(path: str, layouts: dict[str, Layout]) -> None:
+    """PathError: no such bit, slice or other part."""
+    topic = parse_topic(path, layouts, None)
+    look_up(layouts[topic.source], topic)
 
 
 def _odd_recorder(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from typing import Final
 
 from shmio.config import MqttTopic
@@ -13,7 +14,9 @@ from shmio.endpoints.mqtt.inlet import Inlet
 from shmio.endpoints.mqtt.outbox import Outbox
 from shmio.endpoints.mqtt.rules import Rules
 from shmio.endpoints.mqtt.structure import StructureChannel
+from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
+from shmio.layout.topic import find
 from shmio.layout.write import elements
 from shmio.segment import Block, Frame, Quality
 from shmio.segment.scan import ChangeScan
@@ -193,13 +196,16 @@ class Feed:
 
 
 def _chosen(layout: Layout, rules: Rules, source: str) -> Iterator[tuple[Register, MqttTopic]]:
-    """What is published of a block, each with its rule; arrays as a whole, or by their elements."""
+    """What is published of a block, each with its rule; arrays as a whole, or by their elements; then parts."""
     for register in layout.registers:
         rule = rules.of(source, register.path)
         if not rule.publish:
             continue
         for part in elements(layout, register) if rule.elements and register.dims else (register,):
             yield part, rule
+    for path in rules.parts(source):
+        with suppress(PathError):  # a reload has brought another layout; `check` tells
+            yield find(layout, path), rules.of(source, path)
 
 
 def _depths(layout: Layout) -> Sequence[int]:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 from shmio.config import MqttTopic
 from shmio.layout.glob import Glob
+from shmio.layout.topic import canonical_path, names_part
 
 DEFAULT: Final = MqttTopic(match="**")
 """That of registers that no rule matches."""
@@ -18,13 +19,24 @@ class Rules:
     def __init__(self, topics: Sequence[MqttTopic]) -> None:
         """PathError: a pattern that is none."""
         self._frames = {pattern: rule for rule in topics if rule.payload == "frames" for pattern in rule.patterns}
-        self._rules = [
-            (Glob(pattern), rule) for rule in topics if rule.payload != "frames" for pattern in rule.patterns
-        ]
+        rules = [(pattern, rule) for rule in topics if rule.payload != "frames" for pattern in rule.patterns]
+        self._parts: dict[str, MqttTopic] = {}
+        for pattern, rule in rules:
+            if names_part(pattern):
+                self._parts.setdefault(canonical_path(pattern, parts=True), rule)
+        self._rules = [(Glob(pattern), rule) for pattern, rule in rules if not names_part(pattern)]
 
     def of(self, source: str, path: str) -> MqttTopic:
-        """The rule of a register."""
-        return self._first(f"{source}/{path}")[1]
+        """The rule of a register, or of a bit or slice."""
+        full = f"{source}/{path}"
+        return self._parts.get(full) or self._first(full)[1]
+
+    def parts(self, source: str) -> Iterator[str]:
+        """The paths of the bits, slices and other parts of a source's registers that have topics of their own."""
+        for full, rule in self._parts.items():
+            first, _, path = full.partition("/")
+            if first == source and rule.publish:
+                yield path
 
     def structure(self, source: str, path: str) -> str | None:
         """The structure as whose part a register is published, empty for the whole source; None: by itself."""

@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from shmio.errors import PathError
 from shmio.layout.codec import codec
 from shmio.layout.model import ByteOrder, Layout, Register, array_size
+from shmio.layout.naming import paths_of
 from shmio.layout.topic import find
 from shmio.layout.types import INTEGERS, element_type
-from shmio.layout.write import apply, bits_of, encode
+from shmio.layout.write import Write, apply, bits_of, encode
 from shmio.segment.scan import ChangeScan
 
 ORDERS: st.SearchStrategy[ByteOrder] = st.sampled_from(["big", "little"])
@@ -84,7 +85,8 @@ def test_a_slice_is_these_elements(type_: str, low: int, count: int, data: st.Da
         covered = bytes(part.offset) + bits_of(part)
         assert covered.ljust(layout.size, b"\0") == bytes(own)
 
-    new = {"BOOL": [True], "REAL": [1.5], "STRING[3]": ["xy"]}.get(type_, [7]) * len(elements)
+    one: dict[str, list[object]] = {"BOOL": [True], "REAL": [1.5], "STRING[3]": ["xy"]}
+    new = one.get(type_, [7]) * len(elements)
     after = bytearray(before)
     for write in encode(part, new):
         apply(write, after)
@@ -132,3 +134,31 @@ def test_a_part_of_an_array_is_one_of_an_element() -> None:
     for path in ("a.%X0", "a/0..1.%X0"):
         with pytest.raises(PathError, match="an array has no such part"):
             find(layout, path)
+
+
+@pytest.mark.parametrize("order", ["big", "little"])
+def test_what_is_written_is_named_as_it_was(order: ByteOrder) -> None:
+    registers = (
+        Register("speed", "REAL", (), 0, None, 4, 1),
+        Register("bytes", "BYTE", ((0, 9),), 4, None, 10, 10),
+        Register("on", "BOOL", (), 14, 0, 1, 1),
+        Register("off", "BOOL", (), 14, 1, 1, 1),
+        Register("bits", "BOOL", ((1, 20),), 16, 0, 3, 20),
+        Register("grid", "INT", ((0, 1), (1, 3)), 20, None, 12, 6),
+        Register("word", "WORD", (), 32, None, 2, 1),
+    )
+    layout = Layout("DB1", 1, 34, False, registers, order)
+    for paths in (
+        ["speed"], ["bytes"], ["bytes/3"], ["bytes/3..7"], ["bytes/9.%X0"], ["off"], ["bits/4"], ["bits/3..12"],
+        ["grid/0/2..3", "grid/1/1..2"], ["word"], ["word.%X11"], ["word.%B1"],
+        ["speed", "bytes/0..1", "on", "word.%X0"],
+    ):  # fmt: skip
+        writes: list[Write] = []
+        for path in paths:
+            part = find(layout, path)
+            full: object = {"BOOL": True, "REAL": 1.0, "INT": 1, "BYTE": 1, "WORD": 1}[part.type]
+            writes += encode(part, [full] * part.count if part.dims else full, order)
+        assert paths_of(layout, writes) == paths
+    assert paths_of(layout, [Write(1, 0, b"\0"), Write(15, 0, b"\0"), Write(33, 0, b"\0" * 9)]) == [
+        "speed", "word.%B0" if order == "big" else "word.%B1",
+    ]  # fmt: skip

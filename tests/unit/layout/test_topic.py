@@ -9,7 +9,16 @@ from hypothesis import strategies as st
 from shmio.errors import PathError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Layout, Register
-from shmio.layout.topic import MAX_TOPIC, Topic, canonical_path, decode_segment, encode_segment, find, look_up, parse_topic
+from shmio.layout.topic import (
+    MAX_TOPIC,
+    Topic,
+    canonical_path,
+    decode_segment,
+    encode_segment,
+    find,
+    look_up,
+    parse_topic,
+)
 
 SOURCES = ("cell", "sim", "Robot")
 

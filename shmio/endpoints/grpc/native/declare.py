@@ -20,6 +20,7 @@ from shmio.endpoints.grpc.inlet import Inlet
 from shmio.endpoints.grpc.native.waiting import Waiting
 from shmio.errors import CommandError, ValueRangeError
 from shmio.injection import Program
+from shmio.layout.topic import names_part
 from shmio.messages import declaration_from_wire
 from shmio.segment import Block, Event, EventKind
 from shmio.segment.campaign import check
@@ -145,7 +146,7 @@ def _check(declarations: Sequence[Declaration], blocks: Mapping[str, Block]) -> 
         for target in [declaration.target] if isinstance(declaration.target, str) else declaration.target:
             source, _, path = target.removesuffix("/in").removesuffix("/out").partition("/")
             block = blocks.get(source)
-            if block is None or path not in block.layout.by_path:
+            if block is None or not (path in block.layout.by_path or (names_part(path) and "*" not in path)):
                 looked_at = [block] if block else blocks.values()
                 matches += max((len(one.layout.registers) for one in looked_at), default=0)
     if matches > MAX_MATCHES:

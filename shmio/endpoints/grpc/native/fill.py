@@ -12,7 +12,7 @@ from shmio.endpoints.grpc.native.views import Selection
 from shmio.errors import PathError, ValueRangeError
 from shmio.layout.codec import RegisterCodec, codec
 from shmio.layout.model import Register
-from shmio.layout.topic import find, parse_topic, shorten
+from shmio.layout.topic import find, holders, parse_topic, shorten
 from shmio.wire import shmio_v1_pb2 as wire
 
 
@@ -90,9 +90,6 @@ class Fill:
         if topic.source != block.source:
             raise PathError(f"{shorten(text)}: {topic.source} is reserved; begin the path with {block.source}")
         register = find(block.layout, topic.path)
-        whole = register.path
-        while whole and whole not in self._by_path:
-            whole = whole.rpartition("/")[0]
-        if not whole or topic.direction == "in":
+        if self._by_path.keys().isdisjoint(holders(register.path)) or topic.direction == "in":
             raise PathError(f"{shorten(text)}: it is none of the outputs of {block.source}")
         return register

@@ -158,6 +158,23 @@ def test_rules_say_what_is_published_and_how(segment: Segment, broker: Mosquitto
             assert not later.values("cell/step/out")
 
 
+def test_bits_and_slices_have_topics_where_a_rule_names_them(segment: Segment, broker: Mosquitto) -> None:
+    rules = [
+        MqttTopic(match="cell/inputs/1.%X2"),
+        MqttTopic(match=["cell/inputs/0..1", "cell/inputs/0.%X9"], retain=False),
+    ]
+    writer = segment.writer("cell")
+    writer.publish(image(inputs=b"\3\4"), cycle=1)
+    with listening(broker.address) as listener, bridge(segment, broker.address, topic=rules):
+        assert listener.until("cell/inputs/1.%X2/out") == b"true"
+        writer.publish(image(inputs=b"\3\5"), cycle=2)  # a neighbour
+        writer.publish(image(inputs=b"\3\1"), cycle=3)
+        assert listener.until("cell/inputs/1.%X2/out") == b"false"
+        assert json.loads(listener.until("cell/inputs/0..1/out", b"[3,1]")) == [3, 1]
+        assert f"{PREFIX}/cell/inputs/0.%X9/out" not in {topic for topic, _ in listener.heard}
+    assert listener.values("cell/inputs/1.%X2/out") == ["true", "false"]
+
+
 def wait_for(listener: Listener, topic: str, count: int) -> list[str]:
     while len(values := listener.values(topic)) < count:
         listener.message()
