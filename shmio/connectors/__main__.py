@@ -87,17 +87,21 @@ def _part(worker: Worker) -> _Part:
     writer = segment.writer(worker.name)  # after its source: one that cannot be as configured has begun nothing
     schedule = Schedule(segment.header.started_ns, writer.block.period_ns)
     owner_of, blocks = partial(_owner_of, segment), partial(_blocks, segment)
-    writable = worker.config["writable"]
+    writable, allow = worker.config["writable"], worker.config["allow_nonfinite"]
     if isinstance(source, Connector):
         clock = WallClock()
         armed = writer.block.attributes.armed
-        loop = SourceLoop(source, writer, schedule, clock, writable, armed=armed, owner_of=owner_of, blocks=blocks)
+        loop = SourceLoop(
+            source, writer, schedule, clock, writable,
+            allow_nonfinite=allow, armed=armed, owner_of=owner_of, blocks=blocks,
+        )  # fmt: skip
         return _Part(loop, clock.stop, source.timeout_s)
     page_clock = PageClock(segment.clock, worker.slot.index)
     inputs = _inputs(source, writer, segment)
     stepped = SteppedLoop(
-        source, writer, schedule, page_clock, writable, inputs=inputs, owner_of=owner_of, blocks=blocks
-    )
+        source, writer, schedule, page_clock, writable,
+        allow_nonfinite=allow, inputs=inputs, owner_of=owner_of, blocks=blocks,
+    )  # fmt: skip
 
     def stop() -> None:
         page_clock.stop()
@@ -125,6 +129,7 @@ def _replay(worker: Worker, options: Any) -> _Part:
         beginning,
         clock,
         worker.config["writable"],
+        allow_nonfinite=worker.config["allow_nonfinite"],
         owner_of=partial(_owner_of, segment),
         blocks=partial(_blocks, segment),
     )

@@ -16,6 +16,7 @@ from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.batch import End, Item, coalesce, ends, one_each, records
 from shmio.connectors.campaign import Blocks
 from shmio.connectors.chain import meet, pieces
+from shmio.connectors.finite import Finite
 from shmio.connectors.injections import Injection, uncovered
 from shmio.connectors.injector import Injector, OwnerOf
 from shmio.connectors.output import Output
@@ -45,6 +46,7 @@ class CommandDesk:
         writable: Iterable[str] | None,
         now_ns: Callable[[], int],
         *,
+        allow_nonfinite: Iterable[str] = (),
         armed: bool = False,
         owner_of: OwnerOf = lambda _: None,
         blocks: Blocks | None = None,
@@ -52,6 +54,7 @@ class CommandDesk:
     ) -> None:
         """``writable``: patterns; None: the device cannot be written at all. ``armed``: injections may reach it.
 
+        ``allow_nonfinite``: patterns of what may be written NaN and infinities.
         ``owner_of``: which process has a command queue. ``blocks``: of all sources, for the conditions of declared
         injections; default: this one. ``accepted``: called when items wait.
         """
@@ -62,6 +65,7 @@ class CommandDesk:
         self._cannot = "this source's connector cannot write" if writable is None else ""
         layout = self._writer.block.layout
         self._writable = cover(layout, writable or ())
+        self._finite = Finite(layout, allow_nonfinite)
         self._most_bytes = MAX_WAITING_BLOCKS * layout.size
         refuse_in = self._cannot or ("" if armed else _UNARMED)
         blocks = blocks or (lambda: {output.writer.block.source: output.writer.block})
@@ -233,6 +237,7 @@ class CommandDesk:
     def _accept(self, command: Command, layer: Injection | None) -> None:
         """Let a command meet the injections below ``layer``, and have what they leave of it wait for the cycle."""
         left, taken = meet(self._output, command, layer)
+        left = [pair for pair in left if not self._made_unfit(pair[0])]
         self._end(taken, [(EventKind.TAKEN, "")] * len(taken))  # now all that injections get of it has been told
         items = [item for item, _ in left]
         with self._verdict:
@@ -247,6 +252,13 @@ class CommandDesk:
             self._end(items, [(EventKind.EXPIRED, closed)] * len(items))
         elif items:
             self._accepted()
+
+    def _made_unfit(self, item: Item) -> bool:
+        """Whether declared injections have made of it what is not written; that is told."""
+        reason = "" if item.data is None else self._finite.refusal(item.parts())
+        if reason:
+            self._end([item], [(EventKind.REFUSED, f"the injection {item.changed_by!r} changes it: {reason}")])
+        return bool(reason)
 
     def _has_room(self, command: Command) -> bool:
         with self._turn:
@@ -278,7 +290,7 @@ class CommandDesk:
             allowed = self._writable[write.offset : stop]
             if not (allowed[0] & write.mask if write.mask else allowed == b"\xff" * len(allowed)):
                 return f"bytes {write.offset} to {stop - 1} are not writable; name them in the source's `writable`"
-        return ""
+        return self._finite.refusal(command.writes)
 
     def _end(self, items: Sequence[Item], ends: Sequence[End]) -> None:
         """Tell what became of accepted items: one event for neighbours in a command that ended alike."""

@@ -80,6 +80,7 @@ class SteppedLoop:
         clock: StepClock,
         writable: Iterable[str] = (),
         *,
+        allow_nonfinite: Iterable[str] = (),
         inputs: Inputs | None = None,
         owner_of: OwnerOf = lambda _: None,
         blocks: Blocks | None = None,
@@ -95,8 +96,9 @@ class SteppedLoop:
         self._output = Output(writer, clock.now_ns)
         # Whatever is injected here reaches no plant, so that no arming is needed.
         self.desk = CommandDesk(
-            self._output, writable, clock.now_ns, armed=True, owner_of=owner_of, blocks=blocks, accepted=clock.nudge
-        )
+            self._output, writable, clock.now_ns, allow_nonfinite=allow_nonfinite, armed=True, owner_of=owner_of,
+            blocks=blocks, accepted=clock.nudge,
+        )  # fmt: skip
         self._condition = Condition(writer)
         self._handled = 0  # the last step computed, or passed over
         self._cycle: int | None = None  # the last one computed in wall time

@@ -26,6 +26,20 @@ def paths_of(layout: Layout, writes: Iterable[Write]) -> list[str]:
     return [path for index in sorted(touched) for path in _of(layout, layout.registers[index], bits)]
 
 
+def path_at(layout: Layout, offset: int) -> str:
+    """Return the path of the register, or of the array's element, that lies at a byte; empty if there is none."""
+    for index in _overlapping(layout, offset, offset + 1):
+        register = layout.registers[index]
+        if not register.dims or register.bit is not None:
+            return register.path
+        flat, indices = (offset - register.offset) // register.element.stride, list[str]()
+        for low, high in reversed(register.dims):
+            flat, place = divmod(flat, high - low + 1)
+            indices.insert(0, str(low + place))
+        return "/".join((register.path, *indices))
+    return ""
+
+
 def _overlapping(layout: Layout, start: int, stop: int) -> range:
     """The registers that share a byte with a range."""
     first = bisect_right(layout.registers, start, key=lambda register: register.offset + register.size)

@@ -160,6 +160,7 @@ def _source(name: str, own: Source | None, section: Replay, files: list[str]) ->
         name=name,
         connector="replay",
         writable=own.writable if own else [],
+        allow_nonfinite=own.allow_nonfinite if own else (),
         realtime_priority=own.realtime_priority if own else None,
         options={"file": files, "source": name, "own_clock": True, **options},
     )

@@ -47,6 +47,7 @@ class ReplayLoop:
         clock: StepClock,
         writable: Iterable[str] = (),
         *,
+        allow_nonfinite: Iterable[str] = (),
         owner_of: OwnerOf = lambda _: None,
         blocks: Blocks | None = None,
     ) -> None:
@@ -63,8 +64,9 @@ class ReplayLoop:
         self._output = Output(writer, clock.now_ns)
         # Whatever is injected here reaches no plant, so that no arming is needed.
         self.desk = CommandDesk(
-            self._output, writable, clock.now_ns, armed=True, owner_of=owner_of, blocks=blocks, accepted=clock.nudge
-        )
+            self._output, writable, clock.now_ns, allow_nonfinite=allow_nonfinite, armed=True, owner_of=owner_of,
+            blocks=blocks, accepted=clock.nudge,
+        )  # fmt: skip
         self._player = Player(source.tape, self._output, keep=source.keep)
         self._search: tuple[int, Search] | None = None
         self._play, self._done_ns = beginning

@@ -52,7 +52,7 @@ class Device:
         self.idle = False
         self.taken = threading.Event()
         self._writer = writer
-        self._desk = CommandDesk(Output(writer), WRITABLE, time.monotonic_ns)
+        self._desk = CommandDesk(Output(writer), WRITABLE, time.monotonic_ns, allow_nonfinite=["speed"])
         self._stop = threading.Event()
         self._threads = [threading.Thread(target=self._desk.run), threading.Thread(target=self._cycles)]
         self.desk.open()

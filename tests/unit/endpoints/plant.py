@@ -30,8 +30,9 @@ class Plant:
         self.quality = Quality.GOOD
         self.output = Output(writer)
         self.desk = CommandDesk(
-            self.output, writer.block.attributes.writable, time.monotonic_ns, armed=armed, owner_of=self.owners.get
-        )
+            self.output, writer.block.attributes.writable, time.monotonic_ns,
+            allow_nonfinite=["axis/position"], armed=armed, owner_of=self.owners.get,
+        )  # fmt: skip
         self.desk.open()
         self._cycles = 0
         self._stop = threading.Event()
