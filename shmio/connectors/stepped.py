@@ -90,6 +90,7 @@ class SteppedLoop:
         source.attach(writer)
         self._writer = writer
         self._page = writer.block.clock
+        writer.utc_ns = self._page.utc_ns
         self._schedule = schedule
         self._clock = clock
         self._inputs = inputs

@@ -203,6 +203,8 @@ class BlockWriter:
         """The present cycle, which events are stamped with."""
         self.at_ns: int | None = None
         """What frames and events are stamped with in virtual time, comparable to CLOCK_MONOTONIC; None: now."""
+        self.utc_ns: Callable[[int], int] | None = None
+        """Turns such a time into UTC, which events are then stamped with, too."""
         self._quality = Quality.BAD
         self.incarnation = block.ring.begin()
         block.events.ring.begin(self.incarnation)
@@ -250,7 +252,9 @@ class BlockWriter:
 
     def _present(self) -> Stamp:
         now_ns = self.now_ns()
-        return Stamp(now_ns, self._clock_ns(now_ns))
+        if self.at_ns is None or self.utc_ns is None:
+            return Stamp(now_ns, self._clock_ns(now_ns))
+        return Stamp(now_ns, self._clock_ns(now_ns), self.utc_ns(now_ns))
 
     def event(self, record: Record, *, quality: Quality | None = None, at: Stamp | None = None) -> int:
         """Publish one event and wake the readers of frames and events; returns its number.

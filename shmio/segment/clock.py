@@ -101,6 +101,10 @@ class Bell:
         _atomics.bell_relay(self._memory, self._offset, shared, descriptor, turn_ns)
 
 
+SIMULATED_UTC_NS: Final = 946_684_800_000_000_000
+"""UTC at which time that was virtual from the start begins: 2000-01-01."""
+
+
 class ClockPage:
     """The section of one segment; several threads may use it, to write it is the owner of time's alone."""
 
@@ -177,8 +181,9 @@ class ClockPage:
         return self._started_ns + time_ns
 
     def utc_ns(self, monotonic_ns: int) -> int:
-        """Such a time as UTC."""
-        return self._started_utc_ns + monotonic_ns - self._started_ns
+        """Such a time as UTC; of an instance whose time was virtual from the start it is the same in each run."""
+        since_ns = monotonic_ns - self._started_ns
+        return (SIMULATED_UTC_NS if self.stepped else self._started_utc_ns) + since_ns
 
     def slot_bell(self, index: int) -> Bell:
         """The bell of the process in this slot of the table: rung when the page has something for it to do."""

@@ -13,6 +13,7 @@ from google.protobuf.empty_pb2 import Empty
 from google.protobuf.struct_pb2 import Value
 
 import shmio
+from shmio.wire import shmio_v1_pb2 as ours
 from shmio.wire import simlog_v1_pb2 as v1
 from shmio.wire import simlog_v2_pb2 as v2
 from shmio.wire import simserver_pb2 as sim
@@ -114,7 +115,8 @@ class Campaign:
         await outgoing.done_writing()
         await outgoing
         async with asyncio.timeout(PATIENCE_S):
-            return {name: await reader for name, reader in self._readers.items()}
+            streams = {name: await reader for name, reader in self._readers.items()}
+        return streams | {"shmio.v1": [update for message in streams["shmio.v1"] for update in _updates(message)]}
 
     # ---- listening -------------------------------------------------------------------------------------------------
 
@@ -135,6 +137,12 @@ class Campaign:
         await self._follow(
             "status", self._channel, "/com.ttsnetwork.simulator3.SimServerAPI/subscribe", Empty(),
             lambda data: sim.SimStatus.FromString(data).clock == over,
+        )  # fmt: skip
+
+        await self._follow(
+            "shmio.v1", self._channel, "/shmio.v1.Shmio/Subscribe",
+            ours.SubscribeRequest(patterns=["sim", "noise", "panel", f"sim/{J2}/in"]),
+            lambda data: ours.SubscribeResponse.FromString(data).step.number == STEPS,
         )  # fmt: skip
 
     async def _subscribe_new(self, uuid: str, *paths: str) -> None:
@@ -213,6 +221,15 @@ class Campaign:
 
 def _published(path: str, value: str) -> v1.PubRequest:
     return v1.PubRequest(topic=v1.TopicDescriptor(path=path), data=v1.ROSMessage(type="double", value=value))
+
+
+def _updates(message: bytes) -> list[bytes]:
+    """Those of a message, which holds as many as have come meanwhile, without what another process counts anew."""
+    updates = ours.SubscribeResponse.FromString(message).updates
+    for update in updates:
+        for name in ("table", "frame", "incarnation"):
+            update.ClearField(name)
+    return [update.SerializeToString(deterministic=True) for update in updates]
 
 
 def _step_ms(number: int) -> int:

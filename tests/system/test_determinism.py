@@ -89,6 +89,7 @@ def test_a_campaign_repeats_exactly(cell: Cell) -> None:
         m.header.path for m in two
     }
     assert len(first["v1 noise/measured"]) == STEPS + 1
+    assert len(first["shmio.v1"]) > 2 * STEPS
     assert -20.0 in [m.value.number_value for m in two if m.header.path == J1], "the injection"
     second_joint = [m.value.number_value for m in two if m.header.path == J2]
     assert any(value not in (0.0, *(1 / n for n in range(1, STEPS, 2))) for value in second_joint), "the declared one"

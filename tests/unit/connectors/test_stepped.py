@@ -33,6 +33,7 @@ from shmio.segment import (
     Segment,
     Stamp,
 )
+from shmio.segment.clock import SIMULATED_UTC_NS
 from shmio.segment.commander import Commander
 from shmio.segment.coordinator import Coordinator
 
@@ -259,7 +260,7 @@ def test_time_stands_until_it_is_stepped_and_each_step_is_one_frame(instance: st
             (3, 3, 3_600_070, 0),
         ]
         assert frames[0].publish_ns == segment.header.started_ns + 50 * MS
-        assert frames[0].source_ns == segment.header.started_utc_ns + 50 * MS
+        assert frames[0].source_ns == SIMULATED_UTC_NS + 50 * MS
         assert segment.blocks["sim"].assess(frames[-1]) == (Quality.GOOD, "")
 
 
