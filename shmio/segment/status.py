@@ -166,7 +166,7 @@ def _state(told: InstanceState, processes: list[SourceStatus | ProcessStatus]) -
 
 def complaint(kind: str, note: str) -> str:
     """What a running process reports as wrong though it runs: a recorder that is well names its file, ``to FILE``."""
-    return note if kind == "mqtt" or (kind == "recorder" and not note.startswith("to ")) else ""
+    return note if kind in ("mqtt", "grpc") or (kind == "recorder" and not note.startswith("to ")) else ""
 
 
 def assess(running: Sequence[bool], qualities: Sequence[Quality | None]) -> InstanceState:

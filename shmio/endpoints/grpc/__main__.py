@@ -84,6 +84,8 @@ async def _serve(worker: Worker) -> None:
         for address, port in zip(addresses, ports, strict=True)
     ]
     worker.log.info("serving %s", ", ".join(served))
+    if server.shortage:
+        worker.report(note=server.shortage)
     if (file := place.config_file) is not None:
         worker.on_reread(lambda: loop.call_soon_threadsafe(reread, file))
     worker.running()

@@ -16,7 +16,7 @@ from shmio.config import Address, Tls, UnixAddress
 from shmio.config.tls import read_tls
 from shmio.config.unixsocket import SocketFile, clear
 from shmio.endpoints.grpc.core import CoreServer
-from shmio.endpoints.grpc.descriptors import room
+from shmio.endpoints.grpc.descriptors import room, shortage
 from shmio.endpoints.grpc.doors import Listener
 from shmio.endpoints.grpc.gate import Calls, Gate
 from shmio.endpoints.grpc.health import Health
@@ -55,6 +55,8 @@ class Server:
         self._files: dict[str, SocketFile] = {}
         self._connections = 1
         """How many each address may have."""
+        self.shortage = ""
+        """What is wrong though it serves: it has room for few."""
         logging.getLogger("grpc._cython.cygrpc").addFilter(_is_news)
 
     @property
@@ -78,6 +80,7 @@ class Server:
         connections = room(wanted)
         if connections < wanted:
             log.warning("at most %d connections, not %d: the hard limit of open files is too low", connections, wanted)
+        self.shortage = shortage(connections, wanted)
         self._connections = max(1, connections // len(listeners))
         ports = []
         for listener in listeners:

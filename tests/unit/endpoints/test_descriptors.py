@@ -6,7 +6,7 @@ import resource
 
 import pytest
 
-from shmio.endpoints.grpc.descriptors import EACH, OWN, room
+from shmio.endpoints.grpc.descriptors import EACH, FEW, OWN, room, shortage
 
 INFINITE = resource.RLIM_INFINITY
 
@@ -31,3 +31,13 @@ def test_the_limit_is_raised_as_far_as_it_may_be(
     monkeypatch.setattr(resource, "setrlimit", lambda _, new: limits.__setitem__(slice(None), new))
     assert room(2048) == connections
     assert limits == [after, hard]
+
+
+def test_so_few_connections_that_programs_are_turned_away_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (64, 64))
+    told = shortage(1, 2048)
+    assert told.startswith(
+        "it serves at most 1 connections at once, not 2048: the hard limit of open files is 64; raise"
+    )
+    assert shortage(FEW, 2048) == ""
+    assert shortage(2, 2) == ""
