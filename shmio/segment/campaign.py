@@ -26,13 +26,20 @@ class Laid(NamedTuple):
         self.commander.lift(self.number)
 
 
-def check(declarations: Sequence[Declaration], blocks: Mapping[str, Block]) -> list[Program]:
-    """What declarations mean in this instance; ConfigError: the first fault, as ``injection[0].target: …``."""
+def check(
+    declarations: Sequence[Declaration], blocks: Mapping[str, Block], wanted: Callable[[], bool] = lambda: True
+) -> list[Program]:
+    """What declarations mean in this instance; ConfigError: the first fault, as ``injection[0].target: …``.
+
+    ``wanted``: asked before each, for many of a large layout take seconds. CommandError: it is not any more.
+    """
     check_declarations(declarations)
     layouts = {source: block.layout for source, block in blocks.items()}
     periods_ns = {source: block.period_ns for source, block in blocks.items()}
     programs = []
     for index, declaration in enumerate(declarations):
+        if not wanted():
+            raise CommandError("whoever declared it does not wait for it any more")
         try:
             programs.append(compile_program(declaration, layouts, periods_ns))
         except ConfigError as error:

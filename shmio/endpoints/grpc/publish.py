@@ -25,6 +25,8 @@ SETTLE_S: Final = 5.0
 """So long a step waits for what its client has sent before it, and goes on sending."""
 MAX_VALUES: Final = 256
 """Registers that one structure may write at once; a cycle of the source takes as many."""
+LARGE_ELEMENTS: Final = 1024
+"""An array of as many takes noticeable time to read."""
 
 
 class _Way(NamedTuple):
@@ -93,6 +95,13 @@ class _Value:
             stream.settled.set_result(None)
 
 
+async def _read(request: Request, found: Shape) -> Mapping[str, object]:
+    """A request's values; those of a large array beside the event loop. ValueRangeError."""
+    if found.elements < LARGE_ELEMENTS:
+        return request.read(found)
+    return await asyncio.to_thread(request.read, found)
+
+
 class Publisher:
     """Serves Publish. One wrong message ends neither its stream nor anything else: it is counted, logged, passed over.
 
@@ -135,18 +144,22 @@ class Publisher:
         return Empty()
 
     async def _take(self, stream: _Stream, message: bytes, parse: Parse, peer: str) -> None:
-        path = ""
+        path, value = "", _Value(stream)
         try:
             request = parse(message)
             path = request.path
-            way = self._way(request)
+            way = await self._way(request)
         except DecodeError:
             self._refusals.add(f"{len(message)} bytes are no PubRequest", path, peer)
+            value.end()
             return
         except ShmioError as error:
             self._refusals.add(str(error), path, peer)
+            value.end()
             return
-        value = _Value(stream)
+        except BaseException:  # its call ends
+            value.end()
+            raise
         sending = self._send(way, partial(self._ended, value, path, peer), value.hear)
         if way.ready:
             await sending
@@ -193,25 +206,26 @@ class Publisher:
                 answer.set_result((end[0], in_words(end)))
 
         try:
-            await self._way(request).send(ended, accepted)
+            way = await self._way(request)
+            await way.send(ended, accepted)
         except ShmioError:
             self._refusals.count += 1
             raise
         return await answer
 
-    def _way(self, request: Request) -> _Way:
+    async def _way(self, request: Request) -> _Way:
         """What is to be written where; PathError, ValueRangeError, CommandError."""
         if shadow := self._shadows.find(request.path):
             if shadow.way is Way.ORIGINALS:
                 raise CommandError(f"{shorten(request.path)}: originals come from here; values go to the shadow's /in")
             injection = shadow.injection
-            values = request.read(injection.shape)
+            values = await _read(request, injection.shape)
             return _Way(partial(injection.give, values), injection.ready(values))
         topic = self._topics.topic(request.path)
         found = shape(self._topics.layout(topic), topic)
         if topic.direction == "out":
             raise CommandError(f"{shorten(request.path)}: what comes out of a source is not published to; use /in")
-        values = request.read(found)
+        values = await _read(request, found)
         if len(values) > MAX_VALUES:
             raise ValueRangeError(
                 f"{shorten(request.path)}: {len(values)} registers are too many at once, at most {MAX_VALUES}"

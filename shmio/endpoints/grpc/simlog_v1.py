@@ -19,17 +19,16 @@ from shmio.endpoints.grpc.publish import Publisher, Request
 from shmio.endpoints.grpc.rosmessage import encoder, message_type, read, time_stamp
 from shmio.endpoints.grpc.shadows import Shadows
 from shmio.endpoints.grpc.shape import Shape, shape
+from shmio.endpoints.grpc.status import Context, refuse
 from shmio.endpoints.grpc.stepper import Stepper
 from shmio.endpoints.grpc.subject import Subject
 from shmio.endpoints.grpc.topics import Mark, Topics
-from shmio.errors import PathError, ShmioError, TimeError, ValueRangeError
+from shmio.errors import PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import Topic, shorten
 from shmio.logs import fields
 from shmio.wire import simlog_v1_pb2 as wire
 
 SERVICE: Final = wire.DESCRIPTOR.services_by_name["SimlogAPI"].full_name
-
-Context = grpc.aio.ServicerContext[Any, Any]
 
 _MARK_TYPES: Final = {Mark.STEP: "int", Mark.CLOCK: "time"}
 
@@ -74,10 +73,8 @@ class SimlogV1:
         """
         try:
             await self._stepper.set_step_size(request.step * 1_000_000)
-        except ValueRangeError as error:
-            await context.abort(grpc.StatusCode.INVALID_ARGUMENT, str(error))
-        except TimeError as error:
-            await context.abort(grpc.StatusCode.FAILED_PRECONDITION, str(error))
+        except ShmioError as error:
+            await refuse(context, error)
         return Empty()
 
     async def step(self, _: wire.StepRequest, context: Context) -> wire.StepResponse:
@@ -186,19 +183,14 @@ class SimlogV1:
         try:
             return self._topics.mark(path)
         except PathError as error:
-            await context.abort(grpc.StatusCode.NOT_FOUND, str(error))
-            raise  # abort never returns
+            await refuse(context, error)
 
     async def _resolve(self, path: str, context: Context) -> tuple[Topic, Shape]:
         try:
             topic = self._topics.topic(path)
             return topic, self._find(topic)
-        except ValueRangeError as error:
-            await context.abort(grpc.StatusCode.INVALID_ARGUMENT, str(error))
-            raise  # abort never returns
-        except PathError as error:
-            await context.abort(grpc.StatusCode.NOT_FOUND, str(error))
-            raise
+        except ShmioError as error:
+            await refuse(context, error)
 
 
 def _parse(message: bytes) -> Request:

@@ -18,6 +18,7 @@ from shmio.endpoints.grpc.shape import Shape, shape
 from shmio.endpoints.grpc.status import refuse
 from shmio.endpoints.grpc.subscribers import Subscribers
 from shmio.endpoints.grpc.topics import Topics
+from shmio.endpoints.grpc.turns import turns
 from shmio.endpoints.grpc.values import (
     MAX_ELEMENTS,
     MAX_MEMBERS,
@@ -167,7 +168,7 @@ class SimlogV2:
         NOT_FOUND: no such topic; INVALID_ARGUMENT: too much for a message.
         """
         try:
-            return repeated(self._read(request.path))
+            return repeated(await self._read(request.path))
         except ShmioError as error:
             await refuse(context, error)
 
@@ -186,11 +187,11 @@ class SimlogV2:
         inlet = self._topics.feed(topic.source).inlet
         return wire.INOUT if await inlet.writable(found.registers) else wire.OUT
 
-    def _read(self, paths: Iterable[str]) -> list[bytes]:
-        """Serialised messages; PathError, ValueRangeError."""
+    async def _read(self, paths: Iterable[str]) -> list[bytes]:
+        """Serialised messages, made in turns; PathError, ValueRangeError."""
         wanted: list[tuple[str, str | Shadow, Shape]] = []
         members = elements = 0
-        for path in paths:
+        async for path in turns(paths):
             shadow = self._shadows.find(path)
             topic, found = (shadow.injection.target, shadow.injection.shape) if shadow else self._find(path)
             members, elements = members + len(found.registers), elements + found.elements
@@ -206,7 +207,7 @@ class SimlogV2:
             _shadowed(path, source)
             if isinstance(source, Shadow)
             else self._message(path, source, found, frames[source])
-            for path, source, found in wanted
+            async for path, source, found in turns(wanted)
         ]
 
     def _message(self, path: str, source: str, found: Shape, frame: Frame | None) -> bytes:

@@ -12,19 +12,14 @@ from google.protobuf.empty_pb2 import Empty
 from shmio.endpoints.grpc.hold import Status
 from shmio.endpoints.grpc.outbox import StateLane
 from shmio.endpoints.grpc.outboxes import Outboxes
+from shmio.endpoints.grpc.status import Context, refuse
 from shmio.endpoints.grpc.stepper import Stepper
-from shmio.errors import ShmioError, TimeError, ValueRangeError
+from shmio.errors import ShmioError
 from shmio.wire import simserver_pb2 as wire
 
 SERVICE: Final = wire.DESCRIPTOR.services_by_name["SimServerAPI"].full_name
 
-Context = grpc.aio.ServicerContext[Any, Any]
-
 _MS: Final = 1_000_000
-_STATUS: Final = {
-    ValueRangeError: grpc.StatusCode.INVALID_ARGUMENT,
-    TimeError: grpc.StatusCode.FAILED_PRECONDITION,
-}
 
 
 class SimServer:
@@ -59,7 +54,7 @@ class SimServer:
         try:
             step = await self._stepper.step(_ns(request.deltaTime), context.peer())
         except ShmioError as error:
-            await context.abort(_STATUS.get(type(error), grpc.StatusCode.INTERNAL), str(error))
+            await refuse(context, error)
         return _wire(self._stepper.timeline.status._replace(clock_ns=step.time_ns, dt_ns=step.dt_ns))
 
     async def start(self, request: wire.StartRequest, context: Context) -> wire.SimStatus:
@@ -95,8 +90,7 @@ class SimServer:
         try:
             return _wire(await call)
         except ShmioError as error:
-            await context.abort(_STATUS.get(type(error), grpc.StatusCode.INTERNAL), str(error))
-            raise  # abort never returns
+            await refuse(context, error)
 
     def _tell(self, status: Status) -> None:
         if self._lanes:

@@ -10,8 +10,8 @@ from typing import Any
 import grpc
 
 from shmio.endpoints.grpc.hold import Status
-from shmio.endpoints.grpc.native.refusal import Context, refuse
 from shmio.endpoints.grpc.native.steps import Steps
+from shmio.endpoints.grpc.status import Context, refuse
 from shmio.endpoints.grpc.stepper import Stepper
 from shmio.errors import EndpointError, ShmioError, ValueRangeError
 from shmio.segment import Segment

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from typing import Final
 
 import msgspec
@@ -65,6 +65,7 @@ class Campaign:
         self._waiting = Waiting()  # serialised fields of a DeclareResponse
         self._news = asyncio.Event()
         self._laid = False
+        self._abandoned = False
         self._lifting: asyncio.Task[None] | None = None
         self.over = ""
         """Why it has to end, though something of it stands."""
@@ -77,13 +78,18 @@ class Campaign:
         feeds = dict(self._feeds)
         async with self._turn:  # and not on the loop: the registers of a large layout take seconds
             programs = await asyncio.to_thread(
-                _check, self._declarations, {source: feed.block for source, feed in feeds.items()}
+                _check,
+                self._declarations,
+                {source: feed.block for source, feed in feeds.items()},
+                lambda: not self._abandoned,
             )
         declared = wire.Declared()
         try:
             for program in programs:
                 declaration = program.declaration
                 member = Member(self, program.source, feeds[program.source].inlet)
+                if self._abandoned:
+                    raise CommandError("the client is gone")
                 try:
                     member.number = await desk.declare(member.inlet, declaration, member, keep=self._keep)
                 except CommandError as error:
@@ -97,6 +103,10 @@ class Campaign:
             raise
         self._laid = True
         return field(_DECLARED, declared.SerializeToString()) + self._waiting.all()
+
+    def abandon(self) -> None:
+        """Lay no more, and lift what is laid, unless all of it is: the client is gone."""
+        self._abandoned = True
 
     async def close(self) -> None:
         """Lift them, unless they are to be kept. It goes on until their sources have: nobody else would."""
@@ -139,7 +149,9 @@ class Campaign:
         self._news.set()
 
 
-def _check(declarations: Sequence[Declaration], blocks: Mapping[str, Block]) -> list[Program]:
+def _check(
+    declarations: Sequence[Declaration], blocks: Mapping[str, Block], wanted: Callable[[], bool]
+) -> list[Program]:
     """What they mean; ConfigError; ValueRangeError: too much to look for."""
     matches = 0
     for declaration in declarations:
@@ -154,7 +166,7 @@ def _check(declarations: Sequence[Declaration], blocks: Mapping[str, Block]) -> 
             f"targets that are not just a register, times registers of their source, are more than {MAX_MATCHES}: "
             "declare fewer at once"
         )
-    return check(declarations, blocks)
+    return check(declarations, blocks, wanted)
 
 
 class Member(Follower):

@@ -9,6 +9,7 @@ import numpy as np
 from shmio.endpoints.grpc.native.columns import KINDS, Column
 from shmio.endpoints.grpc.native.values import FIELDS, MAX_VALUES, index_of, plain
 from shmio.endpoints.grpc.native.views import Selection
+from shmio.endpoints.grpc.turns import turns
 from shmio.errors import PathError, ValueRangeError
 from shmio.layout.codec import RegisterCodec, codec
 from shmio.layout.model import Register
@@ -25,8 +26,8 @@ class Fill:
         self._slots: dict[tuple[Column, int], tuple[str, RegisterCodec]] = {}
         self._paths: dict[str, Register] = {}
 
-    def packed(self, values: wire.Values, image: bytearray) -> None:
-        """Values by slots. ValueRangeError: not of this table, or of a register's type."""
+    async def packed(self, values: wire.Values, image: bytearray) -> None:
+        """Values by slots, in turns. ValueRangeError: not of this table, or of a register's type."""
         for column, name in FIELDS.items():
             if not values.HasField(name):
                 continue
@@ -43,19 +44,19 @@ class Fill:
             left = np.arange(len(slots))
             if column in KINDS:
                 left = columns.encode(column, slots, np.fromiter(part.values, KINDS[column]), image)
-            for at in left.tolist():
+            async for at in turns(left.tolist()):
                 self._put(*self._at(column, int(slots[at])), part.values[at], image)
 
-    def assigned(self, assignments: Any, image: bytearray) -> None:
-        """Values by paths, with or without the source. PathError: no such register in the table; ValueRangeError."""
+    async def assigned(self, assignments: Any, image: bytearray) -> None:
+        """Values by paths, in turns. PathError: no such register in the table; ValueRangeError."""
         if len(assignments) > (most := self._selection.elements):
             raise ValueRangeError(f"assignments: {len(assignments)} values, the table has {most}: give each once")
-        if len(assignments) > MAX_VALUES:  # each is put in by itself, and nobody is served meanwhile
+        if len(assignments) > MAX_VALUES:  # each is put in by itself
             raise ValueRangeError(
                 f"assignments: {len(assignments)} values, {MAX_VALUES} are the most by path: give them by slots"
             )
         order = self._selection.block.layout.byte_order
-        for assignment in assignments:
+        async for assignment in turns(assignments):
             register = self._paths.get(assignment.path)
             if register is None:
                 register = self._find(assignment.path)

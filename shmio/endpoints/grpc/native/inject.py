@@ -58,6 +58,7 @@ class Injection(Follower):
         self._shown: Frame | None = None
         self._shown_image = b""
         self._timer: asyncio.TimerHandle | None = None
+        self._in_order = asyncio.Lock()
 
     @property
     def source(self) -> str:
@@ -165,7 +166,8 @@ class Injection(Follower):
 
     async def _give(self, shadow: wire.Shadow) -> None:
         try:
-            values, raw = self._values(shadow)
+            async with self._in_order:  # a large message takes turns, in which those behind it must not pass
+                values, raw = await self._values(shadow)
             ends: Sequence[End] = await desk.give(self._inlet, self._beneath.number, values, raw)
         except ShmioError as error:
             if not shadow.sequence:
@@ -179,10 +181,10 @@ class Injection(Follower):
         answer = wire.Answer(sequence=shadow.sequence, outcome=outcome(*end))
         self._tell(field(_ANSWERS, answer.SerializeToString()))
 
-    def _values(self, shadow: wire.Shadow) -> tuple[Mapping[str, object], Sequence[Write]]:
+    async def _values(self, shadow: wire.Shadow) -> tuple[Mapping[str, object], Sequence[Write]]:
         values = packed(shadow.values, self._view) if shadow.HasField("values") else {}
         if shadow.assignments:
-            source, named = assigned(shadow.assignments, self._topics)
+            source, named = await assigned(shadow.assignments, self._topics)
             if source != self.source:
                 raise PathError(f"the injection is over {self.source}, the values are for {source}")
             values |= named

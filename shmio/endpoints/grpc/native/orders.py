@@ -14,9 +14,9 @@ from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.native import describe
 from shmio.endpoints.grpc.native.declare import Campaign
 from shmio.endpoints.grpc.native.inject import Injection
-from shmio.endpoints.grpc.native.refusal import Context, refuse
 from shmio.endpoints.grpc.native.selection import Selections
 from shmio.endpoints.grpc.native.values import assigned, outcome
+from shmio.endpoints.grpc.status import Context, refuse
 from shmio.endpoints.grpc.topics import Topics
 from shmio.errors import CommandError, EndpointError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import shorten
@@ -66,7 +66,7 @@ class Orders:
         try:
             if request.timeout_ms > MAX_TIMEOUT_MS:
                 raise ValueRangeError(f"timeout_ms: at most {MAX_TIMEOUT_MS}, a day")
-            source, values = assigned(request.values, self._topics)
+            source, values = await assigned(request.values, self._topics)
             timeout_s = request.timeout_ms / 1000 or None
             inlet = self._topics.feed(source).inlet
             ends = await desk.write(inlet, values, timeout_s, until_accepted=request.until_accepted)
@@ -149,6 +149,7 @@ class Orders:
             await refuse(context, error)
         finally:
             if opening is not None:
+                campaign.abandon()
                 self._spawn(self._close(campaign, opening))
         if campaign.over:
             await context.abort(grpc.StatusCode.ABORTED, campaign.over)

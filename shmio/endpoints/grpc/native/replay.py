@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import grpc
 
-from shmio.endpoints.grpc.native.refusal import Context, refuse
+from shmio.endpoints.grpc.status import Context, refuse
 from shmio.errors import ShmioError, ValueRangeError
 from shmio.playing import Playing
 from shmio.segment import Segment

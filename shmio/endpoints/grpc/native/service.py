@@ -17,12 +17,12 @@ from shmio.endpoints.grpc.native import describe
 from shmio.endpoints.grpc.native.clock import Clocks
 from shmio.endpoints.grpc.native.follow import aged
 from shmio.endpoints.grpc.native.orders import Orders
-from shmio.endpoints.grpc.native.refusal import Context, refuse
 from shmio.endpoints.grpc.native.replay import Moves
 from shmio.endpoints.grpc.native.selection import Selections
 from shmio.endpoints.grpc.native.simulate import Simulations
 from shmio.endpoints.grpc.native.subscribe import Subscription
 from shmio.endpoints.grpc.native.views import AGE_NS, ORIGINALS, Selection, View
+from shmio.endpoints.grpc.status import Context, refuse
 from shmio.endpoints.grpc.stepper import Stepper
 from shmio.endpoints.grpc.topics import Topics
 from shmio.errors import EndpointError, ShmioError

@@ -17,9 +17,9 @@ from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.native.clock import clock
 from shmio.endpoints.grpc.native.columns import Decoded, pack
 from shmio.endpoints.grpc.native.fill import Fill
-from shmio.endpoints.grpc.native.refusal import Context, refuse
 from shmio.endpoints.grpc.native.selection import MAX_ELEMENTS, MAX_REGISTERS
 from shmio.endpoints.grpc.native.views import Selection
+from shmio.endpoints.grpc.status import Context, refuse
 from shmio.errors import CommandError, ConflictError, PathError, SegmentError, ShmioError, ValueRangeError
 from shmio.layout.image import initial_frame
 from shmio.layout.topic import shorten
@@ -231,7 +231,7 @@ class Simulation:
         async for request in requests:
             if request.WhichOneof("what") != "done":
                 raise ValueRangeError("a model joins once, by the first message; all others answer steps")
-            self._take(request.done)
+            await self._take(request.done)
         self.end()
 
     def taken(self, task: asyncio.Task[None]) -> None:
@@ -240,7 +240,7 @@ class Simulation:
             error = task.exception()
             self.end(error if isinstance(error, ShmioError) else None)
 
-    def _take(self, done: wire.Done) -> None:
+    async def _take(self, done: wire.Done) -> None:
         ask = self._asked
         if ask is None or done.step != ask.step:
             asked = "none is to be done" if ask is None else f"step {ask.step} is to be done"
@@ -250,8 +250,8 @@ class Simulation:
         failure = " ".join(done.failure.split()) if done.HasField("failure") else None
         if failure is None:
             try:
-                self._fill.packed(done.values, image)
-                self._fill.assigned(done.assignments, image)
+                await self._fill.packed(done.values, image)
+                await self._fill.assigned(done.assignments, image)
             except (PathError, ValueRangeError) as error:
                 failure = str(error)
                 self._refused = f"step {ask.step}: {failure}"

@@ -8,6 +8,7 @@ from typing import Any, Final
 from shmio.endpoints.grpc.native.columns import Column
 from shmio.endpoints.grpc.native.views import Selection
 from shmio.endpoints.grpc.topics import Topics
+from shmio.endpoints.grpc.turns import turns
 from shmio.errors import CommandError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.text import from_text, wire_type
@@ -36,15 +37,15 @@ def outcome(kind: EventKind, reason: str) -> wire.Outcome:
     return wire.Outcome(kind=_OUTCOMES.get(kind, wire.Outcome.KIND_UNKNOWN), reason=reason)
 
 
-def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, object]]:
-    """The source, and values by their paths in it. PathError, ValueRangeError; CommandError: ``/out``."""
-    if len(assignments) > MAX_VALUES:  # before looking at any: it takes its time, in which nobody is served
+async def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, object]]:
+    """The source, and values by path, found in turns. PathError, ValueRangeError; CommandError: ``/out``."""
+    if len(assignments) > MAX_VALUES:  # before looking at any
         raise ValueRangeError(
             f"{len(assignments)} values, {MAX_VALUES} are the most: write whole arrays, or less at once"
         )
     values: dict[str, object] = {}
     sources: dict[str, None] = {}
-    for assignment in assignments:
+    async for assignment in turns(assignments):
         topic = topics.topic(assignment.path)
         register = topics.register(topic)
         if topic.direction == "out":

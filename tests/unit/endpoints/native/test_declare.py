@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import struct
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import grpc
@@ -12,6 +14,7 @@ import pytest
 
 from shmio.client import Client, Happening, connect, connect_aio
 from shmio.errors import CommandError, ValueRangeError
+from shmio.injection import Program
 from shmio.segment import EventKind, Segment
 from shmio.segment.view import View
 from shmio.wire import shmio_v1_pb2 as wire
@@ -19,6 +22,7 @@ from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, refusal
 from tests.unit.endpoints.native.harness import stub
 from tests.unit.endpoints.native.test_inject import seen, with_client
 from tests.unit.endpoints.plant import Plant
+from tests.unit.endpoints.rude import NOISE
 from tests.unit.endpoints.test_publish import with_plant
 
 Status = grpc.StatusCode
@@ -219,6 +223,34 @@ def test_too_many_are_refused_before_any_is_looked_at(segment: Segment) -> None:
         code, text = await refusal(call.read())
         assert (code, text) == (Status.INVALID_ARGUMENT, "257 injections are declared, 256 are the most")
 
+    with_plant(segment, test)
+
+
+def test_what_a_client_that_is_gone_has_declared_is_not_looked_at_to_the_end(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun, over = threading.Event(), threading.Event()
+
+    def slow(_: object, __: object, wanted: Callable[[], bool]) -> list[Program]:
+        begun.set()
+        until_s = time.monotonic() + TIMEOUT_S
+        while wanted():
+            assert time.monotonic() < until_s, "it goes on for nobody"
+            time.sleep(0.01)
+        over.set()
+        raise CommandError("nobody waits for it any more")
+
+    async def test(served: Endpoint, _: Plant) -> None:
+        first = stub(served).Declare(wire.DeclareRequest(declarations=[NOISE]), timeout=TIMEOUT_S)
+        assert await asyncio.to_thread(begun.wait, TIMEOUT_S)
+        first.cancel()
+        assert await asyncio.to_thread(over.wait, 2 * TIMEOUT_S)
+        monkeypatch.undo()
+        second = stub(served).Declare(wire.DeclareRequest(declarations=[NOISE]), timeout=TIMEOUT_S)
+        assert (await second.read()).declared.injections, "and the next one has its turn"
+        second.cancel()
+
+    monkeypatch.setattr("shmio.endpoints.grpc.native.declare.check", slow)
     with_plant(segment, test)
 
 

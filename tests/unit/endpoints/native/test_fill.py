@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import pytest
 
 from shmio.endpoints.grpc.native.fill import Fill
@@ -23,9 +25,9 @@ def test_values_by_path_are_few_for_each_takes_its_time(instance: str) -> None:
             fill = Fill(Selection(1, segment.blocks["line"], ROWS.registers))
             given = [wire.Assignment(path=f"rows/{at}", value=value_to_wire(at, "rows")) for at in range(MAX_VALUES)]
             image = bytearray(ROWS.size)
-            fill.assigned(given, image)
+            asyncio.run(fill.assigned(given, image))
             assert image[4 * 4095 : 4 * 4096] == (4095).to_bytes(4, "big")
             with pytest.raises(ValueRangeError, match=r"4097 values, 4096 are the most by path: give them by slots"):
-                fill.assigned([*given, given[0]], image)
+                asyncio.run(fill.assigned([*given, given[0]], image))
         finally:
             segment.unlink()
