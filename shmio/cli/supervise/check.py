@@ -28,6 +28,7 @@ def execute(arguments: argparse.Namespace) -> int:
         "replay": [],
         "segment": f"{PREFIX}{plan.instance}",
         "segment_bytes": plan.segment_bytes,
+        "notes": list(prepared.notes),
         "warnings": list(plan.warnings),
     }
     if prepared.config.replay and prepared.config.replay.file:
@@ -46,6 +47,7 @@ def _lines(found: dict[str, Any]) -> list[str]:
         *(f"  {text}" for text in found["injections"]),
         *(f"  with --mode replay: {_line(source)}" for source in found["replay"]),
         f"  segment {found['segment']}: {found['segment_bytes'] / 1e6:.2f} MB of shared memory",
+        *found["notes"],
         *found["warnings"],
         f"usable, with {count} warning{'s' * (count != 1)}" if count else "no faults found",
     ]

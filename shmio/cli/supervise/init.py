@@ -118,9 +118,9 @@ def _own(file: Path, files: Sequence[Path], name: str | None, *, emulated: bool)
     lines += [
         *emulators,
         "[grpc]",
-        f"listen = {_toml([str(address) for address in _free(GRPC_PORTS, 2)])}",
         f"default_source = {_toml(names[0])}",
         "",
+        *_addresses(["read", "write", "inject", "control"] if emulated else ["read"]),
         "# [recorder]                          # without the first #: everything, to files that shmio-dump reads",
         '# directory = "dumps"',
         "",
@@ -237,6 +237,16 @@ def _emulators(layout: str, blocks: Sequence[Layout], held: int, number: str) ->
 def _instance(block: Layout) -> str:
     """A name for the instance, after its block."""
     return _NAME.sub("-", block.name.lower()).strip("-_")[:40] or "cell"
+
+
+def _addresses(roles: list[str]) -> list[str]:
+    """The sections of the addresses at which gRPC is served, with what all may do who reach them."""
+    others = "all that there are" if len(roles) > 1 else "there are write, inject and control, too"
+    comment = f"# what every user of this host may do here; {others}"
+    lines = []
+    for address in _free(GRPC_PORTS, 2):
+        lines += ["[[grpc.address]]", f"listen = {_toml(str(address))}", f"roles = {_toml(roles)}  {comment}", ""]
+    return lines
 
 
 def _free(ports: range, count: int) -> list[Address]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import msgspec
 
+from shmio.cli.supervise.exposure import exposure
 from shmio.cli.supervise.host import check_host
 from shmio.cli.supervise.layouts import LayoutFiles
 from shmio.cli.supervise.ports import check_listening
@@ -43,6 +44,8 @@ class Prepared:
     """All blocks of each emulator, by its name."""
     injections: tuple[str, ...]
     """What is declared, in words."""
+    notes: tuple[str, ...] = ()
+    """What to know of it that is no fault."""
 
 
 def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = None) -> Prepared:
@@ -95,7 +98,8 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
         remote=sources.remote,
         origin=origin,
     )
-    return Prepared(config, plan, layouts, emulated, described)
+    open_to = None if mode == "log" else exposure(config)  # a log serves nobody
+    return Prepared(config, plan, layouts, emulated, described, (open_to,) if open_to else ())
 
 
 def peer(source: Source) -> str:

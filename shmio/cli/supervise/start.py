@@ -128,11 +128,12 @@ def _replan(plan: Plan, keys: Mapping[str, Any]) -> Callable[[], Plan]:
 
 
 def _processes(prepared: Prepared) -> Iterator[str]:
-    """What there will be, a line each."""
+    """What there will be, a line each, and what to know of it."""
     jobs = prepared.plan.jobs
     width = max((len(job.name) for job in jobs), default=0)
     for job in sorted(jobs, key=lambda job: job.rank):
         yield f"  {job.name:<{width}}  {job.kind:<8}  {_describe(job, prepared)}"
+    yield from prepared.notes
 
 
 def _describe(job: Job, prepared: Prepared) -> str:

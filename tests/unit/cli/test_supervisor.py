@@ -365,6 +365,7 @@ def test_check_as_json(example: Edit, instance: str, capsys: pytest.CaptureFixtu
     }  # fmt: skip
     [warning] = found.pop("warnings")
     assert "'Outpts' names nothing" in warning
+    assert all("other users of this host" in note for note in found.pop("notes"))  # as there are any
     assert found == {
         "config": "supervisor.toml", "instance": instance, "injections": [], "replay": [],
         "processes": ["plc", "cell", "grpc", "broker", "mqtt", "recorder"], "segment": f"shmio-{instance}",

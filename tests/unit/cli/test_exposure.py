@@ -1,0 +1,105 @@
+"""What other users of the host may do to an instance is said in one line."""
+
+from __future__ import annotations
+
+import os
+import pwd
+from pathlib import Path
+
+import pytest
+
+from shmio.cli.supervise import exposure
+from shmio.cli.supervisor import main
+from shmio.config import load
+
+BASE = """
+[instance]
+name = "x"
+
+[[source]]
+name = "cell"
+connector = "memory"
+layout = "cell.toml"
+period_ms = 20
+writable = {writable}
+"""
+TOKEN = f'[[grpc.token]]\nname = "a"\nroles = ["read", "write"]\nsha256 = "{"0" * 64}"\n'
+GRPC = '[grpc]\nlisten = ["127.0.0.1:8089", "[::1]:8090"]\n'
+MQTT = '[mqtt]\nbroker = "embedded"\nlisten = "127.0.0.1:1883"\nprefix = "x"\n'
+
+
+def user(name: str, uid: int, shell: str = "/bin/bash") -> pwd.struct_passwd:
+    return pwd.struct_passwd((name, "x", uid, uid, "", f"/home/{name}", shell))
+
+
+def host_of(monkeypatch: pytest.MonkeyPatch, *users: pwd.struct_passwd) -> None:
+    monkeypatch.setattr(pwd, "getpwall", lambda: list(users))
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("cell.toml").write_text('[registers]\nMode = "INT"\n')
+
+
+@pytest.mark.parametrize(
+    ("sections", "writable", "said"),
+    [
+        (GRPC, "[]", "ada) may write, inject and control by gRPC at 127.0.0.1:8089 and [::1]:8090, for"),
+        (GRPC + TOKEN, "[]", None),
+        ('[grpc]\nlisten = ["unix:s"]\n', "[]", None),
+        ('[[grpc.address]]\nlisten = "127.0.0.1:8089"\n', "[]", None),
+        (
+            '[[grpc.address]]\nlisten = "127.0.0.1:8089"\nroles = ["read", "write"]\n' + MQTT,
+            '["**"]',
+            "ada) may write by gRPC at 127.0.0.1:8089; and write by MQTT at 127.0.0.1:1883, for",
+        ),
+        (MQTT, "[]", None),
+        (MQTT + 'password_file = "accounts"\n', '["**"]', None),
+        ("", '["**"]', None),
+    ],
+)
+def test_ways_in_that_ask_nobody_who_it_is(
+    sections: str, writable: str, said: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    host_of(monkeypatch, user("ada", 1001 + os.geteuid()))
+    Path("accounts").write_text("a:b\n")
+    Path("accounts").chmod(0o600)
+    file = Path("supervisor.toml")
+    file.write_text(BASE.format(writable=writable) + sections)
+    line = exposure.exposure(load(file))
+    assert (line is None) == (said is None)
+    if line is not None:
+        assert said is not None
+        assert said in line
+
+
+def test_who_else_can_log_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    own = user("own", os.geteuid())
+    system = user("postgres", 101), user("nobody", 65534), user("backup", 5000, "/usr/sbin/nologin"), user("root", 0)
+    host_of(monkeypatch, own, *system)
+    assert exposure.other_users() == []
+    host_of(monkeypatch, own, *system, user("eve", 70_000), user("mallory", 70_001, "/bin/zsh"))
+    assert exposure.other_users() == ["eve", "mallory"]
+
+
+def test_check_says_it_and_does_not_count_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    host_of(monkeypatch, *(user(name, 70_000) for name in ("a", "b", "c", "d", "e")))
+    Path("supervisor.toml").write_text(BASE.format(writable="[]") + GRPC)
+    assert main(["check"]) == 0
+    *_, note, last = capsys.readouterr().out.splitlines()
+    assert note.startswith("note: other users of this host (a, b, c and 2 more) may write, inject and control by gRPC")
+    assert last == "no faults found"
+
+
+@pytest.mark.parametrize(
+    ("option", "roles"), [([], ["read"]), (["--emulated"], ["read", "write", "inject", "control"])]
+)
+def test_init_writes_what_each_address_allows(option: list[str], roles: list[str]) -> None:
+    Path("cell.db").write_text("DATA_BLOCK DB7\nSTRUCT\nx : Int;\nEND_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n")
+    assert main(["init", *option, "cell.db"]) == 0
+    grpc = load(Path("supervisor.toml")).grpc
+    assert grpc is not None
+    assert [address.roles for address in grpc.listening.values()] == [roles, roles]
