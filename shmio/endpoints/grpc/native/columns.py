@@ -88,6 +88,15 @@ class _Other:
     size: int
 
 
+class _Rest(NamedTuple):
+    """Elements that are not just numbers. ``invalid``: those that are no value, of the registers at ``places``."""
+
+    numbers: Mapping[Column, Mapping[int, Any]]
+    texts: tuple[str, ...]
+    invalid: frozenset[int]
+    places: tuple[int, ...]
+
+
 class Columns:
     """How registers lie in columns; built once. Decoding remembers what does not change, and is for one thread."""
 
@@ -116,9 +125,12 @@ class Columns:
                 self._numbers.append((column, _numbers(chosen, code, order, where)))
             else:
                 self._others += self._others_of(members, chosen, order)
-        starts = {(other.offset, other.size) for other in self._others}
-        self._watched = np.array([at for start, size in starts for at in range(start, start + size)], np.intp)
-        self._seen: tuple[bytes, dict[Column, list[tuple[int, Any]]], tuple[str, ...], tuple[int, ...]] | None = None
+        sizes = [other.size for other in self._others]
+        starts = np.repeat([other.offset for other in self._others], sizes).astype(np.intp)
+        before = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes) if sizes else np.zeros(0, np.intp)
+        self._watched = starts + np.arange(len(starts)) - before
+        self._owners = np.repeat(np.arange(len(sizes)), sizes)  # whose each of the watched bytes is
+        self._seen: tuple[Array, _Rest] | None = None
 
     def _others_of(self, members: Sequence[int], registers: Sequence[Register], order: ByteOrder) -> Iterable[_Other]:
         for place, register in zip(members, registers, strict=True):
@@ -187,32 +199,35 @@ class Columns:
         arrays = self.decode_numbers(image)
         if not self._others:
             return Decoded(arrays, (), ())
-        numbers, texts, invalid = self._rest(image, np.frombuffer(image, np.uint8))
-        for column, found in numbers.items():
-            for slot, value in found:
+        rest = self._rest(image, np.frombuffer(image, np.uint8))
+        for column, found in rest.numbers.items():
+            for slot, value in found.items():
                 arrays[column][slot] = value
-        return Decoded(arrays, texts, invalid)
+        return Decoded(arrays, rest.texts, rest.places)
 
-    def _rest(
-        self, image: bytes, data: Array
-    ) -> tuple[dict[Column, list[tuple[int, Any]]], tuple[str, ...], tuple[int, ...]]:
+    def _rest(self, image: bytes, data: Array) -> _Rest:
         """What is decoded one by one; not again while its bytes stay the same."""
-        watched = data[self._watched].tobytes()
-        if self._seen is not None and self._seen[0] == watched:
-            return self._seen[1:]
-        numbers: dict[Column, list[tuple[int, Any]]] = {}
-        texts = [""] * self.sizes[Column.TEXT]
-        invalid: dict[int, None] = {}
-        for other in self._others:
+        watched = data[self._watched]
+        if self._seen is None:
+            changed, before = range(len(self._others)), _Rest({}, ("",) * self.sizes[Column.TEXT], frozenset(), ())
+        else:
+            seen, before = self._seen
+            changed = np.unique(self._owners[watched != seen]).tolist()
+            if not changed:
+                return before
+        numbers = {column: dict(found) for column, found in before.numbers.items()}
+        texts, invalid = list(before.texts), set(before.invalid)
+        for index in changed:
+            other = self._others[index]
             value = other.decode(image, other.offset)
-            if value is None:
-                invalid[other.register] = None
-            elif other.column is Column.TEXT:
-                texts[other.slot] = str(value)
+            (invalid.add if value is None else invalid.discard)(index)
+            if other.column is Column.TEXT:
+                texts[other.slot] = "" if value is None else str(value)
             else:
-                numbers.setdefault(other.column, []).append((other.slot, value))
-        self._seen = watched, numbers, tuple(texts), tuple(sorted(invalid))
-        return self._seen[1:]
+                numbers.setdefault(other.column, {})[other.slot] = 0 if value is None else value
+        places = tuple(sorted({self._others[index].register for index in invalid}))
+        self._seen = watched, _Rest(numbers, tuple(texts), frozenset(invalid), places)
+        return self._seen[1]
 
 
 def pack(new: Decoded, old: Decoded | None = None, deadband: float = 0.0) -> bytes:
