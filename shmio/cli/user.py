@@ -15,6 +15,7 @@ from shmio.cli.cell import Cell
 from shmio.cli.local import Local
 from shmio.cli.run import run
 from shmio.cli.target import target
+from shmio.layout.spelling import may_be_foreign, topic_path
 from shmio.segment.attach import Attachment
 
 PROGRAM = "shmio"
@@ -34,11 +35,26 @@ def main(argv: Sequence[str] | None = None) -> int:
             from shmio.cli.remote import connected  # noqa: PLC0415  gRPC only for those who ask for it
 
             with connected(arguments) as remote:
-                return verb(remote, arguments)
+                return verb(remote, _spelled(remote, arguments))
         with Attachment(target(arguments).open(writable=arguments.writable)) as attachment:
-            return verb(Local(attachment), arguments)
+            local = Local(attachment)
+            return verb(local, _spelled(local, arguments))
 
     return run(PROGRAM, command)
+
+
+def _spelled(cell: Cell, arguments: argparse.Namespace) -> argparse.Namespace:
+    """The arguments, with paths that are written as in TIA Portal in our own spelling."""
+    patterns, pairs = getattr(arguments, "patterns", None) or (), getattr(arguments, "pairs", None) or ()
+    if not any(map(may_be_foreign, [*patterns, *(path for path, _ in pairs)])):
+        return arguments
+    layouts = {source: cell.layout(source) for source in cell.sources}
+    default = next(iter(layouts)) if len(layouts) == 1 else None
+    if patterns:
+        arguments.patterns = [topic_path(path, layouts, default) for path in patterns]
+    if pairs:
+        arguments.pairs = [(topic_path(path, layouts, default), text) for path, text in pairs]
+    return arguments
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from itertools import groupby
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import accumulate, groupby
 from typing import Final, NamedTuple, TypeVar
 
 from shmio.connectors.base import Lost
@@ -89,8 +90,8 @@ def ends(
     some were lost.
     """
     lost = any(isinstance(outcome, Lost) for outcome in outcomes)
-    told = [(write, outcome) for write, outcome in zip(writes, outcomes, strict=True) if outcome or lost]
-    found = [_end(item.write, told, error) for item in items]
+    told = _Told((write, outcome) for write, outcome in zip(writes, outcomes, strict=True) if outcome or lost)
+    found = [_end(told.about(item.write), error) for item in items]
     for place, item in enumerate(items):
         if found[place][0] is not EventKind.WRITTEN:
             continue
@@ -101,9 +102,26 @@ def ends(
     return found
 
 
-def _end(write: Write, told: Sequence[tuple[Write, str | Lost]], error: str) -> End:
-    """The end of an item, from those of the writes; ``told`` may leave out what was confirmed unless some were lost."""
-    outcomes = [outcome for other, outcome in told if _share_bits(write, other)]
+class _Told:
+    """What became of writes, by where they are: thousands may have been refused.
+
+    Those that were confirmed may be left out unless some were lost.
+    """
+
+    def __init__(self, told: Iterable[tuple[Write, str | Lost]]) -> None:
+        self._told = sorted(told, key=lambda pair: pair[0].offset)
+        self._starts = [write.offset for write, _ in self._told]
+        self._stops = list(accumulate((write.offset + len(write.data) for write, _ in self._told), max))
+
+    def about(self, write: Write) -> list[str | Lost]:
+        """What became of those that share bits with this one."""
+        first = bisect_right(self._stops, write.offset)
+        last = bisect_left(self._starts, write.offset + len(write.data))
+        return [outcome for other, outcome in self._told[first:last] if _share_bits(write, other)]
+
+
+def _end(outcomes: Sequence[str | Lost], error: str) -> End:
+    """The end of an item, from those of its writes."""
     refusal = next((outcome for outcome in outcomes if outcome and isinstance(outcome, str)), "")
     lost = Lost.UNSENT in outcomes
     if Lost.UNKNOWN in outcomes or (lost and "" in outcomes):  # done in part: neither written nor surely not

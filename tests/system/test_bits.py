@@ -25,7 +25,7 @@ from tests.system.armed import ARMED
 @pytest.fixture(scope="module")
 def cell(make_shared_cell: Callable[..., Cell]) -> Cell:
     """The A50 cell; each test has bytes of its own, from 100 on: they are of no meaning to the controller's program."""
-    cell = make_shared_cell(config=ARMED)
+    cell = make_shared_cell(config=ARMED.replace('["Outputs"]', '["Outputs[*]"]'))
     cell.up()
     until(lambda: cell.processes()["cell"]["quality"] == "good", "good quality")
     return cell
@@ -63,6 +63,10 @@ def test_commands_take_them(cell: Cell, local: Attachment) -> None:
     assert lines(done.stdout) == [
         "cell/Outputs/100.%X5 true", "cell/Outputs/100.%X7 false", "cell/Outputs/103 2", "cell/Outputs/104 3",
     ]  # fmt: skip
+    done = cell.run("shmio", "get", "cell.Outputs[103]", '"cell"."Outputs"[100].%x5')
+    assert lines(done.stdout) == ["cell/Outputs/103 2", "cell/Outputs/100.%X5 true"]
+    done = cell.run("shmio", "set", "Outputs[105].%X0", "1")
+    assert lines(done.stdout) == ["cell/Outputs/105.%X0 written"]
     for path, message in [
         ("cell/Outputs/100.%X8", "BYTE has bits 0 to 7"),
         ("cell/Robot_800/Axs1_Pos.%X0", "REAL has no such part"),

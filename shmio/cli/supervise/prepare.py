@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
 from shmio.cli.supervise.exposure import exposure
 from shmio.cli.supervise.host import check_host
@@ -22,6 +23,7 @@ from shmio.errors import ConfigError, PathError
 from shmio.layout.glob import Glob
 from shmio.layout.image import complaints
 from shmio.layout.model import Layout
+from shmio.layout.spelling import block_path, topic_path
 from shmio.layout.topic import find, look_up, names_part, near, parse_topic
 from shmio.layout.write import chosen
 from shmio.recording.selection import Selection
@@ -69,6 +71,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
             check_listening(config)
             sources = check_sources(config, files, recordings)
         layouts = sources.layouts
+        config = _spelled(config, layouts)
         emulated = {emulator.name: _check_emulator(i, emulator, files) for i, emulator in enumerate(config.emulator)}
         declared, described = _check_injections(config, layouts)
         if config.recorder and config.recorder.trigger:
@@ -100,6 +103,34 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
     )
     open_to = None if mode == "log" else exposure(config)  # a log serves nobody
     return Prepared(config, plan, layouts, emulated, described, (open_to,) if open_to else ())
+
+
+def _spelled(config: Config, layouts: dict[str, Layout]) -> Config:
+    """The configuration, with what is written as in TIA Portal in our own spelling."""
+    default = next(iter(layouts)) if len(layouts) == 1 else None
+
+    def topics(patterns: str | list[str]) -> str | list[str]:
+        if isinstance(patterns, str):
+            return topic_path(patterns, layouts, default)
+        return [topic_path(pattern, layouts, default) for pattern in patterns]
+
+    sources = [
+        replace(
+            source,
+            writable=[block_path(pattern, layouts[source.name]) for pattern in source.writable],
+            allow_nonfinite=tuple(block_path(pattern, layouts[source.name]) for pattern in source.allow_nonfinite),
+        )
+        for source in config.source
+    ]
+    mqtt, recorder = config.mqtt, config.recorder
+    if mqtt is not None:
+        rules = [replace(rule, match=topics(rule.match)) for rule in mqtt.topic]
+        sparkplug = mqtt.sparkplug and replace(mqtt.sparkplug, match=topics(mqtt.sparkplug.match))
+        mqtt = replace(mqtt, topic=rules, sparkplug=sparkplug)
+    if recorder is not None:
+        recorder = replace(recorder, registers=topics(recorder.registers))
+    injections = [replace(one, target=topics(one.target)) for one in config.injection]
+    return replace(config, source=sources, mqtt=mqtt, recorder=recorder, injection=injections)
 
 
 def peer(source: Source) -> str:

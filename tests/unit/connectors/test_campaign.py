@@ -536,3 +536,18 @@ def test_garbage_in_place_of_a_declaration_is_refused(make: Callable[..., Rig]) 
             assert event is not None
         assert event.kind == EventKind.REJECTED
     rig.client.declare(declaration("x", "cell/speed", "freeze"))
+
+
+@pytest.mark.parametrize(("operation", "keys"), [("set", {"value": "NaN"}), ("flip", {"bits": list(range(23, 31))})])
+def test_what_an_injection_makes_no_number_of_does_not_reach_the_device(
+    make: Callable[..., Rig], operation: str, keys: dict[str, Any]
+) -> None:
+    rig = make(declaration("mad", "cell/axis/1/in", operation, **keys))
+    rig.poll()
+    rig.told()
+    rig.write({"axis/1": 0.0, "axis/2": 2.5})
+    rig.poll()
+    (refused,) = rig.told(EventKind.REFUSED)
+    assert refused.text.startswith("the injection 'mad' changes it: axis/1: NaN and infinities are not written")
+    other = LAYOUT.registers[LAYOUT.by_path["axis/2"]].offset
+    assert [write.offset for write in rig.written] == [other]
