@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from shmio.layout.model import Layout, Register
 from shmio.layout.parts import part_of, slice_of
 from shmio.layout.types import INTEGERS
-from shmio.layout.write import Write, bits_of, elements
+from shmio.layout.write import Write, bits_of
 
 
 def paths_of(layout: Layout, writes: Iterable[Write]) -> list[str]:
@@ -32,11 +32,8 @@ def path_at(layout: Layout, offset: int) -> str:
         register = layout.registers[index]
         if not register.dims or register.bit is not None:
             return register.path
-        flat, indices = (offset - register.offset) // register.element.stride, list[str]()
-        for low, high in reversed(register.dims):
-            flat, place = divmod(flat, high - low + 1)
-            indices.insert(0, str(low + place))
-        return "/".join((register.path, *indices))
+        place = _index(register, (offset - register.offset) // register.element.stride)
+        return "/".join((register.path, *map(str, place)))
     return ""
 
 
@@ -54,7 +51,7 @@ def _of(layout: Layout, register: Register, bits: bytearray) -> Iterator[str]:
     if share == own:
         yield register.path
     elif register.dims:
-        yield from _elements(layout, register, bits)
+        yield from _elements(layout, register, share, bits)
     elif register.type in INTEGERS:
         yield from _parts(layout, register, share)
     else:
@@ -63,15 +60,37 @@ def _of(layout: Layout, register: Register, bits: bytearray) -> Iterator[str]:
 
 def _share(register: Register, bits: bytearray) -> bytes:
     """The part of these bits that is a register's."""
-    there = bits[register.offset : register.offset + register.size]
-    return bytes(bit & own for bit, own in zip(there, bits_of(register), strict=True))
+    there = bytes(bits[register.offset : register.offset + register.size])
+    if register.bit is None or register.dims:
+        return there
+    return bytes([there[0] & 1 << register.bit])
 
 
-def _elements(layout: Layout, array: Register, bits: bytearray) -> Iterator[str]:
+def _touched(array: Register, share: bytes) -> range:
+    """The elements among which those lie that have some of these bits."""
+    first, stop = len(share) - len(share.lstrip(b"\0")), len(share.rstrip(b"\0"))
+    if array.bit is None:
+        return range(first // array.element.stride, min(array.count, -(-stop // array.element.stride)))
+    if len(array.dims) == 1:
+        return range(8 * first, min(array.count, 8 * stop))
+    return range(array.count)
+
+
+def _index(array: Register, flat: int) -> tuple[int, ...]:
+    """The declared indices of an element; the last runs fastest."""
+    index: tuple[int, ...] = ()
+    for low, high in reversed(array.dims):
+        flat, place = divmod(flat, high - low + 1)
+        index = (low + place, *index)
+    return index
+
+
+def _elements(layout: Layout, array: Register, share: bytes, bits: bytearray) -> Iterator[str]:
     """Those of an array; neighbours within its last dimension as a slice."""
     run: list[tuple[int, ...]] = []
-    for element in elements(layout, array):
-        index = tuple(int(part) for part in element.path[len(array.path) + 1 :].split("/"))
+    for flat in _touched(array, share):
+        index = _index(array, flat)
+        element = layout.element(array, index)
         whole = _share(element, bits) == bits_of(element)
         if run and (not whole or index[:-1] != run[-1][:-1]):
             yield _run(layout, array, run)

@@ -57,6 +57,18 @@ def test_a_value_reaches_the_device_and_its_end_comes_back(segment: Segment, bro
         listener.shown("cell/inputs/out", "[0,7]")
 
 
+def test_a_bit_and_a_slice_leave_their_neighbours_alone(segment: Segment, broker: Mosquitto) -> None:
+    with running(segment, broker) as (plant, listener):
+        listener.publish("cell/inputs/in", "[240, 255]")
+        assert listener.json("cell/inputs/in/result")["done"]
+        for topic, payload in (("inputs/0.%X1", "true"), ("inputs/1..1", "[9]"), ("bits/6..8", "[true, false, true]")):
+            listener.publish(f"cell/{topic}/in", payload)
+            assert listener.json(f"cell/{topic}/in/result") == {"outcome": "written", "done": True, "reason": ""}
+        listener.shown("cell/inputs/out", "[242,9]")
+        listener.shown("cell/bits/out", "[false,false,false,false,false,false,true,false,true,false]")
+        assert [write.mask for write in plant.written[-3:]] == [0x40, 0x80, 0x01]
+
+
 @pytest.mark.parametrize(
     ("topic", "payload", "reason"),
     [
@@ -67,6 +79,8 @@ def test_a_value_reaches_the_device_and_its_end_comes_back(segment: Segment, bro
         ("cell/axis/nowhere/in", b"1", "no such register"),
         ("cell/axis/in", b"1", "a structure"),
         ("cell/inputs/9/in", b"1", "outside"),
+        ("cell/inputs/0.%X8/in", b"1", "BYTE has bits 0 to 7"),
+        ("cell/axis/speed/in", b"NaN", "NaN and infinities are not written"),
         ("cell/%zz/in", b"1", "hexadecimal"),
         ("cell/bits/in", b"[" * 100_000, "JSON array"),
         ("cell/name/in", b"x" * 2_000_000, "longer than"),
