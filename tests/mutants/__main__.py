@@ -43,14 +43,14 @@ def main() -> int:
         "--only", metavar="TEXT", help="all faults whose FILE:LINE begins with this, instead of random ones"
     )
     parser.add_argument("--list", action="store_true", help="print the faults, run nothing")
-    parser.add_argument("--original", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.list:
         for group in options.group or GROUPS:
             for mutant in _drawn(PROJECT, group, options):
                 sys.stdout.write(f"{group}: {mutant.title}\n")
         return 0
-    if options.original is None:
+    if not options.here:
         return max(_in_a_copy(group, options) for group in options.group or list(GROUPS))
     (group,) = options.group
     session = _Session(group, options)
@@ -78,7 +78,7 @@ def _in_a_copy(group: str, options: argparse.Namespace) -> int:
             if (PROJECT / name).exists():
                 shutil.copy2(PROJECT / name, tree / name)
         command = [sys.executable, "-m", "tests.mutants", "--group", group, "--count", str(options.count)]
-        command += ["--seed", str(options.seed), "--limit-s", str(options.limit_s), "--original", str(PROJECT)]
+        command += ["--seed", str(options.seed), "--limit-s", str(options.limit_s), "--here"]
         if options.only:
             command += ["--only", options.only]
         environment = os.environ | {"PYTHONPATH": folder, "PYTHONDONTWRITEBYTECODE": "1"}
@@ -123,14 +123,14 @@ class _Session:
         return True
 
     def _judge(self, items: Sequence[pytest.Item]) -> int:
-        options, original = self._options, self._options.original
-        judge = Judge(original, options.limit_s)
-        sources = [path.relative_to(original) for path in expand(original, GROUPS[self._group].sources)]
+        options, root = self._options, Path.cwd()
+        judge = Judge(options.limit_s)
+        sources = [path.relative_to(root) for path in expand(root, GROUPS[self._group].sources)]
         _say(f"{self._group}: {len(items)} tests without a fault ...")
         for name in judge.learn(items, sources):
             _say(f"  left out, for it fails without a fault: {name}")
-        drawn = _drawn(original, self._group, options)
-        explained = _explained(original)
+        drawn = _drawn(root, self._group, options)
+        explained = _explained(root)
         caught, survived, equivalent = 0, list[Verdict](), 0
         for mutant in drawn:
             if caught + len(survived) + equivalent == (len(drawn) if options.only else options.count):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import ctypes
 import os
 import re
-import resource
 import select
 import shutil
 import signal
@@ -23,11 +22,14 @@ import pytest
 from tests.mutants.functions import Change, change, watch
 from tests.mutants.mutations import Mutant
 
-MEMORY_BYTES: Final = 8 << 30
-"""Of the address space of each process: a fault may ask for any amount."""
+MEMORY_BYTES: Final = 2 << 30
+"""A process that has more has been caught: a fault may ask for any amount."""
+LOOK_S: Final = 0.2
 SLOWEST_S: Final = 20.0
 """So long each test may take, and ten times what it takes without a fault."""
 PR_SET_PDEATHSIG: Final = 1
+NATIVE: Final = "tests/native/test_stress"
+"""Tests of C alone."""
 STARTS: Final = {"subprocess.Popen", "os.posix_spawn", "os.fork", "os.exec"}
 
 
@@ -55,8 +57,7 @@ class Verdict:
 class Judge:
     """Breaks the copy of the project in the current folder, and runs its tests. One at a time."""
 
-    def __init__(self, original: Path, limit_s: float) -> None:
-        self._original = original
+    def __init__(self, limit_s: float) -> None:
         self._tree = Path.cwd()
         self._limit_s = limit_s
         self._items: dict[str, pytest.Item] = {}
@@ -89,15 +90,15 @@ class Judge:
     def judge(self, mutant: Mutant) -> Verdict | None:
         """Run the tests on a mutant; None if it is none: the compiler refuses it."""
         begun_s = time.monotonic()
-        broken = self._tree / mutant.path
+        broken, whole = self._tree / mutant.path, self._tree / "whole"
+        shutil.copy2(broken, whole)
         broken.write_text(mutant.source)
         try:
             if mutant.path.suffix != ".py" and not self._build():
-                return None
+                return None  # and nothing was exchanged
             changed = None
             if mutant.path.suffix == ".py":
-                original = self._original / mutant.path
-                changed = change(original.read_text(), mutant.source, broken)
+                changed = change(whole.read_text(), mutant.source, broken)
             names, run = self._plan(changed, broken)
             suspect = self._first_failure(run(names, self._limit_s))
             caught = suspect if suspect and self._first_failure(run([suspect], self._limit_s)) else ""
@@ -106,7 +107,7 @@ class Judge:
                 suspect = self._first_failure(run(names, self._limit_s))
                 caught = suspect if suspect and self._first_failure(run([suspect], self._limit_s)) else ""
         finally:
-            shutil.copy2(self._original / mutant.path, broken)
+            shutil.copy2(whole, broken)
             if mutant.path.suffix != ".py":
                 self._restore_build()
         return Verdict(mutant, caught, len(names), time.monotonic() - begun_s)
@@ -124,7 +125,8 @@ class Judge:
         ]
         if not covering:  # called while a module is imported, or in other processes only
             return usable, self._anew
-        beyond = [name for name in usable if self._known[name].starts_processes and name not in covering]
+        starting = [name for name in usable if self._known[name].starts_processes and name not in covering]
+        beyond = [name for name in starting if not name.startswith(NATIVE)]
 
         def run(names: list[str], limit_s: float) -> list[str]:
             def apply() -> None:
@@ -177,7 +179,6 @@ class Judge:
         """The tests, in the child, until one fails; all of them, and what they call, if ``traced``."""
         os.setsid()
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
-        resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
         items = [self._items[name] for name in names]
         with log.open("a", buffering=1) as lines:
             plugins = items[0].config.pluginmanager if items else None
@@ -211,7 +212,11 @@ class Judge:
         arguments = self._tree / "names"
         arguments.write_text("\n".join(names))
         command = [sys.executable, "-m", "pytest", "-x", "-v", "--tb=no", "-p", "no:cacheprovider", "--numprocesses=0"]
-        command += [f"--timeout={SLOWEST_S:g}", f"--basetemp={self._tree / 'anew'}", f"@{arguments}"]
+        command += [
+            f"--timeout={max(SLOWEST_S, *(10 * self._known[name].took_s for name in names)):g}",
+            f"--basetemp={self._tree / 'anew'}",
+            f"@{arguments}",
+        ]
         popen = subprocess.Popen(
             command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True
         )
@@ -249,14 +254,16 @@ class Judge:
         ]
         if subprocess.run(command, capture_output=True, check=False).returncode:
             return False
+        (self._tree / "built").mkdir(exist_ok=True)
         for built in (self._tree / "lib").rglob("_atomics*.so"):
-            built.replace(self._tree / "shmio/segment" / built.name)
+            whole = self._tree / "shmio/segment" / built.name
+            whole.replace(self._tree / "built" / built.name)
+            built.replace(whole)
         return True
 
     def _restore_build(self) -> None:
-        for built in (self._original / "shmio/segment").glob("_atomics*.so"):
-            shutil.copy2(built, self._tree / "whole.so")
-            (self._tree / "whole.so").replace(self._tree / "shmio/segment" / built.name)
+        for built in list((self._tree / "built").glob("*.so")):
+            built.replace(self._tree / "shmio/segment" / built.name)
 
 
 class _Told:
@@ -290,12 +297,15 @@ class _Told:
 
 
 def _wait(pid: int, limit_s: float) -> None:
-    """Until it ends, or its time is over."""
+    """Until it ends, or its time is over, or its memory."""
+    until_s = time.monotonic() + limit_s
     descriptor = os.pidfd_open(pid)
     try:
-        if not select.select([descriptor], [], [], limit_s)[0]:
-            signal.pidfd_send_signal(descriptor, signal.SIGKILL)
-            os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+        while not select.select([descriptor], [], [], LOOK_S)[0]:
+            resident = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+            if time.monotonic() > until_s or resident > MEMORY_BYTES:
+                signal.pidfd_send_signal(descriptor, signal.SIGKILL)
+                break
     finally:
         os.close(descriptor)
     os.waitpid(pid, 0)

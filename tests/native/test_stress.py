@@ -1,4 +1,4 @@
-"""The C core under the sanitizers, many threads on one ring, two on one queue; and its relay in all interleavings."""
+"""The C core under the sanitizers, many threads on one ring, two on one queue; and models of all that may happen."""
 
 from __future__ import annotations
 
@@ -25,8 +25,10 @@ def test_no_sanitizer_finds_anything(name: str, sanitizers: str, tmp_path: Path)
     assert (run.returncode, run.stderr) == (0, "")
 
 
-def test_no_interleaving_loses_a_ring_or_keeps_a_relay_that_was_stopped(tmp_path: Path) -> None:
-    source, program = Path(__file__).with_name("relay_model.c"), tmp_path / "relay_model"
+@pytest.mark.parametrize("name", ["relay_model", "ring_orders"])
+def test_nothing_wrong_can_be_reached(name: str, tmp_path: Path) -> None:
+    """No interleaving loses a ring, or keeps a relay that was stopped; no memory order in the ring is too weak."""
+    source, program = Path(__file__).with_name(f"{name}.c"), tmp_path / name
     command = [COMPILER, "-std=gnu11", "-D_GNU_SOURCE", "-O1", "-Wall", "-Wextra", "-Werror", str(source)]
     subprocess.run([*command, "-o", str(program)], check=True, capture_output=True, text=True)
     run = subprocess.run([program], capture_output=True, text=True, timeout=100, check=False)

@@ -25,6 +25,7 @@ from shmio.segment import (
     Event,
     EventKind,
     ProcessSpec,
+    Record,
     Segment,
     Write,
 )
@@ -322,6 +323,55 @@ def test_what_waits_has_a_bound_and_the_rest_its_turn(bench: Bench) -> None:
         bench.desk.carry_out(confirm(device))
     accepted = [command for command, kind in seen if kind is EventKind.ACCEPTED]
     assert accepted == [number for number in numbers for _ in range(100)]
+
+
+def test_what_waits_has_a_bound_in_bytes(bench: Bench, writer: BlockWriter, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four times what the block has: five of 300 of its 400 bytes."""
+    commands, looked = writer.block.commands, threading.Semaphore(0)
+    wait = commands.wait
+
+    def rest(seen: int, timeout_ns: int) -> None:
+        looked.release()
+        wait(seen, timeout_ns)
+
+    monkeypatch.setattr(commands, "wait", rest)
+    numbers = [bench.send(Write(6, 0, bytes(300))) for _ in range(6)]
+    accepted = [bench.event().command for _ in range(10)]  # two parts each
+    assert accepted == [number for number in numbers[:5] for _ in range(2)]
+    while looked.acquire(blocking=False):
+        pass
+    for _ in range(2):  # one may have been under way
+        commands.wake()
+        assert looked.acquire(timeout=20)
+    assert bench._events.next(0) is None
+    bench.desk.carry_out(confirm([]))
+    after = [bench.event() for _ in range(7)]
+    assert [event.command for event in after if event.kind == EventKind.WRITTEN] == numbers[:5]
+    assert [event.command for event in after if event.kind == EventKind.ACCEPTED] == numbers[5:] * 2
+
+
+def test_a_connection_lost_while_a_command_is_being_accepted(
+    bench: Bench, writer: BlockWriter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was judged before, and would wait after: it is neither done later nor left without an end."""
+    tell = writer.event
+
+    def told(record: Record) -> int:
+        number = tell(record)
+        if record.kind is EventKind.ACCEPTED:
+            bench.desk.close("cable out")
+        return number
+
+    monkeypatch.setattr(writer, "event", told)
+    number = bench.send(Write(0, 0, b"\0\1"))
+    ends = [bench.event() for _ in range(2)]
+    assert [(end.command, end.kind, end.text) for end in ends] == [
+        (number, EventKind.ACCEPTED, ""),
+        (number, EventKind.EXPIRED, "the source is not connected: cable out"),
+    ]
+    bench.desk.open()
+    bench.desk.settle()
+    assert not bench.desk.waiting
 
 
 def test_a_superseded_value_is_not_written_when_what_took_its_place_was_refused(bench: Bench) -> None:

@@ -14,6 +14,7 @@ from shmio.endpoints.grpc.feed import Feed
 from shmio.endpoints.grpc.outbox import Outbox, StateLane
 from shmio.endpoints.grpc.pace import Pace
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Quality, Segment
+from shmio.segment.block import Stamp
 from tests.unit.endpoints.harness import LAYOUT, SOON_STALE_NS, STALE_NS, TIMEOUT_S, WRITABLE, WRITER, image
 from tests.unit.endpoints.test_grpc import STEP
 
@@ -34,7 +35,7 @@ class Followed:
     """A feed, its source, and streams of one register, of which each has had its first value."""
 
     def __init__(self, segment: Segment, *behind: bool, source: str = "cell") -> None:
-        self._writer = segment.writer(source)
+        self.writer = segment.writer(source)
         self._bells = Bells()
         self.told = list[bool]()
         self.feed = Feed(segment.blocks[source], WRITER, self._bells, lambda _, good: self.told.append(good))
@@ -54,13 +55,13 @@ class Followed:
         """Frames with the next numbers, with time between them to be shown or passed over."""
         for _ in range(count):
             self.count += 1
-            self._writer.publish(image(step=self.count), cycle=self.count)
+            self.writer.publish(image(step=self.count), cycle=self.count)
             await self.pass_by()
 
     async def fail(self) -> None:
         """A frame that says that there are no values."""
         self.count += 1
-        self._writer.publish(image(), cycle=self.count, quality=Quality.BAD, reason="cable out")
+        self.writer.publish(image(), cycle=self.count, quality=Quality.BAD, reason="cable out")
         await self.pass_by()
 
     async def pass_by(self) -> None:
@@ -281,3 +282,18 @@ def test_what_was_passed_over_was_no_silence(soon_stale: Segment) -> None:
         assert followed.told == [True]
 
     follow(soon_stale, test, True)
+
+
+def test_whoever_sees_two_frames_at_once_sees_that_nothing_came_between_them_for_too_long(segment: Segment) -> None:
+    """By the time of the next frame, not by that at which somebody was awake to look."""
+
+    async def test(followed: Followed) -> None:
+        (stream,), block = followed.streams, segment.blocks["cell"]
+        asking = asyncio.ensure_future(followed.next(stream))
+        await followed.pass_by()
+        late = Stamp(block.now_ns() + 2 * STALE_NS, 0)
+        followed.writer.publish(image(step=followed.count), cycle=followed.count + 1, at=late)
+        assert await asking == followed.count, "what has not changed, once more"
+        assert followed.told == [True, False, True]
+
+    follow(segment, test, False)

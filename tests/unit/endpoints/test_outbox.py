@@ -209,6 +209,23 @@ def test_values_of_a_step_are_all_kept_or_the_stream_ends(monkeypatch: pytest.Mo
     asyncio.run(test())
 
 
+def test_values_of_a_step_have_a_bound_in_bytes_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "STEP_BOUND_BYTES", 100)
+
+    async def test() -> None:
+        outbox = Outbox()
+        lane = StateLane(outbox)
+        lane.keep(bytes(101))  # a single one always has room
+        assert await rest(outbox) == [bytes(101)]
+        lane.keep(bytes(60))
+        lane.keep(bytes(40))
+        assert outbox.failure == ""
+        lane.keep(b"1")
+        assert outbox.failure == "2 values wait to be read: too many change in one step for this stream"
+
+    asyncio.run(test())
+
+
 def test_a_message_is_taken_when_the_reader_asks_for_the_next_one() -> None:
     async def test() -> None:
         outbox = Outbox()

@@ -172,6 +172,26 @@ def test_a_frame_later_than_the_schedule_is_gone_on_from(instance: str) -> None:
         assert coordinator.read().step == 10**9
 
 
+def test_a_cycle_that_had_begun_when_time_was_taken_over_is_gone_on_from(
+    instance: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The page says first that time stands, so that no more cycles begin; what was under way by then counts."""
+    with built(instance, spec("a"), stepped=False) as segment:
+        writer, write = segment.writer("a"), segment.clock.write
+        modes: list[ClockMode] = []
+
+        def told(state: ClockState, *, ring: bool = True) -> None:
+            write(state, ring=ring)
+            modes.append(state.mode)
+            if len(modes) == 1:
+                writer.publish(bytes(4), cycle=10**9)
+
+        monkeypatch.setattr(segment.clock, "write", told)
+        coordinator = Coordinator(segment)
+        coordinator.take_over()
+        assert (modes[0], coordinator.read().step) == (ClockMode.VIRTUAL, 10**9)
+
+
 def test_the_step_size_is_remembered_and_checked(instance: str) -> None:
     with built(instance) as segment:
         coordinator = Coordinator(segment)

@@ -78,3 +78,21 @@ def test_everything_nothing_and_the_wrong_size() -> None:
         ChangeScan(LAYOUT.registers).changed(old, new + b"x")
     with pytest.raises(ValueError, match="outside"):
         ChangeScan(LAYOUT.registers).changed(old[:4], new[:4])
+
+
+@pytest.mark.parametrize("size", [200, 65_536, 65_600, 200_000])
+def test_a_change_is_found_wherever_it_is(size: int) -> None:
+    """Images are compared in pieces first; a register may lie across several."""
+    each = 100
+    registers = [
+        Register(f"r{at}", "BYTE", ((1, each),), at, None, each, each) for at in range(0, size - each + 1, each)
+    ]
+    scan, old = ChangeScan(registers), bytes(size)
+    last = len(registers) * each - 1
+    for places in ([0], [63], [64], [65], [127, 128], [199], [last - 99], [last], [0, size // 2, last]):
+        new = bytearray(old)
+        for place in places:
+            new[min(place, last)] = 1
+        assert scan.changed(old, bytes(new)) == sorted({min(place, last) // each for place in places}), places
+    everything = scan.changed(old, b"\1" * size)
+    assert everything == list(range(len(registers)))

@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import socket
+import struct
 import threading
 import tracemalloc
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
+from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from shmio.config.address import Address
 from shmio.connectors.s7 import S7Client, S7Options
+from shmio.connectors.s7.pdu import FRAME_OVERHEAD, parse_connect_confirm
 from shmio.emulators.s7 import S7Server
 from shmio.errors import ConfigError, ConnectorError
+from shmio.layout.write import Write
 from shmio.testing.ports import reserved_port
 from tests.unit.connectors.s7.harness import SIZE, Plc, assert_recovers
 
@@ -25,12 +31,12 @@ def scripted() -> Iterator[Scripted]:
     """Make a client of a peer that sends one given answer to each thing it receives, then closes."""
     with ExitStack() as stack:
 
-        def make(*answers: bytes, timeout: int = 5000) -> S7Client:
+        def make(*answers: bytes, timeout: int = 5000, size: int = SIZE) -> S7Client:
             listener = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
 
             def play() -> None:
                 peer, _ = listener.accept()
-                with peer:
+                with peer, suppress(ConnectionError):  # a client that has closed takes no more
                     peer.settimeout(10)
                     for answer in answers:
                         peer.recv(4096)
@@ -41,7 +47,7 @@ def scripted() -> Iterator[Scripted]:
             stack.callback(thread.join)
             host, port = listener.getsockname()
             options = S7Options(host=host, port=port, timeout=timeout)
-            return stack.enter_context(closing(S7Client(options, 201, SIZE)))
+            return stack.enter_context(closing(S7Client(options, 201, size)))
 
         yield make
 
@@ -94,6 +100,38 @@ def test_answers_in_any_order(plc: Plc) -> None:
 
     plc.proxy.edit(swap, frames=3)
     assert client.read() == plc.block
+
+
+class Segmented(socket.socket):
+    """A connection that gives and takes a few bytes at a time, as TCP may."""
+
+    MOST = 1
+
+    def recv_into(self, buffer: Any, nbytes: int = 0, flags: int = 0) -> int:
+        return super().recv_into(buffer, min(len(buffer), nbytes or len(buffer), self.MOST), flags)
+
+    def send(self, data: Any, flags: int = 0) -> int:
+        return super().send(memoryview(data)[: self.MOST], flags)
+
+
+@pytest.mark.parametrize("most", [1, 3, 4, 7, 26, 500, 967, 968, 1500])
+def test_answers_in_segments_of_any_size(monkeypatch: pytest.MonkeyPatch, most: int) -> None:
+    """Answers, and requests, end anywhere in a segment; two may be in one."""
+    monkeypatch.setattr(Segmented, "MOST", most)
+    monkeypatch.setattr(socket, "socket", Segmented)
+    block = bytearray(range(256)) * 8
+    with S7Server(Address("127.0.0.1", 0)) as server:
+        server.add_block(1, block)
+        server.start()
+        options = S7Options(host="127.0.0.1", port=server.address.port, timeout=60_000)
+        with closing(S7Client(options, 1, len(block))) as client:
+            client.connect()
+            for generation in range(3):
+                block[:] = bytes([generation]) + block[1:]
+                assert client.read() == block
+            assert client.write([Write(3, 0, b"\7" * 1000)]) == [""]
+            assert client.read() == block
+            assert block[3:1003] == b"\7" * 1000
 
 
 # -- nobody there ------------------------------------------------------------------------------------------------------
@@ -326,6 +364,98 @@ def test_no_session(scripted: Scripted, answers: list[bytes], text: str) -> None
     with pytest.raises(ConnectorError, match=text):
         client.connect()
     assert not client.connected
+
+
+ANSWER = bytes.fromhex("0300001d 02f080 32 03 0000 0002 0002 0008 0000 04 01 ff 04 0020 01020304")
+
+
+def test_bytes_after_the_last_answer_end_the_session(scripted: Scripted) -> None:
+    client = scripted(CONFIRM, GRANT, NO_MODE, ANSWER + b"\x03", size=4)
+    client.connect()
+    with pytest.raises(ConnectorError, match="unexpected bytes after the last answer"):
+        client.read()
+    assert not client.connected
+
+
+def confirm(parameters: bytes, *, kind: int = 0xD0, indicator: int | None = None, length: int | None = None) -> bytes:
+    """A connection confirm; its lengths are right unless they are given."""
+    head = bytes(((6 + len(parameters)) & 255 if indicator is None else indicator, kind, 0, 1, 0, 7, 0))
+    whole = 4 + len(head) + len(parameters) if length is None else length
+    return struct.pack(">BxH", 3, whole) + head + parameters
+
+
+@pytest.mark.parametrize(
+    ("answer", "text"),
+    [
+        (confirm(bytes(600)), "frame of 611 bytes"),
+        (confirm(b"", length=0xFFFF) + bytes(1 << 20), "frame of 65535 bytes"),
+        (confirm(b"", length=0), "frame of 0 bytes"),
+        (confirm(b"", length=4), "frame of 4 bytes"),
+        (b"\x03\x00\x00\x07\x02\xf0\x80", "COTP TPDU 0xF0"),
+        (b"\x03\x00\x00\x07\x02\xd0\x80", "COTP TPDU 0xD0"),
+        (b"\x03", "closed the connection during set-up"),
+        (b"\x03\x00\x00", "closed the connection during set-up"),
+        (confirm(b"")[:-1], "closed the connection during set-up"),
+        (confirm(b"", indicator=0), "confirm of a wrong length"),
+        (confirm(b"", indicator=255), "confirm of a wrong length"),
+        (confirm(b"\xc0\x01\x00"), "TPDU size code 0"),
+        (confirm(b"\xc0\x01\x06"), "TPDU size code 6"),
+        (confirm(b"\xc0\x01\x11"), "TPDU size code 17"),
+        (confirm(b"\xc0\x01\xff"), "TPDU size code 255"),
+        (confirm(b"\xc1\xff\x00"), "closed the connection during set-up"),  # a parameter that is longer than all of it
+        (confirm(b"\xc0\x00\xc0\x02\x0a\x0a\xc0"), "closed the connection during set-up"),
+        (confirm(b"") * 50, "ROSCTR|not an answer|too short|unexpected"),
+        (b"\x00" * 4000, "not ISO-on-TCP"),
+    ],
+)
+def test_a_hostile_connection_confirm(scripted: Scripted, answer: bytes, text: str) -> None:
+    client = scripted(answer)
+    with pytest.raises(ConnectorError, match=text):
+        client.connect()
+    assert not client.connected
+
+
+@given(st.binary(max_size=80), st.booleans())
+def test_any_connection_confirm_is_refused_or_good(parameters: bytes, framed: bool) -> None:
+    answer = confirm(parameters) if framed else b"\x03\x00" + struct.pack(">H", 4 + len(parameters)) + parameters
+    if len(answer) < FRAME_OVERHEAD:
+        return
+    try:
+        size = parse_connect_confirm(memoryview(answer))
+    except ConnectorError:
+        return
+    assert 128 <= size <= 65531
+
+
+@pytest.mark.parametrize("answers", [(), (CONFIRM,), (CONFIRM, GRANT)])
+def test_a_peer_that_falls_silent_at_any_point_of_the_set_up(answers: tuple[bytes, ...]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener, ExitStack() as stack:
+
+        def play() -> None:
+            peer = stack.enter_context(listener.accept()[0])
+            for answer in answers:
+                peer.recv(4096)
+                peer.sendall(answer)
+
+        thread = threading.Thread(target=play)
+        thread.start()
+        host, port = listener.getsockname()
+        with closing(S7Client(S7Options(host=host, port=port, timeout=300), 201, SIZE)) as client:
+            with pytest.raises(ConnectorError, match=r"^no answer within 300 ms from 127.0.0.1:"):
+                client.connect()
+            assert not client.connected
+        thread.join()
+
+
+def test_a_peer_that_sends_without_end_while_the_session_is_set_up(scripted: Scripted) -> None:
+    """What comes beyond a confirm waits in the kernel; nothing of it is kept here."""
+    client = scripted(CONFIRM + bytes.fromhex("03000007 02f080") * 200_000)
+    tracemalloc.start()
+    with pytest.raises(ConnectorError):
+        client.connect()
+    ours = tracemalloc.take_snapshot().filter_traces([tracemalloc.Filter(True, "*/connectors/s7/*")])
+    tracemalloc.stop()
+    assert sum(trace.size for trace in ours.traces) < 100_000
 
 
 @pytest.mark.parametrize(("db_number", "size"), [(0, 1), (65536, 1), (1, 0), (1, 65537)])
