@@ -11,7 +11,7 @@ from pathlib import Path
 
 from shmio import __version__
 from shmio.cli.interrupt import undone_by_signals
-from shmio.cli.run import add_full, add_json, run, wants_error_json
+from shmio.cli.run import add_full, add_json, complete, run, wants_error_json
 
 PROGRAM = "shmio-dump"
 IGNORABLE = ("times", "cycle", "reason", "events", "ends")
@@ -21,6 +21,7 @@ IGNORABLE = ("times", "cycle", "reason", "events", "ends")
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of the console script; the exit status."""
     parser = _parser()
+    complete(parser)
     arguments, rest = parser.parse_known_args(argv)
     if rest and (arguments.verb != "cat" or any(word.startswith("-") for word in rest)):
         parser.error(f"unrecognized arguments: {' '.join(rest)}")

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from shmio import __version__
-from shmio.cli.run import dumps, run
+from shmio.cli.run import complete, dumps, run
 from shmio.errors import ConfigError, LayoutError
 from shmio.layout.compiler import Program, Source
 from shmio.layout.document import describe
@@ -47,6 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--json", action="store_true", help="print JSON: one object, or a list for several blocks")
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")
+    complete(parser)
     options = parser.parse_intermixed_args(arguments)
     names, sizes = [options.file, *options.types], dict(options.type_bytes)
     return run(parser.prog, lambda: _compile(names, options.block, sizes, as_json=options.json))

@@ -46,6 +46,14 @@ def run(program: str, command: Callable[[], int | None], *, error_json: bool = F
     return status
 
 
+def complete(parser: argparse.ArgumentParser) -> None:
+    """If it is a shell that asks, tell it what may come next on a command line, and exit."""
+    if "_ARGCOMPLETE" in os.environ:
+        from shmio.cli.completion import answer  # noqa: PLC0415  not for those who run a command
+
+        answer(parser)
+
+
 def say(line: str, stream: TextIO | None = None) -> None:
     """Print a line at once; a terminal that has gone away must not stop what runs."""
     with suppress(OSError):

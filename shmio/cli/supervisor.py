@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from shmio import __version__
-from shmio.cli.run import add_json, at_least, run, wants_error_json
+from shmio.cli.run import add_json, at_least, complete, run, wants_error_json
 from shmio.cli.supervise.replaying import add_arguments
 
 PROGRAM = "shmio-supervisor"
@@ -18,7 +18,9 @@ MODES = ("live", "log", "replay")
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of the console script; the exit status."""
-    arguments = _parser().parse_args(argv)
+    parser = _parser()
+    complete(parser)
+    arguments = parser.parse_args(argv)
 
     def command() -> int:
         verb = importlib.import_module(f"shmio.cli.supervise.{arguments.verb}")  # each needs other parts of shmio

@@ -9,16 +9,18 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from shmio import __version__
-from shmio.cli import get, inject, registers, replay, step, watch
+from shmio.cli import completion, get, inject, registers, replay, step, watch
 from shmio.cli import set as set_verb
 from shmio.cli.cell import Cell
 from shmio.cli.local import Local
-from shmio.cli.run import run
+from shmio.cli.run import complete, run
 from shmio.cli.target import target
 from shmio.layout.spelling import may_be_foreign, topic_path
 from shmio.segment.attach import Attachment
 
 PROGRAM = "shmio"
+
+SHELL_HELP = "Print what makes a shell complete command lines: see docs/reference/cli-shmio.md."
 
 Verb = Callable[[Cell, argparse.Namespace], int]
 
@@ -26,10 +28,15 @@ Verb = Callable[[Cell, argparse.Namespace], int]
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of the console script; the exit status."""
     words = list(sys.argv[1:] if argv is None else argv)
-    arguments = _parser().parse_args(set_verb.shield(words) if words[:1] in (["set"], ["inject"]) else words)
+    parser = _parser()
+    complete(parser)
+    arguments = parser.parse_args(set_verb.shield(words) if words[:1] in (["set"], ["inject"]) else words)
 
     def command() -> int:
-        verb: Verb = arguments.verb
+        verb: Verb | None = arguments.verb
+        if verb is None:
+            print(completion.script(arguments.shell))
+            return 0
         if arguments.host is not None:
             os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # what is wrong it tells us, too
             from shmio.cli.remote import connected  # noqa: PLC0415  gRPC only for those who ask for it
@@ -84,4 +91,7 @@ def _parser() -> argparse.ArgumentParser:
         sub = verbs.add_parser(name, parents=[common], help=module.HELP, description=module.HELP)
         module.arguments(sub)
         sub.set_defaults(verb=module.execute, writable=module in (set_verb, inject, step, replay))
+    shell = verbs.add_parser("completion", help=SHELL_HELP, description=SHELL_HELP)
+    shell.add_argument("shell", choices=completion.SHELLS, metavar="SHELL", help=", ".join(completion.SHELLS))
+    shell.set_defaults(verb=None)
     return parser

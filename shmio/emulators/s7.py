@@ -28,7 +28,17 @@ from snap7.server import CPUState, Server, ServerISOConnection, ServerState
 from snap7.type import SrvArea
 
 from shmio.config.address import Address
-from shmio.emulators.s7_jobs import MAX_PDU_SIZE, NOT_AVAILABLE, PROTOCOL, Jobs, Memory, Traits, refusal
+from shmio.emulators.s7_jobs import (
+    MAX_PDU_SIZE,
+    NOT_AVAILABLE,
+    PROTOCOL,
+    READ,
+    Jobs,
+    Memory,
+    Traits,
+    acknowledgement,
+    refusal,
+)
 from shmio.errors import ConfigError, EndpointError, ShmioError
 
 logger = logging.getLogger(__name__)
@@ -46,6 +56,9 @@ _SERVICES = (b"P_PROGRAM", b"_MODU", b"_GARB")  # start; and what a block that l
 _SERVICE_ARGUMENT = 8  # where, in the parameters, a job for a service has the length of what the service is given
 _MODE_LIST = 0x0424
 _RUN, _STOP = 0x08, 0x04  # operating modes in that list
+_IS_IT_RUNNING = bytes((0, 1, 0, 0, READ))
+"""Sizes and parameters of a read without items: ``get_cpu_state()`` of python-snap7 3. It takes any acknowledgement for
+RUN, so in STOP it is refused."""
 _JOIN_TIMEOUT_S = 10
 
 
@@ -238,17 +251,22 @@ class S7Server(Server):
             or ((kind, function) == (S7PDUType.REQUEST, S7Function.PLC_CONTROL) and _is_served(request_data))
         ):
             return super()._process_request(request_data, client_address)
+        if request_data[6:] == _IS_IT_RUNNING and kind == S7PDUType.REQUEST and self.cpu_state == CPUState.RUN:
+            return acknowledgement(int.from_bytes(request_data[4:6], "big"), bytes((READ, 0)))
         if kind == S7PDUType.REQUEST:
             return refusal(int.from_bytes(request_data[4:6], "big"), NOT_AVAILABLE)
         return None
 
     def _get_szl_data(self, szl_id: int, szl_index: int) -> bytes | None:
-        """Tell the operating mode as the reference manual of S7-300/400 has it: one record of 20 bytes."""
+        """Tell the operating mode as the reference manual of S7-300/400 has it: one record of 20 bytes.
+
+        The mode before, in the same byte, is not told: Snap7's ``Cli_GetPlcStatus`` takes RUN after STOP for STOP.
+        """
         if szl_id != _MODE_LIST:
             found: bytes | None = super()._get_szl_data(szl_id, szl_index)
             return found
-        mode, before = (_RUN, _STOP) if self.cpu_state == CPUState.RUN else (_STOP, _RUN)
-        record = struct.pack(">HBB16x", 0x4302 if mode == _RUN else 0x4303, 0xFF, before << 4 | mode)
+        mode = _RUN if self.cpu_state == CPUState.RUN else _STOP
+        record = struct.pack(">HBB16x", 0x4302 if mode == _RUN else 0x4303, 0xFF, mode)
         return struct.pack(">HH", len(record), 1) + record
 
 

@@ -135,7 +135,7 @@ class Jobs:
         self.pdu_size = min(pdu_size, self._traits.max_pdu_size)
         jobs = self._traits.max_jobs
         granted = struct.pack(">BxHHH", SETUP, min(calling, jobs), min(called, jobs), self.pdu_size)
-        return _ack(reference, granted)
+        return acknowledgement(reference, granted)
 
     def _read(self, reference: int, parameters: memoryview) -> bytes:
         parts = []
@@ -149,7 +149,7 @@ class Jobs:
                 if size > self.pdu_size:
                     raise _MalformedJobError
                 parts.append(_read_item(item))
-        return _ack(reference, bytes((READ, parameters[1])), b"".join(parts))
+        return acknowledgement(reference, bytes((READ, parameters[1])), b"".join(parts))
 
     def _write(self, reference: int, parameters: memoryview, data: memoryview) -> bytes:
         codes = bytearray()
@@ -158,7 +158,7 @@ class Jobs:
             values = _values(data, len(items))  # all of them, so that a malformed job stores nothing
             for item, value in zip(items, values, strict=True):
                 codes.append(_write_item(item, value))
-        return _ack(reference, bytes((WRITE, len(items))), codes)
+        return acknowledgement(reference, bytes((WRITE, len(items))), codes)
 
     def _items(self, parameters: memoryview, *denials: Fault) -> list[_Item]:
         if not parameters[1] or len(parameters) != 2 + _ITEM.size * parameters[1]:
@@ -198,7 +198,8 @@ def refusal(reference: int, error: int) -> bytes:
     return _ANSWER.pack(PROTOCOL, 2, 0, reference, 0, 0, error)
 
 
-def _ack(reference: int, parameters: bytes, data: bytes | bytearray = b"") -> bytes:
+def acknowledgement(reference: int, parameters: bytes, data: bytes | bytearray = b"") -> bytes:
+    """Build an answer to a job that is right as a whole."""
     return _ANSWER.pack(PROTOCOL, 3, 0, reference, len(parameters), len(data), 0) + parameters + data
 
 

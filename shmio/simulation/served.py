@@ -84,8 +84,8 @@ class ServedModel:
         self._new.update(dict.fromkeys(path for path in inputs.changed if path in self._inputs))
         self._runner.connect({path: value for path in self._new if (value := inputs[path]) is not None})
         self._new.clear()
-        self._begun = True
         image = self._runner.step(round(time_s * 1e9), round(dt_s * 1e9))
+        self._begun = True  # one that has only failed has computed nothing to go on from
         outputs = dict(self._changes(image))
         self._sent = image
         return outputs

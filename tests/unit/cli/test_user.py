@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import pty
-import re
 import signal
 import subprocess
 import sys
@@ -19,6 +16,7 @@ from shmio.cli.local import Local
 from shmio.cli.user import main
 from shmio.layout.model import Layout, Register
 from shmio.segment import BlockSpec, Segment
+from tests.unit.cli.terminal import Terminal
 
 LAYOUT = Layout("DB1", 1, 2, False, (Register("a", "INT", (), 0, None, 2, 1),))
 
@@ -245,40 +243,12 @@ def test_watch_every_ends_with_the_instance(times: Segment) -> None:
     assert (watch.returncode, err) == (1, f"instance {times.instance!r} has stopped\n")
 
 
-class Terminal:
-    """A command on a terminal of 80 times 6 characters."""
-
-    def __init__(self, *words: str) -> None:
-        self._master, slave = pty.openpty()
-        program = "import sys; from shmio.cli.user import main; sys.exit(main())"
-        environment = os.environ | {"TERM": "xterm", "COLUMNS": "80", "LINES": "6"}
-        self.process = subprocess.Popen(
-            [sys.executable, "-P", "-c", program, *words], stdin=slave, stdout=slave, stderr=slave, env=environment
-        )
-        os.close(slave)
-        self._data = b""
-
-    def until(self, pattern: str) -> str:
-        """What it shows up to there; all of it if it never shows that."""
-        while not (found := re.search(pattern, text := self._data.decode(errors="ignore"), re.DOTALL)):
-            try:
-                self._data += os.read(self._master, 65536)
-            except OSError:  # it has ended
-                raise AssertionError(f"no {pattern!r} in {text!r}") from None
-        self._data = text[found.end() :].encode()
-        return text[: found.end()]
-
-    def __enter__(self) -> Terminal:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.process.kill()
-        self.process.wait()
-        os.close(self._master)
+def terminal_of(*words: str) -> Terminal:
+    return Terminal(sys.executable, "-P", "-c", "import sys; from shmio.cli.user import main; sys.exit(main())", *words)
 
 
 def test_on_a_terminal_watch_is_a_table_that_is_brought_up_to_date_in_place(times: Segment) -> None:
-    with Terminal("watch", "--instance", times.instance, "--every", "0.02", "cell/wait", "cell/many") as terminal:
+    with terminal_of("watch", "--instance", times.instance, "--every", "0.02", "cell/wait", "cell/many") as terminal:
         first = terminal.until(r"\(all: --full\)")
         assert "cell/wait  T#1s500ms" in first
         assert first.splitlines()[-1].count("0,") == 19, "the mark is still in the window"
@@ -287,7 +257,7 @@ def test_on_a_terminal_watch_is_a_table_that_is_brought_up_to_date_in_place(time
         terminal.until("cell/wait  T#7ms")
         terminal.process.send_signal(signal.SIGINT)
         assert terminal.process.wait(60) == 130
-    with Terminal("watch", "--instance", times.instance, "cell/many/0..8") as terminal:
+    with terminal_of("watch", "--instance", times.instance, "cell/many/0..8") as terminal:
         terminal.until(r"cell/many/3.*… and 5 more lines: a higher window, or --lines, shows them")
-    with Terminal("watch", "--lines", "--full", "--instance", times.instance, "cell/many") as terminal:
+    with terminal_of("watch", "--lines", "--full", "--instance", times.instance, "cell/many") as terminal:
         assert "\x1b" not in terminal.until(r"(0,){199}0\]\s")

@@ -135,7 +135,7 @@ def test_a_service_is_read_at_its_place(client: snap7.Client, server: S7Server, 
 
 
 def test_tells_its_operating_mode(client: snap7.Client) -> None:
-    """SZL 0x0424: one record of 20 bytes, in its fourth byte the mode now and before."""
+    """SZL 0x0424: one record of 20 bytes, in its fourth byte the mode; Snap7 takes all but 0x08 for STOP."""
 
     def mode() -> int:
         data = bytes(client.read_szl(0x0424).Data)
@@ -143,14 +143,24 @@ def test_tells_its_operating_mode(client: snap7.Client) -> None:
         assert data[24:] == bytes(len(data) - 24)
         return data[7]
 
-    assert mode() == 0x48
+    assert mode() == 0x08
     client.plc_stop()
-    assert mode() == 0x84
+    assert mode() == 0x04
     client.plc_hot_start()
-    assert mode() == 0x48
+    assert mode() == 0x08
     client.plc_stop()
     client.plc_cold_start()
-    assert mode() == 0x48
+    assert mode() == 0x08
+
+
+def test_python_snap7_is_told_whether_it_runs(client: snap7.Client) -> None:
+    """It takes any acknowledgement of its question for RUN."""
+    assert client.get_cpu_state() == "S7CpuStatusRun"
+    client.plc_stop()
+    with pytest.raises(Exception, match="code=0x04"):
+        client.get_cpu_state()
+    client.plc_hot_start()
+    assert client.get_cpu_state() == "S7CpuStatusRun"
 
 
 def test_an_unknown_system_status_list(client: snap7.Client) -> None:

@@ -102,6 +102,23 @@ def test_a_model_that_nobody_has_computed_yet_begins_with_its_own_values() -> No
     assert served.step(1.0, 1.0, Given({})) == {"start_at": 6}
 
 
+def test_one_that_has_only_failed_goes_on_from_what_another_has_computed() -> None:
+    class Counter(Model):
+        count = Output("INT", 5)
+
+        def step(self, time_s: float, dt_s: float) -> None:
+            if time_s == 1.0:
+                raise ValueError("not yet")
+            self.count += 1
+
+    served = ServedModel(Counter)
+    served.start(Joined({}, {"count": 0}))
+    with pytest.raises(ModelError, match="not yet"):
+        served.step(1.0, 1.0, Given({}))
+    served.start(Joined({}, {"count": 70}, computed=True))
+    assert served.step(2.0, 1.0, Given({})) == {"count": 71}
+
+
 def test_what_is_no_value_is_not_given_and_what_fails_is_given_again() -> None:
     class Fragile(Model):
         number = Input("INT", 1)

@@ -1,0 +1,132 @@
+"""Completion of command lines, by argcomplete: the shell runs the command, which answers what may come next.
+
+Options, verbs and choices argcomplete takes from the parsers. What else there is, this finds by an argument's ``dest``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, Final
+
+from shmio.dump.libraries import library
+from shmio.errors import ShmioError
+
+PROGRAMS: Final = ("shmio", "shmio-supervisor", "shmio-dump", "shmio-layout")
+SHELLS: Final = ("bash", "zsh", "fish")
+
+Completer = Callable[..., Iterable[str]]
+
+
+def script(shell: str) -> str:
+    """What a shell is to read, once each time that it starts. MissingLibraryError."""
+    text: str = _argcomplete().shellcode(PROGRAMS, shell=shell)
+    return text
+
+
+def answer(parser: argparse.ArgumentParser) -> None:
+    """Tell the shell what may come next, and exit. MissingLibraryError."""
+    completers = _argcomplete().completers
+    files = completers.FilesCompleter
+
+    by_dest: dict[str, Completer] = {
+        "config": files(["toml"]),
+        "directory": completers.DirectoriesCompleter(),
+        "instance": _instances,
+        "name": _processes,
+        "only": _registers,
+        "pairs": _registers,
+        "patterns": _registers,
+        "registers": _registers,
+        "source": _sources,
+        "sources": _sources,
+        "value": _registers,
+    }
+    if parser.prog == "shmio-dump":
+        by_dest |= dict.fromkeys(("file", "files"), files(["mem"]))
+    for action in _actions(parser):
+        if action.choices is None and action.nargs != 0:
+            other = files() if "FILE" in str(action.metavar) or action.dest == "types" else _nothing
+            action.completer = by_dest.get(action.dest, other)  # type: ignore[attr-defined]  # argcomplete's way
+    _argcomplete().autocomplete(parser, always_complete_options=False)
+
+
+def _argcomplete() -> Any:
+    return library("argcomplete", "pip install argcomplete")
+
+
+def _actions(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    for action in parser._actions:
+        yield action
+        if isinstance(action, argparse._SubParsersAction):
+            for verb in action.choices.values():
+                yield from _actions(verb)
+
+
+# -- what there is -------------------------------------------------------------------------------------------
+
+
+def _nothing(**_: object) -> list[str]:
+    return []
+
+
+def _instances(**_: object) -> list[str]:
+    from shmio.segment import running_instances  # noqa: PLC0415  what this one needs alone, for it is waited for
+
+    return running_instances()
+
+
+def _processes(parsed_args: argparse.Namespace, **_: object) -> list[str]:
+    """Names for ``restart`` and ``logs``."""
+    from shmio.cli.target import target  # noqa: PLC0415
+
+    try:
+        with target(parsed_args).open() as segment:
+            names = [slot.name for slot in segment.processes]
+    except ShmioError:
+        return []
+    return ["supervisor", *names] if parsed_args.verb == "logs" else names
+
+
+def _sources(parsed_args: argparse.Namespace, **_: object) -> list[str]:
+    return list(_paths(parsed_args))
+
+
+def _registers(prefix: str, parsed_args: argparse.Namespace, **_: object) -> list[str]:
+    """Paths that begin so, to the next slash: as files of folders are completed."""
+    found = _paths(parsed_args)
+    paths = [f"{source}/{path}" for source, ones in found.items() for path in ones]
+    if len(found) == 1 and not any(path.startswith(prefix) for path in paths):
+        paths = [path for ones in found.values() for path in ones]  # its name may be left out
+    ends = ((path, path.find("/", len(prefix)) + 1) for path in paths if path.startswith(prefix))
+    return sorted({path[:end] if end else path for path, end in ends})
+
+
+def _paths(options: argparse.Namespace) -> dict[str, list[str]]:
+    """Registers by their sources: of the recordings that the line names, else of the instance on this host."""
+    files = getattr(options, "files", None) or [getattr(options, "file", None)]
+    try:
+        return _recorded(files) if hasattr(options, "output") or files[0] else _running(options)
+    except (ShmioError, OSError):
+        return {}
+
+
+def _recorded(files: list[Any]) -> dict[str, list[str]]:
+    from shmio.dump.dump import open_dump  # noqa: PLC0415
+
+    found: dict[str, list[str]] = {}
+    with open_dump([file for file in files if file is not None]) as dump:
+        for block in dump.blocks:
+            found.setdefault(block.source, []).extend(register.path for register in block.layout.registers)
+    return found
+
+
+def _running(options: argparse.Namespace) -> dict[str, list[str]]:
+    from shmio.cli.target import target  # noqa: PLC0415
+    from shmio.segment.attach import Attachment  # noqa: PLC0415
+
+    if getattr(options, "host", None) is not None:
+        return {}
+    with Attachment(target(options).open()) as attachment:
+        layouts = {source: attachment.block(source).layout for source in attachment.sources}
+    return {source: [register.path for register in layout.registers] for source, layout in layouts.items()}

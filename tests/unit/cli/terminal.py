@@ -1,0 +1,45 @@
+"""A command on a terminal."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import subprocess
+import termios
+
+
+class Terminal:
+    """A command on a terminal of 80 times 6 characters."""
+
+    def __init__(self, *words: str, **environment: str) -> None:
+        self._master, slave = pty.openpty()
+        termios.tcsetwinsize(slave, (24, 200))
+        variables = os.environ | {"TERM": "xterm", "COLUMNS": "80", "LINES": "6"} | environment
+        self.process = subprocess.Popen(
+            words, stdin=slave, stdout=slave, stderr=slave, env=variables, start_new_session=True
+        )
+        os.close(slave)
+        self._data = b""
+
+    def until(self, pattern: str) -> str:
+        """What it shows up to there; all of it if it never shows that."""
+        while not (found := re.search(pattern, text := self._data.decode(errors="ignore"), re.DOTALL)):
+            try:
+                self._data += os.read(self._master, 65536)
+            except OSError:  # it has ended
+                raise AssertionError(f"no {pattern!r} in {text!r}") from None
+        self._data = text[found.end() :].encode()
+        return text[: found.end()]
+
+    def type(self, keys: str) -> None:
+        """As from its keyboard."""
+        os.write(self._master, keys.encode())
+
+    def __enter__(self) -> Terminal:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.wait()
+        os.close(self._master)
