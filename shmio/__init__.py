@@ -5,8 +5,7 @@ A local program begins with :func:`attach`, one that looks into recordings with 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
+TYPE_CHECKING = False  # typing's own costs every command 10 ms, in which Ctrl-C would print a traceback
 if TYPE_CHECKING:
     from shmio.dump.dump import open_dump
     from shmio.segment.attach import attach
@@ -15,7 +14,7 @@ __version__ = "0.1.0"
 __all__ = ["__version__", "attach", "open_dump"]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     """Import them when they are first asked for: most processes of an instance do without."""
     if name == "attach":
         from shmio.segment.attach import attach  # noqa: PLC0415

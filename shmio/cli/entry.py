@@ -2,8 +2,20 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
+from types import TracebackType
+
+
+def _hook(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    """What the script shows of an error that ends it: nothing of Ctrl-C, by which it ends as shells expect."""
+    if not issubclass(kind, KeyboardInterrupt):
+        sys.__excepthook__(kind, error, trace)
+
+
+sys.excepthook = _hook  # first: all that follows may be interrupted, this module's imports too
+
+import importlib  # noqa: E402
+import signal  # noqa: E402
 
 
 def shmio() -> int:
@@ -32,4 +44,12 @@ def _run(module: str) -> int:
         status: int = importlib.import_module(module).main(sys.argv[1:])
     except KeyboardInterrupt:
         return 130
+    finally:
+        _end_quietly()
     return status
+
+
+def _end_quietly() -> None:
+    """Have Ctrl-C end the process at once: nothing is left to be told, and the interpreter would print a traceback."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -28,6 +28,20 @@ def told_to_stop() -> Iterator[threading.Event]:
 
 
 @contextmanager
+def ended_by_interrupt() -> Iterator[None]:
+    """Ctrl-C ends the process at once, and quietly: for imports of libraries that an exception within would break."""
+    main = threading.current_thread() is threading.main_thread()
+    heeded = main and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if heeded:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        if heeded:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@contextmanager
 def undone_by_signals() -> Iterator[None]:
     """SIGTERM and a closed terminal end what is at work as Ctrl-C does, by an exception: nothing is left half done.
 

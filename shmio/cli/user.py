@@ -12,6 +12,7 @@ from shmio import __version__
 from shmio.cli import completion, get, inject, registers, replay, step, watch
 from shmio.cli import set as set_verb
 from shmio.cli.cell import Cell
+from shmio.cli.interrupt import ended_by_interrupt
 from shmio.cli.local import Local
 from shmio.cli.run import complete, run
 from shmio.cli.target import target
@@ -39,7 +40,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         if arguments.host is not None:
             os.environ.setdefault("GRPC_VERBOSITY", "NONE")  # what is wrong it tells us, too
-            from shmio.cli.remote import connected  # noqa: PLC0415  gRPC only for those who ask for it
+            with ended_by_interrupt():  # gRPC crashes when it is broken off while it is loaded
+                from shmio.cli.remote import connected  # noqa: PLC0415  for those who ask for it alone
 
             with connected(arguments) as remote:
                 return verb(remote, _spelled(remote, arguments))
