@@ -7,6 +7,8 @@ from __future__ import annotations
 
 TYPE_CHECKING = False  # typing's own costs every command 10 ms, in which Ctrl-C would print a traceback
 if TYPE_CHECKING:
+    from typing import Any
+
     from shmio.dump.dump import open_dump
     from shmio.segment.attach import attach
 
@@ -14,7 +16,7 @@ __version__ = "0.1.0"
 __all__ = ["__version__", "attach", "open_dump"]
 
 
-def __getattr__(name: str) -> object:
+def __getattr__(name: str) -> Any:
     """Import them when they are first asked for: most processes of an instance do without."""
     if name == "attach":
         from shmio.segment.attach import attach  # noqa: PLC0415
