@@ -13,7 +13,7 @@ from shmio.config.model import (
     Token,
     Trigger,
 )
-from shmio.config.mqttmodel import Mqtt, MqttTls, MqttTopic, Sparkplug
+from shmio.config.mqttmodel import Mqtt, MqttAccount, MqttTls, MqttTopic, Sparkplug
 from shmio.config.read import RESERVED_SOURCES, load
 
 __all__ = [
@@ -25,6 +25,7 @@ __all__ = [
     "Grpc",
     "Instance",
     "Mqtt",
+    "MqttAccount",
     "MqttTls",
     "MqttTopic",
     "Recorder",

@@ -7,8 +7,10 @@ import hashlib
 import hmac
 import re
 import secrets
+from collections.abc import Sequence
 from typing import Final
 
+from shmio.config.mqttmodel import MqttAccount
 from shmio.config.secretfile import read_secret
 from shmio.errors import ConfigError
 
@@ -28,10 +30,11 @@ def read_password(name: str) -> str:
     return password
 
 
-def read_accounts(name: str) -> dict[str, str]:
+def read_accounts(name: str, roles: Sequence[MqttAccount] = ()) -> dict[str, str]:
     """Names and hashes of who may connect to our broker.
 
-    A line each: ``name:password``, or ``name:hash`` as mosquitto_passwd writes it.
+    A line each: ``name:password``, or ``name:hash`` as mosquitto_passwd writes it. ``roles``: accounts that have to
+    have a line.
 
     ConfigError names the line that will not do, and never says what is in it.
     """
@@ -55,6 +58,9 @@ def read_accounts(name: str) -> dict[str, str]:
         accounts[user] = secret if known else hashed(secret)
     if not accounts:
         raise ConfigError(f"{KEY}: {name}: it has no account: a line each, name:password")
+    for index, account in enumerate(roles):
+        if account.name is not None and account.name not in accounts:
+            raise ConfigError(f"mqtt.account[{index}].name: {account.name!r} has no line in {name}")
     return accounts
 
 

@@ -1,8 +1,9 @@
-"""The rules of ``[mqtt]``: where the broker is, who may reach it, what topics may be called."""
+"""The rules of ``[mqtt]``: where the broker is, who may reach it and do what there, what topics may be called."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Final
 from unicodedata import category
 
@@ -14,6 +15,8 @@ from shmio.errors import ConfigError
 PORT: Final = 1883
 TLS_PORT: Final = 8883
 MAX_PREFIX: Final = 256
+ROLES: Final = ("read", "write")
+"""What an account of our own broker may be allowed: to subscribe, and to publish commands."""
 _ELSEWHERE: Final = ("host", "port", "username")
 """Keys that say where a broker is that is not ours, and who we are there."""
 
@@ -35,6 +38,15 @@ def check_mqtt(config: Config) -> None:
         _check_external(mqtt)
     else:
         _check_own(mqtt)
+        _check_accounts(mqtt, config.instance.name)
+
+
+def own_topics(mqtt: Mqtt, instance: str) -> list[str]:
+    """Filters of all topics that are the instance's: where nobody else publishes, and where commands come."""
+    found = [f"{mqtt.prefix or f'shmio/{instance}'}/#"]
+    if mqtt.sparkplug is not None:
+        found.append(f"spBv1.0/{mqtt.sparkplug.group}/+/{mqtt.sparkplug.node or instance}/#")
+    return found
 
 
 def resolve_mqtt(mqtt: Mqtt, config: Config) -> None:
@@ -97,6 +109,8 @@ def _check_topic(key: str, rule: MqttTopic) -> None:
 
 
 def _check_external(mqtt: Mqtt) -> None:
+    if mqtt.account:
+        raise ConfigError("mqtt.account: an external broker has accounts of its own; leave it out")
     if mqtt.listen is not None:
         raise ConfigError('mqtt.listen: an external broker listens by itself; leave it out, or broker = "embedded"')
     if mqtt.host is None:
@@ -134,3 +148,44 @@ def _check_own(mqtt: Mqtt) -> None:
 
 def _refuse_plain_text(key: str, why: str) -> None:
     raise ConfigError(f"{key}: {why}; that needs a [mqtt.tls] table, or insecure = true beside it")
+
+
+def _check_accounts(mqtt: Mqtt, instance: str) -> None:
+    names: dict[str | None, str] = {}
+    for index, account in enumerate(mqtt.account):
+        key = f"mqtt.account[{index}]"
+        if account.name in names:
+            whose = "one without a name, for who shows no account," if account.name is None else repr(account.name)
+            raise ConfigError(f"{key}.name: {whose} is already {names[account.name]}")
+        names[account.name] = key
+        if account.name is not None and mqtt.password_file is None:
+            raise ConfigError(f"{key}.name: {account.name!r} needs a password, in a line of mqtt.password_file")
+        for place, role in enumerate(account.roles):
+            if role not in ROLES:
+                raise ConfigError(f"{key}.roles[{place}]: no role {role!r}; there are: {', '.join(ROLES)}")
+        if account.publish and "write" not in account.roles:
+            raise ConfigError(f"{key}.publish: needs the role write")
+        for place, topics in enumerate(account.publish):
+            _check_filter(f"{key}.publish[{place}]", topics, own_topics(mqtt, instance))
+
+
+def _check_filter(key: str, topics: str, own: Sequence[str]) -> None:
+    levels = topics.split("/")
+    wild = any(set("+#").intersection(level) and level not in ("+", "#") for level in levels)
+    if wild or "#" in levels[:-1] or topics.startswith("$") or len(topics) > MAX_PREFIX or _is_no_text(topics):
+        raise ConfigError(
+            f"{key}: {topics!r} is no filter of topics: at most {MAX_PREFIX} characters, no $ at its beginning, + and "
+            "# as a whole level each, and # as the last; such as homeassistant/#"
+        )
+    for one in own:
+        if _overlap(levels, one.split("/")):
+            raise ConfigError(f"{key}: {topics!r} would have others publish on the instance's own topics, {one}")
+
+
+def _overlap(one: Sequence[str], other: Sequence[str]) -> bool:
+    """Whether there may be a topic that both filters match."""
+    if ["#"] in (list(one[:1]), list(other[:1])):
+        return True
+    if not one or not other:
+        return not one and not other
+    return (one[0] == other[0] or "+" in (one[0], other[0])) and _overlap(one[1:], other[1:])

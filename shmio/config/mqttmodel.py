@@ -47,7 +47,8 @@ class Sparkplug(Section):
     group: Text
     node: Text | None = None
     primary_host: Text | None = None
-    datatypes: bool = False
+    datatypes: bool = True
+    elements: bool = False
     max_rate_hz: Annotated[float, Meta(gt=0, le=1e6)] | None = None
     match: Text | Texts = "**"
 
@@ -55,6 +56,17 @@ class Sparkplug(Section):
     def patterns(self) -> list[str]:
         """Globs over paths that begin with their source: what is a metric."""
         return [self.match] if isinstance(self.match, str) else self.match
+
+
+class MqttAccount(Section):
+    """``[[mqtt.account]]``: what an account of our own broker may do; without ``name``: who shows no account.
+
+    ``publish``: topic filters of what ``write`` allows beside commands.
+    """
+
+    roles: Texts
+    name: Text | None = None
+    publish: list[Text] = []
 
 
 class Mqtt(Section):
@@ -73,5 +85,6 @@ class Mqtt(Section):
     keep_alive_s: Annotated[int, Meta(ge=5, le=3600)] = 30
     session_expiry_s: Annotated[int, Meta(ge=0, le=2**32 - 2)] = 0
     backlog_mb: Annotated[float, Meta(ge=0, le=65536)] = 16.0
+    account: list[MqttAccount] = []
     topic: list[MqttTopic] = []
     sparkplug: Sparkplug | None = None

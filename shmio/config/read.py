@@ -28,7 +28,7 @@ from shmio.config.model import (
     Trigger,
 )
 from shmio.config.mqtt import check_mqtt, resolve_mqtt
-from shmio.config.mqttmodel import Mqtt, MqttTls, MqttTopic, Sparkplug
+from shmio.config.mqttmodel import Mqtt, MqttAccount, MqttTls, MqttTopic, Sparkplug
 from shmio.config.properties import read_properties
 from shmio.config.section import Section
 from shmio.config.wording import explain, explain_toml, named
@@ -49,6 +49,7 @@ _TABLES: dict[str, type[Section]] = {
     "grpc.client": Client,
     "grpc.address": Listening,
     "mqtt": Mqtt,
+    "mqtt.account": MqttAccount,
     "mqtt.tls": MqttTls,
     "mqtt.topic": MqttTopic,
     "mqtt.sparkplug": Sparkplug,
@@ -98,7 +99,7 @@ def read_tables(file: Path) -> dict[str, Any]:
 def _resolve(tables: dict[str, Any], folder: Path) -> Config:
     if "folder" in tables:
         raise ConfigError(_unknown("folder", ""))
-    inner = [("grpc", name) for name in _OF_GRPC] + [("mqtt", "topic")]
+    inner = [("grpc", name) for name in _OF_GRPC] + [("mqtt", "account"), ("mqtt", "topic")]
     for name, table in [
         ("source", tables),
         ("emulator", tables),

@@ -249,14 +249,17 @@ class Commander:
         return self.outcomes(self.submit(values, timeout_s))
 
     def _register(self, path: str) -> Register:
-        source = self.block.source
         register = find(self.block.layout, path)
+        self.check(register)
+        return register
+
+    def check(self, register: Register) -> None:
+        """CommandError: it is not writable."""
         if not self.is_writable(register):
             remedy = "the configuration has to name it in the source's `writable`"
             if self.block.attributes.connector in _MODELS:
                 remedy += ", unless its model computes it: nobody writes that, and shmio inject shows another value"
-            raise CommandError(f"{source}/{path} is not writable; {remedy}")
-        return register
+            raise CommandError(f"{self.block.source}/{register.path} is not writable; {remedy}")
 
     def _next(self, ticket: Ticket) -> Event | None:
         """The next event about the command; None when none will come, or not in time."""

@@ -206,10 +206,16 @@ def process_names(config: Config) -> list[str]:
 def _mqtt(mqtt: Mqtt) -> list[tuple[str, str, dict[str, Any]]]:
     """The bridge, and the broker if it is ours: each gets the keys that it needs, so that it alone is replaced."""
     section = msgspec.to_builtins(mqtt)
-    listen, accounts = section.pop("listen"), section["password_file"]
+    listen, accounts = section.pop("listen"), section.pop("account")
     if mqtt.broker == "external":
         return [("mqtt", "mqtt", section)]
-    broker = {"broker": mqtt.broker, "listen": listen, "password_file": accounts, "tls": section["tls"]}
+    node = section["sparkplug"]
+    broker = {
+        "listen": listen,
+        "account": accounts,
+        "sparkplug": node and {key: node[key] for key in ("group", "node")},
+    }
+    broker |= {key: section[key] for key in ("broker", "password_file", "tls", "prefix")}
     bridge = section | {"password_file": None, "tls": None}
     return [(BROKER, "mqtt", broker), ("mqtt", "mqtt", bridge)]
 

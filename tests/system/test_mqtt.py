@@ -23,7 +23,9 @@ MQTT = """
 listen = "{broker}"
 prefix = "shmio/test"
 """
+EVERYBODY = '[[mqtt.account]]\nroles = ["read", "write"]\n'
 SOURCE = 'connector = "s7"\n'
+WHO = (("anna", "secret"), ("bert", "hidden"))
 REBIRTH = Payload(metrics=[Metric(name="Node Control/Rebirth", boolean_value=True)]).SerializeToString()
 
 
@@ -47,7 +49,7 @@ def counts(listener: Listener, topic: str, count: int) -> None:
 
 
 def test_clients_see_and_drive_the_cell(make_cell: Callable[..., Cell], broker: Address, program: str) -> None:
-    with running(make_cell, broker, more=f'broker = "{program}"\n') as cell:
+    with running(make_cell, broker, more=f'broker = "{program}"\n{EVERYBODY}') as cell:
         assert cell.status()["state"] == "running", cell.logs()
         with listening(broker, protocol=4) as listener:
             counts(listener, "cell/Robot_800/Axs1_Pos/out", 10)
@@ -85,7 +87,9 @@ def test_a_killed_edge_node_leaves_its_will_and_is_born_again(make_cell: Callabl
     def session(payload: Payload) -> int:
         return next(metric.long_value for metric in payload.metrics if metric.name == "bdSeq")
 
-    more = '[[mqtt.topic]]\nmatch = "**"\npublish = false\n[mqtt.sparkplug]\ngroup = "plant"\nnode = "a50"\n'
+    more = (
+        EVERYBODY + '[[mqtt.topic]]\nmatch = "**"\npublish = false\n[mqtt.sparkplug]\ngroup = "plant"\nnode = "a50"\n'
+    )
     with running(make_cell, broker, more=more) as cell, listening(broker, "spBv1.0/#") as listener:
         names = {}
         listener.client.publish("spBv1.0/plant/NCMD/a50", REBIRTH, 0)
@@ -101,27 +105,59 @@ def test_a_killed_edge_node_leaves_its_will_and_is_born_again(make_cell: Callabl
         told(listener, "NDEATH/a50")
 
 
-def test_accounts_let_in_who_has_one(
+def test_accounts_do_what_their_roles_allow(
     make_cell: Callable[..., Cell], broker: Address, program: str, tmp_path: Path
 ) -> None:
-    (tmp_path / "accounts").write_text("anna:secret\n")
+    (tmp_path / "accounts").write_text("anna:secret\nbert:hidden\n")
     (tmp_path / "accounts").chmod(0o600)
-    with running(make_cell, broker, more=f'broker = "{program}"\npassword_file = "accounts"\n'):
-        with listening(broker, protocol=4, username="anna", password="secret") as listener:
+    more = f'broker = "{program}"\npassword_file = "accounts"\n{EVERYBODY}name = "bert"\n'
+    viewer, writer = (dict(zip(("username", "password"), one, strict=True)) for one in WHO)
+    with running(make_cell, broker, more=more) as cell:
+        with (
+            listening(broker, protocol=4, **viewer) as listener,
+            listening(broker, "none", protocol=4, **viewer) as forger,
+            listening(broker, "none", protocol=4, **writer) as operator,
+        ):
             counts(listener, "cell/Robot_800/Axs1_Pos/out", 3)
+            for topic in (
+                "cell/Outputs/13/in",
+                "cell/Outputs/out",
+                "cell/status",
+                "status",
+                "cell/Outputs/13/in/result",
+            ):
+                forger.publish(topic, "999", retain=True)
+            operator.publish("cell/Outputs/13/in", "1")
+            assert listener.json("cell/Outputs/13/in/result")["done"]
+            while not any(json.loads(value)[13] == 1 for value in listener.values("cell/Outputs/out")):
+                listener.message()
+            assert b"999" not in [payload for _, payload in listener.heard]
+        client_id = f"shmio-{cell.instance}"
+        for taken in (client_id, f"{client_id}-commands"):
+            assert connected(broker, taken, **viewer) == 0
+        with (
+            listening(broker, protocol=4, **viewer) as listener,
+            listening(broker, "none", protocol=4, **writer) as operator,
+        ):
+            operator.publish("cell/Outputs/13/in", "0")
+            assert listener.json("cell/Outputs/13/in/result")["done"]
+            counts(listener, "cell/Robot_800/Axs1_Pos/out", 3)
+            assert b"999" not in [payload for _, payload in listener.heard]
+        assert cell.processes()["mqtt"]["counters"]["connects"] == 1
         for account in ({}, {"username": "anna", "password": "guess"}):
-            assert refused(broker, **account)
+            assert connected(broker, "me", **account) in (4, 5)
 
 
-def refused(broker: Address, **account: str) -> bool:
-    """Whether the broker refuses a client, by MQTT 3.1.1's code for that."""
-    who = b"".join(len(text).to_bytes(2, "big") + text.encode() for text in ("me", *account.values()))
+def connected(broker: Address, client_id: str, **account: str) -> int:
+    """What the broker says to a client, by MQTT 3.1.1; 0: it is let in."""
+    who = b"".join(len(text).to_bytes(2, "big") + text.encode() for text in (client_id, *account.values()))
     flags = 0xC2 if account else 2
     variable = b"\0\x04MQTT\x04" + bytes([flags]) + b"\0\x3c" + who
     with socket.create_connection((broker.host, broker.port), timeout=30) as client:
         client.sendall(bytes([0x10, len(variable)]) + variable)
         answer = client.recv(4)
-    return answer[:3] == b"\x20\x02\x00" and answer[3] in (4, 5)
+    assert answer[:3] == b"\x20\x02\x00"
+    return answer[3]
 
 
 def test_a_port_that_is_taken_is_told_before_anything_starts(make_cell: Callable[..., Cell], broker: Address) -> None:

@@ -33,7 +33,11 @@ def folder(tmp_path: Path, instance: str, broker: Address) -> Iterator[Path]:
         file = tmp_path / "examples/two-cells" / cell / "supervisor.toml"
         text = file.read_text()
         assert text.count("127.0.0.1:1883") == text.count(f'name = "{cell}"') == 1
-        file.write_text(text.replace("127.0.0.1:1883", str(broker)).replace(f'"{cell}"', f'"{instance}-{cell}"'))
+        file.write_text(
+            text.replace("127.0.0.1:1883", str(broker))
+            .replace(f'"{cell}"', f'"{instance}-{cell}"')
+            .replace("+/south", f"+/{instance}-south")
+        )
     yield tmp_path
     for cell in CELLS:
         shell(f"shmio-supervisor down -c examples/two-cells/{cell}/supervisor.toml", tmp_path)

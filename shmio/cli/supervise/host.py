@@ -39,7 +39,10 @@ def _check_mqtt(mqtt: Mqtt) -> None:
     if mqtt.tls:
         (client_context if external else server_context)(mqtt.tls)
     if mqtt.password_file:
-        (read_password if external else read_accounts)(mqtt.password_file)
+        if external:
+            read_password(mqtt.password_file)
+        else:
+            read_accounts(mqtt.password_file, mqtt.account)
     if mqtt.broker == "mosquitto":
         from shmio.endpoints.mqtt import mosquitto  # noqa: PLC0415
 

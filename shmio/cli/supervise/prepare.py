@@ -17,7 +17,8 @@ from shmio.cli.supervise.ports import check_listening
 from shmio.cli.supervise.recordings import Recordings
 from shmio.cli.supervise.replaying import replayed
 from shmio.cli.supervise.sources import check_sources
-from shmio.config import Address, Config, Emulator, Source, load
+from shmio.config import Address, Config, Emulator, Mqtt, Source, load
+from shmio.config.accounts import read_accounts
 from shmio.config.wording import named
 from shmio.errors import ConfigError, PathError
 from shmio.layout.glob import Glob
@@ -213,9 +214,8 @@ def _odd(config: Config, layouts: dict[str, Layout]) -> list[str]:
 def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
     """Patterns of ``[mqtt]`` that name nothing, and a broker open to all. ConfigError: a pattern that is none."""
     mqtt = config.mqtt
-    asked = mqtt and (mqtt.password_file or (mqtt.tls and mqtt.tls.ca))
-    if mqtt and mqtt.listen and not asked and not Address.parse(mqtt.listen).loopback:
-        yield f"mqtt.listen: whoever reaches {mqtt.listen} may publish commands, too: add a password_file"
+    if mqtt and mqtt.listen:
+        yield from _odd_accounts(mqtt, Address.parse(mqtt.listen))
     for key, pattern, frames in _topics(config):
         if frames:
             if pattern not in layouts:
@@ -237,6 +237,21 @@ def _check_part(path: str, layouts: dict[str, Layout]) -> None:
     """PathError: no such bit, slice or other part."""
     topic = parse_topic(path, layouts, None)
     look_up(layouts[topic.source], topic)
+
+
+def _odd_accounts(mqtt: Mqtt, address: Address) -> Iterator[str]:
+    """Who may do more, or less, at our own broker than may be meant."""
+    free = any(account.name is None and "write" in account.roles for account in mqtt.account)
+    shown = mqtt.tls is not None and mqtt.tls.ca is not None
+    if free and (mqtt.password_file or not (address.loopback or shown)):
+        yield (
+            f"mqtt.listen: whoever reaches {mqtt.listen} may publish commands, also without an account: have a "
+            "password_file, and a name in each [[mqtt.account]] with the role write"
+        )
+    if mqtt.password_file:
+        named = {account.name for account in mqtt.account}
+        if others := ", ".join(name for name in read_accounts(mqtt.password_file) if name not in named):
+            yield f"mqtt.password_file: {others} may read alone: [[mqtt.account]] gives it the role write"
 
 
 def _odd_recorder(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:

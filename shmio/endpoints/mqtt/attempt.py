@@ -17,8 +17,10 @@ from paho.mqtt.properties import Properties
 
 from shmio.config.accounts import read_password
 from shmio.config.mqtttls import client_context
+from shmio.endpoints.mqtt.access import BRIDGE, secret_id
 from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.failure import ended, why
+from shmio.endpoints.mqtt.place import secret_of
 from shmio.endpoints.mqtt.target import Dialling
 from shmio.errors import ConfigError
 
@@ -109,10 +111,12 @@ class Attempt:
     def _connect(self) -> None:
         """ConfigError: a file that is needed for it will not do."""
         settings, target, new = self._dialling.settings, self.target, self._protocol == MQTTv5
+        own = secret_of(target.host) if target.transport == "unix" else None
+        client_id = self._dialling.client_id
         # A client of its own for each attempt: what one has not got rid of is none of the next one's business.
         client = self.client = (BrokerClient if settings.tls is None else _TlsClient)(
             CallbackAPIVersion.VERSION2,
-            self._dialling.client_id,
+            client_id if own is None else secret_id(client_id, own),
             clean_session=None if new else not settings.session_expiry_s,
             protocol=self._protocol,
             transport=target.transport,
@@ -122,7 +126,9 @@ class Attempt:
         client.max_inflight_messages_set(0)  # we count them ourselves
         if self._will is not None:
             client.will_set(self._will.topic, self._will.payload, self._will.qos, self._will.retain)
-        if settings.broker == "external":
+        if own is not None:
+            client.username_pw_set(BRIDGE, own)
+        else:
             if settings.username is not None:
                 password = read_password(settings.password_file) if settings.password_file else None
                 client.username_pw_set(settings.username, password)

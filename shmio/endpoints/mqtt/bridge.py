@@ -16,12 +16,13 @@ import msgspec
 from paho.mqtt.client import MQTTMessage
 
 from shmio.config import Mqtt
-from shmio.endpoints.mqtt.channel import Gone, Message, status
-from shmio.endpoints.mqtt.commands import OUTPUTS, Commands, filters, outputs
+from shmio.endpoints.mqtt.channel import Channel, Gone, Message, Presence, status
+from shmio.endpoints.mqtt.commands import OUTPUTS, Commands, answers, filters, outputs
 from shmio.endpoints.mqtt.feed import Feed
+from shmio.endpoints.mqtt.guard import MOST_WAITING, Guard
 from shmio.endpoints.mqtt.intake import Intake
 from shmio.endpoints.mqtt.limits import MOST_IN_FLIGHT
-from shmio.endpoints.mqtt.link import Link
+from shmio.endpoints.mqtt.link import Link, is_watched
 from shmio.endpoints.mqtt.outbox import Outbox
 from shmio.endpoints.mqtt.place import own_socket
 from shmio.endpoints.mqtt.rules import Rules
@@ -29,10 +30,10 @@ from shmio.endpoints.mqtt.sparkplug.device import Device
 from shmio.endpoints.mqtt.sparkplug.session import Session
 from shmio.endpoints.mqtt.steps import Steps
 from shmio.endpoints.mqtt.target import Dialling, targets
+from shmio.layout.topic import shorten
 from shmio.segment import ProcessSlot, Quality, Segment
 from shmio.segment.relay import TURN_NS, Relay
 
-ONLINE: Final = b"online"
 OFFLINE: Final = b"offline"
 STOPPED: Final = "the bridge was stopped"
 LEAVE_S: Final = 2.0
@@ -57,7 +58,10 @@ class Bridge:
         self._wakeup = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._selector.register(self._wakeup, selectors.EVENT_READ, lambda _: os.eventfd_read(self._wakeup))
         client_id = settings.client_id or f"shmio-{segment.instance}"
-        self._status = f"{self.prefix}/status"
+        self._presence = Presence(f"{self.prefix}/status")
+        self._channels: dict[str, Channel] = {self._presence.topic: self._presence}
+        """All that is published now, by topic."""
+        self._guard = Guard(self)
         self._feeds: dict[str, Feed] = {}
         self._relays: dict[int, Relay] = {}
         self._gone: dict[str, Gone] = {}
@@ -67,7 +71,7 @@ class Bridge:
             Dialling(clean, client_id, there),
             self._selector,
             self.wake,
-            lambda: Message(self._status, OFFLINE, 1, True),
+            lambda: Message(self._presence.topic, OFFLINE, 1, True),
             MOST_IN_FLIGHT,
         )
         self.intake = Intake(
@@ -76,11 +80,12 @@ class Bridge:
             self._selector,
             self.wake,
             lambda: filters(self.prefix, self._feeds.values()),
+            lambda: answers(self.prefix, self._feeds.values()),
         )
         self.outbox = Outbox(self.link, self.intake.link, round(settings.backlog_mb * 1e6))
         self._commands = Commands(self.prefix, self._rules, self._feeds, self.outbox.answer)
-        self.intake.link.on_message = self._commands.take
-        self.link.on_message = self._recall
+        self.intake.link.on_message = self._command
+        self.link.on_message = self._hear
         self.link.on_lost = self.outbox.lose
         self.link.admit = lambda: self.intake.settled  # who is told that we are there may send commands at once
         self._recalled: frozenset[str] | None = None
@@ -139,6 +144,7 @@ class Bridge:
         due_s = [TURN_S, *self._settle()]
         self.outbox.flush()
         due_s.append(self._link_turn())
+        due_s.append(self._guard.turn())
         if self._sparkplug is not None:
             due_s.append(self._sparkplug.turn())
         self._rest_s = 0.0 if self._more or self.outbox.able else min(due_s)
@@ -164,13 +170,72 @@ class Bridge:
 
     def _greet(self) -> None:
         """A connection was made: tell that we are there, what was kept, and how everything is now."""
-        self.link.send(Message(self._status, ONLINE, 1, True))
+        self.link.send(self._presence.message())
         if self._recalled is None:
-            self._recalled = frozenset(channel.topic for feed in self._feeds.values() for channel in feed.all())
+            self._recalled = frozenset(self._channels)
             self.link.recall(outputs(self.prefix, self._feeds.values()))
+        self._guard.begin()
         for feed in self._feeds.values():
             feed.show()
         self.outbox.show(self._gone.values())
+
+    # ---- what others publish on our topics ---------------------------------------------------------------------------
+
+    def watch(self) -> None:
+        """Hear it."""
+        self.link.watch(self._own)
+        self.intake.watch()
+
+    def unwatch(self) -> None:
+        """Hear it no more."""
+        self.link.unwatch(self._own)
+        self.intake.unwatch()
+
+    @property
+    def _own(self) -> list[str]:
+        feeds = self._feeds.values()
+        states = [self._presence.topic, f"{self.prefix}/simlog/step", *(feed.status.topic for feed in feeds)]
+        return [*states, *outputs(self.prefix, feeds)]
+
+    def correct(self, topic: str) -> None:
+        """Tell what is so on one, or that there is nothing."""
+        log.warning(
+            "another client publishes on %s, which is ours: it is told again; let no other account publish there, and "
+            "no other bridge have this prefix",
+            shorten(topic),
+        )
+        if (channel := self._channels.get(topic)) is not None:
+            self.outbox.mark(channel)
+        elif self.outbox.waiting < MOST_WAITING:
+            self.outbox.mark(Gone(topic))
+
+    def correct_all(self) -> None:
+        """Tell everything again."""
+        self.outbox.mark(self._presence)
+        for feed in self._feeds.values():
+            feed.show()
+
+    def _hear(self, message: MQTTMessage) -> None:
+        if is_watched(message):
+            self._forged(message)
+        else:
+            self._recall(message)
+
+    def _command(self, message: MQTTMessage) -> None:
+        if is_watched(message):
+            self._forged(message)
+        else:
+            self._commands.take(message)
+
+    def _forged(self, message: MQTTMessage) -> None:
+        with suppress(UnicodeDecodeError):
+            channel = self._channels.get(message.topic)
+            if channel is None:
+                wrong = bool(message.retain and message.payload)
+            else:  # brokers that hand each other's messages back tell us what we have told
+                wrong = channel.message().payload != message.payload
+            if wrong:
+                self._guard.hear(message.topic)
 
     def _recall(self, message: MQTTMessage) -> None:
         """What a bridge before this one has left, by other rules: nobody would ever tell it is old."""
@@ -229,6 +294,7 @@ class Bridge:
                 self._leave(before, feed)
             self._feeds[feed.block.source] = feed
             for channel in feed.all():
+                self._channels[channel.topic] = channel
                 self._gone.pop(channel.topic, None)
             if device is not None and self._sparkplug is not None:
                 self._sparkplug.adopt(device)
@@ -243,6 +309,8 @@ class Bridge:
         self._more.discard(feed)
         stay = set() if successor is None else {channel.topic for channel in successor.all()}
         self.outbox.forget(feed.all())
+        for channel in feed.all():
+            self._channels.pop(channel.topic, None)
         gone = {channel.topic: Gone(channel.topic) for channel in feed.all() if channel.topic not in stay}
         self._gone |= gone  # told again with each connection: the broker may be away
         self.outbox.mark_all(gone.values())
@@ -263,7 +331,7 @@ class Bridge:
         self._drain(until_s, lambda: not self.outbox.busy)
         for feed in self._feeds.values():
             self.link.send(status(feed.status.topic, Quality.BAD, STOPPED, feed.missed))
-        self.link.send(Message(self._status, OFFLINE, 1, True))
+        self.link.send(Message(self._presence.topic, OFFLINE, 1, True))
         self.link.push()
         self._drain(until_s, lambda: not (self.link.in_flight or self.intake.link.in_flight))
         self.intake.link.close()

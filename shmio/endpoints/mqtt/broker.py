@@ -26,7 +26,7 @@ def run(worker: Worker) -> None:
     prepare(place)
     try:
         if program is not None:
-            _run(worker, mosquitto.Mosquitto(program, settings, place), settings)
+            _run(worker, mosquitto.Mosquitto(program, settings, worker.segment.instance, place), settings)
         else:
             log.info("no mosquitto on this machine: aMQTT on %s", settings.listen)
             from shmio.endpoints.mqtt import builtin  # noqa: PLC0415  a large library, for those who need it

@@ -18,10 +18,11 @@ from amqtt.session import Session
 from shmio.config import Address, Mqtt
 from shmio.config.accounts import matches, read_accounts
 from shmio.config.mqtttls import server_context
+from shmio.endpoints.mqtt.access import BRIDGE, EVERYTHING, Guest, Rights, new_secret, rights
 from shmio.endpoints.mqtt.hub import Hub
 from shmio.endpoints.mqtt.place import SOCKET
 from shmio.endpoints.mqtt.shares import MAX_CONNECTIONS, Refusals
-from shmio.endpoints.mqtt.streams import BRIDGE, BridgesWriter, Reader, Writer, greeted
+from shmio.endpoints.mqtt.streams import PEER, BridgesWriter, Reader, Writer, greeted
 from shmio.errors import EndpointError
 from shmio.worker import BEAT_S, Worker
 
@@ -33,7 +34,7 @@ _NOT_AUTHORIZED: Final = b"\x20\x02\x00\x05"
 
 
 class Everybody(BaseAuthPlugin):  # type: ignore[misc]  # the library's classes have no types
-    """Admits everybody: who has no account does not come so far."""
+    """Admits everybody: who may not come in does not come so far."""
 
     async def authenticate(self, *, session: Session) -> bool:  # noqa: ARG002  the library gives it
         """True."""
@@ -42,7 +43,8 @@ class Everybody(BaseAuthPlugin):  # type: ignore[misc]  # the library's classes 
 
 async def serve(worker: Worker, settings: Mqtt, place: Path) -> None:
     """Be the broker until told to stop. EndpointError: the address cannot be listened on; ConfigError."""
-    accounts = read_accounts(settings.password_file) if settings.password_file else None
+    accounts = read_accounts(settings.password_file, settings.account) if settings.password_file else None
+    given = rights(settings, worker.segment.instance, accounts)
     logging.getLogger("amqtt").setLevel(logging.ERROR)
     logging.getLogger("transitions").setLevel(logging.ERROR)
     refusals = Refusals()
@@ -56,7 +58,7 @@ async def serve(worker: Worker, settings: Mqtt, place: Path) -> None:
     await broker.start()
     address = Address.parse(str(settings.listen))
     context = server_context(settings.tls) if settings.tls else None
-    connections = _Connections(broker, accounts, refusals)
+    connections = _Connections(broker, accounts, given, {BRIDGE: new_secret(place)}, refusals)
     servers: list[asyncio.Server] = []
     try:
         servers.append(await asyncio.start_unix_server(connections.take_bridge, place / SOCKET))
@@ -87,14 +89,26 @@ async def _listen(connections: _Connections, address: Address, context: ssl.SSLC
 class _Connections:
     """Gives the broker who connects, as many at once as there may be."""
 
-    def __init__(self, broker: Hub, accounts: Mapping[str, str] | None, refusals: Refusals) -> None:
-        """``accounts``: names and hashes of who may come by the address; None: anybody."""
-        self._broker, self._accounts, self._refusals = broker, accounts, refusals
+    def __init__(
+        self,
+        broker: Hub,
+        accounts: Mapping[str, str] | None,
+        given: Mapping[str | None, Rights],
+        bridge: Mapping[str, str],
+        refusals: Refusals,
+    ) -> None:
+        """``accounts``: names and hashes of who may come by the address, None: anybody; ``given``: what they may do.
+
+        ``bridge``: the account that comes by the UNIX socket.
+        """
+        self._broker, self._refusals = broker, refusals
+        self._guests = _Door(accounts, given)
+        self._bridge = _Door(bridge, {BRIDGE: EVERYTHING})
         self._open: set[StreamWriter] = set()
 
     async def take_bridge(self, reader: StreamReader, writer: StreamWriter) -> None:
         """Of the UNIX socket."""
-        await self._serve(reader, writer, BridgesWriter(writer, self._open, BRIDGE, self._refusals), None)
+        await self._serve(reader, writer, BridgesWriter(writer, self._open, PEER, self._refusals), self._bridge)
 
     async def take(self, reader: StreamReader, writer: StreamWriter) -> None:
         """Of the address."""
@@ -106,20 +120,21 @@ class _Connections:
             return
         self._open.add(writer)
         try:
-            await self._serve(reader, writer, Writer(writer, self._open, client, self._refusals), self._accounts)
+            await self._serve(reader, writer, Writer(writer, self._open, client, self._refusals), self._guests)
         finally:
             self._open.discard(writer)
 
-    async def _serve(
-        self, reader: StreamReader, writer: StreamWriter, adapter: Writer, accounts: Mapping[str, str] | None
-    ) -> None:
+    async def _serve(self, reader: StreamReader, writer: StreamWriter, adapter: Writer, door: _Door) -> None:
         try:
             begun = await asyncio.wait_for(greeted(reader, writer), GREETING_S)
             # Before the library sees it: that would end whoever has the client's name, and only then ask who it is.
-            if begun is not None and accounts is not None and not await _is_known(begun, accounts):
+            guest = None if begun is None else await door.ask(begun)
+            if begun is None:
+                return
+            if guest is None or not self._broker.lets(guest):
                 writer.write(_NOT_AUTHORIZED)
-            elif begun is not None:
-                taken = Reader(reader, begun, adapter.client, self._refusals)
+            else:
+                taken = Reader(reader, begun, adapter.client, self._refusals, guest)
                 await self._broker.external_connected(taken, adapter, _LISTENER)
         except (OSError, TimeoutError, asyncio.IncompleteReadError):
             pass  # it is gone, or speaks something else
@@ -127,12 +142,23 @@ class _Connections:
             writer.close()
 
 
-async def _is_known(connect: bytes, accounts: Mapping[str, str]) -> bool:
-    """Whether a CONNECT has the name and the password of an account."""
-    try:
-        packet = await ConnectPacket.from_stream(BufferReader(connect))
-        name, password = packet.username or "", packet.password or ""
-    except Exception:  # noqa: BLE001 - whatever the library makes of garbage, it is nobody's account
-        return False
-    secret = accounts.get(name)
-    return secret is not None and await asyncio.to_thread(matches, password, secret)
+class _Door:
+    """Asks who connects by one way."""
+
+    def __init__(self, accounts: Mapping[str, str] | None, given: Mapping[str | None, Rights]) -> None:
+        self._accounts, self._given = accounts, given
+
+    async def ask(self, connect: bytes) -> Guest | None:
+        """Who has sent a CONNECT; None: nobody who is let in."""
+        try:
+            packet = await ConnectPacket.from_stream(BufferReader(connect))
+            client_id, name, password = packet.client_id or "", packet.username, packet.password or ""
+        except Exception:  # noqa: BLE001 - whatever the library makes of garbage, it shows no account
+            client_id, name, password = "", None, ""
+        if self._accounts is None:
+            name = None  # it is not asked whose
+        if name is not None:
+            secret = (self._accounts or {}).get(name)
+            if secret is None or not await asyncio.to_thread(matches, password, secret):
+                return None
+        return Guest(name, client_id, self._given[name]) if name in self._given else None

@@ -14,6 +14,7 @@ from shmio.layout.text import json_value, texts
 from shmio.segment import Block, Frame, Quality
 from shmio.segment.view import holds_none, reading
 
+ONLINE: Final = b"online"
 NUMBERS: Final = (int, float)
 
 
@@ -152,6 +153,17 @@ class StatusChannel:
         """As of now."""
         frame, quality, reason = self._showing.shown
         return status(self.topic, quality, reason, self._showing.missed, frame)
+
+
+class Presence:
+    """Whether the bridge is there: it is, if it says anything."""
+
+    def __init__(self, topic: str) -> None:
+        self.topic = topic
+
+    def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  see StatusChannel
+        """It is."""
+        return Message(self.topic, ONLINE, 1, retain=True)
 
 
 class Gone:

@@ -17,7 +17,7 @@ from shmio.endpoints.mqtt.rules import Rules
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.text import MAX_TEXT, from_text
-from shmio.layout.topic import look_up, parse_topic
+from shmio.layout.topic import look_up, parse_topic, shorten
 from shmio.segment import DONE, EventKind
 
 REPLIES: Final = "shmio/results"
@@ -46,6 +46,11 @@ def outputs(prefix: str, feeds: Iterable[Feed]) -> list[str]:
     return deep + [f"{prefix}/{feed.block.source}/frames" for feed in feeds]
 
 
+def answers(prefix: str, feeds: Iterable[Feed]) -> list[str]:
+    """Where results go."""
+    return [f"{one}/result" for one in filters(prefix, feeds)] + [f"{prefix}/{REPLIES}/#"]
+
+
 class Commands:
     """For the bridge's thread."""
 
@@ -71,11 +76,11 @@ class Commands:
         tell = _Reply(self._prefix, topic, message, self._answer)
         if message.retain:  # it may have been there before we were: nobody knows how old it is
             self.refused += 1
-            log.warning("%s: %s", topic, RETAINED)
             tell(EventKind.REJECTED, RETAINED)
             return
         try:
             feed, register = self._find(topic.removeprefix(f"{self._prefix}/"))
+            feed.inlet.check(register)  # before its value is read: another one would not do either
             value = _value(bytes(message.payload), register, json=self._is_json(feed, register))
             feed.inlet.send(register, value, tell)
         except (CommandError, PathError, ValueRangeError) as error:
@@ -97,6 +102,7 @@ class _Reply:
     """Tells what became of one command, once."""
 
     def __init__(self, prefix: str, topic: str, message: MQTTMessage, answer: Answer) -> None:
+        self._command = topic
         self._topic = f"{topic}/result"
         self._qos = min(1, message.qos)
         self._answer = answer
@@ -107,6 +113,9 @@ class _Reply:
             self._topic = wanted
 
     def __call__(self, kind: EventKind, reason: str) -> None:
+        if kind not in DONE:  # who it was MQTT does not say, at most where the client wants to hear of it
+            asked = "" if self._topic == f"{self._command}/result" else f", for {shorten(self._topic)}"
+            log.warning("command on %s%s: %s: %s", shorten(self._command, 400), asked, kind, reason)
         payload = msgspec.json.encode({"outcome": str(kind), "done": kind in DONE, "reason": reason})
         properties = None
         if self._correlation is not None and len(self._correlation) <= MAX_CORRELATION_BYTES:

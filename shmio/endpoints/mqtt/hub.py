@@ -8,11 +8,12 @@ from collections.abc import Iterator
 from functools import partial
 from typing import Any, Final
 
-from amqtt.broker import Broker
+from amqtt.broker import Action, Broker
 from amqtt.session import Session
 
+from shmio.endpoints.mqtt.access import Guest
 from shmio.endpoints.mqtt.shares import Bound, Exchanges, Refusals, Retained, Waiting
-from shmio.endpoints.mqtt.streams import BRIDGE, Reader, Writer
+from shmio.endpoints.mqtt.streams import PEER, Reader, Writer
 from shmio.layout.checks import brief
 
 MAX_UNHANDLED: Final = 64
@@ -39,6 +40,9 @@ NOT_SUBSCRIBED: Final = "client %s: a subscription is refused, for it has too ma
 NOT_KEPT: Final = (
     "client %s: its session is not kept while it is away, for too many are; have it connect with a clean session"
 )
+NOT_ALLOWED: Final = "client %s publishes where it may not: give its account the role write, or topics (mqtt.account)"
+OTHERS: Final = "client %s is refused: a client of another account is called so; give each one a name of its own"
+GUEST: Final = "shmio.guest"
 _REFUSED: Final = 0x80
 """Of a SUBACK."""
 
@@ -67,8 +71,11 @@ class Hub(Broker):  # type: ignore[misc]  # the library's classes have no types
             client_session.inflight_in = Exchanges()
             client_session.delivered_message_queue, client_session.retained_messages = Waiting(), Waiting()
         client_session.inflight_in.connected()
+        client_session.attributes[GUEST] = reader.guest
         handler._pending_subscriptions, handler._pending_unsubscriptions = Waiting(), Waiting()
         reader.client = writer.client = _name(client_session)
+        if client_session.will_flag and not self._may_publish(client_session, client_session.will_topic):
+            client_session.will_flag = False
         reader.on_packet = partial(_count, client_session.inflight_in)
         reader.admit = partial(self._admit, reader, client_session, handler)
         try:
@@ -104,6 +111,28 @@ class Hub(Broker):  # type: ignore[misc]  # the library's classes have no types
             self._refusals.tell(NOT_KEPT, _name(session))
             await self._delete_session(name)
 
+    # ---- who may do what ---------------------------------------------------------------------------------------------
+
+    def lets(self, guest: Guest) -> bool:
+        """Whether who connects may have the client id that he shows: it is nobody's of another account."""
+        session = self._sessions.get(guest.client_id, (None, None))[0]
+        if session is None or session.attributes[GUEST].account == guest.account:
+            return True
+        self._refusals.tell(OTHERS, brief(guest.client_id))
+        return False
+
+    async def _topic_filtering(self, session: Session, topic: str, action: Action) -> bool:
+        if action is Action.PUBLISH:
+            return self._may_publish(session, topic)
+        allowed: bool = session.attributes[GUEST].rights.read
+        return allowed
+
+    def _may_publish(self, session: Session, topic: str) -> bool:
+        allowed: bool = session.attributes[GUEST].rights.may_publish(topic)
+        if not allowed:
+            self._refusals.tell(NOT_ALLOWED, _name(session))
+        return allowed
+
     # ---- what is kept for clients ------------------------------------------------------------------------------------
 
     async def _retain_broadcast_message(self, broadcast: dict[str, Any], qos: int, target_session: Session) -> None:
@@ -125,7 +154,7 @@ class Hub(Broker):  # type: ignore[misc]  # the library's classes have no types
         await super().retain_message(None, topic_name, data, qos)  # who it was would be kept as long as the topic
 
     def _has_room(self, session: Session, topic: str, size: int) -> bool:
-        return session.remote_address == BRIDGE or self._owners.keep(topic, session.client_id, size)
+        return session.remote_address == PEER or self._owners.keep(topic, session.client_id, size)
 
     # ---- subscriptions -----------------------------------------------------------------------------------------------
 

@@ -27,6 +27,10 @@ class Inlet:
         self._pending = Pendings(writer)
         self._events = block.events.cursor()
 
+    def check(self, register: Register) -> None:
+        """CommandError: it is not writable, whatever the value."""
+        self._commander.check(register)
+
     def send(self, register: Register, value: object, done: Done) -> None:
         """Send a value of a register, an array or an element. CommandError, ValueRangeError: it was not sent."""
         cost = Cost.of(sizes(register))

@@ -27,12 +27,16 @@ class Intake:
         selector: selectors.BaseSelector,
         wake: Callable[[], object],
         filters: Callable[[], Sequence[str]],
+        answers: Callable[[], Sequence[str]],
     ) -> None:
-        """``selector``, ``wake``: as of :class:`Link`; ``filters``: what is to be subscribed to at present."""
+        """``selector``, ``wake``: as of :class:`Link`; ``filters``: what is to be subscribed to at present.
+
+        ``answers``: where results go.
+        """
         self._dialling = Dialling(settings, client_id, ())
         self.link = Link(self._dialling, selector, wake, lambda: None, FEW_IN_FLIGHT)
         self.link.close()
-        self._filters = filters
+        self._filters, self._answers = filters, answers
         self._at: Target | None = None
         self._until_s = 0.0
         """When the broker must have answered to what was subscribed to."""
@@ -70,5 +74,14 @@ class Intake:
         """Have commands sent for all that there is now."""
         if self.link.up:
             self.link.subscribe(self._filters())
+            self.watch()
             self.link.push()
             self._until_s = time.monotonic() + CONNECT_S
+
+    def watch(self) -> None:
+        """Hear what others publish where results go."""
+        self.link.watch(self._answers())
+
+    def unwatch(self) -> None:
+        """Hear it no more."""
+        self.link.unwatch(self._answers())

@@ -24,6 +24,8 @@ class Limits(NamedTuple):
     packet_bytes: int | None = None
     qos: int = 1
     retain: bool = True
+    identifiers: bool = True
+    """Whether a subscription may have a number, which what comes by it tells."""
 
     @classmethod
     def told(cls, properties: Properties | None, most: int) -> Limits:
@@ -34,6 +36,7 @@ class Limits(NamedTuple):
             told.get("MaximumPacketSize"),
             min(1, told.get("MaximumQoS", 1)),
             bool(told.get("RetainAvailable", 1)),
+            bool(told.get("SubscriptionIdentifierAvailable", 1)),
         )
 
     def fit(self, message: Message) -> bool:

@@ -20,12 +20,23 @@ from shmio.endpoints.mqtt.limits import Limits, subscription
 from shmio.endpoints.mqtt.pump import Pump
 from shmio.endpoints.mqtt.target import Dialling, Target
 from shmio.endpoints.mqtt.writing import BATCH
+from shmio.layout.topic import shorten
 
 STABLE_S: Final = 5.0
 """Who was connected so long has put his failures behind him."""
+MOST_TOLD: Final = 300
+"""Characters of what is wrong with all brokers."""
 WITH_WILL: Final = "Disconnect with will message"
 
+_WATCHED: Final = 1
+"""The number of the subscription to our own topics."""
+
 log = logging.getLogger("shmio.mqtt")
+
+
+def is_watched(message: MQTTMessage) -> bool:
+    """Whether it is somebody else's, on one of our own topics."""
+    return _WATCHED in (vars(message.properties) if message.properties else {}).get("SubscriptionIdentifier", ())
 
 
 class Link:
@@ -57,6 +68,8 @@ class Link:
         self._client: BrokerClient | None = None
         self._pump: Pump | None = None
         self._target: Target | None = None
+        self._faults: dict[Target | None, str] = {}
+        """What was wrong with each broker that was tried since the last connection."""
         self._attempt: Attempt | None = None
         self._protocol = MQTTv5
         self._until_s: float | None = None
@@ -116,6 +129,7 @@ class Link:
         else:
             if not self.up and self.admit():
                 self.complaints.clear()
+                self._faults.clear()
                 self.up, self.came_up, self._up_s = True, True, now_s
                 self.connects += 1
             if now_s >= self._misc_s:
@@ -222,7 +236,9 @@ class Link:
     def _fail(self, problem: str) -> None:
         self._close()
         self._protocol = MQTTv5
-        self.complaints.say(problem)
+        # Of each broker the last one: who looks at the status wants to know about all that are tried in turn.
+        self._faults[self._target] = problem
+        self.complaints.say(shorten("; ".join(self._faults[one] for one in sorted(self._faults, key=str)), MOST_TOLD))
         self._retry_s = time.monotonic() + self._dialling.wait_s()
 
     def _close(self) -> None:
@@ -272,6 +288,20 @@ class Link:
         _, mid = client.subscribe([(one, options) for one in filters])
         self._needed = self._needed if retained or mid is None else mid
 
+    def watch(self, filters: Sequence[str]) -> None:
+        """Ask for what others publish on our own topics from now on; see :func:`is_watched`. With version 5 alone."""
+        if self._client is None or not (filters and self.mqtt5 and self._limits.identifiers):
+            return  # we would hear ourselves, and could not tell it from what the broker had before
+        properties = Properties(PacketTypes.SUBSCRIBE)  # type: ignore[no-untyped-call]
+        properties.SubscriptionIdentifier = _WATCHED
+        options: Any = subscription(retained=False)
+        self._client.subscribe([(one, options) for one in filters], properties=properties)
+
+    def unwatch(self, filters: Sequence[str]) -> None:
+        """The reverse."""
+        if self._client is not None and filters and self.mqtt5:
+            self._client.unsubscribe(list(filters))
+
     def recall(self, filters: Sequence[str]) -> None:
         """Have what is retained on these sent once."""
         self.subscribe(filters, retained=True)
@@ -282,6 +312,7 @@ class Link:
         """Connect, after :meth:`close`."""
         self._protocol, self._retry_s = MQTTv5, 0.0
         self.complaints.clear()
+        self._faults.clear()
 
     def close(self, *, will: bool = False) -> None:
         """Take leave; what was sent before is on its way. ``will``: have the will published, as far as that can be."""

@@ -11,13 +11,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
 from shmio.config import Address, Mqtt
 from shmio.config.accounts import read_accounts
-from shmio.endpoints.mqtt.place import SOCKET
+from shmio.endpoints.mqtt.access import BRIDGE, ID, Rights, new_secret, rights
+from shmio.endpoints.mqtt.place import SOCKET, write_private
 from shmio.errors import EndpointError
 
 PLACES: Final = ("/usr/local/sbin", "/usr/sbin", "/sbin")
@@ -45,8 +46,8 @@ def find() -> str | None:
     return shutil.which("mosquitto", path=os.pathsep.join([os.environ.get("PATH", os.defpath), *PLACES]))
 
 
-def configuration(settings: Mqtt, place: Path) -> str:
-    """Of a broker whose clients may all publish and subscribe; mosquitto.conf(5)."""
+def configuration(settings: Mqtt, place: Path, *, anonymous: bool) -> str:
+    """mosquitto.conf(5). ``anonymous``: whether who shows no account is let in."""
     address = Address.parse(str(settings.listen))
     lines = [
         "per_listener_settings true",
@@ -60,28 +61,48 @@ def configuration(settings: Mqtt, place: Path) -> str:
         "max_inflight_messages 1000",
         f"listener {address.port} {address.host}",
     ]
+    lines += [f"allow_anonymous {'true' if anonymous else 'false'}", f"acl_file {place / 'rights'}"]
     if settings.password_file:
-        lines += ["allow_anonymous false", f"password_file {place / 'accounts'}"]
-    else:
-        lines.append("allow_anonymous true")
+        lines.append(f"password_file {place / 'accounts'}")
     if tls := settings.tls:
         lines += [f"certfile {tls.certificate}", f"keyfile {tls.key}"]
         if tls.ca:
             lines += [f"cafile {tls.ca}", "require_certificate true"]
     # Ours is the last one: who can connect there knows that the broker listens everywhere.
-    lines += [f"listener 0 {place / SOCKET}", "allow_anonymous true"]
+    lines += [f"listener 0 {place / SOCKET}", "allow_anonymous false"]
+    lines += [f"password_file {place / 'bridge'}", f"acl_file {place / 'bridge-rights'}"]
+    return "".join(f"{line}\n" for line in lines)
+
+
+def access_rules(given: Mapping[str | None, Rights], *, accounts: bool) -> str:
+    """An ACL file. ``accounts``: whether there are any; else a name that a client shows is nobody's, and means nothing.
+
+    What it does not allow is denied, a last will too.
+    """
+    lines = []
+    for name, allowed in sorted(given.items(), key=lambda one: one[0] or ""):  # who shows none comes before all names
+        kind = "topic" if accounts else "pattern"
+        if name is not None:
+            lines.append(f"user {name}")
+        if allowed.read:
+            lines += [f"{kind} read {topics}" for topics in ("#", "$SYS/#")]
+        lines += [f"{kind} write {topics}" for topics in allowed.filters]
     return "".join(f"{line}\n" for line in lines)
 
 
 class Mosquitto:
     """The process. For the main thread: it dies with the thread that starts it."""
 
-    def __init__(self, program: str, settings: Mqtt, place: Path) -> None:
+    def __init__(self, program: str, settings: Mqtt, instance: str, place: Path) -> None:
         """Start it. ConfigError: its accounts cannot be read."""
-        if settings.password_file:
-            accounts = read_accounts(settings.password_file)
-            _write(place / "accounts", "".join(f"{name}:{secret}\n" for name, secret in accounts.items()))
-        _write(place / "mosquitto.conf", configuration(settings, place))
+        accounts = read_accounts(settings.password_file, settings.account) if settings.password_file else None
+        if accounts is not None:
+            write_private(place / "accounts", "".join(f"{name}:{secret}\n" for name, secret in accounts.items()))
+        given = rights(settings, instance, accounts)
+        write_private(place / "rights", access_rules(given, accounts=accounts is not None))
+        write_private(place / "bridge", f"{BRIDGE}:{new_secret(place)}\n")
+        write_private(place / "bridge-rights", f"user {BRIDGE}\ntopic readwrite #\n")
+        write_private(place / "mosquitto.conf", configuration(settings, place, anonymous=None in given))
         self._socket = place / SOCKET
         self._last = ""
         command = [sys.executable, "-P", "-m", "shmio.endpoints.mqtt.tether", str(os.getpid()), program]
@@ -134,11 +155,5 @@ class Mosquitto:
     def _read(self) -> None:
         """Into our log."""
         for line in self._process.stderr or ():
-            self._last = _STAMP.sub("", line.strip())
+            self._last = ID.sub("…", _STAMP.sub("", line.strip()))
             log.info("mosquitto: %s", self._last)
-
-
-def _write(file: Path, text: str) -> None:
-    fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-    with open(fd, "w", encoding="utf-8") as stream:  # noqa: PTH123  a descriptor
-        stream.write(text)

@@ -12,6 +12,9 @@ from shmio.segment import Segment
 SOCKET: Final = "s"
 """So short that its path is no longer than that of the supervisor's socket, which fits where such may be."""
 
+SECRET: Final = "key"  # noqa: S105  a name
+"""The bridge's password."""
+
 
 def folder(segment: Segment) -> Path:
     """Where it is; not made here."""
@@ -21,6 +24,18 @@ def folder(segment: Segment) -> Path:
 def own_socket(segment: Segment) -> str:
     """Where our own broker is reached by us alone."""
     return str(folder(segment) / SOCKET)
+
+
+def secret_of(socket: str) -> str:
+    """The bridge's password at the broker of a socket. FileNotFoundError: the broker does not run."""
+    return Path(socket).with_name(SECRET).read_text(encoding="utf-8")
+
+
+def write_private(file: Path, text: str) -> None:
+    """Make a file, mode 0600, which is not there yet."""
+    fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    with open(fd, "w", encoding="utf-8") as stream:  # noqa: PTH123  a descriptor
+        stream.write(text)
 
 
 def prepare(place: Path) -> None:

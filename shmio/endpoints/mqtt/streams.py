@@ -9,10 +9,11 @@ from typing import Final, NoReturn
 
 from amqtt.adapters import StreamReaderAdapter, StreamWriterAdapter
 
+from shmio.endpoints.mqtt.access import Guest
 from shmio.endpoints.mqtt.mosquitto import MAX_PACKET_BYTES
 from shmio.endpoints.mqtt.shares import Bound, Refusals
 
-BRIDGE: Final = "bridge"
+PEER: Final = "bridge"
 """The address of the UNIX socket's clients, which have none."""
 UNREAD: Final = Bound(8 << 20, 64 << 20)
 """That may wait for clients; for one it is several packets of the largest kind."""
@@ -22,7 +23,9 @@ MAX_FIELDS: Final = 4096
 """Of one packet: each topic that is subscribed to has three."""
 TOO_LARGE: Final = "client %s: a packet is too large, or of too many topics: its connection is ended; send smaller ones"
 TOO_SLOW: Final = "client %s reads too slowly: its connection is ended; have it subscribe to less"
+NO_TOPIC: Final = "client %s publishes on what is no topic: its connection is ended"
 _CONNECT: Final = 0x10
+_PUBLISH: Final = 0x30
 _UNSUPPORTED: Final = b"\x20\x03\x00\x84\x00"
 """MQTT 5.0, section 3.2: a CONNACK that refuses the protocol's version."""
 
@@ -30,9 +33,10 @@ _UNSUPPORTED: Final = b"\x20\x03\x00\x84\x00"
 class Reader(StreamReaderAdapter):  # type: ignore[misc]  # the library's classes have no types
     """Takes no packet that is too large, nor any while too much waits."""
 
-    def __init__(self, reader: StreamReader, begun: bytes, client: str, refusals: Refusals) -> None:
+    def __init__(self, reader: StreamReader, begun: bytes, client: str, refusals: Refusals, guest: Guest) -> None:
         """``begun``: what was read before; ``client``: its address."""
         super().__init__(reader)
+        self.guest = guest
         self.client = client
         """Its name, for people."""
         self.on_packet: Callable[[], object] = lambda: None
@@ -41,6 +45,7 @@ class Reader(StreamReaderAdapter):  # type: ignore[misc]  # the library's classe
         """Waited for before more of a packet is read than its head, which has to come within the keep-alive."""
         self._begun, self._refusals = begun, refusals
         self._head = b""
+        self._publishing = False
         self._left = self._fields = 0  # of the packet that is being read: bytes to come, fields that have
 
     async def read(self, n: int = -1) -> bytes:
@@ -57,6 +62,8 @@ class Reader(StreamReaderAdapter):  # type: ignore[misc]  # the library's classe
             await self.admit()
         data = await self._take(n)
         self._left -= n
+        if self._publishing and not _begins_topic(self._fields, data):
+            self.end(NO_TOPIC)  # the library would take what follows for another packet, and wait for its rest
         return data
 
     async def _take(self, n: int) -> bytes:
@@ -71,6 +78,7 @@ class Reader(StreamReaderAdapter):  # type: ignore[misc]  # the library's classe
         if not length or (length[-1] & 0x80 and len(length) < 4):
             return
         self._left = sum((byte & 0x7F) << 7 * place for place, byte in enumerate(length))
+        self._publishing = self._head[0] & 0xF0 == _PUBLISH
         self._head, self._fields = b"", 0
         if self._left > MAX_PACKET_BYTES or length[-1] & 0x80:
             self.end(TOO_LARGE)
@@ -80,6 +88,16 @@ class Reader(StreamReaderAdapter):  # type: ignore[misc]  # the library's classe
         """Give it up. OSError: with one of its own errors the library would go on, and take its data for packets."""
         self._refusals.tell(why, self.client)
         raise OSError(why)
+
+
+def _begins_topic(field: int, data: bytes) -> bool:
+    """Whether a field of a PUBLISH may be so: the first is the topic's length, the second the topic (3.1.1, 3.3.2)."""
+    if field > 2:
+        return True
+    try:
+        return any(data) if field == 1 else not set("+#\0").intersection(data.decode())
+    except UnicodeDecodeError:
+        return False
 
 
 async def greeted(reader: StreamReader, writer: StreamWriter) -> bytes | None:
@@ -131,4 +149,4 @@ class BridgesWriter(Writer):
 
     def get_peer_info(self) -> tuple[str, int]:
         """What the library takes for its address."""
-        return BRIDGE, 0
+        return PEER, 0

@@ -12,6 +12,8 @@ from shmio.config.mqtt import brokers
 
 FIRST_WAIT_S: Final = 0.25
 MOST_WAIT_S: Final = 15.0
+OWN_WAIT_S: Final = 0.5
+"""At most for our own broker: it is on this host, and is started again at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +67,8 @@ class Dialling:
 
     def wait_s(self) -> float:
         """How long to wait after a failure: longer after each."""
-        wait_s: float = min(MOST_WAIT_S, FIRST_WAIT_S * 2 ** min(self._failures // self.count, 16))
+        most_s = OWN_WAIT_S if all(target.transport == "unix" for target in self._targets) else MOST_WAIT_S
+        wait_s: float = min(most_s, FIRST_WAIT_S * 2 ** min(self._failures // self.count, 16))
         self._failures += 1
         # Not all bridges of a plant at once, when their broker is back.
         return wait_s * random.uniform(0.5, 1.5)  # noqa: S311  not a secret

@@ -521,15 +521,18 @@ def test_a_pattern_that_names_nothing_is_odd(
     assert ("usable, with 1 warning\n" in output) is odd
 
 
-@pytest.mark.parametrize(("more", "odd"), [("", True), ('password_file = "accounts"', False)])
-def test_a_broker_that_lets_everybody_in_is_odd(
-    example: Edit, more: str, odd: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(("roles", "odd"), [('["read", "write"]', True), ('["read"]', False)])
+def test_a_broker_that_lets_everybody_write_is_odd(
+    example: Edit, roles: str, odd: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "accounts").write_text("anna:secret\n")
     (tmp_path / "accounts").chmod(0o600)
-    example('listen = "127.0.0.1:1883"', f'listen = "0.0.0.0:1883"\ninsecure = true\n{more}')
+    example('listen = "127.0.0.1:1883"', 'listen = "0.0.0.0:1883"\ninsecure = true\npassword_file = "accounts"')
+    example('roles = ["read", "write"]', f"roles = {roles}")
     assert main(["check"]) == 0
-    assert ("whoever reaches 0.0.0.0:1883 may publish commands, too" in capsys.readouterr().out) is odd
+    output = capsys.readouterr().out
+    assert ("whoever reaches 0.0.0.0:1883 may publish commands, also without an account" in output) is odd
+    assert "mqtt.password_file: anna may read alone: [[mqtt.account]] gives it the role write" in output
 
 
 @pytest.mark.parametrize("key", ["dbNumber = 7", 'block = "db7"'])

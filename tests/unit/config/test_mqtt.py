@@ -6,13 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from shmio.config import Mqtt, load
+from shmio.config import Mqtt, MqttAccount, load
 from shmio.config.accounts import hashed, matches, read_accounts, read_password
 from shmio.config.mqtt import brokers
 from shmio.errors import ConfigError
 
 OWN = '[mqtt]\nlisten = "127.0.0.1:1883"\n'
 EXTERNAL = '[mqtt]\nbroker = "external"\n'
+ACCOUNT = "[[mqtt.account]]\nroles = "
 TLS = '[mqtt.tls]\nca = "ca.pem"\n'
 
 
@@ -91,6 +92,22 @@ def test_where_an_external_broker_is(tmp_path: Path, text: str, expected: list[s
             "mqtt.topic[0].deadband: is for single",
         ),
         (f'{OWN}[[mqtt.topic]]\nmatch = "a"\npayload = "frames"\nelements = true\n', "mqtt.topic[0].elements: is for"),
+        (f'{OWN}[mqtt.account]\nroles = ["read"]\n', "mqtt.account: write [[mqtt.account]]"),
+        (f"{OWN}[[mqtt.account]]\n", "mqtt.account[0].roles: this key is needed"),
+        (f'{OWN}{ACCOUNT}["see"]\n', "mqtt.account[0].roles[0]: no role 'see'; there are: read, write"),
+        (f'{OWN}{ACCOUNT}["read"]\n{ACCOUNT}["write"]\n', "mqtt.account[1].name: one without a name"),
+        (f'{OWN}{ACCOUNT}["read"]\nname = "a"\n', "mqtt.account[0].name: 'a' needs a password"),
+        (f'{OWN}{ACCOUNT}["read"]\npublish = ["a"]\n', "mqtt.account[0].publish: needs the role write"),
+        (f'{OWN}{ACCOUNT}["write"]\npublish = ["a/#/b"]\n', "mqtt.account[0].publish[0]: 'a/#/b' is no filter"),
+        (f'{OWN}{ACCOUNT}["write"]\npublish = ["$SYS/#"]\n', "publish[0]: '$SYS/#' is no filter of topics"),
+        (f'{OWN}{ACCOUNT}["write"]\npublish = ["b", "+/#"]\n', "publish[1]: '+/#' would have others publish on"),
+        (f'{OWN}{ACCOUNT}["write"]\npublish = ["shmio/a"]\n', "the instance's own topics, shmio/a/#"),
+        (f'{OWN}{ACCOUNT}["write"]\npublish = ["shmio/+/x"]\n', "the instance's own topics, shmio/a/#"),
+        (
+            f'{OWN}{ACCOUNT}["write"]\npublish = ["spBv1.0/g/DDATA/#"]\n[mqtt.sparkplug]\ngroup = "g"\n',
+            "the instance's own topics, spBv1.0/g/+/a/#",
+        ),
+        (f'{EXTERNAL}host = "127.0.0.1"\n{ACCOUNT}["read"]\n', "an external broker has accounts of its own"),
         (EXTERNAL, 'mqtt.host: broker = "external" needs it'),
         (f'{EXTERNAL}host = "b"\n', "b:1883 would be spoken to in plain text over the network"),
         (f'{EXTERNAL}host = ["b", "c:x"]\n{TLS}', "mqtt.host[1]"),
@@ -105,6 +122,17 @@ def test_what_will_not_do_is_named(tmp_path: Path, text: str, told: str) -> None
     with pytest.raises(ConfigError) as caught:
         read(tmp_path, text)
     assert told in str(caught.value)
+
+
+def test_topics_beside_the_instances_own_may_be_anybodys(tmp_path: Path) -> None:
+    topics = ["shmio/b/#", "shmio", "homeassistant/+/x", "spBv1.0/g/+/b/#"]
+    mqtt = read(tmp_path, f'{OWN}{ACCOUNT}["write"]\npublish = {topics}\n[mqtt.sparkplug]\ngroup = "g"\n')
+    assert mqtt.account[0].publish == topics
+
+
+def test_an_account_with_roles_has_a_password(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"mqtt\.account\[1\]\.name: 'bert' has no line"):
+        read_accounts(secret(tmp_path, "anna:x\n"), [MqttAccount(roles=["read"], name=one) for one in ("anna", "bert")])
 
 
 def secret(folder: Path, text: str, mode: int = 0o600) -> str:

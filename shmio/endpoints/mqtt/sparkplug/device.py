@@ -35,14 +35,17 @@ class News(NamedTuple):
 class Device:
     """Follows one block, for the bridge's thread. For a big layout to make one takes seconds."""
 
-    def __init__(self, block: Block, inlet: Inlet, globs: Sequence[Glob]) -> None:
-        """``inlet``: where commands go. ``globs``: over paths with the source, of what is a metric."""
+    def __init__(self, block: Block, inlet: Inlet, globs: Sequence[Glob], *, elements: bool) -> None:
+        """``inlet``: where commands go. ``globs``: over paths with the source, of what is a metric.
+
+        ``elements``: of arrays each element is one.
+        """
         self.block = block
         self.inlet = inlet
         registers = [
             one for one in block.layout.registers if any(g.matches(f"{block.source}/{one.path}") for g in globs)
         ]
-        self.parts: tuple[Register, ...] = tuple(parts_of(block.layout, registers))
+        self.parts: tuple[Register, ...] = tuple(parts_of(block.layout, registers, single=elements))
         self.alive = False
         """Whether the source has good values, or doubtful ones."""
         self._metrics: Sequence[Metric] = ()

@@ -133,10 +133,13 @@ class Metric:
         return shaped
 
 
-def parts_of(layout: Layout, registers: Iterable[Register]) -> Iterator[Register]:
-    """What is a metric each: registers, and the elements of arrays that are not of numbers or bits."""
+def parts_of(layout: Layout, registers: Iterable[Register], *, single: bool = False) -> Iterator[Register]:
+    """What is a metric each: registers, and the elements of arrays that are not of numbers or bits.
+
+    ``single``: of all arrays.
+    """
     for register in registers:
-        if register.dims and register.element.base not in _KINDS:
+        if register.dims and (single or register.element.base not in _KINDS):
             yield from elements(layout, register)
         else:
             yield register

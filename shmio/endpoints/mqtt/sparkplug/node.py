@@ -55,7 +55,7 @@ class EdgeNode:
         node: str,
         now_ms: Callable[[], int] = lambda: time.time_ns() // 1_000_000,
         *,
-        datatypes: bool = False,
+        datatypes: bool = True,
     ) -> None:
         """``datatypes``: data tell their types, too, as a host needs that does not know them from the births."""
         self._group, self._node, self._datatypes = group, node, datatypes
@@ -142,11 +142,12 @@ class EdgeNode:
         """Whether a device was born in this session, and has not died."""
         return device in self._born
 
-    def command(self, topic: str, data: bytes) -> Command:
+    def command(self, topic: str, data: bytes, check: Callable[[str, Register], object] = lambda *_: None) -> Command:
         """What a message on one of the topics of :attr:`commands` says.
 
         ValueRangeError: it is no payload of Sparkplug B, or has values that are none of their metrics; PathError:
-        there is no such device or metric.
+        there is no such device or metric. ``check``: asked about the register of such a value, to raise what matters
+        more.
         """
         if len(data) > MAX_BYTES:  # before it is taken apart: each metric is an object
             raise ValueRangeError(f"{topic}: the payload is longer than {MAX_BYTES} bytes")
@@ -169,7 +170,11 @@ class EdgeNode:
             metric = self._metric(device, found)
             if metric.name in values:
                 raise ValueRangeError(f"{metric.name}: given twice")
-            values[metric.name] = metric.take(found)
+            try:
+                values[metric.name] = metric.take(found)
+            except ValueRangeError:
+                check(device, metric.register)
+                raise
         if not values:
             raise ValueRangeError(f"{topic}: there is no metric in it")
         return Command(device=device, values=values)
@@ -177,9 +182,9 @@ class EdgeNode:
     def _metric(self, device: str, found: wire.Metric) -> Metric:
         """By its name or its alias; PathError."""
         metrics = self.metrics[device]
-        metric = metrics.get(found.name) if found.HasField("name") else self._by_alias.get(found.alias)
+        metric = metrics.get(found.name) if found.name else self._by_alias.get(found.alias)  # some send an empty name
         if metric is None or metrics.get(metric.name) is not metric:
-            what = repr(found.name[:100]) if found.HasField("name") else f"alias {found.alias}"
+            what = repr(found.name[:100]) if found.name else f"alias {found.alias}"
             raise PathError(f"{device}: there is no metric {what}")
         return metric
 

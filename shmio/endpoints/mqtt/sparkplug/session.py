@@ -27,6 +27,8 @@ from shmio.endpoints.mqtt.sparkplug.primary import PrimaryHost
 from shmio.endpoints.mqtt.target import Dialling, targets
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.glob import Glob
+from shmio.layout.model import Register
+from shmio.layout.topic import shorten
 from shmio.segment import DONE, EventKind, Segment
 
 TURN_SAMPLES: Final = 2000
@@ -66,6 +68,7 @@ class Session:
         """Whether the host has gone since the births, though it may be back: it knows nothing of them then."""
         self._until_s = 0.0
         """So long the host has to say that it is there; then another broker is tried, if there is one."""
+        self._elements = sparkplug.elements
         self._globs = [Glob(pattern) for pattern in sparkplug.patterns]
         self._devices: dict[str, Device] = {}
         self._waiting: dict[str, dict[int, None]] = {}
@@ -101,7 +104,7 @@ class Session:
 
     def device(self, feed: Feed) -> Device:
         """What a source is to be; any thread may make it."""
-        return Device(feed.block, feed.inlet, self._globs)
+        return Device(feed.block, feed.inlet, self._globs, elements=self._elements)
 
     def adopt(self, device: Device) -> None:
         """There is one more."""
@@ -261,8 +264,8 @@ class Session:
             self._refused += 1
             return
         try:
-            command = self.node.command(topic, bytes(message.payload))
-        except (PathError, ValueRangeError) as error:
+            command = self.node.command(topic, bytes(message.payload), self._check)
+        except (CommandError, PathError, ValueRangeError) as error:
             self._refuse(str(error))
             return
         if command.rebirth:
@@ -276,9 +279,12 @@ class Session:
             except (CommandError, ValueRangeError) as error:
                 self._refuse(str(error))
 
+    def _check(self, device: str, register: Register) -> None:
+        self._devices[device].inlet.check(register)
+
     def _refuse(self, why: str) -> None:
         self._refused += 1
-        log.warning("Sparkplug command: %s", why)
+        log.warning("Sparkplug command: %s", shorten(why, 500))  # the topic may be as long as any
 
 
 class _Outcome:

@@ -24,6 +24,21 @@ def segment(instance: str) -> Iterator[Segment]:
 
 
 @pytest.fixture
+def make_segment(instance: str) -> Iterator[Callable[[], Segment]]:
+    """More of them, each of another instance."""
+    with ExitStack() as stack:
+
+        def make() -> Segment:
+            block = BlockSpec("cell", LAYOUT, 20_000_000, STALE_NS, 1 << 20, Attributes("test", WRITABLE))
+            processes = [ProcessSpec("cell", "source"), ProcessSpec("mqtt", "mqtt")]
+            made = stack.enter_context(Segment.create(f"{instance}-2", [block], processes))
+            stack.callback(made.unlink)
+            return made
+
+        yield make
+
+
+@pytest.fixture
 def make_broker(tmp_path: Path) -> Iterator[Callable[..., Mosquitto]]:
     """Start a mosquitto of this test's own."""
     if reason := missing():

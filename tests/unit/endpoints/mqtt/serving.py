@@ -88,6 +88,9 @@ class Process:
 
 @contextmanager
 def serving(segment: Segment, address: Address, program: str, **config: Any) -> Iterator[Process]:
+    """Unless ``account`` says otherwise, who shows none may do everything."""
+    config.setdefault("prefix", PREFIX)
+    config.setdefault("account", [{"roles": ["read", "write"], "publish": ["#"]}])
     process = Process(segment, broker=program, listen=str(address), **config)
     try:
         assert process.ready.wait(TIMEOUT_S)
@@ -112,11 +115,21 @@ def bridged(segment: Segment) -> Iterator[Running]:
 class Raw:
     """A client that sends what it likes; MQTT 3.1.1."""
 
-    def __init__(self, address: Address, name: str, *, clean: bool = True, account: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self,
+        address: Address,
+        name: str,
+        *,
+        clean: bool = True,
+        account: tuple[str, ...] = (),
+        will: tuple[str, str] | None = None,
+    ) -> None:
+        """``will``: topic and payload of a retained one."""
         self._socket = socket.create_connection((address.host, address.port), TIMEOUT_S)
         self._numbers = 0
-        flags = 2 * clean | (0xC0 if account else 0)
-        self.send(0x10, b"\0\4MQTT\4" + bytes([flags]) + b"\0\0" + b"".join(map(_text, (name, *account))))
+        flags = 2 * clean | (0xC0 if account else 0) | (0x24 if will else 0)
+        fields = (name, *(will or ()), *account)
+        self.send(0x10, b"\0\4MQTT\4" + bytes([flags]) + b"\0\0" + b"".join(map(_text, fields)))
         kind, told = self.packet()
         assert kind == 0x20
         self.before, self.code = bool(told[0]), told[1]

@@ -75,7 +75,7 @@ def test_only_who_has_an_account_gets_in(segment: Segment, address: Address, pro
     accounts = tmp_path / "accounts"
     accounts.write_text("anna:secret\n")
     accounts.chmod(0o600)
-    with serving(segment, address, program, password_file=str(accounts)), bridged(segment):
+    with serving(segment, address, program, password_file=str(accounts), account=[]), bridged(segment):
         with listening(address, protocol=MQTTv311, username="anna", password="secret") as listener:
             assert listener.until("cell/step/out") == b"7"
         assert answer(address, MQTTv311) == "Not authorized"
@@ -167,12 +167,17 @@ def test_a_mosquitto_that_is_insisted_on_and_not_there_is_told(
 def test_what_mosquitto_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LOGNAME", "nobody")  # as some ways to become root leave it
     tls = MqttTls(ca="/c/ca.pem", certificate="/c/c.pem", key="/c/k.pem")
-    text = mosquitto.configuration(Mqtt(listen="[::1]:1883", password_file="/c/a", tls=tls), tmp_path)
+    text = mosquitto.configuration(Mqtt(listen="[::1]:1883", password_file="/c/a", tls=tls), tmp_path, anonymous=False)
     lines = text.splitlines()
     own, others = lines.index(f"listener 0 {tmp_path / 's'}"), lines.index("listener 1883 ::1")
-    assert lines[own + 1 :] == ["allow_anonymous true"]
+    assert lines[own + 1 :] == [
+        "allow_anonymous false",
+        f"password_file {tmp_path / 'bridge'}",
+        f"acl_file {tmp_path / 'bridge-rights'}",
+    ]
     assert lines[others + 1 : own] == [
         "allow_anonymous false",
+        f"acl_file {tmp_path / 'rights'}",
         f"password_file {tmp_path / 'accounts'}",
         "certfile /c/c.pem",
         "keyfile /c/k.pem",

@@ -76,6 +76,7 @@ def test_a_bit_and_a_slice_leave_their_neighbours_alone(segment: Segment, broker
         ("cell/axis/position/in", b"\xff\xfe", "not UTF-8"),
         ("cell/step/in", b"99999", "INT"),
         ("cell/secret/in", b"1", "not writable"),
+        ("cell/secret/in", b"fast", "not writable"),
         ("cell/axis/nowhere/in", b"1", "no such register"),
         ("cell/axis/in", b"1", "a structure"),
         ("cell/inputs/9/in", b"1", "outside"),
@@ -87,13 +88,19 @@ def test_a_bit_and_a_slice_leave_their_neighbours_alone(segment: Segment, broker
     ],
 )
 def test_what_cannot_be_done_is_told_and_the_bridge_goes_on(
-    segment: Segment, broker: Mosquitto, topic: str, payload: bytes, reason: str
+    segment: Segment,
+    broker: Mosquitto,
+    topic: str,
+    payload: bytes,
+    reason: str,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     with running(segment, broker) as (plant, listener):
         listener.publish(topic, payload)
         told = listener.json(f"{topic}/result")
         assert (told["outcome"], told["done"]) == ("rejected", False)
         assert reason in told["reason"]
+        assert f"command on {PREFIX}/{topic}: rejected: {told['reason']}" in caplog.messages
         assert not plant.written
         listener.publish("cell/step/in", "5")
         assert listener.json("cell/step/in/result")["done"]

@@ -335,7 +335,7 @@ def test_who_is_not_let_in_leaves_nothing(segment: Segment, address: Address, tm
     accounts.write_text("anna:secret\n")
     accounts.chmod(0o600)
     with (
-        serving(segment, address, "embedded", password_file=str(accounts)),
+        serving(segment, address, "embedded", password_file=str(accounts), account=[]),
         Raw(address, "3", account=("anna", "secret")) as known,
     ):
         for number in range(6):
@@ -346,3 +346,17 @@ def test_who_is_not_let_in_leaves_nothing(segment: Segment, address: Address, tm
             assert stranger.code == 5
         known.ping()
         assert list(hubs[0].sessions) == ["3"]
+
+
+@pytest.mark.parametrize("topic", [b"", b"a/#", b"a/+/b", b"\xff", b"a\0b", b"$SYS/x"])
+@pytest.mark.parametrize("qos", [0, 1, 2])
+def test_what_is_published_on_no_topic_ends_its_connection(
+    segment: Segment, address: Address, topic: bytes, qos: int
+) -> None:
+    with serving(segment, address, "embedded"), Raw(address, "odd") as odd, Raw(address, "other") as other:
+        odd.subscribe(f"{PREFIX}/mine")
+        odd.send(0x30 | qos << 1, len(topic).to_bytes(2, "big") + topic + (odd.number() if qos else b"") + b"1")
+        if qos == 2:
+            odd.send(0x62, b"\0\2")  # PUBREL
+        assert odd.ended()
+        other.ping()

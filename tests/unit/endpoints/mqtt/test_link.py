@@ -212,3 +212,12 @@ def test_a_broker_hears_that_we_leave_though_what_it_sent_last_is_not_read(leave
             broker.hear(0xE0)
         finally:
             broker.close()
+
+
+def test_our_own_broker_is_tried_again_soon_however_long_it_is_away() -> None:
+    own = Mqtt(listen="127.0.0.1:1883")
+    dialling = Dialling(own, "test", targets(own, "/run/own"))
+    assert max(dialling.wait_s() for _ in range(50)) <= 0.75
+    external = Mqtt(broker="external", host="127.0.0.1")
+    dialling = Dialling(external, "test", targets(external, ""))
+    assert max(dialling.wait_s() for _ in range(50)) > 5

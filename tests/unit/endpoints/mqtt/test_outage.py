@@ -306,3 +306,9 @@ def test_a_file_that_cannot_be_read_at_present_holds_up_nothing(
         with pipe.open("wb"):  # the one who waits has it now
             pipe.unlink()
         running.until(lambda: "mqtt.tls.ca" in running.bridge.problem)
+
+
+def test_of_several_brokers_the_fault_of_each_is_told(segment: Segment) -> None:
+    with reserved_port() as one, reserved_port() as other, bridge(segment, [one, other]) as running:
+        told = sorted(f"broker {address}: nothing listens there" for address in (one, other))
+        running.until(lambda: running.bridge.problem == "; ".join(told))

@@ -6,6 +6,7 @@ import base64
 import json
 import shutil
 import subprocess
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from hypothesis import strategies as st
 from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.sparkplug.metrics import parts_of
 from shmio.endpoints.mqtt.sparkplug.node import MAX_METRICS, REBIRTH, Command, EdgeNode, Sample
-from shmio.errors import PathError, ValueRangeError
+from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.codec import codec
 from shmio.layout.model import Layout, Register
 from shmio.segment import Quality
@@ -53,7 +54,7 @@ LAYOUT = Layout("ALL", None, 512, False, tuple(REGISTERS))
 AXIS = Layout("AXIS", None, 4, False, (Register("position", "REAL", (), 0, None, 4, 1),))
 
 
-def node(*, datatypes: bool = False) -> EdgeNode:
+def node(*, datatypes: bool = True) -> EdgeNode:
     edge = EdgeNode("plant", "a50", lambda: NOW_MS, datatypes=datatypes)
     edge.define({name: parts_of(layout, layout.registers) for name, layout in (("cell", LAYOUT), ("axis", AXIS))})
     return edge
@@ -125,7 +126,7 @@ def test_a_device_lives_from_its_birth_to_its_death_or_the_next_session() -> Non
 
 
 def test_aliases_are_of_one_metric_each_in_the_whole_node_and_stand_for_names_in_data() -> None:
-    edge = node()
+    edge = node(datatypes=False)
     edge.will()
     edge.birth()
     births = [payload(edge.device_birth(device, samples(edge, device))) for device in ("cell", "axis")]
@@ -196,6 +197,7 @@ def test_commands_are_by_name_or_by_alias() -> None:
     assert edge.commands == ["spBv1.0/plant/NCMD/a50", "spBv1.0/plant/DCMD/a50/+"]
     assert commanded(edge, name="position", float_value=2.5) == Command(device="axis", values={"position": 2.5})
     assert commanded(edge, alias=position.alias, double_value=3.5).values == {"position": 3.5}
+    assert commanded(edge, name="", alias=position.alias, float_value=4.5).values == {"position": 4.5}
     assert commanded(edge, "cell", name="DINT", int_value=2**32 - 7).values == {"DINT": -7}
     assert commanded(edge, "cell", name="DINT", long_value=2**64 - 7).values == {"DINT": -7}
     assert commanded(edge, "cell", name="UINT", long_value=7).values == {"UINT": 7}
@@ -238,11 +240,96 @@ def test_a_command_has_something_once_and_not_too_much_of_it() -> None:
         edge.command("spBv1.0/plant/NCMD/a50", wire.Payload(metrics=[one]).SerializeToString())
 
 
+METRICS = st.lists(
+    st.builds(
+        wire.Metric,
+        name=st.sampled_from(["", "DINT", "BOOL", "row/INT", "row/BOOL", "STRING[10]", "ULINT", REBIRTH]) | st.text(),
+        alias=st.integers(0, 2**64 - 1) | st.integers(0, 30),
+        datatype=st.integers(0, 2**32 - 1),
+        is_null=st.booleans(),
+    ),
+    max_size=5,
+)
+FIELDS: st.SearchStrategy[dict[str, Any]] = st.fixed_dictionaries(
+    {},
+    optional={
+        "int_value": st.integers(0, 2**32 - 1),
+        "long_value": st.integers(0, 2**64 - 1),
+        "float_value": st.floats(width=32),
+        "double_value": st.floats(),
+        "boolean_value": st.booleans(),
+        "string_value": st.text(),
+        "bytes_value": st.binary(max_size=40),
+    },
+)
+
+
+@given(METRICS, st.lists(FIELDS, max_size=5))
+def test_whatever_is_commanded_is_a_value_of_its_register_or_refused(
+    metrics: list[wire.Metric], fields: list[dict[str, Any]]
+) -> None:
+    edge = node()
+    for metric, given_fields in zip(metrics, fields, strict=False):
+        for name, value in given_fields.items():
+            setattr(metric, name, value)
+    data = wire.Payload(metrics=metrics).SerializeToString()
+    try:
+        command = edge.command("spBv1.0/plant/DCMD/a50/cell", data)
+    except (ValueRangeError, PathError):
+        return
+    for path, value in command.values.items():
+        with suppress(ValueRangeError):
+            codec(edge.metrics["cell"][path].register).encode_into(value, bytearray(LAYOUT.size))
+
+
+def _length(size: int) -> bytes:
+    found = bytearray()
+    while size > 127:
+        found.append(size & 0x7F | 0x80)
+        size >>= 7
+    return bytes([*found, size])
+
+
+def _nested() -> bytes:
+    data = b""
+    for _ in range(2000):
+        data = b"\x12" + _length(len(data)) + data  # metrics, of a template
+        data = b"\x92\x01" + _length(len(data)) + data  # template_value of a metric
+    return b"\x12" + _length(len(data)) + data
+
+
+@pytest.mark.parametrize("data", [_nested(), b"\x1b" * 100_000], ids=["templates", "groups"])
+def test_what_is_in_each_other_is_refused_however_deep_it_is(data: bytes) -> None:
+    with pytest.raises((ValueRangeError, PathError)):
+        node().command("spBv1.0/plant/DCMD/a50/cell", data)
+
+
+def test_what_is_not_writable_is_told_before_what_its_value_is_not() -> None:
+    def check(device: str, register: Register) -> None:
+        raise CommandError(f"{device}/{register.path} is not writable")
+
+    data = wire.Payload(metrics=[wire.Metric(name="DINT", string_value="x")]).SerializeToString()
+    with pytest.raises(CommandError, match="cell/DINT is not writable"):
+        node().command("spBv1.0/plant/DCMD/a50/cell", data, check)
+
+
 @given(st.binary(max_size=200))
 def test_garbage_is_refused(data: bytes) -> None:
     for topic in ("spBv1.0/plant/DCMD/a50/cell", "spBv1.0/plant/NCMD/a50"):
         with pytest.raises((ValueRangeError, PathError)):
             node().command(topic, data)
+
+
+def test_elements_of_arrays_are_metrics_of_their_own_if_wanted() -> None:
+    edge = EdgeNode("plant", "a50", lambda: NOW_MS)
+    edge.define({"cell": parts_of(LAYOUT, LAYOUT.registers, single=True)})
+    assert len(edge.metrics["cell"]) == len(REGISTERS) + 4 * (12 - 1)
+    edge.will()
+    edge.birth()
+    born = {metric.name: metric.datatype for metric in payload(edge.device_birth("cell", [])).metrics}
+    assert (born["row/BOOL/3/2"], born["row/INT/1/0"], born["row/REAL/2/3"]) == (11, 3, 9)
+    assert commanded(edge, "cell", name="row/INT/2/1", int_value=7).values == {"row/INT/2/1": 7}
+    assert commanded(edge, "cell", name="row/BOOL/2/1", boolean_value=True).values == {"row/BOOL/2/1": True}
 
 
 def test_texts_of_an_array_are_metrics_of_their_own() -> None:
@@ -254,7 +341,7 @@ def test_texts_of_an_array_are_metrics_of_their_own() -> None:
 @pytest.mark.skipif(shutil.which("node") is None, reason="needs Node")
 def test_another_implementation_reads_it_and_commands_it() -> None:
     assert (NODE / "node_modules").exists(), f"its packages are not installed: npm ci --prefix {NODE}"
-    edge = node(datatypes=True)
+    edge = node()
     edge.will()
     scalars = [sample for sample in samples(edge) if "row" not in sample.metric.name]
     given = [edge.birth().payload, edge.device_birth("cell", samples(edge)).payload]
