@@ -44,11 +44,11 @@ class Host:
     def next(self) -> Heard:
         """The next message of the node."""
         message = self._listener.message()
+        while message.topic.split("/")[1] == "STATE" or message.topic.split("/")[2] in ("NCMD", "DCMD"):  # our own
+            message = self._listener.message()
         assert not message.retain
         kind = message.topic.split("/")[2]
         payload = wire.Payload.FromString(bytes(message.payload))
-        if kind in ("NCMD", "DCMD"):  # our own
-            return self.next()
         assert payload.HasField("seq") == (kind != "NDEATH")
         if kind == "NBIRTH":
             self._names, self.seqs = {}, []
@@ -68,8 +68,11 @@ class Host:
     def command(self, kind: str, *metrics: wire.Metric, device: str = "") -> None:
         """Send one."""
         topic = NODE.format(kind) + (f"/{device}" if device else "")
-        data = wire.Payload(timestamp=1, metrics=metrics).SerializeToString()
-        self._listener.client.publish(topic, data, 0).wait_for_publish(30)
+        self.send(topic, wire.Payload(timestamp=1, metrics=metrics).SerializeToString())
+
+    def send(self, topic: str, data: bytes, *, retain: bool = False) -> None:
+        """Send whatever."""
+        self._listener.client.publish(topic, data, 0, retain).wait_for_publish(30)
 
 
 @contextmanager
@@ -179,6 +182,41 @@ def test_commands_reach_the_device_and_garbage_nothing(segment: Segment, broker:
                 pass
             assert changed.float_value == 2.5
             running.until(lambda: running.bridge.counters[1:3] == (4, 3))
+    finally:
+        plant.stop()
+
+
+def test_an_element_of_an_array_is_written_by_itself_and_garbage_leaves_the_node_as_it_is(
+    segment: Segment, broker: Mosquitto
+) -> None:
+    plant = Plant(segment.writer("cell"))
+    plant.owners[WRITERS["mqtt"]] = Owner(WRITERS["mqtt"], 3)
+    plant.run()
+    elements = Sparkplug(group="plant", node="a50", elements=True, primary_host="scada")
+    try:
+        with hosting(broker.address) as host, node(segment, broker.address, sparkplug=elements) as running:
+            online = b'{"online":true,"timestamp":1}'
+            host.send("spBv1.0/STATE/scada", online, retain=True)
+            alias = host.until("DBIRTH").metrics["inputs/1"].alias
+            for state in (
+                b"",
+                b"\xff",
+                b"[" * 100_000,
+                b'{"online":1,"timestamp":2}',
+                b'{"online":true,"timestamp":1e999}',
+            ):
+                host.send("spBv1.0/STATE/scada", state)
+            for data in (b"", b"\xff" * 1000, b"\x12\x00" * 5000, b"\x00" * (1 << 20), b"\x12\x84\x80\x80\x80\x08"):
+                for kind in ("NCMD", "DCMD"):
+                    host.send(NODE.format(kind) + "/cell" * (kind == "DCMD"), data)
+            host.send(NODE.format("DCMD") + "/" + "x" * 60_000, b"")
+            host.command("DCMD", wire.Metric(name="inputs/1", int_value=300), device="cell")
+            host.command("DCMD", wire.Metric(name="", alias=alias, int_value=7), device="cell")
+            while (changed := host.until("DDATA").metrics.get("inputs/1")) is None:
+                pass
+            assert (changed.int_value, changed.datatype) == (7, 5)
+            running.until(lambda: running.bridge.counters[1:3] == (13, 12))
+            assert running.bridge.problem == ""
     finally:
         plant.stop()
 
