@@ -7,6 +7,7 @@ import secrets
 import sys
 import threading
 import time
+from collections.abc import Sequence
 from typing import Final
 
 import msgspec
@@ -16,6 +17,7 @@ from shmio.cli.interrupt import told_to_stop
 from shmio.cli.run import dumps
 from shmio.config import Declaration
 from shmio.config.campaign import read_campaign
+from shmio.errors import CommandError
 from shmio.logs import printable
 
 TURN_S: Final = 0.2
@@ -31,9 +33,11 @@ def run_campaign(cell: Cell, options: argparse.Namespace) -> int:
     seed = secrets.randbits(SEED_BITS) if options.seed is None else options.seed
     read = read_campaign(options.file)
     declarations = [_with_seed(declaration, seed) for declaration in read]
+    now_s = cell.clock.present_ns / 1e9
     if options.from_now:
-        now_s = cell.clock.present_ns / 1e9
         declarations = [_shifted(declaration, now_s) for declaration in declarations]
+    else:
+        _refuse_past(declarations, now_s)
     with told_to_stop() as over, cell.declare(declarations, keep=options.keep) as campaign:
         if any(declaration.seed is None for declaration in read):
             told = dumps({"seed": seed}) if options.json else f"seed {seed}: --seed {seed} does the same again"
@@ -56,6 +60,16 @@ def _follow(campaign: Campaign, over: threading.Event, options: argparse.Namespa
         if ended or not campaign.stands:
             return
         over.wait(TURN_S)
+
+
+def _refuse_past(declarations: Sequence[Declaration], now_s: float) -> None:
+    """CommandError: the time of one is over, so that it would do nothing."""
+    for one in declarations:
+        if one.end_s is not None and one.end_s <= now_s:
+            raise CommandError(
+                f"the time of injection {one.name!r} has passed: its end_s is {one.end_s:g}, the instance's clock "
+                f"is at {now_s:.3f} s; --from-now counts the file's times from now"
+            )
 
 
 def _with_seed(declaration: Declaration, seed: int) -> Declaration:

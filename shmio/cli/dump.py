@@ -129,6 +129,13 @@ def _parser() -> argparse.ArgumentParser:
     merge.add_argument("files", nargs="+", type=Path, metavar="FILE")
     _output(merge, "the new file")
 
+    campaign = verb("campaign", "write what was injected as a campaign, which shmio inject --file does again")
+    campaign.add_argument("files", nargs="+", type=Path, metavar="FILE")
+    _output(campaign, "the new file, such as campaign.toml")
+    campaign.add_argument(
+        "--from-zero", action="store_true", help="have the first one begin at 0, for shmio inject --from-now"
+    )
+
     cat = verb("cat", "print values as they changed, events, and what was missed")
     cat.add_argument("file", type=Path, metavar="FILE")
     cat.add_argument("patterns", nargs="*", metavar="PATH", help="register, element, structure or glob (default: all)")

@@ -16,7 +16,7 @@ import msgspec
 
 from shmio.config import Declaration
 from shmio.config.declaration import complaints
-from shmio.connectors.chain import Chain, about, lost
+from shmio.connectors.chain import Chain, about, in_parts, lost
 from shmio.connectors.conditions import Readings
 from shmio.connectors.declared import MAX_HELD, Declared, declared, resumed
 from shmio.connectors.injections import Bits, Now, Owner
@@ -27,7 +27,6 @@ from shmio.injection.activation import State
 from shmio.injection.program import NEVER, compile_condition
 from shmio.layout.write import Write
 from shmio.segment import NO_WRITER, Block, Command, EventKind, Frame, Record
-from shmio.segment.events import EVENT_DATA_SIZE
 from shmio.segment.standing import Running, Standing
 
 SEED_BITS: Final = 53
@@ -209,7 +208,8 @@ class Campaign:
             self._chain.tell()
         if any(map(_finished, changed)):
             self._own.commands.wake()  # for who lifts them
-        return [_turned(layer) for layer in changed if layer.active is not before[layer.id]]
+        turned = [_turned(layer) for layer in changed if layer.active is not before[layer.id]]
+        return [*self._chain.computed(image.base), *turned]
 
     def release(self, cycle: int) -> list[tuple[Declared, Write]]:
         """What delays over ``/in`` have held long enough, for the cycle that is about to write."""
@@ -250,7 +250,4 @@ def _turned(layer: Declared) -> Record:
 def _told(layer: Declared, command: Command | None) -> Iterator[Record]:
     """The events of one that is laid: its declaration with its seed, in parts."""
     document = msgspec.json.encode(msgspec.structs.replace(layer.program.declaration, seed=layer.seed))
-    for at in range(0, len(document), EVENT_DATA_SIZE):
-        part = document[at : at + EVENT_DATA_SIZE]
-        record = about(EventKind.INJECTED, layer, layer.name, command)
-        yield record._replace(offset=at, size=len(part), data=part)
+    return in_parts(about(EventKind.INJECTED, layer, layer.name, command), document)

@@ -31,6 +31,7 @@ class Chain:
         self._refuse_in = refuse_in
         self._shown: dict[int, tuple[object, bytes]] = {}  # by number: what it was made from, and the JSON
         self._ranges: dict[int, tuple[tuple[int, int, int], ...]] = {}
+        self._computed: dict[int, list[Write]] = {}  # by number: what was told last of what declared ones give it
 
     @property
     def injections(self) -> Injections:
@@ -68,6 +69,7 @@ class Chain:
             for layer in gone:
                 self._shown.pop(layer.id, None)
                 self._ranges.pop(layer.id, None)
+                self._computed.pop(layer.id, None)
             self.tell()
             ends = [about(EventKind.LIFTED, layer, reason, command) for layer in gone]
             held = [record for layer in gone if isinstance(layer, Declared) for record in lost(layer, reason)]
@@ -82,6 +84,33 @@ class Chain:
         for layer in layers:
             told = Record(EventKind.DIVERTED, layer.name, end.writer, end.command, injection=layer.id)
             yield from _parts(told, self.injections.beneath(self.output.base, layer))
+
+    def computed(self, base: bytes) -> Iterator[Record]:
+        """What clients' layers over ``/out`` get by now from declared ones further in, if it has changed.
+
+        No command brings it: its number is 0, and each event is the item-th of so many items.
+        """
+        for layer in self.injections.layers:
+            inner = self.injections.inner(layer) if layer.given else []
+            if not any(isinstance(one, Declared) and (one.cover & layer.cover).any() for one in inner):
+                self._computed.pop(layer.id, None)
+                continue
+            writes = self.injections.beneath(base, layer)
+            if writes != self._computed.get(layer.id):
+                self._computed[layer.id] = writes
+                parts = list(_parts(Record(EventKind.DIVERTED, layer.name, injection=layer.id), writes))
+                yield from (part._replace(item=item, items=len(parts)) for item, part in enumerate(parts))
+
+    def laid(self, layer: Injection, end: Record) -> Iterator[Record]:
+        """The events that a client's layer was laid: which way, over what, for how long."""
+        how = {
+            "direction": layer.direction.name.lower(),
+            "priority": layer.priority,
+            "keep": layer.keep,
+            "pid": layer.owner.pid,
+            "ranges": self._ranges[layer.id],
+        }
+        return in_parts(end, msgspec.json.encode(how))
 
     def tell(self, growth: int = 0) -> None:
         """Say in the segment what stands, with the output's ``turn`` held.
@@ -153,6 +182,11 @@ def _parts(told: Record, writes: Iterable[Write]) -> Iterator[Record]:
         for start in range(0, len(data), EVENT_DATA_SIZE):
             part = data[start : start + EVENT_DATA_SIZE]
             yield told._replace(offset=offset + start, mask=mask, size=len(part), data=part)
+
+
+def in_parts(told: Record, document: bytes) -> Iterator[Record]:
+    """The events of an injection that is laid: how, as JSON in parts."""
+    yield from _parts(told, [Write(0, 0, document)])
 
 
 def about(kind: EventKind, layer: Injection, text: str, command: Command | None = None) -> Record:

@@ -223,9 +223,12 @@ class CommandDesk:
         if not reason and write:
             reason = self._injector.campaign.crowded
         if reason:
-            self._writer.event(
-                Record(EventKind.REJECTED, reason, command.writer, command.id, 0, max(1, len(command.writes)))
-            )
+            count = max(1, len(command.writes))
+            told = Record(EventKind.REJECTED, reason, command.writer, command.id, 0, count)
+            if write:
+                offset, mask, data = command.writes[0]
+                told = told._replace(offset=offset, mask=mask, size=len(data))
+            self._writer.event(told)
         if reason or not write:
             return True
         if not self._has_room(command):

@@ -128,15 +128,15 @@ class Injections:
 
     def before(self, raw: bytes, layer: Injection) -> Bits:
         """What consumers would see of an image without a layer and those further out."""
-        inner = self.layers[: self.layers.index(layer)]
-        return self.seen(raw, [other for other in inner if other.direction is Direction.OUT and other.active])
+        return self.seen(raw, self.inner(layer))
 
     def inner(self, layer: Injection) -> list[Injection]:
-        """The layers over ``/out`` that are further in than one of them, and that clients give values to."""
-        return [other for other in self.layers[: self.layers.index(layer)] if other.given]
+        """The layers over ``/out`` that are further in than one of them, and change what they cover."""
+        inner = self.layers[: self.layers.index(layer)]
+        return [other for other in inner if other.direction is Direction.OUT and other.active]
 
     def outer(self, layer: Injection) -> list[Injection]:
-        """Those that are further out; of one over ``/in`` none."""
+        """Those that are further out and that clients give values to; of one over ``/in`` none."""
         if layer.direction is Direction.IN:
             return []
         return [other for other in self.layers[self.layers.index(layer) + 1 :] if other.given]
@@ -149,14 +149,19 @@ class Injections:
             bits |= other.cover & layer.cover
         return merge(self.seen(raw, inner).tobytes(), bits.tobytes(), [(0, self.size)] if inner else [])
 
-    def onward(self, layer: Injection, write: Write) -> list[tuple[Injection, list[Write]]]:
-        """What of the values that a layer over ``/out`` gives goes to those further out, instead of to consumers."""
+    def onward(self, raw: bytes, layer: Injection, write: Write) -> list[tuple[Injection, list[Write]]]:
+        """What of the values that a layer over ``/out`` gives goes to clients' further out, instead of to consumers.
+
+        It is what those in between make of it.
+        """
         taken: list[tuple[Injection, list[Write]]] = []
         bits = np.full(len(write.data), write.mask or 0xFF, np.uint8)
         for other in self.outer(layer):
-            hit = bits & other.cover[write.offset : write.offset + len(write.data)]
+            span = slice(write.offset, write.offset + len(write.data))
+            hit = bits & other.cover[span]
             if hit.any():
-                taken.append((other, parts_of(write, hit)))
+                data = self.before(raw, other)[span].tobytes()
+                taken.append((other, parts_of(write._replace(data=data), hit)))
                 bits &= ~hit
         return taken
 

@@ -108,7 +108,7 @@ class Injector:
             layer.values = self.injections.before(self._output.base, layer)
             above = [layer, *self.injections.outer(layer)] if layer.direction is Direction.OUT else []
             end = about(EventKind.INJECTED, layer, command.name)
-            self._output.show([*self._chain.beneath(above, end), end])
+            self._output.show([*self._chain.beneath(above, end), *self._chain.laid(layer, end)])
         return ""
 
     def _shadow(self, layer: Injection, command: Command) -> str:
@@ -120,7 +120,7 @@ class Injector:
             diverted = [
                 record
                 for place, write in enumerate(command.writes)
-                for other, parts in self.injections.onward(layer, write)
+                for other, parts in self.injections.onward(self._output.base, layer, write)
                 for record in pieces(EventKind.DIVERTED, command, place, parts, other)
             ]
             shadowed = [

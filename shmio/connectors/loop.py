@@ -126,8 +126,8 @@ class SourceLoop:
         finally:
             self.desk.stop()
             self._connector.close()
-            cycle = self._schedule.next(self._clock.now_ns()).cycle
-            self._disconnected(cycle, "the source was stopped")
+            self._writer.cycle = max(self._writer.cycle, self._schedule.at(self._clock.now_ns()))
+            self._disconnected(self._writer.cycle, "the source was stopped")
             self._writer.event(Record(EventKind.STOPPED))
 
     def poll(self, cycle: int) -> bool:

@@ -26,7 +26,7 @@ class Schedule:
 
     def next(self, now_ns: int) -> Due:
         """The cycle after the last one given, or a later one if that is wholly past."""
-        current = (now_ns - self._start_ns) // self._period_ns
+        current = self.at(now_ns)
         if self._last is None:
             cycle, skipped = current + 1, 0
         else:
@@ -38,6 +38,10 @@ class Schedule:
     def due_ns(self, cycle: int) -> int:
         """When a cycle is due."""
         return self._start_ns + cycle * self._period_ns
+
+    def at(self, now_ns: int) -> int:
+        """The cycle that was due last: no process to come begins with one before."""
+        return (now_ns - self._start_ns) // self._period_ns
 
     def restart(self) -> None:
         """Forget the last cycle: what passes until the next one is an outage, not an overrun."""

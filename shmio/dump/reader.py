@@ -5,12 +5,13 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Final, NamedTuple
 
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import Metadata
+from mcap.records import Header, Metadata
 
 from shmio.dump.channels import MAX_CHANNEL_BYTES, MAX_CHANNELS, Channel, describe
 from shmio.dump.damage import Damage, DamageLog
@@ -21,6 +22,7 @@ from shmio.dump.encoding import (
     GAP,
     PLACES,
     PROCESS,
+    PROFILE,
     STEP,
     Gap,
     Place,
@@ -34,7 +36,7 @@ from shmio.dump.encoding import (
     decode_step,
     restore,
 )
-from shmio.dump.records import BROKEN, Record, Records, stream
+from shmio.dump.records import BROKEN, LOOK_BYTES, MAGIC, ONLY_BEGUN, Record, Records, stream
 from shmio.errors import LayoutError, RecordingError
 from shmio.layout.model import Layout
 from shmio.segment import Event, Frame
@@ -97,6 +99,7 @@ class Reader:
         self._layouts: dict[str, Layout] = {}
         self._layout_bytes = 0
         self._summarized = False
+        self._ours = False  # by what the file's header says
 
     def messages(
         self,
@@ -248,10 +251,23 @@ class Reader:
                     self.about = metadata.metadata
                 elif metadata.name == PLACES:
                     self.places = {int(section): decode_place(place) for section, place in metadata.metadata.items()}
+            elif record.opcode == Opcode.HEADER:
+                self._ours = self._profile(record) == PROFILE
             elif record.opcode == Opcode.ATTACHMENT and len(self.attachments) < MAX_ATTACHMENTS:
                 self._attachment(record)
         except (ValueError, struct.error, McapError):
             raise RecordingError(f"{self.file}: the record at byte {record.at} is damaged") from None
+
+    def _is_cut_short(self) -> bool:
+        """Whether it ends within its header."""
+        start = self.records.read(len(MAGIC), min(1, self.records.size - len(MAGIC)))
+        return start in (b"", bytes([Opcode.HEADER])) and self.records.record(len(MAGIC)) is None
+
+    def _profile(self, record: Record) -> str:
+        """What a header says that the file is; nothing depends on it but what is said of one without content."""
+        with suppress(ValueError, struct.error, McapError):
+            return str(Header.read(stream(self.records.read(record.at, min(record.size, LOOK_BYTES)))).profile)
+        return ""
 
     def _attachment(self, record: Record) -> None:
         data = stream(self.records.read(record.at, min(record.size, _ATTACHMENT_HEAD)))
@@ -278,6 +294,8 @@ class Reader:
     def require_ours(self) -> None:
         """RecordingError if nothing in what was read is of a recorder of shmio."""
         if not self.about and not any(channel.encoding for channel in self.channels.values()):
+            if not self.records.closed and (self._ours or self._is_cut_short()):
+                raise RecordingError(f"{self.file} {ONLY_BEGUN}")
             raise RecordingError(f"{self.file} is an MCAP file, but no recording of shmio")
 
     def close(self) -> None:

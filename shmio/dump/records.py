@@ -32,6 +32,7 @@ MAX_RECORD_BYTES: Final = 1 << 20
 
 BROKEN: Final = 0
 """The opcode, which no record of MCAP has, of bytes that make no sense."""
+ONLY_BEGUN: Final = "ends where it begins: its recorder was killed before it wrote anything, or has just begun"
 LOOK_BYTES: Final = 4096
 """So much at a record's beginning tells how long it is: names of attachments and metadata fit in."""
 BEAT_BYTES: Final = 1 << 20
@@ -92,10 +93,11 @@ class Records:
             raise
         if start != MAGIC:
             os.close(self._fd)
-            empty = (
-                "is empty: its recorder wrote nothing" if not start else "is no recording: it does not begin as MCAP"
-            )
-            raise RecordingError(f"{file} {empty}")
+            if not start:
+                raise RecordingError(f"{file} is empty: its recorder wrote nothing")
+            if MAGIC.startswith(start):
+                raise RecordingError(f"{file} {ONLY_BEGUN}")
+            raise RecordingError(f"{file} is no recording: it does not begin as MCAP")
 
     def walk(self, to: int | None = None) -> Iterator[Record]:
         """All records up to the footer; ends where the file ends.

@@ -30,6 +30,7 @@ class Gatherer:
     """Gathers the events about what was diverted, or of another kind with data; give it all of a block's, in order.
 
     A command is whole when it says something else, or when another one is diverted. What is diverted says so at once.
+    What no command has brought (its number is 0) is whole with its last part.
     """
 
     def __init__(self, kind: EventKind = EventKind.DIVERTED) -> None:
@@ -45,6 +46,8 @@ class Gatherer:
         whole = [] if command == self._command else self._whole()
         self._command = command
         self._parts.setdefault(event.injection, []).append(event)
+        if not event.command and event.item + 1 >= event.items:
+            whole += self._whole()
         return whole
 
     def _whole(self) -> list[Diverted]:

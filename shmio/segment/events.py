@@ -51,7 +51,8 @@ class EventKind(IntEnum):
     INJECTED = 12
     """An injection was laid; the end of the command that asked for it, whose number is its own.
 
-    One that was declared has its declaration as data, JSON in parts, with the seed that it runs with.
+    Its data, JSON in parts, say how: of one that was declared its declaration, with the seed that it runs with; of a
+    client's ``direction``, ``priority``, ``keep``, the client's ``pid`` and ``ranges``: (offset, size, bits).
     """
     LIFTED = 13
     """An injection was lifted, with the reason; the end of the command that asked for it, if one did."""

@@ -16,11 +16,12 @@ from shmio.cli.dumping.progress import Progress
 from shmio.cli.run import room
 from shmio.dump.channels import Channel
 from shmio.dump.encoding import EVENT, FRAME, GAP, PROCESS, STEP, ProcessChange, StepMark
+from shmio.dump.explain import Explainer
 from shmio.dump.reader import Message, Reader
 from shmio.dump.survey import Survey, survey
 from shmio.errors import PathError, RecordingError
 from shmio.layout.glob import named
-from shmio.layout.model import Register
+from shmio.layout.model import Layout, Register
 from shmio.layout.topic import parse_topic
 from shmio.logs import printable
 from shmio.segment import Event, Frame
@@ -52,6 +53,7 @@ def execute(arguments: argparse.Namespace) -> int:
             for c in channels
             if c.encoding == GAP or (c.encoding in (STEP, PROCESS) and not arguments.patterns)
         }
+        explainers = {c.number: Explainer(c.source, _layout(reader, c)) for c in channels if c.encoding == EVENT}
         silent = True
         begin_ns = max(from_ns, found.begin_ns)
         progress.total = max(1, min(to_ns, found.end_ns) - begin_ns)
@@ -59,7 +61,7 @@ def execute(arguments: argparse.Namespace) -> int:
             lambda channel: channel.number in wanted, from_ns, to_ns, partial(complaints.damage, arguments.file)
         ):
             progress.at(message.log_ns - begin_ns)
-            for line in _lines(message, views, sources, printer):
+            for line in _lines(message, views, sources, printer, explainers):
                 print(line)
                 silent = False
         sys.stdout.flush()
@@ -127,13 +129,23 @@ def _one_file(patterns: Sequence[str]) -> None:
             raise PathError(f"{pattern} is a file, and cat prints one: shmio-dump merge FILE… -o NEW makes one of them")
 
 
-def _lines(message: Message, views: dict[int, View], sources: set[str], printer: Printer) -> Iterator[str]:
+def _layout(reader: Reader, channel: Channel) -> Layout | None:
+    """None: it is damaged, which is told where frames are to be printed."""
+    try:
+        return reader.layout(channel)
+    except RecordingError:
+        return None
+
+
+def _lines(
+    message: Message, views: dict[int, View], sources: set[str], printer: Printer, explainers: dict[int, Explainer]
+) -> Iterator[str]:
     channel, time_ns, item = message
     if isinstance(item, Frame):
         if views[channel.number].news(item):
             yield from printer.frame(time_ns, views[channel.number], item)
     elif isinstance(item, Event):
-        yield printer.event(time_ns, channel.source, item)
+        yield printer.event(time_ns, channel.source, item, explainers[channel.number].explain(item))
     elif isinstance(item, StepMark):
         yield printer.step(time_ns, item)
     elif isinstance(item, ProcessChange):

@@ -48,5 +48,7 @@ def _entries(
             yield entry
         elif (part := parts.of(entry)) is not None:
             yield part
+    if not anything and not dump.begin_ns:
+        raise RecordingError(f"{dump.files[0]}: nothing is recorded in it")
     if not anything:
         raise RecordingError(f"nothing of {dump.files[0]} is in that time; it goes {span(dump.begin_ns, dump.end_ns)}")

@@ -6,7 +6,7 @@ import csv
 import io
 from collections.abc import Iterator, Sequence
 from itertools import chain
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 import msgspec
 
@@ -16,6 +16,7 @@ from shmio.cli.run import dumps
 from shmio.dump.channels import Channel
 from shmio.dump.columns import heading
 from shmio.dump.encoding import Gap, ProcessChange, StepMark
+from shmio.dump.explain import Explained
 from shmio.layout.codec import codec
 from shmio.layout.model import Layout, Register
 from shmio.layout.text import json_value, to_text
@@ -50,8 +51,8 @@ class Printer(Protocol):
     def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
         """A frame's chosen values."""
 
-    def event(self, time_ns: int, source: str, event: Event) -> str:
-        """An event."""
+    def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
+        """An event, and what it is about."""
 
     def gap(self, time_ns: int, gap: Gap) -> str:
         """What was missed."""
@@ -69,6 +70,53 @@ def kind_of(event: Event) -> str:
         return str(EventKind(event.kind))
     except ValueError:  # of a later version
         return f"kind {event.kind}"
+
+
+ABOUT: Final = ("path", "value", "direction", "by")
+"""Columns of what an event is about, in tables."""
+MAX_PLACES: Final = 4
+"""So many registers of one event are printed for people."""
+
+
+def object_of(event: Event, explained: Explained) -> dict[str, Any]:
+    """What an event is about, as JSON has it; ``data`` in hexadecimal digits."""
+    places = explained.places
+    return {
+        "by": explained.by,
+        "direction": explained.direction,
+        "paths": [place.path for place in places],
+        "values": {place.path: place.plain for place in places if place.valued},
+        "laid": explained.laid,
+        "injection": event.injection,
+        **{name: getattr(event, name) for name in ("command", "item", "items", "offset", "mask", "size", "text")},
+        "data": event.data.hex(),
+    }
+
+
+def cells_of(explained: Explained) -> tuple[str, ...]:
+    """What an event is about, as tables have it under ABOUT: of several registers the values are a JSON object."""
+    places = explained.places
+    valued = [place for place in places if place.valued]
+    value = dumps({place.path: place.plain for place in valued}) if valued[1:] else "".join(p.text for p in valued)
+    return ", ".join(place.path for place in places), value, explained.direction, explained.by
+
+
+def _where(event: Event, explained: Explained, room: int | None) -> str:
+    """The registers with their direction and values, for people; of what has no name the bytes."""
+    if not explained.places:
+        return f"{event.size} bytes at {event.offset}" if event.size and not event.data.startswith(b"{") else ""
+    way = f"/{explained.direction}" if explained.direction else ""
+    texts = [
+        f"{printable(place.path)}{way}{f' = {shown(place.value, place.register, room)}' if place.valued else ''}"
+        for place in explained.places[:MAX_PLACES]
+    ]
+    more = len(explained.places) - MAX_PLACES
+    return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
+
+
+def _laid(laid: dict[str, Any]) -> str:
+    """How an injection is laid, as a campaign file has it; what its event says already is left out."""
+    return ", ".join(f"{key} = {dumps(value)}" for key, value in laid.items() if key not in ("name", "direction"))
 
 
 class JsonLines:
@@ -92,10 +140,9 @@ class JsonLines:
             values=values,
         )
 
-    def event(self, time_ns: int, source: str, event: Event) -> str:
-        """``event`` is its number; ``data`` in hexadecimal digits."""
-        fields = {name: getattr(event, name) for name in ("cycle", "incarnation", "writer", "command", "item", "items")}
-        fields |= {name: getattr(event, name) for name in ("offset", "mask", "size", "text")}
+    def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
+        """``event`` is its number."""
+        fields = {name: getattr(event, name) for name in ("cycle", "incarnation", "writer")}
         return self._line(
             time_ns,
             source,
@@ -104,7 +151,7 @@ class JsonLines:
             after_frame=event.frame,
             quality=str(event.quality),
             **fields,
-            data=event.data.hex(),
+            **object_of(event, explained),
         )
 
     def gap(self, time_ns: int, gap: Gap) -> str:
@@ -149,15 +196,18 @@ class Table:
         quality = "" if frame.quality is Quality.GOOD else f"  {frame.quality}: {printable(frame.reason)}"
         yield f"{local(time_ns)}  {view.source}  {frame.number:<5}  {self._row(cells)}{quality}".rstrip()
 
-    def event(self, time_ns: int, source: str, event: Event) -> str:
-        """Kind and reason, and of a command which bytes."""
+    def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
+        """Kind and reason; of a command what it is about, and whose it is; of an injection how it is laid."""
         what = f"{kind_of(event)} {event.quality}" if event.kind == EventKind.QUALITY else kind_of(event)
+        if where := _where(event, explained, self._room):
+            what += f" {where}"
+        if explained.by:
+            what += f" by {explained.by}"
         if event.command and event.kind != EventKind.NOTED:
-            what += (
-                f" command {event.command}.{event.item} of writer {event.writer}: {event.size} bytes at {event.offset}"
-            )
+            what += f", command {event.command}.{event.item}"
         text = f": {printable(event.text)}" if event.text else ""
-        return f"{local(time_ns)}  {source}  event {event.number} after frame {event.frame}: {what}{text}"
+        laid = f" {printable(_laid(explained.laid))}" if explained.laid else ""
+        return f"{local(time_ns)}  {source}  event {event.number} after frame {event.frame}: {what}{text}{laid}"
 
     def gap(self, time_ns: int, gap: Gap) -> str:
         """How many, which, why."""
@@ -185,7 +235,7 @@ class Csv:
     Arrays are JSON; a value is empty where the source never had any, or it is of another block.
     """
 
-    OWN = ("time", "source", "what", "number", "quality", "text")
+    OWN = ("time", "source", "what", "number", "quality", "text", *ABOUT)
 
     def __init__(self, views: Sequence[View]) -> None:
         several = len({view.source for view in views}) > 1
@@ -209,9 +259,10 @@ class Csv:
                 values[self._columns[name]] = to_text(decode.decode(frame.image), register)
         yield self._row(time_ns, view.source, "frame", frame.number, str(frame.quality), frame.reason, values)
 
-    def event(self, time_ns: int, source: str, event: Event) -> str:
+    def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
         """``what`` is its kind."""
-        return self._row(time_ns, source, kind_of(event), event.number, str(event.quality), event.text)
+        row = time_ns, source, kind_of(event), event.number, str(event.quality), event.text
+        return self._row(*row, about=cells_of(explained))
 
     def gap(self, time_ns: int, gap: Gap) -> str:
         """``number`` is the first that is missing."""
@@ -227,7 +278,15 @@ class Csv:
         return self._row(time_ns, "", f"process {change.what}", change.pid, "", text)
 
     def _row(
-        self, time_ns: int, source: str, what: str, number: int, quality: str, text: str, values: Sequence[str] = ()
+        self,
+        time_ns: int,
+        source: str,
+        what: str,
+        number: int,
+        quality: str,
+        text: str,
+        values: Sequence[str] = (),
+        about: Sequence[str] = ("",) * len(ABOUT),
     ) -> str:
         lines = io.StringIO(newline="")
         writer = csv.writer(lines, lineterminator="\n")
@@ -235,5 +294,5 @@ class Csv:
             self._begun = True
             writer.writerow([*self.OWN, *self._columns])
         filled = values or [""] * len(self._columns)
-        writer.writerow([iso(time_ns), source, what, number, quality, text, *filled])
+        writer.writerow([iso(time_ns), source, what, number, quality, text, *about, *filled])
         return lines.getvalue().removesuffix("\n")

@@ -19,7 +19,7 @@ MAX_TOLD = 1000
 def execute(arguments: argparse.Namespace) -> int:
     """Write a new, closed file with every message of every whole chunk, and tell what was lost."""
     file: Path = arguments.file
-    path = arguments.output or file.with_name(f"{file.stem}-recovered{file.suffix}")
+    path = arguments.output or file.parent / f"{file.stem}-recovered{file.suffix}"
     places: list[str] = []
 
     def damaged(_: Path, damage: Damage) -> None:

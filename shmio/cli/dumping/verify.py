@@ -40,6 +40,8 @@ def verify(file: Path) -> dict[str, Any]:
 def lines(found: dict[str, Any]) -> list[str]:
     """For people."""
     whole = f"{found['chunks']} chunks and {found['messages']} messages are whole"
+    if not found["chunks"]:
+        whole = "nothing is recorded in it"
     return [f"{found['file']}: {ended(found)}; {whole}{'' if found['damage'] else ', no damage'}"] + [
         f"  damage: {text}" for text in found["damage"]
     ]

@@ -13,11 +13,12 @@ import numpy.typing as npt
 from mcap.writer import Writer
 
 from shmio import __version__
-from shmio.cli.dumping.printers import kind_of
+from shmio.cli.dumping.printers import kind_of, object_of
 from shmio.cli.dumping.progress import Progress
 from shmio.dump.blocks import DumpBlock
 from shmio.dump.columns import Columns, heading
 from shmio.dump.dump import Dump
+from shmio.dump.explain import Explainer
 from shmio.dump.names import Chosen
 from shmio.dump.pieces import pieces
 from shmio.layout.model import Register
@@ -26,7 +27,12 @@ FRAME: Final = "frame"
 HEAD: Final = {"number": "integer", "cycle": "integer", "quality": "integer", "provenance": "integer"}
 """What each frame tells of itself, under FRAME."""
 _TYPES: Final = {"b": "boolean", "i": "integer", "u": "integer", "f": "number", "m": "integer"}
-_EVENT: Final = {"kind": "string", "text": "string", "quality": "string", "frame": "integer", "command": "integer"}
+_EVENT: Final = {
+    "kind": "string", "text": "string", "quality": "string", "number": "integer", "frame": "integer",
+    "cycle": "integer", "by": "string", "direction": "string", "paths": "array", "values": "object",
+    "laid": "object", "injection": "integer", "command": "integer", "item": "integer", "items": "integer",
+    "offset": "integer", "mask": "integer", "size": "integer", "data": "string",
+}  # fmt: skip
 
 
 class _Row(NamedTuple):
@@ -76,12 +82,22 @@ def _frames(
 
 def _events(dump: Dump, source: str, writer: Writer, from_ns: int, to_ns: int) -> Iterator[_Row]:
     channel = 0
-    for log_ns, _, event in dump.events(source, from_ns, to_ns):
-        schema = {name: {"type": kind} for name, kind in _EVENT.items()}
+    explainers: dict[DumpBlock, Explainer] = {}
+    for log_ns, block, event in dump.events(source, from_ns, to_ns):
+        schema = {name: _property(kind) for name, kind in _EVENT.items()}
         channel = channel or _channel(writer, f"/{source}/events", "event", schema)
-        told = {"kind": kind_of(event), "text": event.text, "quality": str(event.quality)}
-        told_in_numbers = {"frame": event.frame, "command": event.command}
-        yield _Row(log_ns, channel, log_ns, msgspec.json.encode(told | told_in_numbers))
+        if block is None:
+            continue
+        explained = explainers.setdefault(block, Explainer(source, block.layout)).explain(event)
+        told = {"kind": kind_of(event), "quality": str(event.quality), "number": event.number}
+        about = object_of(event, explained)
+        about["laid"] = about["laid"] or {}
+        told_in_numbers = {"frame": event.frame, "cycle": event.cycle}
+        yield _Row(log_ns, channel, log_ns, msgspec.json.encode(told | told_in_numbers | about))
+
+
+def _property(kind: str) -> dict[str, Any]:
+    return {"type": kind, "items": {"type": "string"}} if kind == "array" else {"type": kind}
 
 
 def _channel(writer: Writer, topic: str, name: str, properties: dict[str, Any]) -> int:

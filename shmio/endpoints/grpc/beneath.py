@@ -12,7 +12,7 @@ from shmio.segment.diverted import apply
 
 
 class Beneath:
-    """The image beneath one injection of a block. What shmio runs by itself is not in it."""
+    """The image beneath one injection of a block."""
 
     def __init__(self, block: Block, image: bytes = b"") -> None:
         """``image``: as it is at first, as far as others further in give it; default: zeros."""
@@ -34,7 +34,7 @@ class Beneath:
         for one in self._block.standing.read() if self.number else ():
             if one.id == self.number:
                 break
-            if one.direction == "out" and one.running is None:
+            if one.direction == "out" and one.active:
                 for offset, size, mask in one.ranges:
                     bits[offset : offset + size] |= mask
         self._inner = (bits.tobytes(), bytes(self.given)) if bits.any() else None

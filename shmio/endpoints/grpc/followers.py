@@ -7,8 +7,7 @@ from typing import Final, Protocol
 from shmio.segment import Event, EventKind
 from shmio.segment.diverted import Diverted, Gatherer
 
-_STACKED: Final = frozenset({EventKind.INJECTED, EventKind.LIFTED})
-_HAPPENED: Final = _STACKED | {EventKind.ACTIVATED, EventKind.DEACTIVATED}
+_STACKED: Final = frozenset({EventKind.INJECTED, EventKind.LIFTED, EventKind.ACTIVATED, EventKind.DEACTIVATED})
 
 
 class Follower:
@@ -21,7 +20,7 @@ class Follower:
         """A command's values went to it."""
 
     def restack(self) -> None:
-        """An injection was laid or lifted, on the same source."""
+        """An injection was laid or lifted, became active or is no longer, on the same source."""
 
     def lifted(self, reason: str) -> None:
         """It was lifted."""
@@ -55,7 +54,7 @@ class Followers:
     def gather(self, event: Event) -> list[News]:
         """What is to be told by this event."""
         news: list[News] = [*self._gatherer.follow(event)]
-        if (event.kind in _HAPPENED and not event.offset) or (event.kind == EventKind.ACCEPTED and self._listeners):
+        if (event.kind in _STACKED and not event.offset) or (event.kind == EventKind.ACCEPTED and self._listeners):
             news.append(event)  # of a long declaration's parts the first
         return news
 

@@ -128,7 +128,7 @@ def test_cat_prints_a_line_for_each_change(file: str, said: Output) -> None:
         r"time +cell  frame  count",
         rf"{stamp}  cell  1      7",
         rf"{stamp}  cell  3      8",
-        rf"{stamp}  cell  event 2 after frame 3: written command 99\.0 of writer 4: 2 bytes at 0",
+        rf"{stamp}  cell  event 2 after frame 3: written cell/count/in by grpc, command 99\.0",
         rf"{stamp}  cell  event 3 after frame 3: quality bad: cable out",
         rf"{stamp}  cell  4      8      bad: cable out",
         rf"{stamp}  cell  event 1 after frame 0: started: pid \d+",
@@ -221,10 +221,38 @@ def test_cat_of_several_files_says_how(file: str, said: Output) -> None:
     )
 
 
-@pytest.mark.parametrize("verb", ["info", "cat", "verify", "recover"])
-def test_a_folder_is_no_recording(verb: str, tmp_path: Path, said: Output) -> None:
-    assert main([verb, str(tmp_path)]) == 1
-    assert said() == ([], [f"{tmp_path} is a folder; name the recordings in it: {tmp_path}/*.mem"])
+@pytest.mark.parametrize(
+    "verb", [["info"], ["cat"], ["verify"], ["recover"], ["cut", "-o", "x"], ["campaign", "-o", "x"]]
+)
+def test_what_is_no_recording_is_told(verb: list[str], file: str, tmp_path: Path, said: Output) -> None:
+    data = Path(file).read_bytes()
+    contents = {"short": data[:5], "magic": data[:8], "header": data[:40], "text": b"some text", "empty": b""}
+    for name, content in contents.items():
+        Path(name).write_bytes(content)
+    begun = "ends where it begins: its recorder was killed before it wrote anything, or has just begun"
+    for path, why in (
+        (str(tmp_path), f"is a folder; name the recordings in it: {tmp_path}/*.mem"),
+        (".", "is a folder; name the recordings in it: ./*.mem"),
+        ("short", begun),
+        ("magic", begun),
+        ("header", begun),
+        ("text", "is no recording: it does not begin as MCAP"),
+        ("empty", "is empty: its recorder wrote nothing"),
+    ):
+        assert main([*verb, path]) == 1
+        assert said() == ([], [f"{path} {why}"])
+    assert main([*verb, "no.mem"]) == 1
+    assert said() == ([], ["no.mem: No such file or directory"])
+
+
+def test_a_recording_of_nothing_is_whole(segment: Segment, tmp_path: Path, said: Output) -> None:
+    work = recorder(segment, tmp_path, selection=Selection(["nobody"]))
+    work.close()
+    path = work.output.path
+    assert main(["verify", str(path)]) == 0
+    assert said() == ([f"{path}: closed; nothing is recorded in it, no damage"], [])
+    assert main(["cut", str(path), "-o", "x"]) == 1
+    assert said() == ([], [f"{path}: nothing is recorded in it"])
 
 
 def test_a_recording_that_was_not_closed_is_read_and_that_is_told(file: str, said: Output) -> None:
@@ -288,7 +316,12 @@ def test_cat_as_csv(file: str, said: Output) -> None:
     out, err = said()
     rows = list(csv.reader(out))
     assert err == []
-    assert rows[0] == ["time", "source", "what", "number", "quality", "text", "count", "speed"]
+    own = ["time", "source", "what", "number", "quality", "text", "path", "value", "direction", "by"]
+    assert rows[0] == [*own, "count", "speed"]
+    about = rows[0].index("path")
+    [written] = [row for row in rows if row[2] == "written"]
+    assert written[about : about + 4] == ["cell/count", "", "in", "grpc"]
+    rows = [row[:about] + row[about + 4 :] for row in rows]
     assert [row[1:] for row in rows if row[2] == "frame"] == [
         ["cell", "frame", "1", "good", "", "7", ""],
         ["cell", "frame", "3", "good", "", "8", ""],

@@ -208,7 +208,7 @@ def test_recover_of_what_is_no_recording(tmp_path: Path, capsys: pytest.CaptureF
         pass
     assert main(["recover", "x.mem"]) == 1
     assert capsys.readouterr().err == "x.mem: nothing is recorded in it\n"
-    for content, message in ((b"", "is empty"), (b"nothing", "is no recording"), (MAGIC, "no recording of shmio")):
+    for content, message in ((b"", "is empty"), (b"nothing", "is no recording"), (MAGIC, "ends where it begins")):
         Path("x.mem").write_bytes(content)
         assert main(["recover", "x.mem"]) == 1
         assert message in capsys.readouterr().err

@@ -8,6 +8,7 @@ import msgspec
 import pytest
 
 import shmio
+from shmio.config import Declaration
 from shmio.connectors.injections import Owner
 from shmio.errors import CommandError, PathError
 from shmio.layout.codec import Value
@@ -80,6 +81,25 @@ def test_one_that_is_laid_beneath_another_finds_what_is_there(rig: Rig) -> None:
     rig.other.lift(innermost)
     assert beneath(rig, outer, EventKind.LIFTED) == [], "it is the device's again"
     assert rig.value("speed") == 100
+
+
+def test_what_a_declared_one_computes_goes_to_the_one_further_out(rig: Rig, local: Attachment) -> None:
+    rig.client.write({"speed": 3})
+    rig.sees({"speed": 3})
+    with local.inject("cell/speed", "cell/position", priority=1) as outer:
+        stream = outer.diverted(timeout_s=20)
+        drift = msgspec.convert(
+            {"name": "drift", "target": "cell/speed", "operation": "offset", "value": 100}, Declaration
+        )
+        declared = rig.client.declare(drift)
+        assert next(stream).values == {"speed": 103}, "from the cycle on in which it is active"
+        rig.client.write({"speed": 4})
+        assert next(stream).values == {"speed": 104}
+        inner = rig.other.inject(["speed"], priority=-1)
+        rig.other.shadow(inner, {"speed": 7})
+        assert any(one.values == {"speed": 107} for one in stream), "what it makes of what an inner one gives"
+        rig.client.lift(declared)
+        assert any(one.values == {"speed": 7} for one in stream)
 
 
 def test_a_program_gets_what_others_write_command_by_command(rig: Rig, local: Attachment) -> None:

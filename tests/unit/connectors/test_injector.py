@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
@@ -170,6 +171,9 @@ def test_events_tell_what_was_done(rig: Rig) -> None:
     laid = rig.event(EventKind.INJECTED)
     assert (laid.injection, laid.command, laid.writer, laid.text) == (number, number, 4, "drive test")
     (standing,) = rig.block.standing.read()
+    assert json.loads(laid.data) == {
+        "direction": "out", "priority": 3, "keep": False, "pid": 100, "ranges": [list(standing.ranges[0])],
+    }  # fmt: skip
     assert (standing.id, standing.direction, standing.priority, standing.name) == (number, "out", 3, "drive test")
     assert (standing.writer, standing.pid, standing.keep) == (4, 100, False)
     assert [register.path for register in LAYOUT.registers if standing.covers(register)] == ["speed"]

@@ -115,6 +115,22 @@ def test_a_failure_is_one_bad_frame_with_the_last_bytes_and_recovery_needs_no_re
     assert (loop.counters.failures, loop.counters.overruns) == (3, 0)
 
 
+def test_cycles_do_not_go_back_when_a_source_is_stopped_and_started_within_a_period(segment: Segment) -> None:
+    class Punctual(VirtualClock):
+        def wait_ns(self, duration_ns: int) -> bool:
+            return super().wait_ns(min(duration_ns, self.end_ns - self.time_ns))
+
+    cursor = segment.blocks["cell"].cursor()
+    clock = Punctual(5 * PERIOD_NS + PERIOD_NS // 4)
+    for end_ns in (clock.end_ns, 7 * PERIOD_NS):
+        clock.end_ns = end_ns
+        SourceLoop(Device(lambda *_: None), segment.writer("cell"), Schedule(0, PERIOD_NS), clock).run()
+    cycles = []
+    while (frame := cursor.poll()) is not None:
+        cycles.append(frame.cycle)
+    assert cycles[:7] == [1, 2, 3, 4, 5, 5, 6], "the end has the cycle that it came in"
+
+
 def test_a_new_reason_is_a_new_bad_frame(segment: Segment) -> None:
     reasons = iter(["refused", "refused", "garbage"])
 

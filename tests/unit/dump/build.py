@@ -13,7 +13,7 @@ from shmio.dump.encoding import Gap, Life, ProcessChange, Reason, StepMark
 from shmio.layout.model import Layout, Register
 from shmio.recording.output import Output
 from shmio.recording.writer import Channels, Writer
-from shmio.segment import Block, Event, EventKind, Frame, Provenance, Quality
+from shmio.segment import Block, Event, EventKind, Frame, Provenance, Quality, Record
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 20_000_000
@@ -93,6 +93,18 @@ class Build:
         event = Event(
             number, EventKind.QUALITY, after, after, clock_ns, clock_ns, utc_ns, 1, Quality.GOOD,
             0xFFFFFFFF, 0, 0, 0, 0, 0, 0, b"", text, 0,
+        )  # fmt: skip
+        self.writer.event(self.blocks[source], event, utc_ns)
+
+    def tell(self, record: Record, after: int = 1, source: str = "cell") -> None:
+        """Whatever happened, behind a frame."""
+        self.events[source] += 1
+        clock_ns = after * PERIOD_NS
+        utc_ns = START_NS + clock_ns
+        event = Event(
+            self.events[source], record.kind, after, after, clock_ns, clock_ns, utc_ns, 1, Quality.GOOD,
+            record.writer, record.command, record.item, record.items, record.offset, record.mask, record.size,
+            record.data, record.text, record.injection,
         )  # fmt: skip
         self.writer.event(self.blocks[source], event, utc_ns)
 

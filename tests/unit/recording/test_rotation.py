@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import threading
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -179,6 +180,34 @@ def test_a_file_whose_predecessor_could_not_be_written_stays_empty(
     assert not outputs[1].close(30)
     assert "one before it was not written to its end" in outputs[1].problem
     assert (tmp_path / "two").read_bytes() == b""
+
+
+def test_a_series_does_not_write_on_where_the_file_before_was_not_written(
+    segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk is slow when the new file is begun, and then takes no more of the old one."""
+    answered, put = threading.Event(), Output._put
+    work = series(segment, tmp_path, rotate_mb=0.001)
+    first = work.recorder.output
+
+    def held(output: Output, piece: bytes) -> bool:
+        if output is not first:
+            return put(output, piece)
+        answered.wait(30)
+        return False
+
+    monkeypatch.setattr(Output, "_put", held)
+    publish(segment.writer("cell"), 100)
+    work.turn()
+    work.recorder._writer.flush()
+    work.tend()
+    second = work.recorder.output
+    assert second is not first
+    publish(segment.writer("cell"), 1)
+    work.turn()
+    answered.set()
+    assert len(work.close()) == 2
+    assert second.path.read_bytes() == b""
 
 
 # ---- retention -------------------------------------------------------------------------------------------------------

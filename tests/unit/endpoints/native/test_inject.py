@@ -375,15 +375,21 @@ def test_too_many_pieces_are_refused_before_any_is_looked_at(segment: Segment) -
     with_plant(segment, test)
 
 
-def test_what_a_declared_one_makes_is_not_an_original(segment: Segment) -> None:
-    """And does not hide the source's own value either."""
+def test_what_a_declared_one_further_in_makes_is_an_original(segment: Segment) -> None:
+    """Until it is lifted: then it is what the source delivers."""
 
     def test(cell: Client, device: Plant, _: Endpoint) -> None:
         struct.pack_into(">f", device.memory, 0, 1.5)
         offset = {"name": "x", "target": "cell/axis/position", "operation": "offset", "value": 5}
-        with cell.declare([offset]), cell.inject("cell/axis/position", originals=True) as shadow:
-            while (found := next(shadow)["cell/axis/position"]) != 1.5:
-                assert found == 0.0
+        with cell.declare([offset]) as campaign, cell.inject("cell/axis/position", originals=True) as shadow:
+            while next(shadow)["cell/axis/position"] != 6.5:
+                pass
+            struct.pack_into(">f", device.memory, 0, 2.5)
+            while next(shadow)["cell/axis/position"] != 7.5:
+                pass
+            cell.lift("cell", campaign.declared[0].number)
+            while next(shadow)["cell/axis/position"] != 2.5:
+                pass
 
     with_client(segment, test)
 

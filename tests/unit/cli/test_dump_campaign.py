@@ -1,0 +1,127 @@
+"""``shmio-dump campaign``: what was injected, as a file that does it again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from shmio.cli.dump import main
+from shmio.config.campaign import read_campaign
+from shmio.segment import EventKind, Record
+from tests.unit.dump.build import Build, build, image
+
+DRIFT: dict[str, Any] = {
+    "name": "drift", "target": "cell/speed", "operation": "offset", "value": 2.5,
+    "start_s": 0.5, "end_s": 0.9, "seed": 7,
+}  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def declared(number: int, keys: dict[str, Any]) -> Record:
+    document = msgspec.json.encode(keys)
+    return Record(EventKind.INJECTED, keys["name"], 0, number, 0, 1, 0, 0, len(document), document, number)
+
+
+def laid(number: int, direction: str, *ranges: tuple[int, int, int], name: str = "") -> Record:
+    how = {"direction": direction, "priority": 3, "keep": False, "pid": 1, "ranges": ranges}
+    return Record(EventKind.INJECTED, name, 0, number, 0, 1, 0, 0, 0, msgspec.json.encode(how), number)
+
+
+def given(number: int, count: int) -> Record:
+    return Record(EventKind.SHADOWED, "", 0, 50, 0, 1, 0, 0, 2, count.to_bytes(2, "big"), number)
+
+
+def lifted(number: int, reason: str = "lifted") -> Record:
+    return Record(EventKind.LIFTED, reason, 0, 9, 0, 1, injection=number)
+
+
+Derive = Callable[..., list[dict[str, Any]]]
+
+
+@pytest.fixture
+def derive(capsys: pytest.CaptureFixture[str]) -> Derive:
+    """What the file of a recording with these events, each behind a frame, declares; nothing is said."""
+
+    def derive(*told: tuple[int, Record], options: tuple[str, ...] = (), said: str = "") -> list[dict[str, Any]]:
+        for file in ("a.mem", "campaign.toml"):
+            Path(file).unlink(missing_ok=True)
+        with build(Path("a.mem")) as work:
+            work.block("cell")
+            for number in range(1, 101):
+                work.frame(number, image(number))
+                _tell(work, number, told)
+        assert main(["campaign", "a.mem", "-o", "campaign.toml", *options]) == 0
+        assert capsys.readouterr().err == said
+        return [msgspec.to_builtins(one) for one in read_campaign(Path("campaign.toml"))]
+
+    return derive
+
+
+def _tell(work: Build, number: int, told: tuple[tuple[int, Record], ...]) -> None:
+    for at, record in told:
+        if at == number:
+            work.tell(record, after=number)
+
+
+def test_what_was_declared_before_it_began_is_declared_the_same(derive: Derive) -> None:
+    [one] = derive((10, declared(5, DRIFT)), (60, lifted(5, "over")))
+    assert one == DRIFT
+
+
+def test_when_it_was_laid_and_lifted_counts(derive: Derive) -> None:
+    """A period is 20 ms."""
+    keys = {name: DRIFT[name] for name in ("name", "target", "operation", "value", "seed")}
+    [one] = derive((10, declared(5, keys)), (60, lifted(5)))
+    assert one == keys | {"start_s": 0.200000001, "end_s": 1.200000001}
+    [one] = derive((10, declared(5, keys)), (60, lifted(5)), options=("--from-zero",))
+    assert one == keys | {"end_s": 1.0}
+    [one] = derive((30, declared(5, DRIFT)))
+    assert one == DRIFT | {"start_s": 0.600000001}, "it came too late for its beginning"
+
+
+def test_texts_lists_and_names(derive: Derive) -> None:
+    keys = DRIFT | {"operation": "set", "target": ["cell/row", 'cell/\u00fc "\\'], "value": [1, -2, 3]}
+    again = keys | {"value": "16#FF", "target": "cell/count"}
+    first, second = derive((10, declared(5, keys)), (20, declared(6, again)))
+    assert (first, second) == (keys, again | {"name": "drift-2"})
+
+
+def test_what_a_client_gave_consumers_is_set_from_value_to_value(derive: Derive) -> None:
+    found = derive(
+        (10, laid(5, "out", (0, 2, 255), name="hand")),
+        (10, given(5, 7)),
+        (15, given(5, 7)),
+        (20, given(5, 8)),
+        (30, lifted(5, "its client is gone")),
+    )
+    same = {"target": "cell/count", "operation": "set", "priority": 3}
+    assert found == [
+        same | {"name": "hand", "value": 7, "start_s": 0.200000001, "end_s": 0.400000001},
+        same | {"name": "hand-2", "value": 8, "start_s": 0.400000001, "end_s": 0.600000001},
+    ]
+
+
+def test_what_cannot_be_declared_is_told(derive: Derive, capsys: pytest.CaptureFixture[str]) -> None:
+    limit = laid(5, "in", (0, 2, 255), name="limit")
+    why = "a client gave it values over /in, which depended on what was written"
+    earlier = "it was laid before the recording began"
+    derive(
+        (5, given(4, 1)), (5, given(4, 2)), (10, limit), (20, declared(6, DRIFT)),
+        said=f"not as it was: 4: {earlier}\nnot as it was: limit: {why}\n",
+    )  # fmt: skip
+    Path("campaign.toml").unlink()
+    with build(Path("b.mem")) as work:
+        work.block("cell")
+        work.frame(1, image(1))
+    assert main(["campaign", "b.mem", "-o", "campaign.toml"]) == 1
+    assert capsys.readouterr().err == "b.mem: no injection was laid in it that can be declared\n"
+    assert not Path("campaign.toml").exists()
