@@ -105,6 +105,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     _times(export)
     _some(export)
+    export.add_argument("--events", action="store_true", help="a table of the events in place of the values")
     export.add_argument("--raw", action="store_true", help="what sources delivered, without what was injected")
 
     add_json(export)

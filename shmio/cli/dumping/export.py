@@ -10,6 +10,7 @@ from typing import IO, Final, Protocol
 
 from shmio.cli.dumping.complaints import Complaints
 from shmio.cli.dumping.csvfile import CsvTable
+from shmio.cli.dumping.eventtable import export_events
 from shmio.cli.dumping.moments import span, time_range
 from shmio.cli.dumping.parquet import ParquetTable
 from shmio.cli.dumping.progress import Progress
@@ -50,6 +51,8 @@ def execute(arguments: argparse.Namespace) -> int:
     """Write tables, a file for each block, or one MCAP file for viewers."""
     complaints = Complaints()
     named, form = _form(arguments.output, arguments.format)
+    if arguments.events and (not named or form not in TABLES):
+        raise RecordingError(f"{arguments.output}: --events makes one table: have its name end in .csv or .parquet")
     with (
         complaints.open(arguments.files) as dump,
         Progress(f"exporting to {arguments.output}") as progress,
@@ -59,6 +62,11 @@ def execute(arguments: argparse.Namespace) -> int:
         if not chosen:
             raise RecordingError(f"{dump.files[0]}: nothing is recorded in it")
         sources = list(dict.fromkeys(block.source for block in chosen))
+        if arguments.events:
+            progress.total = dump.end_ns - dump.begin_ns
+            with new_file(arguments.output) as stream:
+                count = export_events(dump, sources, stream, form, from_ns, to_ns, progress)
+            return _told(arguments, complaints, [(arguments.output, count)], "rows")
         if form == "mcap":
             progress.total = dump.end_ns - dump.begin_ns
             with new_file(arguments.output) as stream:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -119,6 +120,37 @@ def test_the_export_for_viewers_has_all_of_an_event(capsys: pytest.CaptureFixtur
         {"cell/count": 5}, ["cell/count"], "grpc", "in",
     )  # fmt: skip
     assert (second["offset"], second["size"], second["data"], second["item"]) == (7, 1, "01", 1)
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+def test_a_table_of_events(form: str, capsys: pytest.CaptureFixture[str]) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    two = accepted(Write(8, 0, b"\0\6\0\7\0\x08\0"), 1)
+    recorded(
+        accepted(Write(0, 0, b"\0\5")), two._replace(offset=0, data=b"\0\1" + bytes(5), size=7), Record(EventKind.NOTED)
+    )
+    assert main(["export", "a.mem", "--events", "-o", f"events.{form}"]) == 0
+    assert capsys.readouterr().out == f"events.{form}: 3 rows\n"
+    if form == "csv":
+        with Path("events.csv").open(newline="") as stream:
+            rows = list(csv.DictReader(stream))
+    else:
+        rows = parquet.read_table("events.parquet").to_pylist()
+    about = [tuple(str(row[name]) for name in ("kind", "path", "value", "direction", "by", "command")) for row in rows]
+    assert about == [
+        ("accepted", "cell/count", "5", "in", "grpc", "99"),
+        (
+            "accepted",
+            "cell/count, cell/speed, cell/on",
+            '{"cell/count":1,"cell/speed":0.0,"cell/on":false}',
+            "in",
+            "grpc",
+            "99",
+        ),
+        ("noted", "", "", "", "", "0"),
+    ]
+    assert main(["export", "a.mem", "--events", "-o", "folder"]) == 1
+    assert "--events makes one table" in capsys.readouterr().err
 
 
 def test_names_are_those_of_what_was_recorded(capsys: pytest.CaptureFixture[str]) -> None:
