@@ -107,7 +107,6 @@ class Chain:
             "direction": layer.direction.name.lower(),
             "priority": layer.priority,
             "keep": layer.keep,
-            "pid": layer.owner.pid,
             "ranges": self._ranges[layer.id],
         }
         return in_parts(end, msgspec.json.encode(how))

@@ -52,7 +52,7 @@ class EventKind(IntEnum):
     """An injection was laid; the end of the command that asked for it, whose number is its own.
 
     Its data, JSON in parts, say how: of one that was declared its declaration, with the seed that it runs with; of a
-    client's ``direction``, ``priority``, ``keep``, the client's ``pid`` and ``ranges``: (offset, size, bits).
+    client's ``direction``, ``priority``, ``keep`` and ``ranges``: (offset, size, bits).
     """
     LIFTED = 13
     """An injection was lifted, with the reason; the end of the command that asked for it, if one did."""

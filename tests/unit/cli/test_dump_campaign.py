@@ -32,7 +32,7 @@ def declared(number: int, keys: dict[str, Any]) -> Record:
 
 
 def laid(number: int, direction: str, *ranges: tuple[int, int, int], name: str = "") -> Record:
-    how = {"direction": direction, "priority": 3, "keep": False, "pid": 1, "ranges": ranges}
+    how = {"direction": direction, "priority": 3, "keep": False, "ranges": ranges}
     return Record(EventKind.INJECTED, name, 0, number, 0, 1, 0, 0, 0, msgspec.json.encode(how), number)
 
 

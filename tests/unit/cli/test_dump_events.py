@@ -85,7 +85,7 @@ def test_what_has_no_name_is_told_by_its_bytes(capsys: pytest.CaptureFixture[str
 
 
 def test_an_injection_is_told_as_it_was_laid(capsys: pytest.CaptureFixture[str]) -> None:
-    how = {"direction": "out", "priority": 3, "keep": False, "pid": 1, "ranges": [[0, 2, 255], [6, 1, 8]]}
+    how = {"direction": "out", "priority": 3, "keep": False, "ranges": [[0, 2, 255], [6, 1, 8]]}
     drift = {"name": "drift", "target": "cell/speed/in", "operation": "offset", "value": 2.5, "note": "x" * 300}
     document = msgspec.json.encode(drift)
     laid = Record(EventKind.INJECTED, "test", PROGRAM, 7, 0, 1, 0, 0, 0, msgspec.json.encode(how), 7)
@@ -98,7 +98,7 @@ def test_an_injection_is_told_as_it_was_laid(capsys: pytest.CaptureFixture[str])
     old = Record(EventKind.INJECTED, "of a version before", PROGRAM, 6, 0, 1, injection=6)
     found = told(capsys, laid, *parts, Record(EventKind.ACTIVATED, "drift", injection=8), lifted, old)
     assert (found[0]["paths"], found[0]["direction"]) == (["cell/count", "cell/on"], "out")
-    assert found[0]["laid"] == {name: how[name] for name in ("direction", "priority", "keep", "pid")}
+    assert found[0]["laid"] == {name: how[name] for name in ("direction", "priority", "keep")}
     assert [event["laid"] for event in found[1:3]] == [None, drift], "with the last of its parts"
     assert found[3]["direction"] == "in"
     assert (found[4]["paths"], found[4]["direction"]) == (["cell/count", "cell/on"], "out")

@@ -172,7 +172,7 @@ def test_events_tell_what_was_done(rig: Rig) -> None:
     assert (laid.injection, laid.command, laid.writer, laid.text) == (number, number, 4, "drive test")
     (standing,) = rig.block.standing.read()
     assert json.loads(laid.data) == {
-        "direction": "out", "priority": 3, "keep": False, "pid": 100, "ranges": [list(standing.ranges[0])],
+        "direction": "out", "priority": 3, "keep": False, "ranges": [list(standing.ranges[0])],
     }  # fmt: skip
     assert (standing.id, standing.direction, standing.priority, standing.name) == (number, "out", 3, "drive test")
     assert (standing.writer, standing.pid, standing.keep) == (4, 100, False)
