@@ -11,7 +11,7 @@ import msgspec
 from shmio.config import Declaration
 from shmio.dump.dump import Dump
 from shmio.dump.explain import Explained, Explainer, Place
-from shmio.segment.events import Event, EventKind
+from shmio.segment.events import NO_WRITER, Event, EventKind
 
 NS = 1e9
 
@@ -99,6 +99,11 @@ class _Source:
     def _lay(self, event: Event, explained: Explained) -> None:
         how = dict(explained.laid or {})
         declaration = None
+        if event.writer == NO_WRITER:
+            self._found.left_out.append(
+                f"{event.text}: no command has laid it: the configuration, or a replayed recording, does"
+            )
+            return
         if "operation" in how:
             try:
                 declaration = msgspec.convert(how, Declaration)

@@ -11,7 +11,7 @@ import pytest
 
 from shmio.cli.dump import main
 from shmio.config.campaign import read_campaign
-from shmio.segment import EventKind, Record
+from shmio.segment import NO_WRITER, EventKind, Record
 from tests.unit.dump.build import Build, build, image
 
 DRIFT: dict[str, Any] = {
@@ -111,12 +111,14 @@ def test_what_a_client_gave_consumers_is_set_from_value_to_value(derive: Derive)
 
 
 def test_what_cannot_be_declared_is_told(derive: Derive, capsys: pytest.CaptureFixture[str]) -> None:
+    blind = declared(7, DRIFT | {"name": "blind"})._replace(writer=NO_WRITER)
+    again = "no command has laid it: the configuration, or a replayed recording, does"
     limit = laid(5, "in", (0, 2, 255), name="limit")
     why = "a client gave it values over /in, which depended on what was written"
     earlier = "it was laid before the recording began"
     derive(
-        (5, given(4, 1)), (5, given(4, 2)), (10, limit), (20, declared(6, DRIFT)),
-        said=f"not as it was: 4: {earlier}\nnot as it was: limit: {why}\n",
+        (1, blind), (5, given(4, 1)), (5, given(4, 2)), (10, limit), (20, declared(6, DRIFT)),
+        said=f"not as it was: blind: {again}\nnot as it was: 4: {earlier}\nnot as it was: limit: {why}\n",
     )  # fmt: skip
     Path("campaign.toml").unlink()
     with build(Path("b.mem")) as work:
