@@ -26,8 +26,9 @@ class _Held:
 
 @dataclass(slots=True)
 class _Laid:
-    """An injection from the time when it was laid."""
+    """An injection from the time when it was laid, the ``place``-th."""
 
+    place: int
     name: str
     since_ns: int
     declaration: Declaration | None
@@ -39,7 +40,10 @@ class _Laid:
 
 @dataclass(slots=True)
 class Derived:
-    """Declarations by the time when they begin, and what of the recording's injections is not in them."""
+    """Declarations, source by source, as they were laid (of several over one register the newest is outermost).
+
+    ``left_out``: what of the recording's injections is not in them.
+    """
 
     declarations: list[Declaration] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
@@ -77,7 +81,6 @@ def derive(dump: Dump) -> Derived:
                 explainer = explainers.setdefault(block.section, Explainer(source, block.layout))
                 work.follow(event, explainer.explain(event))
         work.end()
-    found.declarations.sort(key=lambda one: one.start_s or 0.0)
     found.declarations = list(_named(found))
     return found
 
@@ -86,6 +89,8 @@ class _Source:
     def __init__(self, found: Derived) -> None:
         self._found = found
         self._laid: dict[int, _Laid] = {}
+        self._declared: list[tuple[int, Declaration]] = []
+        self._count = 0
         self._unknown: set[int] = set()
 
     def follow(self, event: Event, explained: Explained) -> None:
@@ -116,8 +121,9 @@ class _Source:
             )
             return
         priority = how.get("priority", 0)
+        self._count += 1
         self._laid[event.injection] = _Laid(
-            event.text, event.clock_ns, declaration, priority if isinstance(priority, int) else 0
+            self._count, event.text, event.clock_ns, declaration, priority if isinstance(priority, int) else 0
         )
 
     def _shadow(self, event: Event, explained: Explained) -> None:
@@ -150,6 +156,8 @@ class _Source:
                 self._set(laid, held, None)
             if laid.declaration is not None:
                 self._declare(laid, laid.declaration, None)
+        self._declared.sort(key=lambda pair: pair[0])
+        self._found.declarations += [one for _, one in self._declared]
 
     def _set(self, laid: _Laid, held: _Held, until_ns: int | None) -> None:
         place = held.place
@@ -168,7 +176,7 @@ class _Source:
         if until_ns is not None and (one.end_s is None or one.end_s > (until_ns + 1) / NS):
             one = msgspec.structs.replace(one, end_s=_round((until_ns + 1) / NS))
         if one.end_s is None or one.end_s > (one.start_s or 0.0):
-            self._found.declarations.append(one)
+            self._declared.append((laid.place, one))
 
 
 def _named(found: Derived) -> Iterator[Declaration]:

@@ -91,8 +91,9 @@ def test_when_it_was_laid_and_lifted_counts(derive: Derive) -> None:
 def test_texts_lists_and_names(derive: Derive) -> None:
     keys = DRIFT | {"operation": "set", "target": ["cell/row", 'cell/\u00fc "\\'], "value": [1, -2, 3]}
     again = keys | {"value": "16#FF", "target": "cell/count"}
-    first, second = derive((10, declared(5, keys)), (20, declared(6, again)))
-    assert (first, second) == (keys, again | {"name": "drift-2"})
+    later = {"name": "later", "target": "cell/count", "operation": "freeze", "start_s": 0.6}
+    found = derive((10, declared(7, later)), (10, declared(5, keys)), (20, declared(6, again)), (40, lifted(7)))
+    assert found == [later | {"end_s": 0.800000001}, keys, again | {"name": "drift-2"}], "as they were laid"
 
 
 def test_what_a_client_gave_consumers_is_set_from_value_to_value(derive: Derive) -> None:
