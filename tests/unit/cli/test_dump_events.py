@@ -142,7 +142,7 @@ def test_a_table_of_events(form: str, capsys: pytest.CaptureFixture[str]) -> Non
         (
             "accepted",
             "cell/count, cell/speed, cell/on",
-            '{"cell/count":1,"cell/speed":0.0,"cell/on":false}',
+            '{"cell/count": 1, "cell/speed": 0.0, "cell/on": false}',
             "in",
             "grpc",
             "99",
