@@ -106,11 +106,7 @@ class Campaign:
         return ""
 
     def follow(self) -> None:
-        """Take over what has changed in the configuration and in other sources; lift what is over."""
-        over = {layer.id for layer in self._layers if _finished(layer)}
-        if over:
-            self._chain.lift(lambda layer: layer.id in over, "over")
-            self.settle()
+        """Take over what has changed in the configuration and in other sources."""
         sequence = self._own.declared.sequence
         if sequence == self._configuration or sequence % 2:  # odd: it is just being written, and a bell follows
             return
@@ -206,10 +202,17 @@ class Campaign:
         changed = [layer for layer in self._layers if layer.advance(now, readings.of(layer.program))]
         if changed:
             self._chain.tell()
-        if any(map(_finished, changed)):
-            self._own.commands.wake()  # for who lifts them
         turned = [_turned(layer) for layer in changed if layer.active is not before[layer.id]]
-        return [*self._chain.computed(image.base), *turned]
+        return [*self._chain.computed(image.base), *turned, *self._lift_finished()]
+
+    def _lift_finished(self) -> list[Record]:
+        """Lift what is over, in the cycle in which it comes to that: nobody sees anything else by it."""
+        over = {layer.id for layer in self._layers if _finished(layer)}
+        if not over:
+            return []
+        told = self._chain.removed(lambda layer: layer.id in over, "over")
+        self._settle()
+        return told
 
     def release(self, cycle: int) -> list[tuple[Declared, Write]]:
         """What delays over ``/in`` have held long enough, for the cycle that is about to write."""

@@ -63,18 +63,22 @@ class Chain:
     def lift(self, which: Callable[[Injection], bool], reason: str, command: Command | None = None) -> None:
         """Remove layers and tell why."""
         with self.output.turn:
-            gone = [layer for layer in self.injections.layers if which(layer)]
-            above = {other.id for layer in gone for other in self.injections.outer(layer)}
-            self.injections.lift(which)
-            for layer in gone:
-                self._shown.pop(layer.id, None)
-                self._ranges.pop(layer.id, None)
-                self._computed.pop(layer.id, None)
-            self.tell()
-            ends = [about(EventKind.LIFTED, layer, reason, command) for layer in gone]
-            held = [record for layer in gone if isinstance(layer, Declared) for record in lost(layer, reason)]
-            left = [layer for layer in self.injections.layers if layer.id in above]
-            self.output.show([*held, *self.beneath(left, ends[0]), *ends] if ends else [])
+            self.output.show(self.removed(which, reason, command))
+
+    def removed(self, which: Callable[[Injection], bool], reason: str, command: Command | None = None) -> list[Record]:
+        """Remove layers, with the output's ``turn`` held; the events that tell why."""
+        gone = [layer for layer in self.injections.layers if which(layer)]
+        above = {other.id for layer in gone for other in self.injections.outer(layer)}
+        self.injections.lift(which)
+        for layer in gone:
+            self._shown.pop(layer.id, None)
+            self._ranges.pop(layer.id, None)
+            self._computed.pop(layer.id, None)
+        self.tell()
+        ends = [about(EventKind.LIFTED, layer, reason, command) for layer in gone]
+        held = [record for layer in gone if isinstance(layer, Declared) for record in lost(layer, reason)]
+        left = [layer for layer in self.injections.layers if layer.id in above]
+        return [*held, *self.beneath(left, ends[0]), *ends] if ends else []
 
     def beneath(self, layers: Iterable[Injection], end: Record) -> Iterator[Record]:
         """What clients' layers over ``/out`` get by now from those further in.

@@ -60,8 +60,8 @@ GROUPS: Final = {
         ("tests/unit/endpoints/test_*.py",),
     ),
     "recorder": Group(
-        ("shmio/recording/*.py",),
-        ("tests/unit/recording",),
+        ("shmio/recording/*.py", "shmio/dump/records.py"),
+        ("tests/unit/recording", "tests/unit/dump"),
     ),
 }
 
