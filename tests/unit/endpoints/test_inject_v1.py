@@ -496,17 +496,19 @@ def test_publishing_to_a_shadow_is_counted_and_its_refusals_logged(
     with_plant(segment, test)
 
 
-def test_what_declared_injections_make_of_it_is_not_in_the_originals(segment: Segment) -> None:
+def test_what_declared_injections_further_in_make_of_it_is_in_the_originals(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         consumer = served.subscribe("cell/step")
         program = Commander(segment.blocks["cell"], GUEST)
-        declaration = Declaration(name="eleven", target="cell/step", operation="set", value=11)
-        await asyncio.to_thread(program.declare, declaration)
-        await seen(consumer, "11")
+        declaration = Declaration(name="hundred", target="cell/step", operation="offset", value=100)
+        number = await asyncio.to_thread(program.declare, declaration)
+        await seen(consumer, "100")
         originals = await laid(served, "cell/step", "s")
-        assert await value(originals) == "0"
+        await seen(originals, "100")
         await publish(served, ("cell/step", "4"))
-        assert await value(originals) == "4"
+        await seen(originals, "104")
+        await asyncio.to_thread(program.lift, number)
+        await seen(originals, "4")
         originals.cancel()
 
     with_plant(segment, test)
