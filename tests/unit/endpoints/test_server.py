@@ -83,7 +83,7 @@ def test_calls_of_unknown_names_stop_nobody(
                 assert await value(stream) == str(number)
                 flood = Flood()
                 with flood.upon(target, trust):
-                    await refused(server, flood, 1000)
+                    await refused(server, flood, 100)
                     assert await known(before)
                     async with channel() as after:
                         assert await known(after)
@@ -91,7 +91,7 @@ def test_calls_of_unknown_names_stop_nobody(
                         assert await code(call(b"", timeout=TIMEOUT_S)) is grpc.StatusCode.UNIMPLEMENTED
                     served.publish(image(step=number + 100))
                     assert await value(stream) == str(number + 100), "what is open goes on"
-                    await refused(server, flood, 1000)
+                    await refused(server, flood, 100)
                 assert flood.lost == 0
                 stream.cancel()
         await server.stop()
