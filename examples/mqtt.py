@@ -38,6 +38,8 @@ def main() -> int:
 
     def heard(_client: Client, _data: object, message: MQTTMessage) -> None:
         nonlocal seen
+        if 0 < arguments.count <= seen:  # it came before we had left
+            return
         print(message.topic.removeprefix(f"{prefix}/"), message.payload.decode() or "no good value", flush=True)
         seen += 1
         if message.topic.endswith("/in/result") or seen == arguments.count:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from shmio.errors import PathError
 from shmio.layout.model import Layout
-from shmio.layout.topic import holder, parse_topic
+from shmio.layout.topic import holder, near, parse_topic
 from shmio.layout.write import chosen, covering
 from shmio.segment import Block, Frame
 
@@ -63,11 +63,21 @@ class Selection:
             if source not in layouts
         ]
         missing += [
-            f"{pattern}: no register has such a path"
+            f"{pattern}: no register has such a path{_near(pattern, layouts)}"
             for pattern in self._registers
             if not any(_paths(pattern, source, layout, layouts) for source, layout in layouts.items())
         ]
         return missing
+
+
+def _near(pattern: str, layouts: Mapping[str, Layout]) -> str:
+    """What may have been meant, to go on with after a message."""
+    try:
+        topic = parse_topic(pattern, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
+    except PathError:
+        return ""
+    alike = [] if "*" in pattern or topic.source not in layouts else near(layouts[topic.source], topic.path)
+    return f"; near: {', '.join(f'{topic.source}/{path}' for path in alike)}" if alike else ""
 
 
 def _paths(pattern: str, source: str, layout: Layout, sources: Collection[str]) -> set[str]:

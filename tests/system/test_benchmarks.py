@@ -186,3 +186,14 @@ def test_a_replays_timing_and_speed_are_measured() -> None:
     assert re.findall(r"^(50|1000) Hz +([1-9]\d*)( +\d+){4}$", text, re.MULTILINE)
     [missed] = re.findall(r"^50 Hz +[1-9]\d* +[1-9]\d* +(\d+)$", text, re.MULTILINE)
     assert missed == "0"
+
+
+def test_a_soak_watches_all_processes_and_the_recording() -> None:
+    found = printed("soak")
+    rows = re.findall(r"^(plc|cell|grpc|recorder) +\d+\.\d\d +\d+\.\d\d +[1-9]\d* +[1-9]\d*$", found, re.MULTILINE)
+    assert sorted(rows) == ["cell", "grpc", "plc", "recorder"]
+    assert re.search(
+        r"^[1-9]\d* frames, \d+ overruns, .* [1-9]\d* changes, [1-9]\d* messages received", found, re.MULTILINE
+    )
+    assert re.search(r"^the machine stood still .* of \d+ skipped cycles came without that", found, re.MULTILINE)
+    assert re.search(r"^[1-9]\d* frames recorded in [1-9]\d* files", found, re.MULTILINE)

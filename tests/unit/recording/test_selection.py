@@ -96,6 +96,8 @@ def test_from_outside(segment: Segment, tmp_path: Path, capsys: pytest.CaptureFi
     record = ["record", "--instance", segment.instance, "-o", str(tmp_path), "--for", "0.01"]
     assert main([*record, "--register", "cell/speed", "cell/nothing"]) == 1
     assert "cell/nothing: no register has such a path" in capsys.readouterr().err
+    assert main([*record, "--register", "cell/sped"]) == 1
+    assert capsys.readouterr().err == "cell/sped: no register has such a path; near: cell/speed\n"
     assert list(tmp_path.iterdir()) == []
     publish(segment.writer("cell"), 1)
     assert main([*record, "--register", "cell/speed"]) == 0
