@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from itertools import product
+from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 from shmio.layout.codec import Value, codec
-from shmio.layout.model import Layout, Register
-from shmio.layout.write import Write, bits_of
+from shmio.layout.model import Layout
+from shmio.layout.naming import paths_of
+from shmio.layout.topic import find_each
+from shmio.layout.write import Write
 from shmio.layout.write import apply as write_to
 from shmio.segment.events import Event, EventKind
 
@@ -67,25 +68,6 @@ def apply(image: bytearray, writes: Iterable[Write]) -> None:
 
 
 def values(layout: Layout, image: bytes, writes: Iterable[Write]) -> dict[str, Value]:
-    """The values in an image of what was written, by path: registers, or of arrays written in part their elements."""
-    bits = bytearray(layout.size)
-    apply(bits, (Write(offset, mask, b"\xff" * len(data)) for offset, mask, data in writes))
-    found: dict[str, Value] = {}
-    for register in layout.registers:
-        share = _share(bits, register)
-        in_part = register.dims and any(share) and share != bits_of(register)
-        for part in _elements(layout, register) if in_part else (register,):
-            if any(_share(bits, part)):
-                found[part.path] = codec(part, layout.byte_order).decode(image)
-    return found
-
-
-def _share(bits: bytearray, register: Register) -> bytes:
-    """The part of these bits that is a register's."""
-    own = bits[register.offset : register.offset + register.size]
-    return bytes(bit & mine for bit, mine in zip(own, bits_of(register), strict=True))
-
-
-def _elements(layout: Layout, register: Register) -> Iterator[Register]:
-    for index in product(*(range(low, high + 1) for low, high in register.dims)):
-        yield layout.element(register, index)
+    """The values in an image of what was written, by path: registers, or of those written in part elements and bits."""
+    named = (part for path in paths_of(layout, writes) for part in find_each(layout, path))
+    return {part.path: codec(part, layout.byte_order).decode(image) for part in named}

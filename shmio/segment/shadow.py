@@ -27,7 +27,7 @@ Next = Callable[[Cursor[Event], float | None], Event | None]
 class Diversion:
     """What one command wrote toward a source, or of it what went to an injection.
 
-    ``values``: by path in the block; of an array that was written in part, its elements. ``writer``, ``command``: whose
+    ``values``: by path in the block; of what was written in part, its elements or bits. ``writer``, ``command``: whose
     it was, as in events. ``clock_ns``: when, on the instance's clock; ``utc_ns``: in UTC. ``missed``: events lost
     between the one before and this one, which may have been about more of the same.
     """

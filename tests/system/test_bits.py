@@ -154,6 +154,7 @@ def test_an_injection_toward_the_device_takes_one_bit(cell: Cell, local: Attachm
         until(lambda: local["cell/Outputs/140"] == 0xFB, "all but the bit")
         shadow.set({"cell/Outputs/140.%X2": True})
         until(lambda: local["cell/Outputs/140"] == 0xFF, "the injected bit")
+        assert next(shadow.diverted(PATIENCE_S)).values == {"Outputs/140.%X2": True}
 
 
 def test_hundreds_of_bits_in_one_command(cell: Cell, local: Attachment) -> None:
