@@ -110,9 +110,16 @@ def _run(layout: Layout, array: Register, run: list[tuple[int, ...]]) -> str:
 
 
 def _parts(layout: Layout, register: Register, share: bytes) -> Iterator[str]:
-    """Bits of an integer; whole bytes of it as such, the least significant first."""
-    for number, byte in enumerate(reversed(share) if layout.byte_order == "big" else share):
-        if byte == 0xFF:
-            yield part_of(layout, register, "B", number).path
+    """Bits of an integer; whole bytes, words and double words of it as such, the least significant first."""
+    ascending = share[::-1] if layout.byte_order == "big" else share
+    at = 0
+    while at < len(ascending):
+        for kind, width in (("D", 4), ("W", 2), ("B", 1)):
+            if width < len(ascending) and at % width == 0 and ascending[at : at + width] == b"\xff" * width:
+                yield part_of(layout, register, kind, at // width).path
+                at += width
+                break
         else:
-            yield from (part_of(layout, register, "X", 8 * number + bit).path for bit in range(8) if byte >> bit & 1)
+            bits = (8 * at + bit for bit in range(8) if ascending[at] >> bit & 1)
+            yield from (part_of(layout, register, "X", number).path for number in bits)
+            at += 1

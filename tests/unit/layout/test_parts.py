@@ -146,19 +146,20 @@ def test_what_is_written_is_named_as_it_was(order: ByteOrder) -> None:
         Register("bits", "BOOL", ((1, 20),), 16, 0, 3, 20),
         Register("grid", "INT", ((0, 1), (1, 3)), 20, None, 12, 6),
         Register("word", "WORD", (), 32, None, 2, 1),
+        Register("long", "LWORD", (), 34, None, 8, 1),
     )
-    layout = Layout("DB1", 1, 34, False, registers, order)
+    layout = Layout("DB1", 1, 42, False, registers, order)
     for paths in (
         ["speed"], ["bytes"], ["bytes/3"], ["bytes/3..7"], ["bytes/9.%X0"], ["off"], ["bits/4"], ["bits/3..12"],
         ["grid/0/2..3", "grid/1/1..2"], ["word"], ["word.%X11"], ["word.%B1"],
-        ["speed", "bytes/0..1", "on", "word.%X0"],
+        ["speed", "bytes/0..1", "on", "word.%X0"], ["long.%D1"], ["long.%X7", "long.%B1", "long.%W2"], ["long.%W1"],
     ):  # fmt: skip
         writes: list[Write] = []
         for path in paths:
             part = find(layout, path)
-            full: object = {"BOOL": True, "REAL": 1.0, "INT": 1, "BYTE": 1, "WORD": 1}[part.type]
+            full: object = {"BOOL": True, "REAL": 1.0, "INT": 1, "BYTE": 1, "WORD": 1, "DWORD": 1}[part.type]
             writes += encode(part, [full] * part.count if part.dims else full, order)
         assert paths_of(layout, writes) == paths
-    assert paths_of(layout, [Write(1, 0, b"\0"), Write(15, 0, b"\0"), Write(33, 0, b"\0" * 9)]) == [
-        "speed", "word.%B0" if order == "big" else "word.%B1",
+    assert paths_of(layout, [Write(1, 0, b"\0"), Write(15, 0, b"\0"), Write(33, 0, b"\0" * 99)]) == [
+        "speed", "word.%B0" if order == "big" else "word.%B1", "long",
     ]  # fmt: skip
