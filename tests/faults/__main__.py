@@ -7,15 +7,18 @@ import os
 import secrets
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import threading
 from pathlib import Path
 
 from tests.faults import report
+from tests.faults.inflict import OWN_SHM, SHM
 from tests.faults.stepping import Stepping
 from tests.faults.suite import Record, Suite
 
+SHM_SIZE = "384m"
 STEPPED = 0.2
 """The share of a run that is for the instance that is stepped."""
 
@@ -29,6 +32,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, help="which faults come when; default: a new one")
     parser.add_argument("--report", type=Path, metavar="FILE", help="default: printed at the end")
     arguments = parser.parse_args()
+    _have_own_shm()
     seed = secrets.randbits(32) if arguments.seed is None else arguments.seed
     folder = Path(tempfile.mkdtemp(prefix="shmio-faults-"))
     print(f"fault suite: seed {seed}, {arguments.for_s:g} s, in {folder}", flush=True)
@@ -62,6 +66,16 @@ def main() -> int:
         return 1
     shutil.rmtree(folder)
     return 0
+
+
+def _have_own_shm() -> None:
+    """Go on in a mount name space with a small /dev/shm of its own, which may be filled; only root can."""
+    space = ["unshare", "--mount", "--propagation", "private"]
+    if OWN_SHM in os.environ or os.geteuid() or subprocess.run([*space, "true"], check=False).returncode:
+        return
+    mount = f'mount -t tmpfs -o size={SHM_SIZE} tmpfs {SHM} && exec "$@"'
+    command = [*space, "sh", "-c", mount, "sh", sys.executable, "-m", "tests.faults", *sys.argv[1:]]
+    os.execvpe(command[0], command, os.environ | {OWN_SHM: "1"})
 
 
 if __name__ == "__main__":

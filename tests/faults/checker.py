@@ -11,23 +11,20 @@ import sys
 import threading
 import time
 import traceback
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from tests.faults.checks import Counts, Source
+from tests.faults.pulse import Pulse
 from tests.faults.truth import Truth
 
 NOTES: Final = ("landed", "guarded", "given")
 """The truths of a source beside that of what its PLC's program did; see :class:`Source`."""
 TELL_S: Final = 0.1
-PULSE_S: Final = 0.05
 SLACK_NS: Final = 1_000_000_000
 """How much later than it was sent something may come to a checker's notice on a machine that is not overloaded."""
-REMEMBERED: Final = 200
-"""Pulses, 10 s of them and more."""
 TRACED: Final = 4096
 """Characters of a traceback that are told."""
 
@@ -38,6 +35,7 @@ class Description:
 
     instance: str
     grpc: str
+    mqtt: str
     seed: int
     reader: str
     """The program of examples/reader.c, compiled."""
@@ -69,7 +67,7 @@ class Checker:
         self._counts: dict[str, Counts] = {}
         self._turn = threading.Lock()
         self._threads: list[threading.Thread] = []
-        self._held_up: deque[int] = deque([0], maxlen=REMEMBERED)
+        self._pulse = Pulse()
 
     def complain(self, problem: str) -> None:
         """Tell a violation."""
@@ -96,19 +94,21 @@ class Checker:
     @property
     def slack_ns(self) -> int:
         """How late something may come to our notice: more, when the machine has lately kept us waiting."""
-        return SLACK_NS + 3 * max(self._held_up)
+        return round(SLACK_NS * self.slowness) + 3 * self._pulse.held_up_ns
 
-    def _pulse(self) -> None:
-        """Measure how long the machine keeps a thread waiting that wants to run."""
+    @property
+    def slowness(self) -> float:
+        """How many times longer than on an idle machine a process that has much to do takes for it."""
+        return self._pulse.slowness
+
+    def _beat(self) -> None:
         while not self.stopping.is_set():
-            due_ns = time.monotonic_ns() + round(PULSE_S * 1e9)
-            time.sleep(PULSE_S)
-            self._held_up.append(max(0, time.monotonic_ns() - due_ns))
+            self._pulse.beat()
 
     def run(self) -> None:
         """Tell until standard input ends."""
         threading.Thread(target=self._await_end, daemon=True).start()
-        threading.Thread(target=self._pulse, daemon=True).start()
+        threading.Thread(target=self._beat, daemon=True).start()
         while not self.stopping.wait(TELL_S):
             self._tell({"counts": {name: asdict(counts) for name, counts in self._counts.items()}})
         for thread in self._threads:

@@ -55,12 +55,14 @@ program = "counter"
 listen = "{plc}"
 [grpc]
 listen = ["{grpc}"]
+[mqtt]
+listen = "{mqtt}"
 [recorder]
 """
 
 
 class Configuration:
-    """supervisor.toml and the layouts. ``ports``: of the devices as the sources see them, of ``plc`` and ``grpc``."""
+    """supervisor.toml and the layouts. ``ports``: of the devices as the sources see them, and of others by name."""
 
     def __init__(self, folder: Path, instance: str, ports: Mapping[str, Address]) -> None:
         self.file = folder / "supervisor.toml"
@@ -69,6 +71,7 @@ class Configuration:
         self._folder = folder
         self._instance = instance
         self._ports = ports
+        self._addresses = {name: ports[name] for name in ("plc", "grpc", "mqtt")}
         self._extra = False
         for name in SIZES:
             self._write_layout(name, NAMES[0])
@@ -98,4 +101,4 @@ class Configuration:
             port = self._ports.get(name, self._ports["plc"]).port
             times = {"period_ms": PERIODS_MS[layout], "stale_ms": STALE_MS[layout]}
             text += _SOURCE.format(name=name, layout=layout, port=port, number=NUMBER, **times)
-        self.file.write_text(text + _OTHERS.format(layout=EMULATED, plc=self._ports["plc"], grpc=self._ports["grpc"]))
+        self.file.write_text(text + _OTHERS.format(layout=EMULATED, **self._addresses))

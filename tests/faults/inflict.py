@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import random
 import signal
+import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
 from shmio.segment import Segment
@@ -19,6 +23,9 @@ from tests.faults.schedule import SUPERVISOR, Fault
 GONE_S: Final = 20.0
 """A frozen process is found out and replaced within this time."""
 DAY_NS: Final = 86_400 * 10**9
+SHM: Final = Path("/dev/shm")
+OWN_SHM: Final = "SHMIO_FAULTS_OWN_SHM"
+"""In the environment of a suite whose /dev/shm is its own: that of the host is not filled."""
 GARBAGE: Final = (
     b"\0" * 64,
     b"\xff" * 64,
@@ -89,6 +96,7 @@ class Inflictor(ProcessInflictor):
             "reload": lambda _: self._rig.reload(Configuration.toggle_extra),
             "clock": lambda f: self._rig.set_clock(f.number % 3 and round((f.number / 2**31 - 1) * 30 * DAY_NS)),
             "midwrite": lambda f: self._mid_write.strike(f.number),
+            "shm_full": lambda f: fill(SHM, f.for_s),
         }
 
     def inflict(self, fault: Fault) -> None:
@@ -141,6 +149,22 @@ class Inflictor(ProcessInflictor):
             time.sleep(fault.for_s)
             proxy.delay(0.0, 0.0)
         proxy.pass_all()
+
+
+def fill(folder: Path, for_s: float) -> None:
+    """Leave no room in a file system for a while, if it is ours."""
+    if OWN_SHM not in os.environ:
+        return
+    with tempfile.TemporaryFile(dir=folder) as file:
+        for piece in (1 << 20, 1 << 12):
+            try:
+                while True:
+                    file.seek(0, os.SEEK_END)
+                    os.posix_fallocate(file.fileno(), file.tell(), piece)
+            except OSError as error:
+                if error.errno != errno.ENOSPC:
+                    raise
+        time.sleep(for_s)
 
 
 def _stopped(pid: int) -> bool:

@@ -12,10 +12,11 @@ from typing import Final, Self
 from tests.faults.checker import Description
 from tests.faults.checks import Counts
 
-MODULES: Final = ("local", "remote", "churn", "writing", "injecting", "recorded")
+MODULES: Final = ("local", "remote", "mqtt", "churn", "writing", "injecting", "recorded")
 LATE: Final = ("slow", "recorded", "injected")
 """How the counts begin of those who see values long after they were published, or one source after the other."""
-END_S: Final = 20.0
+END_S: Final = 200.0
+"""The one of recordings reads, at the end, all that it has not come to before: on a loaded machine that takes time."""
 
 
 class Panel:

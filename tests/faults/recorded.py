@@ -156,8 +156,8 @@ def main() -> None:
 
     def work() -> None:
         while not checker.stopping.wait(LOOK_S):
-            watch.look(ended=False, slack_ns=checker.slack_ns + START_NS)
-        watch.look(ended=True, slack_ns=checker.slack_ns + START_NS)
+            watch.look(ended=False, slack_ns=checker.slack_ns + round(START_NS * checker.slowness))
+        watch.look(ended=True, slack_ns=checker.slack_ns + round(START_NS * checker.slowness))
 
     checker.work(work)
     checker.run()

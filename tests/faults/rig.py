@@ -27,7 +27,9 @@ from tests.faults.truth import Truth
 
 ROOT: Final = Path(__file__).parents[2]
 HERE: Final = Path(__file__).parent
-COMMAND_S: Final = 60.0
+COMMAND_S: Final = 180.0
+OTHERS: Final = ("plc", "grpc", "mqtt")
+"""What listens beside the devices of :data:`~tests.faults.schedule.SOURCES`."""
 MARK: Final = "SHMIO_FAULTS"
 """A variable in the environment of every process of a run: none of them can hide."""
 TOLERANCE_MS: Final = 100
@@ -160,13 +162,13 @@ class Rig(Instance):
         self._stack.close()
 
     def _build(self, stack: ExitStack) -> None:
-        reserved = {name: stack.enter_context(reserved_port()) for name in ("fast", "block", "plc", "grpc")}
-        ports = {name: reserved[name] for name in ("plc", "grpc")}
+        reserved = {name: stack.enter_context(reserved_port()) for name in ("fast", "block", *OTHERS)}
+        ports = {name: reserved[name] for name in OTHERS}
         for name in ("fast", "block"):
             device = self.devices[name] = Device(name, self.folder, reserved[name], self.environment)
             stack.callback(device.stop)
             ports[name] = device.proxy.address
-        self.grpc = ports["grpc"]
+        self.grpc, self.mqtt = ports["grpc"], ports["mqtt"]
         self.configuration = Configuration(self.folder, self.instance, ports)
 
     def description(self, seed: int) -> Description:
@@ -182,7 +184,9 @@ class Rig(Instance):
         with Segment.open(self.instance) as segment:
             rings = {name: block.ring.slot_count * block.period_ns for name, block in segment.blocks.items()}
         reader, recordings = str(self.folder / "reader"), str(self.folder / "dumps")
-        return Description(self.instance, str(self.grpc), seed, reader, recordings, rings, tuple(sources))
+        return Description(
+            self.instance, str(self.grpc), str(self.mqtt), seed, reader, recordings, rings, tuple(sources)
+        )
 
     def reload(self, change: Callable[[Configuration], None]) -> None:
         """Change the configuration and have the instance take it."""

@@ -9,8 +9,8 @@ from typing import Final
 
 SOURCES: Final = ("fast", "block")
 """Sources whose PLC is behind a proxy and keeps the truth."""
-WORKERS: Final = ("fast", "block", "demo", "plc", "grpc", "recorder")
-"""Processes that the supervisor starts: sources, an emulator that feeds ``demo``, the endpoint, the recorder."""
+WORKERS: Final = ("fast", "block", "demo", "plc", "grpc", "mqtt", "recorder")
+"""Processes that the supervisor starts: sources, an emulator that feeds ``demo``, the endpoints, the recorder."""
 SUPERVISOR: Final = "supervisor"
 
 PROCESS_FAULTS: Final = {"kill": 6, "pause": 3, "hang": 1, "restart": 3, "torn": 2, "relayout": 2}
@@ -18,7 +18,14 @@ DEVICE_FAULTS: Final = {
     "delay": 2, "cut": 2, "cut_after": 2, "freeze": 2, "refuse": 2, "garble": 2, "late": 2, "reference": 2, "drop": 2,
     "plc_kill": 2, "plc_pause": 2,
 }  # fmt: skip
-OTHER_FAULTS: Final = {"supervisor_kill": 3, "supervisor_pause": 2, "clock": 3, "midwrite": 3, "reload": 2}
+OTHER_FAULTS: Final = {
+    "supervisor_kill": 3,
+    "supervisor_pause": 2,
+    "clock": 3,
+    "midwrite": 3,
+    "reload": 2,
+    "shm_full": 2,
+}
 WEIGHTS: Final = PROCESS_FAULTS | DEVICE_FAULTS | OTHER_FAULTS
 """How often each kind comes, relative to the others."""
 

@@ -31,12 +31,12 @@ def scripted() -> Iterator[Scripted]:
     """Make a client of a peer that sends one given answer to each thing it receives, then closes."""
     with ExitStack() as stack:
 
-        def make(*answers: bytes, timeout: int = 5000, size: int = SIZE) -> S7Client:
+        def make(*answers: bytes, timeout: int = 60_000, size: int = SIZE) -> S7Client:
             listener = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
 
             def play() -> None:
                 peer, _ = listener.accept()
-                with peer, suppress(ConnectionError):  # a client that has closed takes no more
+                with peer, suppress(OSError):  # a client that has closed takes no more
                     peer.settimeout(10)
                     for answer in answers:
                         peer.recv(4096)
