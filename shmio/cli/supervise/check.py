@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from shmio.cli.run import dumps
+from shmio.cli.supervise.ports import taken
 from shmio.cli.supervise.prepare import peer, prepare
 from shmio.cli.target import config_file
+from shmio.errors import ShmioError
 from shmio.logs import printable
-from shmio.segment import PREFIX, BlockSpec
+from shmio.segment import PREFIX, BlockSpec, Segment
+from shmio.supervisor.plan import Plan
 
 
 def execute(arguments: argparse.Namespace) -> int:
@@ -28,7 +33,7 @@ def execute(arguments: argparse.Namespace) -> int:
         "replay": [],
         "segment": f"{PREFIX}{plan.instance}",
         "segment_bytes": plan.segment_bytes,
-        "notes": list(prepared.notes),
+        "notes": [*prepared.notes, *_taken(file, plan)],
         "warnings": list(plan.warnings),
     }
     if prepared.config.replay and prepared.config.replay.file:
@@ -37,6 +42,14 @@ def execute(arguments: argparse.Namespace) -> int:
         found["warnings"] += [warning for warning in replay.warnings if warning not in plan.warnings]
     print(dumps(found, indent=2) if arguments.json else "\n".join(map(printable, _lines(found))))
     return 0
+
+
+def _taken(file: Path, plan: Plan) -> list[str]:
+    """Addresses for which ``up`` would wait in vain, unless it is this instance that has them."""
+    with suppress(ShmioError), Segment.open(plan.instance, config=file) as segment:
+        if segment.supervised:
+            return []
+    return [f"note: up would fail at present: {problem}" for problem in taken(plan)]
 
 
 def _lines(found: dict[str, Any]) -> list[str]:

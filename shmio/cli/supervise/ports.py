@@ -51,7 +51,13 @@ def check_listening(config: Config) -> None:
 
 
 def check_ports(plan: Plan) -> None:
-    """EndpointError when an address of the plan is taken, naming who has it if that is a process of an instance.
+    """EndpointError when an address of the plan is taken."""
+    for problem in taken(plan):
+        raise EndpointError(problem)
+
+
+def taken(plan: Plan) -> Iterator[str]:
+    """Each address of the plan that is taken, and by whom, as far as this user may know it.
 
     Whatever else may be wrong with an address is for its process to find.
     """
@@ -60,9 +66,9 @@ def check_ports(plan: Plan) -> None:
             address = parse_address(text)
             if isinstance(address, UnixAddress):
                 if reason := obstacle(address.path):
-                    raise EndpointError(f"{job.name}: cannot listen on {address}: {reason}")
+                    yield f"{job.name}: cannot listen on {address}: {reason}"
             elif in_use(address):
-                raise EndpointError(f"{job.name}: cannot listen on {address}: {_holder(address)}")
+                yield f"{job.name}: cannot listen on {address}: {_holder(address)}"
 
 
 def in_use(address: Address) -> bool:
@@ -121,6 +127,9 @@ def _holder(address: Address) -> str:
                         f"process {process.name} of instance {instance}, pid {process.pid}, listens there; choose "
                         f"another port, or stop that instance: shmio-supervisor down --instance {instance}"
                     )
+    for pid in _pids():
+        if links.intersection(_open_files(pid)):
+            return f"{_command(pid)}, pid {pid}, listens there; choose another port, or end that program"
     return f"another program listens there; choose another port, or see which: ss -ltnp sport = :{address.port}"
 
 
@@ -147,6 +156,16 @@ def _with_children(pid: int) -> Iterator[int]:
     with suppress(OSError):
         for task in Path(f"/proc/{pid}/task").iterdir():
             yield from map(int, (task / "children").read_text().split())
+
+
+def _pids() -> list[int]:
+    return sorted(int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdecimal())
+
+
+def _command(pid: int) -> str:
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/comm").read_text(errors="replace").strip()
+    return "a program"
 
 
 def _open_files(pid: int) -> Iterator[str]:

@@ -84,6 +84,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
             *_odd_topics(config, layouts),
             *_odd_recorder(config, layouts),
             *_not_served(config, layouts, emulated),
+            *_not_emulated(config),
             *_unread(emulated),
         ]
     except ConfigError as error:
@@ -289,6 +290,18 @@ def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, 
             if wanted not in served:
                 held = ", ".join(f"DB{number}" for number in served)
                 yield f"source[{index}]: it reads DB{wanted} of emulator {emulator.name!r}, which serves {held} alone"
+
+
+def _not_emulated(config: Config) -> Iterator[str]:
+    """Sources that read a controller of this host where no emulator of this file listens, though it has some."""
+    listening = {emulator.name: str(Address.parse(emulator.listen)) for emulator in config.emulator}
+    for index, source in enumerate(config.source):
+        device = peer(source)
+        if source.connector != "s7" or not listening or device in listening.values() or ":" not in device:
+            continue
+        if Address.parse(device).loopback:
+            places = ", ".join(f"{name} listens on {address}" for name, address in listening.items())
+            yield f"source[{index}]: it reads {device}, where no [[emulator]] of this file listens: {places}"
 
 
 def _unread(emulated: dict[str, tuple[Layout, ...]]) -> Iterator[str]:

@@ -350,6 +350,20 @@ def test_check_tells_what_the_instance_takes(example: Edit, instance: str, capsy
     assert instance not in instances()
 
 
+def test_a_source_that_reads_beside_its_emulator_is_pointed_out(
+    example: Edit, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example("port = 1102", "port = 1103")
+    assert main(["check"]) == 0
+    said = (
+        "source[0]: it reads 127.0.0.1:1103, where no [[emulator]] of this file listens: plc listens on 127.0.0.1:1102"
+    )
+    assert said in capsys.readouterr().out
+    example('host = "127.0.0.1" ', 'host = "10.76.0.12" ')
+    assert main(["check"]) == 0
+    assert "where no [[emulator]]" not in capsys.readouterr().out, "it is a real one"
+
+
 def test_check_as_json(example: Edit, instance: str, capsys: pytest.CaptureFixture[str]) -> None:
     example('name = "a50"', f'name = "{instance}"')
     example("writable = [", 'writable = ["Outpts", ')
@@ -365,7 +379,7 @@ def test_check_as_json(example: Edit, instance: str, capsys: pytest.CaptureFixtu
     }  # fmt: skip
     [warning] = found.pop("warnings")
     assert "'Outpts' names nothing" in warning
-    assert all("other users of this host" in note for note in found.pop("notes"))  # as there are any
+    found.pop("notes")  # they are of the host: its other users, ports that are taken
     assert found == {
         "config": "supervisor.toml", "instance": instance, "injections": [], "replay": [],
         "processes": ["plc", "cell", "grpc", "broker", "mqtt", "recorder"], "segment": f"shmio-{instance}",

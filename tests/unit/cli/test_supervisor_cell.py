@@ -234,10 +234,14 @@ def test_a_port_that_another_program_has_is_found_before_the_start(cell: Cell, a
         port = taken.getsockname()[1]
         serve_on(cell, f"0.0.0.0:{port}")
         error = cell.run(*arguments, status=1).stderr
-    assert error == (
-        f"grpc: cannot listen on 0.0.0.0:{port}: another program listens there; choose another port, or see which: "
-        f"ss -ltnp sport = :{port}\n"
+        checked = cell.run("check", status=0).stdout
+    comm = Path("/proc/self/comm").read_text().strip()
+    told = (
+        f"grpc: cannot listen on 0.0.0.0:{port}: {comm}, pid {os.getpid()}, listens there; choose another port, or end "
+        "that program\n"
     )
+    assert error == told
+    assert f"note: up would fail at present: {told}" in checked
     assert not (cell.folder / "logs").exists()
 
 
@@ -249,7 +253,8 @@ def test_a_left_over_segment_without_processes_hides_no_taken_port(cell: Cell) -
         port = taken.getsockname()[1]
         serve_on(cell, f"127.0.0.1:{port}")
         error = cell.run("up", "--detach", status=1).stderr
-    assert error.startswith(f"grpc: cannot listen on 127.0.0.1:{port}: another program listens there; ")
+    assert f"grpc: cannot listen on 127.0.0.1:{port}: " in error
+    assert f", pid {os.getpid()}, listens there; " in error
 
 
 def test_what_an_instances_broker_has_is_said_to_be_its(cell: Cell) -> None:
@@ -263,9 +268,9 @@ def test_what_an_instances_broker_has_is_said_to_be_its(cell: Cell) -> None:
     text = broker.sub(lambda _: port[0], moved(text)).replace("listen = [", 'listen = ["127.0.0.1:0"] #')
     text = text.replace(f'"{cell.instance}"', f'"{cell.instance}-2"\nlog_dir = "logs-2"')
     (cell.folder / "second.toml").write_text(text)
-    assert cell.run("up", "-c", "second.toml", status=1).stderr.startswith(
-        f"broker: cannot listen on {port[1]}: process broker of instance {cell.instance}, pid {cell.of('broker').pid}, "
-    )
+    *_, last = cell.run("up", "-c", "second.toml", status=1).stderr.splitlines()
+    owner = f"process broker of instance {cell.instance}, pid {cell.of('broker').pid}"
+    assert last.startswith(f"broker: cannot listen on {port[1]}: {owner}, ")
     cell.run("down", status=0)
 
 
@@ -275,13 +280,13 @@ def test_what_another_instance_has_is_said_to_be_its(cell: Cell) -> None:
     text = (cell.folder / "supervisor.toml").read_text().replace(f'"{cell.instance}"', f'"{cell.instance}-2"')
     (cell.folder / "second.toml").write_text(moved(text).replace("listen = [", 'listen = ["127.0.0.1:0"] #'))
     refused = cell.run("up", "-c", "second.toml", status=1).stderr
-    assert refused.startswith(f"instance.log_dir: instance {cell.instance!r} writes its logs to ")
+    assert refused.splitlines()[-1].startswith(f"instance.log_dir: instance {cell.instance!r} writes its logs to ")
     text = text.replace(f'"{cell.instance}-2"', f'"{cell.instance}-2"\nlog_dir = "logs-2"')
     for name, listen in (("plc", r'listen = "127.0.0.1:(\d+)"'), ("grpc", r'listen = \["127.0.0.1:(\d+)"\]')):
         port = re.search(listen, text)
         assert port is not None
         (cell.folder / "second.toml").write_text(text)
-        assert cell.run("up", "-c", "second.toml", status=1).stderr == (
+        assert cell.run("up", "-c", "second.toml", status=1).stderr.endswith(
             f"{name}: cannot listen on 127.0.0.1:{port[1]}: process {name} of instance {cell.instance}, pid "
             f"{cell.of(name).pid}, listens there; choose another port, or stop that instance: shmio-supervisor down "
             f"--instance {cell.instance}\n"
