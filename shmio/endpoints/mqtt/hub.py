@@ -133,6 +133,12 @@ class Hub(Broker):  # type: ignore[misc]  # the library's classes have no types
             self._refusals.tell(NOT_ALLOWED, _name(session))
         return allowed
 
+    async def _delete_session(self, client_id: str) -> None:
+        session, handler = self._sessions.get(client_id, (None, None))
+        await super()._delete_session(client_id)
+        if session is not None and session.transitions.state == "connected":  # the library would leave it there, deaf
+            await handler.handle_connection_closed()
+
     # ---- what is kept for clients ------------------------------------------------------------------------------------
 
     async def _retain_broadcast_message(self, broadcast: dict[str, Any], qos: int, target_session: Session) -> None:

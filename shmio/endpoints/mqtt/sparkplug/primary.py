@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import logging
+import time
+from typing import Final
 
 import msgspec
 
 from shmio.endpoints.mqtt.sparkplug.node import NAMESPACE
+
+AHEAD_MS: Final = 86_400_000
+"""The clock of a host may be ahead of ours, by no more than this."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -36,5 +41,7 @@ class PrimaryHost:
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             log.warning("%s: expected JSON with online, true or false, and a timestamp", self.topic)
             return
-        if state.timestamp >= self._at_ms:
+        if state.timestamp > time.time() * 1000 + AHEAD_MS:  # none that comes would be newer
+            log.warning("%s: the timestamp is more than a day ahead; it is in ms since 1970", self.topic)
+        elif state.timestamp >= self._at_ms:
             self.online, self._at_ms = state.online, state.timestamp

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from shmio.config import Address, Mqtt, MqttAccount
-from shmio.endpoints.mqtt.access import rights
+from shmio.endpoints.mqtt.access import rights, secret_id
 from shmio.endpoints.mqtt.place import SECRET, folder
 from shmio.segment import Segment
 from tests.unit.endpoints.harness import image
@@ -158,7 +158,10 @@ def test_nobody_publishes_on_a_topic_of_the_brokers_own(
         assert b"forged" not in [payload for _, payload in listener.heard]
 
 
-def test_nobody_else_connects_as_the_bridge(cells: Cells, segment: Segment, program: str) -> None:
+def test_nobody_else_connects_as_the_bridge(
+    cells: Cells, segment: Segment, program: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
     with cells(program) as cell:
         name = f"shmio-{segment.instance}"
         for suffix in ("", "-commands", "-sparkplug"):
@@ -169,6 +172,8 @@ def test_nobody_else_connects_as_the_bridge(cells: Cells, segment: Segment, prog
         secret = (place / SECRET).read_text()
         with Raw(cell.address, "me", account=("bridge", secret)) as client:
             assert client.code == 5, "it comes by its socket alone"
+        assert f"connected to broker of this instance as {name}," in caplog.text
+        assert secret_id(name, secret) not in caplog.text
         for file in place.iterdir():
             mode = file.stat().st_mode
             assert stat.S_ISSOCK(mode) or stat.S_IMODE(mode) == 0o600, file
@@ -207,6 +212,10 @@ def test_the_one_in_python_keeps_a_name_for_its_account(cells: Cells, monkeypatc
             assert other.code == 5
         client.publish(f"{PREFIX}/cell/secret/in", b"5")
         cell.listener.json("cell/secret/in/result")
+        with cell.client("hmi", WRITER) as again:
+            assert client.ended(), "it is the same client, which has connected again"
+            again.publish(f"{PREFIX}/cell/secret/in", b"5")
+            cell.listener.json("cell/secret/in/result")
 
 
 @pytest.mark.parametrize(

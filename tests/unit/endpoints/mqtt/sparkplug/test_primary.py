@@ -47,7 +47,14 @@ def test_a_node_is_born_when_its_primary_host_is_there_dies_with_it_and_keeps_wh
     with listening(broker.address, NODES) as listener, bridge(segment, broker.address, sparkplug=WAITING) as running:
         host = Host(listener)
         running.until(lambda: "the primary host is not there (spBv1.0/STATE/scada)" in running.bridge.problem)
-        for nothing in (b"ONLINE", b"[" * 5000, {"online": "true", "timestamp": 1}, {"online": True}, offline(5)):
+        for nothing in (
+            b"ONLINE",
+            b"[" * 5000,
+            {"online": "true", "timestamp": 1},
+            {"online": True},
+            online(2**53),
+            offline(5),
+        ):
             say(listener, nothing)
         say(listener, online(9), "spBv1.0/STATE/another")
         writer.publish(image(step=2), cycle=2)
