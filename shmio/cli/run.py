@@ -12,7 +12,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any, TextIO
 
-from shmio.errors import ShmioError
+from shmio.errors import ConfigError, ControlError, LayoutError, ShmioError
 from shmio.logs import printable
 
 MAX_SECONDS = 86_400
@@ -31,8 +31,11 @@ def run(program: str, command: Callable[[], int | None], *, error_json: bool = F
     try:
         status = command() or 0
         sys.stdout.flush()
-    except ShmioError as error:
+    except (ConfigError, ControlError, LayoutError) as error:  # which tell all that is wrong, a line each
         _tell(str(error), error_json=error_json)
+        return 1
+    except ShmioError as error:
+        _tell(str(error).replace("\n", "\\n"), error_json=error_json)
         return 1
     except KeyboardInterrupt:
         return 130
@@ -67,7 +70,7 @@ def say_json(value: Any) -> None:
 
 
 def _tell(error: str, *, error_json: bool) -> None:
-    sys.stderr.write(f"{printable(error)}\n")
+    sys.stderr.write("".join(f"{printable(line)}\n" for line in error.split("\n")))
     if error_json:
         say_json({"error": error})
 

@@ -46,17 +46,22 @@ _OPERANDS: Final = tuple(dict.fromkeys(key for keys in KEYS.values() for key in 
 
 def check_declarations(declarations: Sequence[Declaration]) -> None:
     """Refuse what no layout could make right; ConfigError with the key ``injection[…]….``."""
+    for fault in declaration_faults(declarations):
+        raise ConfigError(fault)
+
+
+def declaration_faults(declarations: Sequence[Declaration]) -> Iterator[str]:
+    """What no layout could make right, each with its key."""
     if len(declarations) > MAX_DECLARATIONS:
-        raise ConfigError(f"injection: {len(declarations)} of them; at most {MAX_DECLARATIONS}")
+        yield f"injection: {len(declarations)} of them; at most {MAX_DECLARATIONS}"
+        return
     seen: dict[str, int] = {}
     for index, declaration in enumerate(declarations):
         first = seen.setdefault(declaration.name, index)
         if first != index:
-            raise ConfigError(
-                f"injection[{index}].name: {declaration.name!r} is already the name of injection[{first}]"
-            )
+            yield f"injection[{index}].name: {declaration.name!r} is already the name of injection[{first}]"
         for complaint in complaints(declaration):
-            raise ConfigError(f"injection[{index}].{complaint}")
+            yield f"injection[{index}].{complaint}"
 
 
 def complaints(declaration: Declaration) -> Iterator[str]:

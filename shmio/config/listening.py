@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Final
 
 from shmio.config.address import UNIX, Address, UnixAddress, parse_address
@@ -15,21 +16,24 @@ Place = Address | UnixAddress
 _DIGITS: Final = frozenset("0123456789abcdef")
 
 
-def check_listening(config: Config) -> None:
-    """Addresses, and what may be reached there in plain text; tokens and roles. ConfigError."""
+def check_listening(config: Config, catching: Callable[[], AbstractContextManager[None]]) -> None:
+    """Addresses, and what may be reached there in plain text; tokens and roles.
+
+    ``catching``: what makes a context that keeps a ConfigError for later.
+    """
     for index, emulator in enumerate(config.emulator):
         key, remedy = f"emulator[{index}].listen", "insecure = true beside it"
-        _check_address(key, emulator.listen, Address.parse, safe=emulator.insecure, remedy=remedy)
+        with catching():
+            _check_address(key, emulator.listen, Address.parse, safe=emulator.insecure, remedy=remedy)
     if config.grpc:
-        _check_tokens(config.grpc)
-        _check_addresses(config.grpc)
+        with catching():
+            _check_tokens(config.grpc)
+        with catching():
+            _check_addresses(config.grpc)
 
 
 def resolve(grpc: Grpc, config: Config) -> None:
     """Make the section's paths absolute."""
-    grpc.listen = [_resolved(f"grpc.listen[{index}]", text, config) for index, text in enumerate(grpc.listen)]
-    for index, address in enumerate(grpc.address):
-        address.listen = _resolved(f"grpc.address[{index}].listen", address.listen, config)
     for token in grpc.token:
         if token.token_file is not None:
             token.token_file = str(config.path(token.token_file))
@@ -37,6 +41,9 @@ def resolve(grpc: Grpc, config: Config) -> None:
         for field in ("certificate", "key", "client_ca"):
             if name := getattr(grpc.tls, field):
                 setattr(grpc.tls, field, str(config.path(name)))
+    grpc.listen = [_resolved(f"grpc.listen[{index}]", text, config) for index, text in enumerate(grpc.listen)]
+    for index, address in enumerate(grpc.address):
+        address.listen = _resolved(f"grpc.address[{index}].listen", address.listen, config)
 
 
 def encrypted(grpc: Grpc, address: Listening) -> bool:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 import tomllib
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
-from shmio.config.declaration import check_declarations
+from shmio.config.declaration import declaration_faults
+from shmio.config.faults import Faults
+from shmio.config.lines import MAX_KEY, MAX_PARTS, too_long
 from shmio.config.listening import check_listening, resolve
 from shmio.config.model import (
     Client,
@@ -31,12 +34,17 @@ from shmio.config.mqtt import check_mqtt, resolve_mqtt
 from shmio.config.mqttmodel import Mqtt, MqttAccount, MqttTls, MqttTopic, Sparkplug
 from shmio.config.properties import read_properties
 from shmio.config.section import Section
-from shmio.config.wording import explain, explain_toml, named
+from shmio.config.wording import explain, explain_toml, near
 from shmio.errors import ConfigError
 
 RESERVED_SOURCES = frozenset({"simlog", "model", "shmio"})
 SECTION_PROCESSES = frozenset({"broker", "grpc", "mqtt", "recorder", "supervisor", "web"})
 MAX_FILE_BYTES = 1 << 20
+MAX_DEPTH = 64
+MAX_SECTIONS = 1_000
+"""Of one name that are looked at."""
+MAX_SOURCES = 200
+"""An instance has no more processes."""
 
 _TABLES: dict[str, type[Section]] = {
     "instance": Instance,
@@ -57,7 +65,17 @@ _TABLES: dict[str, type[Section]] = {
     "recorder.trigger": Trigger,
     "replay": Replay,
 }
-_OF_GRPC = ("token", "client", "address")
+_SEVERAL = {
+    "source",
+    "emulator",
+    "injection",
+    "grpc.token",
+    "grpc.client",
+    "grpc.address",
+    "mqtt.account",
+    "mqtt.topic",
+}
+_SLIPPED = re.compile(r"[A-Za-z]:[\x00-\x1f\\]")  # a Windows path in double quotes, whose \t became a tab
 _DERIVED = ("folder", "options", "texts")  # fields that are no keys of the file
 _Table = TypeVar("_Table", bound=Section)
 
@@ -65,17 +83,36 @@ _Table = TypeVar("_Table", bound=Section)
 def load(file: Path) -> Config:
     """Read, check and resolve a ``supervisor.toml``.
 
-    Raises ConfigError: no such file, not TOML, unknown key, wrong type, a rule of the contract broken.
+    Raises ConfigError: no such file, not TOML, unknown key, wrong type, a rule of the contract broken; a line for each.
     """
-    tables = read_tables(file)
-    try:
-        return _resolve(tables, file.resolve().parent)
-    except ConfigError as error:
-        raise ConfigError(f"{file}: {named(str(error), tables)}") from None
+    found = examine(file)
+    found.faults.raise_any()
+    return found.config
+
+
+class Examined(NamedTuple):
+    """A configuration without the sections in which something is wrong, and what that is."""
+
+    config: Config
+    faults: Faults
+    broken: dict[int, tuple[str, dict[str, Any], dict[str, str]]]
+    """Of the sources that are left out, by their places: connector, and its own keys, inline and of its properties."""
+
+
+def examine(file: Path) -> Examined:
+    """Read a ``supervisor.toml`` and find all that is wrong with it; ConfigError: it cannot be read at all."""
+    text = read_text(file)
+    tables = parse(file, text)
+    return _examine(tables, file.resolve().parent, Faults(file, tables, text))
 
 
 def read_tables(file: Path) -> dict[str, Any]:
     """The file's TOML, unchecked; ConfigError."""
+    return parse(file, read_text(file))
+
+
+def read_text(file: Path) -> str:
+    """The file's text; ConfigError."""
     try:
         with file.open("rb") as stream:
             data = stream.read(MAX_FILE_BYTES + 1)
@@ -88,54 +125,196 @@ def read_tables(file: Path) -> dict[str, Any]:
     if len(data) > MAX_FILE_BYTES:
         raise ConfigError(f"{file}: larger than {MAX_FILE_BYTES} bytes")
     try:
-        text = data.decode("utf-8")
-        return tomllib.loads(text)
+        return data.decode("utf-8")
     except UnicodeDecodeError as error:
         raise ConfigError(f"{file}: not UTF-8 at byte {error.start}") from None
+
+
+def parse(file: Path, text: str) -> dict[str, Any]:
+    """The tables of a text; ConfigError: not TOML, or keys that no parser should be given."""
+    if line := too_long(text):
+        raise ConfigError(f"{file}:{line}: a key is longer than {MAX_KEY} characters or {MAX_PARTS} parts")
+    try:
+        tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # a TOMLDecodeError, or a number that int() does not take
         raise ConfigError(f"{file}: not TOML: {explain_toml(error, text)}") from None
+    if _depth(tables) > MAX_DEPTH:
+        raise ConfigError(f"{file}: tables and lists are nested more than {MAX_DEPTH} deep")
+    return tables
 
 
-def _resolve(tables: dict[str, Any], folder: Path) -> Config:
-    if "folder" in tables:
-        raise ConfigError(_unknown("folder", ""))
-    inner = [("grpc", name) for name in _OF_GRPC] + [("mqtt", "account"), ("mqtt", "topic")]
-    for name, table in [
-        ("source", tables),
-        ("emulator", tables),
-        ("injection", tables),
-        *((f"{section}.{name}", tables.get(section)) for section, name in inner),
-    ]:
-        if isinstance(table, dict) and isinstance(table.get(name.rpartition(".")[2]), dict):
-            raise ConfigError(f"{name}: write [[{name}]], in two brackets: there can be several")
-    check_text(tables, "")
+def _depth(value: Any) -> int:
+    """How deep tables and lists are nested; without recursion, for they may be nested deeper than that goes."""
+    depth, level = 0, [value]
+    while level and depth <= MAX_DEPTH:
+        depth += 1
+        inner: list[Any] = []
+        for item in level:
+            inner += (
+                one for one in (item.values() if isinstance(item, dict) else item) if isinstance(one, dict | list)
+            )
+        level = inner
+    return depth
+
+
+def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
+    broken: dict[int, tuple[str, dict[str, Any], dict[str, str]]] = {}
     sources = tables.get("source", [])
     if isinstance(sources, list):
-        tables = {**tables, "source": [_with_options(source, i, folder) for i, source in enumerate(sources)]}
-    config = convert({**tables, "folder": str(folder)}, Config)
-    _check_names(config)
-    _check_times(config)
-    _check_rotation(config)
-    check_declarations(config.injection)
-    check_listening(config)
-    check_mqtt(config)
+        tables = {**tables, "source": sources[:MAX_SOURCES]}
+        if len(sources) > MAX_SOURCES:
+            faults.add(
+                f"source: {len(sources)} of them; an instance has at most {MAX_SOURCES} processes, "
+                "and no more are looked at"
+            )
+    sound, places = _Structure(faults, folder, broken).sections(tables)
+    faults.places = places
+    config = convert({**sound, "folder": str(folder)}, Config)
+    for fault in _name_faults(config):
+        faults.add(fault)
+    if not faults:  # what refers to another section may refer to one that is left out, or named otherwise
+        for fault in _reference_faults(config):
+            faults.add(fault)
+    for fault in (*_time_faults(config), *_rotation_faults(config), *declaration_faults(config.injection)):
+        faults.add(fault)
+    check_listening(config, faults.catching)
+    with faults.catching():
+        check_mqtt(config)
     if config.grpc:
-        resolve(config.grpc, config)
+        with faults.catching():
+            resolve(config.grpc, config)
     if config.mqtt:
         resolve_mqtt(config.mqtt, config)
-    return config
+    return Examined(config, faults, broken)
 
 
-def _with_options(source: Any, index: int, folder: Path) -> Any:
-    """Move the connector's own keys to ``options`` and ``texts``; inline keys win."""
-    if not isinstance(source, dict):
-        return source
-    common = set(Source.__struct_fields__) - set(_DERIVED)
-    inline = {key: value for key, value in source.items() if key not in common}
-    properties = source.get("properties")
-    read = read_properties(folder / properties, f"source[{index}]") if isinstance(properties, str) else {}
-    texts = {key: text for key, text in read.items() if key not in inline}
-    return {key: source[key] for key in source if key in common} | {"options": inline, "texts": texts}
+@cache
+def _fields(kind: type[Section]) -> tuple[msgspec.structs.FieldInfo, ...]:
+    """The keys of a section."""
+    return tuple(field for field in msgspec.structs.fields(kind) if field.name not in _DERIVED)
+
+
+class _Structure:
+    """Looks at each key of each section by itself: whether it is known, there, and of its type."""
+
+    def __init__(
+        self, faults: Faults, folder: Path, broken: dict[int, tuple[str, dict[str, Any], dict[str, str]]]
+    ) -> None:
+        self._faults = faults
+        self._folder = folder
+        self._broken = broken
+
+    def sections(self, tables: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[int]]]:
+        """The sections without a fault, and where in the file those are of which there can be several."""
+        sound: dict[str, Any] = {}
+        places: dict[str, list[int]] = {}
+        hinted = self._unknown(tables, "", Config)
+        if "instance" not in tables and "instance" not in hinted:
+            self._faults.add("instance: this key is needed")
+        for name in (one for one in _TABLES if "." not in one):
+            if name not in tables:
+                continue
+            value = tables[name]
+            if name not in _SEVERAL:
+                good, found = self.table(value, name, name)
+                sound |= {name: found} if good else {}
+            elif isinstance(value, list):
+                results = [self._one(item, name, index) for index, item in enumerate(self._first(value, name))]
+                places[name] = [index for index, (good, _) in enumerate(results) if good]
+                sound[name] = [found for good, found in results if good]
+            else:
+                self._no_list(name, value)
+        sound.setdefault("instance", {"name": "unnamed"})
+        return sound, places
+
+    def _one(self, value: Any, name: str, index: int) -> tuple[bool, Any]:
+        key = f"{name}[{index}]"
+        if name != "source" or not isinstance(value, dict):
+            return self.table(value, key, name)
+        common = {*Source.__struct_fields__} - {*_DERIVED}
+        options = {name: item for name, item in value.items() if name not in common}
+        before = self._faults.count
+        for fault in text_faults(options, key):
+            self._faults.add(fault)
+        read: dict[str, str] = {}
+        properties = value.get("properties")
+        if isinstance(properties, str) and not any(text_faults(properties, "")):
+            with self._faults.catching():
+                read = read_properties(self._folder / properties, key)
+        usable = self._faults.count == before
+        texts = {name: text for name, text in read.items() if name not in options}
+        good, found = self.table({name: value[name] for name in value if name in common}, key, name)
+        if good and usable:
+            return True, found | {"options": options, "texts": texts}
+        connector = value.get("connector")
+        if isinstance(connector, str) and usable:
+            self._broken[index] = connector, options, texts
+        return False, found
+
+    def _no_list(self, key: str, value: Any) -> None:
+        if isinstance(value, dict):
+            self._faults.add(f"{key}: write [[{key}]], in two brackets: there can be several")
+        else:
+            self._faults.add(f"{key}: expected tables [[{key}]]")
+
+    def table(self, value: Any, key: str, name: str) -> tuple[bool, dict[str, Any]]:
+        """Whether there is no fault in a table, and the keys without one."""
+        if not isinstance(value, dict):
+            self._faults.add(f"{key}: expected a table [{name}]")
+            return False, {}
+        kind = _TABLES[name]
+        before = self._faults.count
+        hinted = self._unknown(value, key, kind)
+        found: dict[str, Any] = {}
+        for field in _fields(kind):
+            inner = f"{key}.{field.name}"
+            if field.name not in value:
+                if field.required and field.name not in hinted:
+                    self._faults.add(f"{inner}: this key is needed")
+            elif f"{name}.{field.name}" in _TABLES:
+                found[field.name] = self._inner(value[field.name], inner, f"{name}.{field.name}")
+            elif self._field(value[field.name], inner, field.type):
+                found[field.name] = value[field.name]
+        return self._faults.count == before, found
+
+    def _inner(self, value: Any, key: str, name: str) -> Any:
+        if name not in _SEVERAL:
+            return self.table(value, key, name)[1]
+        if not isinstance(value, list):
+            self._no_list(name, value)
+            return []
+        return [self.table(item, f"{key}[{index}]", name)[1] for index, item in enumerate(self._first(value, key))]
+
+    def _first(self, value: list[Any], key: str) -> list[Any]:
+        """Those of several sections that are looked at."""
+        if len(value) > MAX_SECTIONS:
+            self._faults.add(f"{key}: {len(value)} of them; at most {MAX_SECTIONS} are looked at")
+        return value[:MAX_SECTIONS]
+
+    def _field(self, value: Any, key: str, kind: Any) -> bool:
+        for fault in text_faults(value, key):
+            self._faults.add(fault)
+            return False
+        try:
+            msgspec.convert(value, kind)
+        except msgspec.ValidationError as error:
+            self._faults.add(explain(error, key))
+            return False
+        return True
+
+    def _unknown(self, table: dict[str, Any], key: str, kind: type[Section]) -> set[str]:
+        """Note the keys that nobody knows; return those that were meant, perhaps."""
+        known = [name for name in kind.__struct_fields__ if name not in _DERIVED]
+        hinted: set[str] = set()
+        for name in table:
+            if name in known:
+                continue
+            if self._faults.full:
+                self._faults.count += 1
+                continue
+            self._faults.add(_unknown(f"{key}.{name}".lstrip("."), key, Config if not key else kind))
+            hinted |= {*near(name, known)}
+        return hinted
 
 
 def convert(tables: dict[str, Any], kind: type[_Table]) -> _Table:
@@ -166,60 +345,64 @@ def unknown_option(index: int, key: str, known: list[str]) -> str:
 
 
 def _hint(key: str, names: list[str], otherwise: str) -> str:
-    near = difflib.get_close_matches(key, names, 1)
-    return f"did you mean {near[0]}?" if near else otherwise
+    meant = near(key, names)
+    return f"did you mean {meant[0]}?" if meant else otherwise
 
 
 def check_text(value: Any, key: str) -> None:
     """No control characters: no file name or terminal takes them. (Not a pattern: msgspec 0.22 crashes at exit.)."""
+    for fault in text_faults(value, key):
+        raise ConfigError(fault)
+
+
+def text_faults(value: Any, key: str) -> Iterator[str]:
+    """Control characters in texts, wherever they are inside."""
     if isinstance(value, str) and any(char < " " or char == "\x7f" for char in value):
-        raise ConfigError(f"{key}: must not hold control characters")
+        path = "; a path with backslashes is written in single quotes" if _SLIPPED.search(value) else ""
+        yield f"{key}: must not hold control characters{path}"
     if isinstance(value, dict):
         for name, item in value.items():
-            check_text(item, f"{key}.{name}".lstrip("."))
+            yield from text_faults(item, f"{key}.{name}".lstrip("."))
     elif isinstance(value, list):
         for index, item in enumerate(value):
-            check_text(item, f"{key}[{index}]")
+            yield from text_faults(item, f"{key}[{index}]")
 
 
-def _check_names(config: Config) -> None:
+def _name_faults(config: Config) -> Iterator[str]:
     seen: dict[str, str] = {}
     for table in ("source", "emulator"):
         for index, section in enumerate(getattr(config, table)):
             key = f"{table}[{index}].name"
             folded = section.name.lower()
             if folded in RESERVED_SOURCES:
-                raise ConfigError(f"{key}: {section.name!r} is reserved")
-            if folded in SECTION_PROCESSES:
-                raise ConfigError(f"{key}: {section.name!r} is the name of a process of ours")
-            if folded in seen:
-                raise ConfigError(
-                    f"{key}: {section.name!r} is already the name of {seen[folded]} (case does not count)"
-                )
+                yield f"{key}: {section.name!r} is reserved"
+            elif folded in SECTION_PROCESSES:
+                yield f"{key}: {section.name!r} is the name of a process of ours"
+            elif folded in seen:
+                yield f"{key}: {section.name!r} is already the name of {seen[folded]} (case does not count)"
             seen[folded] = f"{table}[{index}]"
+
+
+def _reference_faults(config: Config) -> Iterator[str]:
     names = [source.name for source in config.source]
     for name in config.recorder.sources if config.recorder else ():
         if name not in names:
-            raise ConfigError(f"recorder.sources: no source {name!r}; there are: {', '.join(names)}")
+            yield f"recorder.sources: no source {name!r}; there are: {', '.join(names)}"
     if config.grpc and config.grpc.default_source is not None and config.grpc.default_source not in names:
-        raise ConfigError(
-            f"grpc.default_source: no source {config.grpc.default_source!r}; there are: {', '.join(names)}"
-        )
+        yield f"grpc.default_source: no source {config.grpc.default_source!r}; there are: {', '.join(names)}"
 
 
-def _check_times(config: Config) -> None:
+def _time_faults(config: Config) -> Iterator[str]:
     for index, source in enumerate(config.source):
         if source.stale_ms is not None and source.stale_ms < 2 * source.period_ms:
-            raise ConfigError(
+            yield (
                 f"source[{index}].stale_ms: {source.stale_ms:g} is less than two periods of {source.period_ms:g} ms: "
                 "one late frame would make the source bad"
             )
 
 
-def _check_rotation(config: Config) -> None:
+def _rotation_faults(config: Config) -> Iterator[str]:
     for key, least in (("rotate_min", 0.1), ("rotate_mb", 1)) if config.recorder else ():
         value: float = getattr(config.recorder, key)
         if 0 < value < least:
-            raise ConfigError(
-                f"recorder.{key}: {value:g} is less than {least:g}, which would make files without number; 0: never"
-            )
+            yield f"recorder.{key}: {value:g} is less than {least:g}, which would make files without number; 0: never"

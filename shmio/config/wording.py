@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import difflib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from tomllib import TOMLDecodeError
 from typing import Any, get_args
 
 from msgspec import ValidationError
 
+from shmio.config.lines import Lines
 from shmio.config.model import (
     NAME_PATTERN,
     NAME_RULE,
@@ -20,6 +22,11 @@ from shmio.config.model import (
 from shmio.config.mqttmodel import BrokerName, PayloadName
 
 MAX_LINE = 80
+MAX_HINTED = 100
+"""Characters of a word for which a similar one is looked for."""
+_QUOTES = "'"
+_DOUBLE = ("Cannot overwrite", "Cannot declare", "Duplicate inline table key")
+_ESCAPE = ("Unescaped", "Invalid hex", "Escaped character", "Illegal character")
 _PLACE = re.compile(r"\(at line (\d+), column (\d+)\)\Z")
 _BARE = re.compile(r"[^\s,=#\[\]{}\"']+")
 _TEXT = re.compile(r"[^\W\d].*|.*[:/].*|\d+(?:\.\d+){2,}")  # a name, a path, an address
@@ -53,12 +60,24 @@ def explain(error: ValidationError, key: str = "") -> str:
         text = f"expected a name: {NAME_RULE}"
     elif unknown := re.fullmatch(r"Invalid enum value ('.*')", text):
         words = get_args(_WORDS[path.rpartition(".")[2]])
-        text = f"{unknown[1]} is none; there are: {', '.join(words)}"
+        text = f"{unknown[1]} is none; there are: {', '.join(words)}{meant(unknown[1].strip(_QUOTES), words)}"
     elif text.endswith("of length >= 1"):
         text = "must not be empty"
     text = re.sub(r"`([a-z]+(?: \| [a-z]+)*)`", _types, text)
     text = text[:1].lower() + text[1:]
     return f"{path}: {text}" if path else text
+
+
+def near(word: str, names: Iterable[str]) -> list[str]:
+    """The name that was meant, perhaps, in whatever case it is written; empty if none is similar."""
+    folded = {name.lower(): name for name in names}
+    found = difflib.get_close_matches(word.lower(), folded, 1) if len(word) <= MAX_HINTED else []
+    return [folded[found[0]]] if found else []
+
+
+def meant(word: str, names: Iterable[str]) -> str:
+    """What to add to a message about a word that is none of these."""
+    return "".join(f"; did you mean {name}?" for name in near(word, names))
 
 
 def _types(match: re.Match[str]) -> str:
@@ -75,12 +94,18 @@ def explain_toml(error: Exception, text: str) -> str:
     lines = text.replace("\r\n", "\n").split("\n")
     line, column = lines[int(place[1]) - 1], int(place[2]) - 1
     shown = line.strip()[:MAX_LINE]
+    double = Lines(text).double
+    if double and str(error).startswith(_DOUBLE):
+        key, first, second = double
+        return f"{error}: {key[:MAX_LINE]} is there twice, in lines {first} and {second}; keep one of them"
     return f"{error}: {shown}{_slip(str(error), line, column)}" if shown else str(error)
 
 
 def _slip(message: str, line: str, column: int) -> str:
     if message.startswith("Illegal character '\\n'"):
         return "; a quote is missing at its end"
+    if "\\" in line and message.startswith(_ESCAPE):
+        return "; in double quotes a backslash has a meaning of its own: write a path in single quotes, 'C:\\cell.db'"
     word = next((word[0] for word in _BARE.finditer(line) if word.start() <= column < word.end()), "").strip("“”")
     if message.startswith("Expected '='") or not _TEXT.fullmatch(word):
         return ""

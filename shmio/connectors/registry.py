@@ -6,12 +6,12 @@ Most reach a device; some are computed here, or play a recording, and live on th
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from shmio.config.wording import explain
+from shmio.config.wording import explain, meant
 from shmio.connectors.base import Connector
 from shmio.connectors.computed import Computed
 from shmio.connectors.replayed import Replayed
@@ -50,7 +50,7 @@ def load(name: str) -> type[Connector] | type[Computed] | type[Replayed]:
     else:
         points = [point for point in _offered() if point.name == name]
         if not points:
-            raise ConfigError(f"no connector {name!r}; there are: {', '.join(names())}")
+            raise ConfigError(f"no connector {name!r}; there are: {', '.join(names())}{meant(name, names())}")
         try:
             found = points[0].load()
         except Exception as error:
@@ -70,13 +70,37 @@ def convert_options(name: str, options: dict[str, Any], texts: Mapping[str, str]
 
     ConfigError begins with the key alone: the caller knows where the keys stand.
     """
+    for fault in option_faults(name, options, texts or {}):
+        raise ConfigError(fault)
     kind = options_type(name)
-    types = {field.encode_name: field.type for field in msgspec.structs.fields(kind)}
-    read = {key: _convert_text(key, text, types.get(key, Any)) for key, text in (texts or {}).items()}
     try:
-        return msgspec.convert(read | options, kind)
+        return msgspec.convert(_read(kind, texts or {}) | options, kind)
     except msgspec.ValidationError as error:
         raise ConfigError(explain(error)) from None
+
+
+def option_faults(name: str, options: Mapping[str, Any], texts: Mapping[str, str]) -> Iterator[str]:
+    """All that is wrong with a source's own keys, each taken by itself; each begins with the key."""
+    kind = options_type(name)
+    read: dict[str, Any] = {}
+    for field in msgspec.structs.fields(kind):
+        key = field.encode_name
+        try:
+            if key in options:
+                msgspec.convert(options[key], field.type)
+            elif key in texts:
+                read[key] = _convert_text(key, texts[key], field.type)
+            elif field.required:
+                yield f"{key}: this key is needed"
+        except msgspec.ValidationError as error:
+            yield explain(error, key)
+        except ConfigError as error:
+            yield str(error)
+
+
+def _read(kind: type[msgspec.Struct], texts: Mapping[str, str]) -> dict[str, Any]:
+    types = {field.encode_name: field.type for field in msgspec.structs.fields(kind)}
+    return {key: _convert_text(key, text, types.get(key, Any)) for key, text in texts.items()}
 
 
 def _convert_text(key: str, text: str, kind: Any) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
+from shmio.config.wording import meant
 from shmio.emulators.a50 import A50
 from shmio.emulators.counter import Counter
 from shmio.emulators.idle import Idle
@@ -39,5 +40,7 @@ def program(name: str, layout: Layout) -> Program:
     try:
         build = PROGRAMS[name]
     except KeyError:
-        raise ConfigError(f"program: {name!r} is none; there are: {', '.join(sorted(PROGRAMS))}") from None
+        raise ConfigError(
+            f"program: {name!r} is none; there are: {', '.join(sorted(PROGRAMS))}{meant(name, PROGRAMS)}"
+        ) from None
     return build(layout)

@@ -24,6 +24,7 @@ from typing import Final
 
 import msgspec
 
+from shmio.config.lines import MAX_PARTS, too_long
 from shmio.config.wording import explain, explain_toml
 from shmio.layout.lexer import MAX_SOURCE_BYTES
 from shmio.layout.model import Diagnostic, Layout
@@ -57,6 +58,10 @@ def _read(file: str, data: bytes, report: Report) -> Table:
         text = data.decode()
     except UnicodeDecodeError as error:
         report.add(Diagnostic(file, data.count(b"\n", 0, error.start) + 1, 1, "it is not in UTF-8"))
+        return Table({})
+    if line := too_long(text, MAX_SOURCE_BYTES):
+        what = f"a key has more than {MAX_PARTS} parts; a path with dots is written in quotes"
+        report.add(Diagnostic(file, line, 1, what))
         return Table({})
     try:
         return msgspec.convert(tomllib.loads(text), Table)

@@ -29,7 +29,7 @@ from typing import Any, Final
 import msgspec
 
 from shmio.errors import ControlError, UnreachableError
-from shmio.supervisor.shorten import cut, shorten
+from shmio.supervisor.shorten import cut_lines, shorten
 from shmio.supervisor.socketpath import remove_socket
 
 MAX_REQUEST_BYTES: Final = 4096
@@ -80,7 +80,7 @@ class Answer:
 
     def error(self, message: str) -> None:
         """Not done, and why."""
-        self._server.answer(self._client, {"error": cut(message)})
+        self._server.answer(self._client, {"error": cut_lines(message, MAX_ANSWER_BYTES // 8)})
 
 
 class ControlServer:

@@ -23,6 +23,18 @@ def cut(line: str) -> str:
     return line if len(line) <= LINE_CHARS else line[: LINE_CHARS - 1] + "…"
 
 
+def cut_lines(text: str, most_chars: int) -> str:
+    """A text of several lines with each of them cut, and the last ones left out and counted if there are too many."""
+    lines = text.split("\n")
+    kept: list[str] = []
+    for line in map(cut, lines):
+        most_chars -= len(line) + 1
+        if most_chars < 0:
+            return "\n".join([*kept, f"{len(lines) - len(kept)} more lines"])
+        kept.append(line)
+    return "\n".join(kept)
+
+
 def shorten(answer: dict[str, object], most_bytes: int) -> dict[str, object]:
     """The answer with its lines cut, and the last ones of each kind left out and counted until it fits as JSON."""
     short = dict(answer)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import grp
 import os
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 
 from shmio import realtime
@@ -15,22 +17,33 @@ from shmio.config.tokens import read_tokens
 from shmio.errors import ConfigError
 
 
-def check_host(config: Config) -> None:
-    """Group, priorities, folders of log files and recordings, TLS files, tokens; ConfigError. Nothing is made."""
-    _check_group(config.instance.group)
+def check_host(config: Config, catching: Callable[[], AbstractContextManager[None]]) -> None:
+    """Group, priorities, folders of log files and recordings, TLS files, tokens. Nothing is made.
+
+    ``catching``: what makes a context that keeps a ConfigError for later.
+    """
+    with catching():
+        _check_group(config.instance.group)
     for index, source in enumerate(config.source):
-        _check_priority(f"source[{index}]", source.realtime_priority)
+        with catching():
+            _check_priority(f"source[{index}]", source.realtime_priority)
     for index, emulator in enumerate(config.emulator):
-        _check_priority(f"emulator[{index}]", emulator.realtime_priority)
-    _check_folder("instance.log_dir", config.log_dir)
+        with catching():
+            _check_priority(f"emulator[{index}]", emulator.realtime_priority)
+    with catching():
+        _check_folder("instance.log_dir", config.log_dir)
     if config.recorder:
-        _check_folder("recorder.directory", config.path(config.recorder.directory))
+        with catching():
+            _check_folder("recorder.directory", config.path(config.recorder.directory))
     if config.grpc:
-        if config.grpc.tls:
-            read_tls(config.grpc.tls)
-        read_tokens(config.grpc.token)
+        with catching():
+            if config.grpc.tls:
+                read_tls(config.grpc.tls)
+        with catching():
+            read_tokens(config.grpc.token)
     if config.mqtt:
-        _check_mqtt(config.mqtt)
+        with catching():
+            _check_mqtt(config.mqtt)
 
 
 def _check_mqtt(mqtt: Mqtt) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from shmio.config import Config, Emulator, Source
-from shmio.errors import ConfigError
+from shmio.errors import ConfigError, LayoutError
 from shmio.layout import compiler
 from shmio.layout.lexer import MAX_SOURCE_BYTES
 from shmio.layout.model import Diagnostic, Layout
@@ -23,7 +23,7 @@ class LayoutFiles:
     def __init__(self, config: Config) -> None:
         self._config = config
         self._programs: dict[tuple[Path, ...], compiler.Program] = {}
-        self._compiled: dict[object, compiler.Compiled] = {}
+        self._compiled: dict[object, compiler.Compiled | LayoutError] = {}
         self.warnings: list[str] = []
         self.odd: list[str] = []
         """What is odd about the sections' keys, each beginning with the key."""
@@ -64,9 +64,15 @@ class LayoutFiles:
         sizes = section.type_bytes
         which = paths, block and block.lower(), tuple(sorted(sizes.items()))
         if which not in self._compiled:
-            compiled = self._compiled[which] = program.compile(None if block is None else (block,), sizes)
-            self.warnings += [line for line in summarize(compiled.warnings) if line not in self.warnings]
-        compiled = self._compiled[which]
+            try:
+                compiled = self._compiled[which] = program.compile(None if block is None else (block,), sizes)
+                self.warnings += [line for line in summarize(compiled.warnings) if line not in self.warnings]
+            except LayoutError as error:
+                self._compiled[which] = error
+        found = self._compiled[which]
+        if isinstance(found, LayoutError):
+            raise found
+        compiled = found
         held = ", ".join(layout.name for layout in compiled.layouts)
         self.odd += [f"{key}.type_bytes: nothing in {held} is of the type {name!r}" for name in compiled.unused]
         return compiled.layouts

@@ -16,10 +16,12 @@ from shmio.cli.supervise.layouts import LayoutFiles
 from shmio.cli.supervise.ports import check_listening
 from shmio.cli.supervise.recordings import Recordings
 from shmio.cli.supervise.replaying import replayed
-from shmio.cli.supervise.sources import check_sources
-from shmio.config import Address, Config, Emulator, Mqtt, Source, load
+from shmio.cli.supervise.sources import check_sources, note_options
+from shmio.config import Address, Config, Emulator, Mqtt, Source
 from shmio.config.accounts import read_accounts
-from shmio.config.wording import named
+from shmio.config.faults import Faults
+from shmio.config.read import examine
+from shmio.config.wording import meant
 from shmio.errors import ConfigError, PathError
 from shmio.layout.glob import Glob
 from shmio.layout.image import complaints
@@ -56,39 +58,56 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
 
     ``keys``: of ``[replay]``, in place of those of the file.
     """
-    config = load(file)
+    config, faults, broken = examine(file)
     origin, notices = None, list[str]()
-    if mode == "log" and config.recorder is None:
+    if mode == "log" and config.recorder is None and not faults:
         raise ConfigError(
             f"{file}: --mode log reads the sources and records them, and there is no [recorder] section: "
             'add one, such as [recorder] with directory = "dumps", or leave out --mode log'
         )
-    try:
-        with Recordings() as recordings:
-            if mode == "replay":
+    with Recordings() as recordings:
+        if mode == "replay":
+            faults.raise_any()
+            with faults.catching():
                 config, origin, notices = replayed(config, keys or {}, recordings)
-            files = LayoutFiles(config)
-            check_host(config)
-            check_listening(config)
-            sources = check_sources(config, files, recordings)
-        layouts = sources.layouts
+            faults.raise_any()
+            faults = Faults(file, msgspec.to_builtins(config))  # its sources are not those of the file
+        files = LayoutFiles(config)
+        check_host(config, faults.catching)
+        if not faults:
+            with faults.catching():
+                check_listening(config)
+        sources = check_sources(config, files, recordings, faults)
+    places, faults.places = faults.places, {}
+    for index, own in broken.items():
+        note_options(index, *own, faults)
+    faults.places = places
+    emulated: dict[str, tuple[Layout, ...]] = {}
+    for index, emulator in enumerate(config.emulator):
+        with faults.catching():
+            emulated[emulator.name] = _check_emulator(index, emulator, files)
+    faults.raise_any()
+    layouts = sources.layouts
+    with faults.catching():
         config = _spelled(config, layouts)
-        emulated = {emulator.name: _check_emulator(i, emulator, files) for i, emulator in enumerate(config.emulator)}
+    declared, described = dict[str, bytes](), tuple[str, ...]()
+    with faults.catching():
         declared, described = _check_injections(config, layouts)
-        if config.recorder and config.recorder.trigger:
+    if config.recorder and config.recorder.trigger:
+        with faults.catching():
             _check_trigger(config.recorder.trigger.when, layouts)
-        odd = [
-            *notices,
-            *files.odd,
-            *_odd(config, layouts),
-            *_odd_topics(config, layouts),
-            *_odd_recorder(config, layouts),
-            *_not_served(config, layouts, emulated),
-            *_not_emulated(config),
-            *_unread(emulated),
-        ]
-    except ConfigError as error:
-        raise ConfigError(f"{file}: {named(str(error), msgspec.to_builtins(config))}") from None
+    odd = [*notices, *files.odd]
+    for found in (
+        lambda: _odd(config, layouts),
+        lambda: _odd_topics(config, layouts),
+        lambda: _odd_recorder(config, layouts),
+        lambda: _not_served(config, layouts, emulated),
+        lambda: _not_emulated(config),
+        lambda: _unread(emulated),
+    ):
+        with faults.catching():
+            odd += found()
+    faults.raise_any()
     warnings = [*files.warnings, *(f"{file}: warning: {text}" for text in odd)]
     plan = make_plan(
         config,
@@ -164,7 +183,10 @@ def _check_emulator(index: int, emulator: Emulator, files: LayoutFiles) -> tuple
 
     key = f"emulator[{index}]"
     if emulator.kind not in EMULATOR_KINDS:
-        raise ConfigError(f"{key}.kind: {emulator.kind!r} is none; there are: {', '.join(EMULATOR_KINDS)}")
+        raise ConfigError(
+            f"{key}.kind: {emulator.kind!r} is none; there are: {', '.join(EMULATOR_KINDS)}"
+            + meant(emulator.kind, EMULATOR_KINDS)
+        )
     if emulator.program == IDLE and emulator.block is None and emulator.dbNumber is None:
         layouts = files.all(key, emulator)
         _check_numbers(key, layouts)

@@ -5,16 +5,20 @@ Connectors are imported here, and only when they are asked: status and its like 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, Final, NamedTuple
 
 import msgspec
 
 from shmio.cli.supervise.layouts import LayoutFiles
 from shmio.cli.supervise.recordings import Recordings
 from shmio.config import Config, Source
+from shmio.config.faults import Faults
 from shmio.config.read import unknown_option
+from shmio.config.wording import near
 from shmio.errors import ConfigError, RecordingError
 from shmio.layout.model import Layout
+
+NEEDED: Final = "this key is needed"
 
 
 class Sources(NamedTuple):
@@ -29,71 +33,121 @@ class Sources(NamedTuple):
     """Patterns of what a program elsewhere computes, of sources that have such: outputs, in-outs."""
 
 
-def check_sources(config: Config, files: LayoutFiles, recordings: Recordings) -> Sources:
-    """Ask the connectors of all sources whether they can be as configured.
+def check_sources(config: Config, files: LayoutFiles, recordings: Recordings, faults: Faults) -> Sources:
+    """Ask the connectors of all sources whether they can be as configured, and note what is wrong.
 
-    Their ``options`` are complete and of their types from here on. ConfigError, LayoutError.
+    Their ``options`` are complete and of their types from here on.
     """
+    found = Sources({}, [], [], {})
+    inputs: dict[int, tuple[str, ...]] = {}
+    for index, source in enumerate(config.source):
+        with faults.catching():
+            _check_source(index, source, found, inputs, config, files, recordings, faults)
+    if not faults:
+        for index, paths in inputs.items():
+            from shmio.cli.supervise.models import check_connections  # noqa: PLC0415
+
+            source, key = config.source[index], f"source[{index}]"
+            with faults.catching():
+                check_connections(key, source.name, source.options.get("connections", {}), paths, found.layouts)
+    return found
+
+
+def _check_source(
+    index: int,
+    source: Source,
+    found: Sources,
+    inputs: dict[int, tuple[str, ...]],
+    config: Config,
+    files: LayoutFiles,
+    recordings: Recordings,
+    faults: Faults,
+) -> None:
     from shmio.connectors import registry  # noqa: PLC0415
     from shmio.connectors.computed import Computed  # noqa: PLC0415
     from shmio.connectors.replayed import Replayed  # noqa: PLC0415
 
-    layouts: dict[str, Layout] = {}
-    inputs: dict[int, tuple[str, ...]] = {}
-    computed = []
-    replayed = []
-    remote: dict[str, tuple[list[str], list[str]]] = {}
-    for index, source in enumerate(config.source):
-        key = f"source[{index}]"
-        options = _options(index, source)
-        found = registry.load(source.connector)
-        if issubclass(found, Computed | Replayed):
-            computed.append(source.name)
-        if issubclass(found, Replayed):
-            replayed.append(source.name)
-            layouts[source.name] = _recorded(key, source, config, recordings)
-            continue
-        if source.connector == "simulation":
-            layouts[source.name], inputs[index] = _model(key, source, config, files)
-            continue
-        layout = layouts[source.name] = files.get(key, source, source.options.get("dbNumber"))
-        try:
-            made = found(options, layout)
-        except ConfigError as error:
-            raise ConfigError(f"{key}.{error}") from None
-        if isinstance(made, Computed):
-            inputs[index] = made.inputs
-        else:
-            made.close()
-        if source.connector == "remote":
-            remote[source.name] = source.options["outputs"], source.options["inouts"]
-    for index, paths in inputs.items():
-        from shmio.cli.supervise.models import check_connections  # noqa: PLC0415
-
-        source = config.source[index]
-        check_connections(f"source[{index}]", source.name, source.options.get("connections", {}), paths, layouts)
-    return Sources(layouts, computed, replayed, remote)
+    key = f"source[{index}]"
+    options = _options(key, source, faults)
+    try:
+        connector = registry.load(source.connector)
+    except ConfigError:  # which is told with the options
+        return
+    if issubclass(connector, Computed | Replayed):
+        found.computed.append(source.name)
+    if issubclass(connector, Replayed):
+        found.replayed.append(source.name)
+        if options is not None:
+            found.layouts[source.name] = _recorded(key, source, config, recordings)
+        return
+    if source.connector == "simulation":
+        if options is not None:
+            found.layouts[source.name], inputs[index] = _model(key, source, config, files)
+        return
+    layout = found.layouts[source.name] = files.get(key, source, source.options.get("dbNumber"))
+    if options is None:  # its faults are told; what else the connector would say is told with them
+        options = _filled(connector.Options, source)
+        if options is None:
+            return
+    try:
+        made = connector(options, layout)
+    except ConfigError as error:
+        raise ConfigError(f"{key}.{error}") from None
+    if isinstance(made, Computed):
+        inputs[index] = made.inputs
+    elif not isinstance(made, Replayed):
+        made.close()
+    if source.connector == "remote" and "outputs" in source.options:
+        found.remote[source.name] = source.options["outputs"], source.options["inouts"]
 
 
-def _options(index: int, source: Source) -> msgspec.Struct:
-    """The connector's own keys, checked; ConfigError."""
+def note_options(index: int, connector: str, options: dict[str, Any], texts: dict[str, str], faults: Faults) -> None:
+    """Note what is wrong with the connector's own keys of a source, by its place in the file."""
     from shmio.connectors import registry  # noqa: PLC0415
 
     key = f"source[{index}]"
     try:
-        connector = registry.load(source.connector)
+        known = [field.encode_name for field in msgspec.structs.fields(registry.options_type(connector))]
     except ConfigError as error:
-        raise ConfigError(f"{key}.connector: {error}") from None
-    known = [field.encode_name for field in msgspec.structs.fields(connector.Options)]
-    for option in (*source.options, *source.texts):
+        faults.add(f"{key}.connector: {error}")
+        return
+    near_to = {name for option in (*options, *texts) if option not in known for name in near(option, known)}
+    for option in (*options, *texts):
         if option not in known:
-            raise ConfigError(unknown_option(index, option, known))
+            faults.add(unknown_option(index, option, known))
+    for fault in registry.option_faults(connector, options, texts):
+        missing, _, what = fault.partition(": ")
+        if missing not in near_to or what != NEEDED:
+            faults.add(f"{key}.{fault}")
+
+
+def _options(key: str, source: Source, faults: Faults) -> msgspec.Struct | None:
+    """The connector's own keys, checked; None if there are faults, which are noted."""
+    from shmio.connectors import registry  # noqa: PLC0415
+
+    before = faults.count
+    note_options(int(key[7:-1]), source.connector, source.options, source.texts, faults)
+    if faults.count > before:
+        return None
     try:
         options = registry.convert_options(source.connector, source.options, source.texts)
     except ConfigError as error:
-        raise ConfigError(f"{key}.{error}") from None
+        faults.add(f"{key}.{error}")
+        return None
     source.options, source.texts = msgspec.to_builtins(options), {}
     return options
+
+
+def _filled(kind: type[msgspec.Struct], source: Source) -> msgspec.Struct | None:
+    """The options with something in place of texts that are missing; None if more than that is wrong."""
+    fields = msgspec.structs.fields(kind)
+    known = {field.encode_name for field in fields}
+    given = {key: value for key, value in (source.texts | source.options).items() if key in known}
+    missing = {field.encode_name: "missing" for field in fields if field.required}
+    try:
+        return msgspec.convert(missing | given, kind, strict=False)
+    except (msgspec.ValidationError, ConfigError):
+        return None
 
 
 def _recorded(key: str, source: Source, config: Config, recordings: Recordings) -> Layout:

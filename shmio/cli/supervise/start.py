@@ -82,7 +82,7 @@ def detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> int
             supervisor = Supervisor(plan, replan=_replan(plan, keys), on_state=on_state)
             supervisor.run()
     except ShmioError as error:
-        tell(Failed(printable(str(error))))
+        tell(Failed("\n".join(map(printable, str(error).split("\n")))))
         return 1
     except OSError as error:
         tell(Failed(printable(f"{error.filename}: {error.strerror}" if error.filename else str(error))))

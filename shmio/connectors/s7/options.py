@@ -8,6 +8,8 @@ from typing import Annotated
 
 import msgspec
 
+from shmio.config.wording import meant
+
 # The slot of the CPU in its rack, by family, where nothing is configured.
 _CPU_SLOT = {"S7_300": 2, "S7_400": 3, "S7_1200": 1, "S7_1500": 1}
 
@@ -36,7 +38,9 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
                 f"host: {self.host!r} is no host name or address; write it without port: that is a key of its own"
             )
         if self.model is not None and _family(self.model) not in _CPU_SLOT:
-            raise ValueError(f"model: {self.model!r} is none; there are: {', '.join(_CPU_SLOT)}")
+            raise ValueError(
+                f"model: {self.model!r} is none; there are: {', '.join(_CPU_SLOT)}{meant(self.model, _CPU_SLOT)}"
+            )
 
     @property
     def cpu_slot(self) -> int:

@@ -29,6 +29,11 @@ TYPE = 'TYPE "Axis"\nSTRUCT\na : Real;\nEND_STRUCT;\nEND_TYPE\n'
 Edit = Callable[[str, str], None]
 
 
+def unplaced(text: str) -> str:
+    """What is told, without the lines of the file."""
+    return re.sub(r"^(\w+\.toml):[0-9]+: ", r"\1: ", text, flags=re.MULTILINE)
+
+
 def block(name: str, kind: str) -> str:
     """The source of a data block with one register of a type."""
     return f"DATA_BLOCK {name}\nSTRUCT\nx : {kind};\nEND_STRUCT;\nBEGIN\nEND_DATA_BLOCK\n"
@@ -110,7 +115,7 @@ def test_init_from_a_layout_alone_leaves_the_address_to_fill_in(capsys: pytest.C
     assert (source.layout, source.options) == ("blocks/x.db", {}), "an address must not be made up"
     assert "next: fill in host in other.toml, then shmio-supervisor check -c other.toml" in capsys.readouterr().out
     assert main(["check", "-c", "other.toml"]) == 1
-    assert capsys.readouterr().err == 'other.toml: source[0].host: this key is needed (source "cell")\n'
+    assert capsys.readouterr().err == 'other.toml:4: source[0].host: this key is needed (source "cell")\n'
 
 
 @pytest.mark.parametrize("order", [["cell.db", "types.udt"], ["types.udt", "plc.ini", "cell.db"]])
@@ -459,7 +464,7 @@ def test_faults_are_named(example: Edit, old: str, new: str, error: str, capsys:
     for verb in ("check", "up"):
         assert main([verb]) == 1
         output = capsys.readouterr()
-        assert output.err.startswith(f"supervisor.toml: {error}")
+        assert unplaced(output.err).startswith(f"supervisor.toml: {error}")
         assert output.err.count("\n") == 1
 
 
@@ -467,7 +472,7 @@ def test_a_fault_that_a_detached_one_finds_is_told_here(example: Edit, capsys: p
     example("period_ms = 20", "perid_ms = 20")
     assert main(["up", "--detach"]) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("supervisor.toml: source[0].perid_ms: unknown key")
+    assert line.startswith("supervisor.toml:12: source[0].perid_ms: unknown key")
     example("perid_ms", "period_ms")
     Path("supervisor.toml").rename("other.toml")
     assert main(["up", "--detach", "--mode", "replay", "-c", "other.toml"]) == 1
@@ -586,7 +591,7 @@ def test_a_replay_that_cannot_be_is_refused(
 ) -> None:
     assert main(["up", *options]) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith(f"supervisor.toml: {error}")
+    assert unplaced(line).startswith(f"supervisor.toml: {error}")
 
 
 def test_what_is_for_a_replay_goes_with_no_other_mode(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
@@ -862,7 +867,7 @@ def test_faults_of_declared_injections_are_named(
     example(old, new)
     assert main(["check"]) == 1
     told = capsys.readouterr().err
-    assert told.startswith(f"supervisor.toml: injection[0].{error}"), told
+    assert unplaced(told).startswith(f"supervisor.toml: injection[0].{error}"), told
     assert told.endswith('(injection "one")\n')
 
 
@@ -882,3 +887,41 @@ def test_what_is_declared_for_a_source_has_a_bound(example: Edit, capsys: pytest
     example("[grpc]\n", f"{tables}[grpc]\n")
     assert main(["check"]) == 1
     assert "injection: 65 over source 'cell': a source has at most 64" in capsys.readouterr().err
+
+
+def test_all_that_is_missing_is_told_in_one_round(example: Edit, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("big.db").write_text(block('"Cell"', "Array[0..99] of Int") + block('"Timers"', "TON_TIME"))
+    example('layout = "db201.db"\nhost = "127.0.0.1"', 'layout = "big.db"\nblock = "Cell"\n#')
+    example("port = 1102", "port = 1102\nslott = 2")
+    example('program = "a50"', 'program = "A50"')
+    example("[mqtt]", '[[source]]\nname = "two"\nconnector = "S7"\nlayout = "none.db"\n[mqtt]')
+    for verb in ("check", "up"):
+        assert main([verb]) == 1
+        err = capsys.readouterr().err.splitlines()
+        assert [unplaced(line).removeprefix("supervisor.toml: ").partition("; there")[0] for line in err] == [
+            'source[0].slott: unknown key; did you mean slot? (source "cell")',
+            'source[0].host: this key is needed (source "cell")',
+            "source[0].dbNumber: this key is needed, for the layout 'Cell' has no number in its name (source \"cell\")",
+            "source[1].connector: no connector 'S7'",
+            "emulator[0].program: 'A50' is none",
+        ]
+        assert all(re.match(r"supervisor\.toml:[0-9]+: ", line) for line in err)
+    assert "did you mean s7?" in err[3]
+    assert "did you mean a50?" in err[4]
+
+
+def test_faults_of_keys_and_of_the_connector_are_told_together(
+    example: Edit, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example("period_ms = 20", 'period_ms = "20"')
+    example("port = 1102", 'port = "x"')
+    example('layout = "db201.db"\nprogram', 'layout = "broken.db"\nprogram')
+    Path("broken.db").write_text("DATA_BLOCK DB201 STRUCT a : Nope; b : Nope2; END_STRUCT; BEGIN END_DATA_BLOCK")
+    assert main(["check"]) == 1
+    err = capsys.readouterr().err.splitlines()
+    assert [re.sub(r"^.*(supervisor\.toml|broken\.db):([0-9]+):", r"\2", line)[:40] for line in err] == [
+        "12 source[0].period_ms: expected a numbe",
+        "11 source[0].port: expected a whole numb",
+        "129: error: expected a known type, found",
+        "139: error: expected a known type, found",
+    ]

@@ -55,3 +55,9 @@ def test_a_file_of_another_kind_is_one_fault_with_its_remedy(name: str, data: by
 def test_a_source_is_none_of_these(text: str) -> None:
     for encoding in ("utf-8-sig", "utf-16"):
         assert compile_sources([Source("x.db", text.encode(encoding))]).layouts
+
+
+def test_a_key_that_takes_long_to_read_is_refused_at_once() -> None:
+    text = f'[registers]\na = "INT"\n{".".join("a" * 20_000)} = "INT"\n'
+    with pytest.raises(LayoutError, match=r"t\.toml:3:1: error: a key has more than 64 parts"):
+        compile_sources([Source("t.toml", text.encode())])
