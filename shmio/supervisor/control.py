@@ -218,7 +218,7 @@ def request(
             ) from None
     try:
         answer = msgspec.json.decode(received, type=dict[str, Any])
-    except msgspec.DecodeError:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         raise ControlError("the supervisor's answer makes no sense; is it of this version?") from None
     if "error" in answer:
         raise ControlError(str(answer["error"]))

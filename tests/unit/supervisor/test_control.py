@@ -10,6 +10,7 @@ import stat
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import msgspec
@@ -278,3 +279,27 @@ def test_asking_in_vain(tmp_path: Path) -> None:
         deaf.listen(1)
         with pytest.raises(ControlError, match=r"not answered within 0\.01 s"):
             control.request(str(tmp_path / "deaf.sock"), Stop(), 0.01)
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [b"", b"garbage\n", b"[]\n", b'{"ok": "\xff"}\n', b'{"a":' * 12_000 + b"\n", b"x" * (2 * control.MAX_ANSWER_BYTES)],
+)
+def test_whoever_has_taken_the_sockets_path_cannot_make_a_client_fail_otherwise(tmp_path: Path, answer: bytes) -> None:
+    """Its command ends with one line, and has read no more than an answer may have."""
+    path = tmp_path / "taken.sock"
+    with socket.socket(socket.AF_UNIX) as hijacker:
+        hijacker.bind(str(path))
+        hijacker.listen()
+
+        def reply() -> None:
+            taken, _ = hijacker.accept()
+            with taken, suppress(OSError):  # who was asked too much has hung up
+                taken.recv(control.MAX_REQUEST_BYTES)
+                taken.sendall(answer)
+
+        serving = threading.Thread(target=reply)
+        serving.start()
+        with pytest.raises(ControlError):
+            control.request(str(path), Stop(), 60)
+        serving.join()
