@@ -59,7 +59,8 @@ def _mqtt(config: Config) -> Iterator[str]:
     mqtt = config.mqtt
     if mqtt is None or not mqtt.listen or not any(source.writable for source in config.source):
         return
-    if not (mqtt.password_file or (mqtt.tls and mqtt.tls.ca)):
+    free = any(account.name is None and "write" in account.roles for account in mqtt.account)
+    if free and not (mqtt.tls and mqtt.tls.ca):
         yield f"write by MQTT at {mqtt.listen}"
 
 

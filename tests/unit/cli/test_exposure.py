@@ -26,6 +26,7 @@ writable = {writable}
 TOKEN = f'[[grpc.token]]\nname = "a"\nroles = ["read", "write"]\nsha256 = "{"0" * 64}"\n'
 GRPC = '[grpc]\nlisten = ["127.0.0.1:8089", "[::1]:8090"]\n'
 MQTT = '[mqtt]\nbroker = "embedded"\nlisten = "127.0.0.1:1883"\nprefix = "x"\n'
+FREE = '[[mqtt.account]]\nroles = ["read", "write"]\n'
 
 
 def user(name: str, uid: int, shell: str = "/bin/bash") -> pwd.struct_passwd:
@@ -50,11 +51,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         ('[grpc]\nlisten = ["unix:s"]\n', "[]", None),
         ('[[grpc.address]]\nlisten = "127.0.0.1:8089"\n', "[]", None),
         (
-            '[[grpc.address]]\nlisten = "127.0.0.1:8089"\nroles = ["read", "write"]\n' + MQTT,
+            '[[grpc.address]]\nlisten = "127.0.0.1:8089"\nroles = ["read", "write"]\n' + MQTT + FREE,
             '["**"]',
             "ada) may write by gRPC at 127.0.0.1:8089; and write by MQTT at 127.0.0.1:1883, for",
         ),
-        (MQTT, "[]", None),
+        (MQTT + FREE, "[]", None),
+        (MQTT, '["**"]', None),
         (MQTT + 'password_file = "accounts"\n', '["**"]', None),
         ("", '["**"]', None),
     ],
