@@ -23,8 +23,8 @@ from plc import NUMBER, SIZE
 from shmio import attach
 from shmio.config.address import Address
 from shmio.connectors.s7 import S7Client, S7Options
+from shmio.local.attach import Attachment
 from shmio.segment import EventKind, Write
-from shmio.segment.attach import Attachment
 
 PATH = "cell/Stamp"
 OURS = "shmio"

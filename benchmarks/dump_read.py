@@ -26,9 +26,9 @@ from common import begin, db201, interleave, report, report_spread, table
 
 import shmio
 from shmio.cli.dump import main as shmio_dump
-from shmio.dump.dump import Dump
-from shmio.recording.output import Output
-from shmio.recording.writer import Writer
+from shmio.recorder.output import Output
+from shmio.recorder.writer import Writer
+from shmio.recording.dump import Dump
 from shmio.segment import Block, Frame, Provenance, Quality
 
 OURS = "shmio columns"

@@ -17,10 +17,10 @@ import msgspec
 from common import begin, db201, interleave, table
 
 from shmio.config import Declaration
-from shmio.connectors.desk import CommandDesk
+from shmio.connectors.commands.processor import CommandDesk
 from shmio.connectors.output import Image, Output
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Provenance, Quality, Segment
-from shmio.segment.standing import declared_document
+from shmio.segment.standing_injections import declared_document
 
 LAYOUT = db201()
 AXES = [f"cell/Robot_{robot}/Axs{axis}_Pos" for robot in (800, 825, 850) for axis in range(1, 7)]

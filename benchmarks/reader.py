@@ -8,7 +8,7 @@ import threading
 from common import tell, wait_for_parent
 
 from shmio import attach
-from shmio.layout.codec import codec
+from shmio.layout.values.codec import codec
 from shmio.segment import Block
 
 

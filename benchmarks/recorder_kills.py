@@ -25,8 +25,8 @@ from mcap.exceptions import EndOfFile
 from mcap.reader import NonSeekingReader, make_reader
 
 from shmio.cli.dump import main as dump
-from shmio.dump.reader import Reader
-from shmio.dump.survey import survey
+from shmio.recording.reading.reader import Reader
+from shmio.recording.reading.survey import survey
 from shmio.segment import Activity, Segment
 from shmio.testing.cell import kill, until
 

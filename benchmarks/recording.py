@@ -24,12 +24,12 @@ import mcap.writer
 import zstandard
 from common import CpuTime, begin, db201, table
 
-from shmio.dump.encoding import FRAME, differ, encode_frame
-from shmio.emulators.a50 import A50
+from shmio.emulators.programs import A50
 from shmio.layout.model import Layout
-from shmio.recording.output import Output, create
-from shmio.recording.recorder import CHUNK_S
-from shmio.recording.writer import Writer
+from shmio.recorder.output import Output, create
+from shmio.recorder.recorder import CHUNK_S
+from shmio.recorder.writer import Writer
+from shmio.recording.format.encoding import FRAME, differ, encode_frame
 from shmio.segment import Block, BlockSpec, BlockWriter, Frame, ProcessSpec, Provenance, Quality, Segment
 from shmio.segment.processes import Activity
 
@@ -189,7 +189,7 @@ def recorder(segment: Segment, folder: Path) -> Iterator[int]:
         "log_file": str(folder / "recorder.log"),
         "config": {"directory": str(folder / "dumps"), "config_file": str(folder / "supervisor.toml")},
     }
-    process = subprocess.Popen([sys.executable, "-m", "shmio.recording"], stdin=subprocess.PIPE, text=True)
+    process = subprocess.Popen([sys.executable, "-m", "shmio.recorder"], stdin=subprocess.PIPE, text=True)
     try:
         assert process.stdin is not None
         process.stdin.write(json.dumps(description))

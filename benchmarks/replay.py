@@ -17,11 +17,11 @@ from pathlib import Path
 from common import begin, db201, quantiles, table
 
 from shmio.config import Address
-from shmio.recording.output import Output, create
-from shmio.recording.recorder import Recorder
-from shmio.recording.tap import FROM_THE_FIRST, Tap
+from shmio.local.attach import attach
+from shmio.recorder.output import Output, create
+from shmio.recorder.recorder import Recorder
+from shmio.recorder.tap import FROM_THE_FIRST, Tap
 from shmio.segment import BlockSpec, Origin, Quality, Segment, Stamp
-from shmio.segment.attach import attach
 from shmio.testing.cell import Cell
 
 CONFIG = '[instance]\nname = "{name}"\nclock = "{clock}"\n'

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from common import begin, db201, interleave, per_call_ns, report
 
-from shmio.layout.codec import Value, codec
 from shmio.layout.compiler import Source, compile_sources
-from shmio.layout.framecodec import FrameCodec
 from shmio.layout.model import Layout, Register
-from shmio.segment.scan import ChangeScan
+from shmio.layout.values.codec import Value, codec
+from shmio.layout.values.frame_codec import FrameCodec
+from shmio.segment.changed_registers import ChangeScan
 
 OURS = "shmio"
 PERCENTAGES = (0, 1, 5, 100)

@@ -26,8 +26,8 @@ from typing import Any
 from common import Child, machine, table
 from instance import Instance, instance
 
-from shmio.layout.codec import codec
 from shmio.layout.topic import find
+from shmio.layout.values.codec import codec
 from shmio.segment import Block, Quality
 
 REGISTERS = [f"Robot_800/Axs{axis}_Pos" for axis in range(1, 6)]

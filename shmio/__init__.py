@@ -9,8 +9,8 @@ TYPE_CHECKING = False  # typing's own costs every command 10 ms, in which Ctrl-C
 if TYPE_CHECKING:
     from typing import Any
 
-    from shmio.dump.dump import open_dump
-    from shmio.segment.attach import attach
+    from shmio.local.attach import attach
+    from shmio.recording.dump import open_dump
 
 __version__ = "0.1.0"
 __all__ = ["__version__", "attach", "open_dump"]
@@ -19,11 +19,11 @@ __all__ = ["__version__", "attach", "open_dump"]
 def __getattr__(name: str) -> Any:
     """Import them when they are first asked for: most processes of an instance do without."""
     if name == "attach":
-        from shmio.segment.attach import attach  # noqa: PLC0415
+        from shmio.local.attach import attach  # noqa: PLC0415
 
         return attach
     if name == "open_dump":
-        from shmio.dump.dump import open_dump  # noqa: PLC0415
+        from shmio.recording.dump import open_dump  # noqa: PLC0415
 
         return open_dump
     raise AttributeError(f"module 'shmio' has no attribute {name!r}")

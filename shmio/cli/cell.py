@@ -8,12 +8,12 @@ from typing import NamedTuple, Protocol
 
 from shmio.config import Declaration
 from shmio.layout.model import Layout, Register
-from shmio.playing import Playing
+from shmio.local.reading import Reading
+from shmio.local.replays import Wanted
+from shmio.local.writer import Outcome
+from shmio.model.replay_status import Playing
 from shmio.segment.clock import ClockState
-from shmio.segment.commander import Outcome
-from shmio.segment.replays import Wanted
-from shmio.segment.standing import Standing
-from shmio.segment.view import Reading
+from shmio.segment.standing_injections import Standing
 
 
 class Selected(NamedTuple):

@@ -9,8 +9,8 @@ import argparse
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final
 
-from shmio.dump.libraries import library
 from shmio.errors import ShmioError
+from shmio.recording.libraries import library
 
 PROGRAMS: Final = ("shmio", "shmio-supervisor", "shmio-dump", "shmio-layout")
 SHELLS: Final = ("bash", "zsh", "fish")
@@ -112,7 +112,7 @@ def _paths(options: argparse.Namespace) -> dict[str, list[str]]:
 
 
 def _recorded(files: list[Any]) -> dict[str, list[str]]:
-    from shmio.dump.dump import open_dump  # noqa: PLC0415
+    from shmio.recording.dump import open_dump  # noqa: PLC0415
 
     found: dict[str, list[str]] = {}
     with open_dump([file for file in files if file is not None]) as dump:
@@ -123,7 +123,7 @@ def _recorded(files: list[Any]) -> dict[str, list[str]]:
 
 def _running(options: argparse.Namespace) -> dict[str, list[str]]:
     from shmio.cli.target import target  # noqa: PLC0415
-    from shmio.segment.attach import Attachment  # noqa: PLC0415
+    from shmio.local.attach import Attachment  # noqa: PLC0415
 
     if getattr(options, "host", None) is not None:
         return {}

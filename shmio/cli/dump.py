@@ -1,4 +1,4 @@
-"""``shmio-dump``: record a running instance, look into recordings. Each verb is a module of ``shmio.cli.dumping``."""
+"""``shmio-dump``: record a running instance, look into recordings. A module of ``shmio.cli.recordings`` each."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from shmio.cli.run import add_full, add_json, complete, run, wants_error_json
 
 PROGRAM = "shmio-dump"
 IGNORABLE = ("times", "cycle", "reason", "events", "ends")
-"""What ``diff`` may pass over: shmio.dump.compare, which is not imported for other verbs."""
+"""What ``diff`` may pass over: shmio.recording.compare, which is not imported for other verbs."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error("--before and --after are for --when: without a condition all is recorded, from now on")
 
     def command() -> int:
-        verb = importlib.import_module(f"shmio.cli.dumping.{arguments.verb}")
+        verb = importlib.import_module(f"shmio.cli.recordings.{arguments.verb}")
         status: int = verb.execute(arguments)
         return status
 

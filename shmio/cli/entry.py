@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import signal
 import sys
 from types import TracebackType
 
@@ -13,9 +15,6 @@ def _hook(kind: type[BaseException], error: BaseException, trace: TracebackType 
 
 
 sys.excepthook = _hook  # first: all that follows may be interrupted, this module's imports too
-
-import importlib  # noqa: E402
-import signal  # noqa: E402
 
 
 def shmio() -> int:

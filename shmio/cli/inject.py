@@ -15,10 +15,10 @@ from shmio.cli.interrupt import told_to_stop
 from shmio.cli.run import dumps, seconds
 from shmio.cli.set import Pairs, read_value
 from shmio.errors import CommandError, PathError, ValueRangeError
-from shmio.layout.codec import Value
 from shmio.layout.naming import paths_of
 from shmio.layout.topic import Topic, look_up, parse_topic
-from shmio.layout.write import Write
+from shmio.layout.values.codec import Value
+from shmio.layout.values.write import Write
 from shmio.logs import printable
 
 HELP = "Have consumers, or with /in the device, get other values than they would, until Ctrl-C."

@@ -13,8 +13,8 @@ from shmio.errors import ConfigError, LayoutError
 from shmio.layout.compiler import Program, Source
 from shmio.layout.document import describe
 from shmio.layout.image import complaints
-from shmio.layout.lexer import MAX_SOURCE_BYTES
 from shmio.layout.model import MAX_BLOCK_BYTES, Layout, Register
+from shmio.layout.source.lexer import MAX_SOURCE_BYTES
 from shmio.logs import printable
 
 _HEADINGS = ("offset", "size", "type", "path", "initial", "comment")

@@ -13,15 +13,15 @@ from shmio.cli.readings import choose
 from shmio.config import Declaration
 from shmio.errors import CommandError, NotRunningError, PathError
 from shmio.layout.model import Layout, Register
-from shmio.playing import Playing
+from shmio.local.attach import Attachment
+from shmio.local.injection import Shadow
+from shmio.local.reading import Reading, reading
+from shmio.local.replays import Wanted
+from shmio.local.writer import Outcome
+from shmio.model.replay_status import Playing
 from shmio.segment import Block, Cursor, Event, EventKind, Frame, Quality
-from shmio.segment.attach import Attachment
 from shmio.segment.clock import ClockState
-from shmio.segment.commander import Outcome
-from shmio.segment.replays import Wanted
-from shmio.segment.shadow import Shadow
-from shmio.segment.standing import Standing
-from shmio.segment.view import Reading, reading
+from shmio.segment.standing_injections import Standing
 
 IDLE_S: Final = 0.5
 WAITING_FRAMES: Final = 64

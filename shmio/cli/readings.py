@@ -8,15 +8,15 @@ from typing import Any
 
 from shmio.cli.cell import Cell, Selected
 from shmio.errors import PathError
-from shmio.layout.codec import Value
 from shmio.layout.glob import named
-from shmio.layout.literal import literal_text
 from shmio.layout.model import Register
-from shmio.layout.text import json_value
 from shmio.layout.topic import parse_topic
+from shmio.layout.values.codec import Value
+from shmio.layout.values.literal import literal_text
+from shmio.layout.values.text import json_value
+from shmio.local.reading import Reading
 from shmio.logs import printable
 from shmio.segment.frame import Provenance, Quality
-from shmio.segment.view import Reading
 
 CUT = "… (all: --full)"
 

@@ -22,16 +22,16 @@ from shmio.client import Shadow as ClientShadow
 from shmio.config import Declaration
 from shmio.config.address import UNIX, Address
 from shmio.errors import ConfigError, NotRunningError, PathError, RemoteError, ShmioError, UnknownClientError
-from shmio.layout.codec import Value
 from shmio.layout.model import Layout, Register
 from shmio.layout.types import element_type
-from shmio.playing import Playing
+from shmio.layout.values.codec import Value
+from shmio.local.reading import Reading
+from shmio.local.replays import Wanted
+from shmio.local.writer import Outcome as LocalOutcome
+from shmio.model.replay_status import Playing
 from shmio.segment import EventKind, Quality
 from shmio.segment.clock import ClockMode, ClockState
-from shmio.segment.commander import Outcome as LocalOutcome
-from shmio.segment.replays import Wanted
-from shmio.segment.standing import Running, Standing
-from shmio.segment.view import Reading
+from shmio.segment.standing_injections import Running, Standing
 
 
 @contextmanager

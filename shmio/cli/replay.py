@@ -11,9 +11,9 @@ import msgspec
 
 from shmio.cli.cell import Cell
 from shmio.cli.run import dumps
+from shmio.local.replays import Wanted
 from shmio.logs import printable
-from shmio.playing import Playing
-from shmio.segment.replays import Wanted
+from shmio.model.replay_status import Playing
 
 HELP = "Tell how recordings play, and move them: pause, play, seek, and more."
 

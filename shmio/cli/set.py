@@ -11,16 +11,16 @@ from collections.abc import Sequence
 from shmio.cli.cell import Cell, Selected
 from shmio.cli.run import dumps, seconds
 from shmio.errors import CommandError, PathError, ValueRangeError
-from shmio.layout.codec import Value
 from shmio.layout.glob import select
-from shmio.layout.lists import split_array
-from shmio.layout.literal import parse_literal
 from shmio.layout.model import Register
-from shmio.layout.text import from_text, wire_type
+from shmio.layout.source.lists import split_array
 from shmio.layout.topic import look_up, parse_topic
+from shmio.layout.values.codec import Value
+from shmio.layout.values.literal import parse_literal
+from shmio.layout.values.text import from_text, wire_type
+from shmio.local.writer import MIN_PERIODS, TIMEOUT_S, Outcome
 from shmio.logs import printable
 from shmio.segment import EventKind
-from shmio.segment.commander import MIN_PERIODS, TIMEOUT_S, Outcome
 
 HELP = "Write values of registers, and print what became of each."
 MATCHES = 3

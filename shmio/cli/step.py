@@ -8,12 +8,12 @@ import math
 import msgspec
 
 from shmio.cli.cell import Cell
+from shmio.cli.instance.status import clock_line
 from shmio.cli.interrupt import told_to_stop
 from shmio.cli.run import at_least, dumps
-from shmio.cli.supervise.status import clock_line
 from shmio.errors import CommandError, ValueRangeError
-from shmio.segment.coordinator import MAX_RATE, MAX_STEP_NS, MIN_STEP_NS, check_step
-from shmio.segment.status import clock_status
+from shmio.local.status import clock_status
+from shmio.local.time_control import MAX_RATE, MAX_STEP_NS, MIN_STEP_NS, check_step
 
 HELP = "Step the instance's time: from the first step on nothing else moves it."
 LOOK_S = 0.2

@@ -1,4 +1,4 @@
-"""``shmio-supervisor``: start, watch and stop an instance. Each verb is a module of ``shmio.cli.supervise``."""
+"""``shmio-supervisor``: start, watch and stop an instance. Each verb is a module of ``shmio.cli.instance``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from shmio import __version__
 from shmio.cli.run import add_json, at_least, complete, run, wants_error_json
-from shmio.cli.supervise.replaying import add_arguments
+from shmio.plan.replay import add_arguments
 
 PROGRAM = "shmio-supervisor"
 MODES = ("live", "log", "replay")
@@ -23,7 +23,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(argv)
 
     def command() -> int:
-        verb = importlib.import_module(f"shmio.cli.supervise.{arguments.verb}")  # each needs other parts of shmio
+        verb = importlib.import_module(f"shmio.cli.instance.{arguments.verb}")  # each needs other parts of shmio
         status: int = verb.execute(arguments)
         return status
 

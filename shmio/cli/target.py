@@ -13,8 +13,8 @@ import msgspec
 from shmio.config.model import NAME_RULE, Name
 from shmio.config.read import read_tables
 from shmio.errors import ConfigError, ControlError, NotRunningError, UnreachableError
+from shmio.local.status import supervisor_silence
 from shmio.segment import Segment, running_instances
-from shmio.segment.status import supervisor_silence
 from shmio.supervisor import control
 
 DEFAULT_CONFIG = Path("supervisor.toml")

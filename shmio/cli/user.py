@@ -17,7 +17,7 @@ from shmio.cli.local import Local
 from shmio.cli.run import complete, run
 from shmio.cli.target import target
 from shmio.layout.spelling import may_be_foreign, topic_path
-from shmio.segment.attach import Attachment
+from shmio.local.attach import Attachment
 
 PROGRAM = "shmio"
 

@@ -14,8 +14,8 @@ from shmio.cli.cell import Cell, News
 from shmio.cli.readings import as_json, as_line, choose
 from shmio.cli.run import add_full, at_least, dumps, room, seconds
 from shmio.errors import NotRunningError, PathError
+from shmio.local.reading import Reading
 from shmio.segment import Quality
-from shmio.segment.view import Reading
 
 HELP = "Print the values of registers whenever they change, the present ones first; on a terminal a table of them."
 

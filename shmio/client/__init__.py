@@ -16,20 +16,20 @@ from __future__ import annotations
 from os import PathLike
 from pathlib import Path
 
-from shmio.client import aio
+from shmio.client.aio import client
 from shmio.client.calls import Clock, Outcome, Stepped, Target
 from shmio.client.injections import Declared, Happening, Injection, Lifted, Running
 from shmio.client.layout import BlockLayout
 from shmio.client.model import Work
 from shmio.client.replay import Wish
-from shmio.client.sync import Client, Subscription
-from shmio.client.sync_campaign import Campaign
-from shmio.client.sync_model import Simulation
-from shmio.client.sync_shadow import Shadow
-from shmio.client.sync_steps import Steps
+from shmio.client.sync.campaign import Campaign
+from shmio.client.sync.client import Client, Subscription
+from shmio.client.sync.injection import Shadow
+from shmio.client.sync.model import Simulation
+from shmio.client.sync.steps import Steps
 from shmio.client.table import Change, Column, Register, Table
 from shmio.client.update import Piece, Provenance, Quality, Snapshot, Update
-from shmio.playing import Playing
+from shmio.model.replay_status import Playing
 
 __all__ = [
     "BlockLayout",
@@ -95,9 +95,11 @@ def connect_aio(
     token: str | None = None,
     token_in_plain_text: bool = False,
     timeout_s: float = 10.0,
-) -> aio.Client:
+) -> client.Client:
     """The same for asyncio."""
-    return aio.Client(Target(address, _path(ca), _path(certificate), _path(key), token, token_in_plain_text), timeout_s)
+    return client.Client(
+        Target(address, _path(ca), _path(certificate), _path(key), token, token_in_plain_text), timeout_s
+    )
 
 
 def _path(file: _File) -> Path | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any, Final, TypedDict
 
-from shmio.playing import Playing
+from shmio.model.replay_status import Playing
 from shmio.wire import shmio_v1_pb2 as wire
 
 SEARCH_PATIENCE_S: Final = 600.0

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, field
 
-from shmio.config.mqttmodel import Mqtt
+from shmio.config.mqtt.model import Mqtt
 from shmio.config.section import Section, Text, Texts
 
 NAME_PATTERN = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,39}\Z"

@@ -30,8 +30,8 @@ from shmio.config.model import (
     Token,
     Trigger,
 )
-from shmio.config.mqtt import check_mqtt, resolve_mqtt
-from shmio.config.mqttmodel import Mqtt, MqttAccount, MqttTls, MqttTopic, Sparkplug
+from shmio.config.mqtt.model import Mqtt, MqttAccount, MqttTls, MqttTopic, Sparkplug
+from shmio.config.mqtt.rules import check_mqtt, resolve_mqtt
 from shmio.config.properties import read_properties
 from shmio.config.section import Section
 from shmio.config.wording import explain, explain_toml, near

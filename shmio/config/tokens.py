@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 from shmio.config.model import Token
-from shmio.config.secretfile import read_secret
+from shmio.config.secret_file import read_secret
 from shmio.errors import ConfigError
 
 MIN_LENGTH: Final = 20

@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from shmio import worker
 from shmio.connectors import registry
 from shmio.connectors.base import Connector
-from shmio.connectors.computed import Computed
-from shmio.connectors.injections import Owner
-from shmio.connectors.inputs import Inputs
+from shmio.connectors.injection.layers import Owner
 from shmio.connectors.loop import SourceLoop, WallClock
-from shmio.connectors.replayed import Replayed
+from shmio.connectors.models.computed import Computed
+from shmio.connectors.models.inputs import Inputs
+from shmio.connectors.models.stepped import PageClock, SteppedLoop
+from shmio.connectors.replay.replayed import Replayed
 from shmio.connectors.schedule import Schedule
-from shmio.connectors.stepped import PageClock, SteppedLoop
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.topic import parse_topic
 from shmio.segment import Block, BlockWriter, Segment

@@ -11,7 +11,7 @@ import msgspec
 
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout
-from shmio.layout.write import Write
+from shmio.layout.values.write import Write
 from shmio.segment import Provenance
 
 

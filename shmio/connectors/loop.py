@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple, Protocol, TypeVar
 
 from shmio.connectors.base import Connector
-from shmio.connectors.campaign import Blocks
-from shmio.connectors.desk import CommandDesk
-from shmio.connectors.injector import OwnerOf
+from shmio.connectors.commands.processor import CommandDesk
+from shmio.connectors.injection.campaign import Blocks
+from shmio.connectors.injection.processor import OwnerOf
 from shmio.connectors.output import Image, Output
 from shmio.connectors.schedule import Backoff, Schedule
-from shmio.connectors.telling import Condition, Counters
+from shmio.connectors.source_status import Condition, Counters
 from shmio.errors import ConnectorError
 from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
 

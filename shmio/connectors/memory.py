@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 import msgspec
 
-from shmio.connectors.computed import Computed
+from shmio.connectors.models.computed import Computed
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout
-from shmio.layout.write import Write, apply
+from shmio.layout.values.write import Write, apply
 
 
 class Memory(Computed):

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
-from shmio.connectors.injections import Injections
+from shmio.connectors.injection.layers import Injections
 from shmio.segment import BlockWriter, Provenance, Quality, Record, Stamp
 
 EXTRA_FRAMES: Final = 4

@@ -13,8 +13,8 @@ import msgspec
 
 from shmio.config.wording import explain, meant
 from shmio.connectors.base import Connector
-from shmio.connectors.computed import Computed
-from shmio.connectors.replayed import Replayed
+from shmio.connectors.models.computed import Computed
+from shmio.connectors.replay.replayed import Replayed
 from shmio.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -24,9 +24,9 @@ GROUP = "shmio.connectors"
 
 BUILT_IN = {
     "memory": "shmio.connectors.memory:Memory",
-    "remote": "shmio.connectors.remote:Remote",
+    "remote": "shmio.connectors.models.remote:Remote",
     "replay": "shmio.connectors.replay.source:Replay",
-    "simulation": "shmio.connectors.simulation:Simulation",
+    "simulation": "shmio.connectors.models.simulation:Simulation",
     "s7": "shmio.connectors.s7.connector:S7Connector",
 }
 

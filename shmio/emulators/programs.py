@@ -3,14 +3,96 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Protocol
 
+import numpy as np
+
 from shmio.config.wording import meant
-from shmio.emulators.a50 import A50
-from shmio.emulators.counter import Counter
-from shmio.emulators.idle import Idle
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout
+from shmio.simulation import ModelRunner
+from shmio.simulation.a50 import A50Cell
+
+
+class A50:
+    """The program of the cell's controller, and the plant."""
+
+    period_ms = 10
+
+    def __init__(self, layout: Layout) -> None:
+        """Find the registers; ConfigError names one that the layout lacks or has as another type."""
+        # The printed DB201 has a space for the underscore in some names.
+        named = tuple(replace(register, path=register.path.replace(" ", "_")) for register in layout.registers)
+        try:
+            self._runner = ModelRunner(A50Cell, replace(layout, registers=named))
+        except ConfigError as error:
+            raise ConfigError(f"program a50: {str(error).removeprefix('layout: ')}") from None
+
+    def step(self, time_s: float, frame: bytearray) -> None:
+        """Put axes, inputs and outputs of this time into the frame."""
+        self._runner.resume(bytes(frame))  # clients write what they please, outputs included
+        frame[:] = self._runner.step(round(time_s * 1e9), self.period_ms * 1_000_000)
+
+
+# Odd, so that word i of generation g, g + i * STRIDE modulo 2**64, repeats neither along the block nor, within
+# any time a test runs, at the same place.
+_STRIDE = 0x9E37_79B9_7F4A_7C15
+
+
+class Counter:
+    """Fills the block with big-endian 64-bit words: the generation (cycles since start), then mixed with the place.
+
+    A rest of less than eight bytes holds the first bytes of its word and is checked too.
+    """
+
+    period_ms = 1
+
+    def __init__(self, layout: Layout) -> None:
+        self._size = layout.size
+        self._places = _places(layout.size)
+
+    def step(self, time_s: float, frame: bytearray) -> None:
+        """Write the generation of this time."""
+        generation = np.uint64(round(time_s * 1000 / self.period_ms))
+        frame[:] = (self._places + generation).astype(">u8").tobytes()[: self._size]
+
+
+def generations(frame: bytes | bytearray | memoryview) -> list[int]:
+    """List the distinct generations in a frame that a ``Counter`` wrote, ascending: one if it is of one cycle.
+
+    A byte that no cycle put there shows as a generation far from the others.
+    """
+    size = len(frame)
+    whole = size // 8 * 8
+    places = _places(size)
+    words = np.frombuffer(frame, ">u8", count=whole // 8).astype(np.uint64) - places[: whole // 8]
+    found = {int(word) for word in np.unique(words)}
+    rest = bytes(frame[whole:])
+    if rest and not any(_word(g, whole // 8)[: len(rest)] == rest for g in found):
+        found.add(int.from_bytes(rest.ljust(8, b"\0"), "big"))
+    return sorted(found)
+
+
+def _places(size: int) -> np.ndarray[tuple[int], np.dtype[np.uint64]]:
+    return np.arange((size + 7) // 8, dtype=np.uint64) * np.uint64(_STRIDE)
+
+
+def _word(generation: int, place: int) -> bytes:
+    return ((generation + place * _STRIDE) & 0xFFFF_FFFF_FFFF_FFFF).to_bytes(8, "big")
+
+
+class Idle:
+    """Leaves every register alone: a controller in RUN without a user program."""
+
+    period_ms = 100
+    """Time between two cycles, which say only that the controller is alive."""
+
+    def __init__(self, layout: Layout) -> None:
+        """Suit every layout."""
+
+    def step(self, time_s: float, frame: bytearray) -> None:
+        """Change nothing."""
 
 
 class Program(Protocol):

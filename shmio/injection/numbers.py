@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from shmio.layout.model import ByteOrder, Register, bit_positions
-from shmio.layout.scalar import REAL_MAX, scalar_codec
 from shmio.layout.types import ElementType
+from shmio.layout.values.scalar import REAL_MAX, scalar_codec
 
 Bytes = npt.NDArray[np.uint8]
 Values = npt.NDArray[Any]

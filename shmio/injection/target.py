@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import Direction, look_up, parse_topic
-from shmio.layout.write import bits_of, chosen
+from shmio.layout.values.write import bits_of, chosen
 
 MAX_REGISTERS: Final = 4096
 """Registers and elements in one target."""

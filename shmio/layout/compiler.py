@@ -11,15 +11,24 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
-from shmio.layout import emit, lexer, parser, tags
-from shmio.layout.constants import Constants
-from shmio.layout.encoding import decode
-from shmio.layout.foreign import foreign
 from shmio.layout.model import MAX_BLOCK_BYTES, MAX_STANDARD_BYTES, Diagnostic, Layout
-from shmio.layout.place import MAX_TEXT, Placer
-from shmio.layout.placed import Cost, Group
+from shmio.layout.placement import emit, tags
+from shmio.layout.placement.place import MAX_TEXT, Placer
+from shmio.layout.placement.placed import Cost, Group
 from shmio.layout.report import Report, TooManyErrors
-from shmio.layout.syntax import Array, BlockDeclaration, ConstantDeclaration, Named, Struct, TypeDeclaration, Unit
+from shmio.layout.source import lexer, parser
+from shmio.layout.source.constants import Constants
+from shmio.layout.source.foreign import foreign
+from shmio.layout.source.syntax import (
+    Array,
+    BlockDeclaration,
+    ConstantDeclaration,
+    Named,
+    Struct,
+    TypeDeclaration,
+    Unit,
+)
+from shmio.layout.source.text_encoding import decode
 
 MAX_ALL_REGISTERS = 500_000
 MAX_ALL_STRUCTURES = 500_000

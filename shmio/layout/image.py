@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from typing import Final
 
 from shmio.errors import ValueRangeError
-from shmio.layout.codec import Value, codec
-from shmio.layout.literal import default_text, parse_literal
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import shorten
+from shmio.layout.values.codec import Value, codec
+from shmio.layout.values.literal import default_text, parse_literal
 
 MAX_TOLD: Final = 20
 """Of so many initial values that cannot be read each is named."""

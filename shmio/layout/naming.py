@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from shmio.layout.model import Layout, Register
 from shmio.layout.parts import part_of, slice_of
 from shmio.layout.types import INTEGERS
-from shmio.layout.write import Write, bits_of
+from shmio.layout.values.write import Write, bits_of
 
 
 def paths_of(layout: Layout, writes: Iterable[Write]) -> list[str]:

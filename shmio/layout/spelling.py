@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from shmio.errors import PathError
 from shmio.layout.model import Layout
 from shmio.layout.topic import MAX_TOPIC, encode_segment, find, parse_topic
-from shmio.layout.write import chosen
+from shmio.layout.values.write import chosen
 
 _SIGNS = re.compile(r'[."\[]')
 _TOKEN = re.compile(

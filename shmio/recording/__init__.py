@@ -1,1 +1,1 @@
-"""Writes recordings: `.mem` files with every frame and event of an instance (docs/reference/dump-format.md)."""
+"""What a recording holds, and reading it (docs/reference/dump-format.md). It is written by `shmio.recorder`."""

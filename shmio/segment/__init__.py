@@ -3,7 +3,7 @@
 The byte format is docs/reference/segment-format.md; a local program starts with :func:`shmio.attach`.
 """
 
-from shmio.layout.write import Write
+from shmio.layout.values.write import Write
 from shmio.segment.block import Attributes, Block, BlockWriter, Stamp
 from shmio.segment.build import BlockSpec, Origin, segment_size
 from shmio.segment.commands import Command, CommandKind, CommandSender, Direction

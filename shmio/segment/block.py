@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from shmio.segment._atomics import FrameTuple
     from shmio.segment.clock import ClockPage
     from shmio.segment.commands import CommandQueues
-    from shmio.segment.link import Link
+    from shmio.segment.model_channel import Link
     from shmio.segment.playhead import Playhead
-    from shmio.segment.standing import DeclaredCell, StandingCell
+    from shmio.segment.standing_injections import DeclaredCell, StandingCell
 
 Bytes = bytes | bytearray | memoryview
 

@@ -15,14 +15,14 @@ import msgspec
 
 from shmio import __version__
 from shmio.layout.model import Layout
-from shmio.segment import _atomics, commands, header, link, playhead
+from shmio.segment import _atomics, commands, header, model_channel, playhead
 from shmio.segment.block import Attributes
 from shmio.segment.clock import ClockPage, page_size
 from shmio.segment.events import EVENT_SIZE, EVENT_SLOTS
 from shmio.segment.header import HEADER_SIZE, SECTION_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
 from shmio.segment.processes import GUESTS, ProcessSpec, ProcessTable, supervisor_beat
 from shmio.segment.shm import SharedObject
-from shmio.segment.standing import CELL_SIZE
+from shmio.segment.standing_injections import CELL_SIZE
 
 RING_SECONDS = 8
 SECTIONS_PER_BLOCK = 8  # of one that has all
@@ -87,7 +87,7 @@ class BlockSpec:
             self.period_ns, self.stale_ns,
         )  # fmt: skip
         linked = _RING.pack(
-            link.SLOTS, self.slot_bytes, self.layout.size, 0, _atomics.RAW_OFFSET, effective, 0, 0, 0, 0
+            model_channel.SLOTS, self.slot_bytes, self.layout.size, 0, _atomics.RAW_OFFSET, effective, 0, 0, 0, 0
         )
         events = _RING.pack(EVENT_SLOTS, EVENT_STRIDE, EVENT_SIZE, 0, _atomics.RAW_OFFSET, 0, 0, 0, 0, 0)
         queues = commands.section_header(self.layout.size)
@@ -99,7 +99,7 @@ class BlockSpec:
             (SectionKind.SOURCE, len(attributes), attributes),
             (SectionKind.STANDING, CELL_SIZE, b""),
             (SectionKind.DECLARED, CELL_SIZE, bytes(8) + self.declared),
-            *([(SectionKind.LINK, *link.section(linked, self.slot_bytes))] if self.attributes.remote else []),
+            *([(SectionKind.LINK, *model_channel.section(linked, self.slot_bytes))] if self.attributes.remote else []),
             *([(SectionKind.PLAYHEAD, playhead.SECTION_SIZE, b"")] if self.attributes.replay else []),
         ]
 

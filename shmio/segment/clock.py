@@ -14,8 +14,8 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 from shmio.segment import _atomics
+from shmio.segment.double_buffer import TwinCell
 from shmio.segment.header import Header, cut, text
-from shmio.segment.twin import TwinCell
 
 STEP_SIZE_NS: Final = 50_000_000
 """The size of a step unless somebody has set another."""

@@ -16,7 +16,7 @@ from enum import IntEnum
 from typing import TYPE_CHECKING, Final, TypedDict, Unpack
 
 from shmio.errors import CommandError
-from shmio.layout.write import Write
+from shmio.layout.values.write import Write
 from shmio.segment import _atomics
 
 if TYPE_CHECKING:

@@ -20,9 +20,9 @@ import msgspec
 
 from shmio.errors import CommandError
 from shmio.segment import _atomics
+from shmio.segment.double_buffer import TwinCell
 from shmio.segment.header import cut, text
 from shmio.segment.shm import SharedObject
-from shmio.segment.twin import TwinCell
 
 if TYPE_CHECKING:
     from shmio.segment.clock import ClockPage

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from shmio.errors import LayoutError, ModelError, ShmioError
 from shmio.layout.model import Layout
+from shmio.layout.placement.tag_place import place_tags
 from shmio.layout.structures import members
-from shmio.layout.tagplace import place_tags
 from shmio.layout.topic import canonical_path
 
 if TYPE_CHECKING:
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 class Declaration:
     """One thing that a model declares: in the class it is this object, in a model its value.
 
-    A single register's value is a bool, int, float or str, as ``shmio.layout.scalar`` tabulates; an array's is a tuple,
-    of tuples for several dimensions, but a row of BYTE is bytes. A structure's is a dict of its members' values;
+    A single register's value is a bool, int, float or str, as ``shmio.layout.values.scalar`` tabulates; an array's is a
+    tuple, of tuples for several dimensions, but a row of BYTE is bytes. A structure's is a dict of its members' values;
     setting one changes the members that it names.
     """
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from shmio.errors import LayoutError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout, Register
-from shmio.layout.write import Write, apply, covering
+from shmio.layout.values.write import Write, apply, covering
 
 
 class Images:

@@ -10,7 +10,7 @@ from shmio.errors import ConfigError, LayoutError, ModelError, PathError, ValueR
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import find
-from shmio.layout.write import Write
+from shmio.layout.values.write import Write
 from shmio.simulation.declarations import Declaration, InOut, Input, Output, Parameter, place_declarations
 from shmio.simulation.failure import explain
 from shmio.simulation.images import Images

@@ -6,8 +6,8 @@ from collections.abc import Collection, Iterator, Mapping
 from typing import Any, Protocol
 
 from shmio.errors import ModelError
-from shmio.layout.codec import codec
-from shmio.layout.write import bits_of
+from shmio.layout.values.codec import codec
+from shmio.layout.values.write import bits_of
 from shmio.simulation.model import Model
 from shmio.simulation.runner import NOTHING, ModelRunner
 

@@ -10,10 +10,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import Final
 
-from shmio.segment import ProcessSpec, Segment, Supervised, leftover
+from shmio.plan.processes import Job
+from shmio.segment import ProcessSpec, Segment, Supervised, stale_segment
 from shmio.supervisor import policy
 from shmio.supervisor.managed import Managed, log, log_step
-from shmio.supervisor.plan import Job
 from shmio.supervisor.policy import Limits
 from shmio.supervisor.process import Adopted, Child
 from shmio.supervisor.reconcile import Present, digest
@@ -105,7 +105,7 @@ class Fleet:
             event = policy.due(managed.life, now_ns, ready=managed.ready, quiet_ns=quiet_ns, limits=self._limits)
             if event is not None:
                 dying = managed.child if managed.life.killed else None
-                self.apply(managed, event, leftover.survivor(dying.pid) if dying else "")
+                self.apply(managed, event, stale_segment.survivor(dying.pid) if dying else "")
 
     def _evict(self, managed: Managed) -> None:
         """Kill a process that holds the role and is not ours.
@@ -116,7 +116,7 @@ class Fleet:
         pid = managed.slot.report.pid
         if managed.child is None or pid in (0, managed.child.pid, managed.evicted_pid):
             return
-        worker = leftover.holder(managed.slot, self._segment.shared)
+        worker = stale_segment.holder(managed.slot, self._segment.shared)
         if worker is not None:
             log.warning("%s is held by pid %d, which no supervisor knows: killed", managed.name, worker.pid)
             with suppress(ProcessLookupError):

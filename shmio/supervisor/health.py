@@ -7,9 +7,9 @@ from collections.abc import Callable
 from typing import Final
 
 from shmio.errors import SegmentError
+from shmio.local.status import assess
 from shmio.segment import Quality, Segment
 from shmio.segment import State as InstanceState
-from shmio.segment.status import assess
 from shmio.supervisor.fleet import Fleet
 from shmio.supervisor.managed import log
 from shmio.supervisor.notify import Notifier

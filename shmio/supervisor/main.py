@@ -5,28 +5,64 @@ from __future__ import annotations
 import os
 import selectors
 import signal
+import socket
 import time
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from types import FrameType
 from typing import Final
 
 from shmio.errors import ShmioError
 from shmio.logs import fields
+from shmio.plan.processes import MODULES, Plan
 from shmio.segment import Segment
 from shmio.segment import State as InstanceState
 from shmio.supervisor import policy
-from shmio.supervisor.changer import Changer
 from shmio.supervisor.control import Answer, ControlServer, Reload, Request, Restart, Stop
 from shmio.supervisor.fleet import TICK_S, Fleet
 from shmio.supervisor.health import Health
 from shmio.supervisor.managed import brief, log
 from shmio.supervisor.notify import Notifier
-from shmio.supervisor.plan import MODULES, Plan
 from shmio.supervisor.policy import Limits
-from shmio.supervisor.signals import wake_on_signals
+from shmio.supervisor.reload import Changer
 from shmio.supervisor.socketpath import socket_path
 from shmio.supervisor.states import Event, State
 from shmio.supervisor.takeover import take_over
+
+
+@contextmanager
+def wake_on_signals(selector: selectors.BaseSelector, on_signal: Callable[[int], None]) -> Iterator[None]:
+    """Have ``on_signal`` called for SIGINT, SIGTERM and SIGHUP from the selector's loop.
+
+    SIGHUP counts unless it is ignored, as by nohup.
+    """
+    receiver, sender = socket.socketpair()
+    with receiver, sender:
+        receiver.setblocking(False)
+        sender.setblocking(False)
+
+        def receive() -> None:
+            for number in receiver.recv(64):
+                on_signal(number)
+
+        selector.register(receiver, selectors.EVENT_READ, receive)
+        old_fd = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+        heeded = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+        if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+            heeded.remove(signal.SIGHUP)
+        old = {sign: signal.signal(sign, _wake) for sign in heeded}
+        try:
+            yield
+        finally:
+            for sign, handler in old.items():
+                signal.signal(sign, handler)
+            signal.set_wakeup_fd(old_fd)
+            selector.unregister(receiver)
+
+
+def _wake(_number: int, _frame: FrameType | None) -> None:
+    """A handler must exist for the wake-up descriptor to be written."""
+
 
 START_TICK_S: Final = 0.01
 """How often it is looked while a process starts: its report has no bell to ring."""

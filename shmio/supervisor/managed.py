@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 
+from shmio.local.status import complaint as complaint_of
 from shmio.logs import fields
+from shmio.plan.processes import Job, rank
 from shmio.segment import Activity, ProcessSlot
-from shmio.segment.status import complaint as complaint_of
 from shmio.supervisor import policy
 from shmio.supervisor.control import Answer
-from shmio.supervisor.plan import Job, rank
 from shmio.supervisor.policy import Life, Limits
 from shmio.supervisor.process import Adopted, Child, describe_end
 from shmio.supervisor.states import Action, State

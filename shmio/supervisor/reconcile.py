@@ -10,8 +10,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from shmio.plan.processes import Plan
 from shmio.segment import Block, BlockSpec
-from shmio.supervisor.plan import Plan
 
 
 class Present(NamedTuple):

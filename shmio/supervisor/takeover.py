@@ -9,9 +9,9 @@ import time
 from dataclasses import dataclass, field
 
 from shmio.errors import FormatError, SegmentError, UnfinishedError
-from shmio.segment import Activity, ProcessSlot, Segment, leftover, shm
+from shmio.plan.processes import Plan
+from shmio.segment import Activity, ProcessSlot, Segment, shm, stale_segment
 from shmio.segment.shm import SharedObject
-from shmio.supervisor.plan import Plan
 from shmio.supervisor.policy import Limits
 from shmio.supervisor.process import Adopted
 from shmio.supervisor.socketpath import remove_socket
@@ -32,7 +32,7 @@ def take_over(plan: Plan, control: str, limits: Limits) -> tuple[Found | None, l
     AlreadyRunningError: a supervisor is alive. SegmentError: no permission, or a process cannot be identified or
     does not end. WrongInstanceError: what lives was started from another configuration file.
     """
-    shared = leftover.claim(plan.instance)
+    shared = stale_segment.claim(plan.instance)
     if shared is None:
         return None, []
     try:
@@ -44,7 +44,7 @@ def take_over(plan: Plan, control: str, limits: Limits) -> tuple[Found | None, l
             segment.lead_to(control, plan.config_file)
             segment.end_replaced()
             return Found(segment, children), [*done, *lines]
-        done += leftover.clear_claimed(shared, plan.instance)
+        done += stale_segment.clear_claimed(shared, plan.instance)
     except BaseException:
         shared.close()
         raise
@@ -55,7 +55,7 @@ def take_over(plan: Plan, control: str, limits: Limits) -> tuple[Found | None, l
 def _fitting(shared: SharedObject, plan: Plan) -> tuple[Segment | None, list[str]]:
     """The segment, if this plan's instance can go on in it; else why not, if that needs saying."""
     try:
-        segment = leftover.read(shared, plan.instance)
+        segment = stale_segment.read(shared, plan.instance)
     except (FormatError, UnfinishedError):  # told by who clears it
         return None, []
     if not any(slot.alive() for slot in segment.processes):
@@ -88,10 +88,10 @@ def _sort(
     living = {slot.name: slot for slot in segment.processes if slot.alive()}
     fit: list[tuple[ProcessSlot, Adopted]] = []
     done, unfit = [], []
-    deadline = time.monotonic() + leftover.GRACE_S
+    deadline = time.monotonic() + stale_segment.GRACE_S
     while living:
         for name, slot in list(living.items()):
-            worker = leftover.holder(slot, shared)
+            worker = stale_segment.holder(slot, shared)
             if worker is not None and (reason := _ails(slot, limits)):
                 unfit.append(worker)
                 done.append(f"{name}, pid {worker.pid}, {reason}: it is replaced")
@@ -109,7 +109,7 @@ def _sort(
             )
         time.sleep(0.01 if living else 0)
     try:
-        leftover.end(segment.instance, unfit)
+        stale_segment.end(segment.instance, unfit)
     except SegmentError:
         for _, child in fit:
             os.close(child.pidfd)

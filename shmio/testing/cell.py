@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from shmio.config import Address
-from shmio.segment.status import read_status
+from shmio.local.status import read_status
 
 BIN = Path(sys.executable).parent
 PATIENCE_S = 120.0

@@ -10,15 +10,171 @@ import contextlib
 import queue
 import select
 import socket
+import struct
 import threading
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from typing import Self
 
 from shmio.config.address import Address
 from shmio.testing.ports import reserved_port
-from shmio.testing.relay import Link, Pipe
-from shmio.testing.tampering import Edit, Framing, Tampering, reference_edit, tpkt
+
+_MAX_QUEUED = 4 << 20  # bytes under way in one direction, beyond which the sender is left waiting
+_RESET = struct.pack("ii", 1, 0)  # SO_LINGER: close with RST
+
+
+class Link:
+    """A client's connection and the one to the server on its behalf."""
+
+    def __init__(self, client: socket.socket, server: socket.socket) -> None:
+        self._sockets = (client, server)
+        for end in self._sockets:
+            end.setblocking(False)
+            end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.up = Pipe(self, client, server)
+        self.down = Pipe(self, server, client)
+        self.pipes = (self.up, self.down)
+
+    @property
+    def open(self) -> bool:
+        """Whether bytes may still pass."""
+        if self._sockets[0].fileno() >= 0 and all(pipe.finished for pipe in self.pipes):
+            self.close()
+        return self._sockets[0].fileno() >= 0
+
+    def close(self, *, reset: bool = False) -> None:
+        """Close both ends; ``reset``: as a crashed peer does."""
+        for end in self._sockets:
+            if end.fileno() >= 0 and reset:
+                end.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, _RESET)
+            end.close()
+
+
+class Pipe:
+    """One direction of a link."""
+
+    def __init__(self, link: Link, source: socket.socket, sink: socket.socket) -> None:
+        self.link = link
+        self.source, self.sink = source, sink
+        self.partial = bytearray()  # of a frame to be edited
+        self.due = bytearray()
+        self.ended = False
+        self.finished = False
+        self.last_sent = 0
+        self._later: deque[tuple[float, bytes]] = deque()
+        self._queued = 0
+
+    @property
+    def hungry(self) -> bool:
+        """Whether to take more from the source."""
+        return not self.ended and self._queued < _MAX_QUEUED
+
+    @property
+    def next_s(self) -> float:
+        """When the next bytes are due, on the monotonic clock; infinity if there are none."""
+        return self._later[0][0] if self._later else float("inf")
+
+    def enqueue(self, data: bytes, delay_s: float) -> None:
+        """Take bytes that become due after a delay."""
+        due_s = time.monotonic() + delay_s
+        if self._later:
+            due_s = max(due_s, self._later[-1][0])  # a shorter delay must not overtake
+        self._later.append((due_s, data))
+        self._queued += len(data)
+
+    def collect_due(self, now_s: float) -> None:
+        """Move to ``due`` what has waited long enough."""
+        while self._later and self._later[0][0] <= now_s:
+            self.due += self._later.popleft()[1]
+
+    def end_when_drained(self) -> None:
+        """Hand on the end of the stream after its last byte."""
+        if self.ended and not self.due and not self._later and not self.finished:
+            self.finished = True
+            with contextlib.suppress(OSError):
+                self.sink.shutdown(socket.SHUT_WR)
+
+    def send(self, limit: int | None) -> None:
+        """Send what is due, at most ``limit`` bytes."""
+        self.last_sent = 0
+        with contextlib.suppress(BlockingIOError):
+            self.last_sent = self.sink.send(self.due if limit is None else self.due[:limit])
+        del self.due[: self.last_sent]
+        self._queued -= self.last_sent
+
+
+Edit = Callable[[bytes], bytes | None]
+Framing = Callable[[bytes | bytearray], int]
+
+
+def tpkt(data: bytes | bytearray) -> int:
+    """Length of the frame that ``data`` begins with, ISO-on-TCP (RFC 1006); 0 if not known yet."""
+    return data[2] << 8 | data[3] if len(data) >= 4 else 0
+
+
+def reference_edit(change: Callable[[int], int]) -> Edit:
+    """An edit of the PDU reference of S7 answers."""
+
+    def edit(frame: bytes) -> bytes:
+        reference = change(int.from_bytes(frame[11:13], "big")) & 0xFFFF
+        return frame[:11] + reference.to_bytes(2, "big") + frame[13:]
+
+    return edit
+
+
+class Tampering:
+    """The edit that is in force, and the frames kept back. Used by the relay's thread, but for ``frame_held``."""
+
+    def __init__(self, framing: Framing | None) -> None:
+        """``framing``: tells where a frame ends; None: what comes at once is a frame."""
+        self._framing = framing
+        self._edit: Edit | None = None
+        self._held: list[bytes] = []
+        self.frame_held = threading.Event()
+        """Set while a frame is kept back."""
+
+    def begin(self, edit: Edit, frames: int | None) -> None:
+        """Pass frames through a function; ``frames``: end after so many."""
+        left = frames
+
+        def counted(frame: bytes) -> bytes | None:
+            nonlocal left
+            if left is not None:
+                left -= 1
+                if not left:
+                    self._edit = None
+            return edit(frame)
+
+        self._edit = counted
+
+    def keep(self, frame: bytes) -> None:
+        """The edit that keeps frames back."""
+        self._held.append(frame)
+        self.frame_held.set()
+
+    def end(self) -> list[bytes]:
+        """Let all pass as it is; what was kept back."""
+        self._edit = None
+        self.frame_held.clear()
+        held, self._held = self._held, []
+        return held
+
+    def passing(self, waiting: bytearray, data: bytes) -> Iterator[bytes]:
+        """What passes when more bytes come; those of a frame that is not whole yet are left waiting."""
+        waiting += data
+        while waiting:
+            size = len(waiting)
+            if self._edit is not None and self._framing is not None:
+                size = self._framing(waiting)
+                if not 0 < size <= len(waiting):
+                    return
+            frame = bytes(waiting[:size])
+            del waiting[:size]
+            passed = frame if self._edit is None else self._edit(frame)
+            if passed:
+                yield passed
+
 
 _CHUNK = 1 << 16
 _TIMEOUT_S = 10

@@ -12,8 +12,8 @@ from shmio.config import Address
 from shmio.connectors.base import Connector
 from shmio.connectors.s7.connector import S7Connector
 from shmio.connectors.s7.options import S7Options
-from shmio.emulators.counter import Counter, generations
 from shmio.emulators.emulator import Emulator
+from shmio.emulators.programs import Counter, generations
 from shmio.emulators.s7_jobs import Traits
 from shmio.layout.model import Layout, Register
 from shmio.segment import EventKind, Quality, Write

@@ -13,9 +13,9 @@ from itertools import count, cycle, product
 from typing import Final
 
 from shmio.errors import CommandError, PathError, QualityError
+from shmio.local.attach import Attachment
 from shmio.segment import EventKind
-from shmio.segment.attach import Attachment
-from shmio.segment.standing import Standing
+from shmio.segment.standing_injections import Standing
 from tests.faults.checker import Checker
 from tests.faults.checks import Counts, Source
 from tests.faults.inject_checks import GuardCheck, LifeCheck

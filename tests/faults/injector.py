@@ -16,8 +16,8 @@ from pathlib import Path
 
 import shmio
 from shmio.errors import ShmioError
+from shmio.local.writer import Outcome
 from shmio.segment import EventKind
-from shmio.segment.commander import Outcome
 from tests.faults.truth import Truth
 
 PAUSE_S = 0.05

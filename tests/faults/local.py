@@ -8,8 +8,8 @@ from functools import partial
 
 import shmio
 from shmio.errors import NotRunningError, QualityError, SegmentError
+from shmio.local.attach import Attachment
 from shmio.segment import Block, Quality
-from shmio.segment.attach import Attachment
 from tests.faults.checker import Checker
 from tests.faults.checks import FrameCheck, Source
 

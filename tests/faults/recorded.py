@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from shmio.dump.channels import Channel
-from shmio.dump.encoding import FRAME, Gap, ProcessChange, StepMark
-from shmio.dump.reader import Reader
-from shmio.dump.survey import survey
+from shmio.recording.format.channels import Channel
+from shmio.recording.format.encoding import FRAME, Gap, ProcessChange, StepMark
+from shmio.recording.reading.reader import Reader
+from shmio.recording.reading.survey import survey
 from shmio.segment import Event, Frame
 from tests.faults.checker import Checker
 from tests.faults.checks import Complain, Counts, FrameCheck, Source

@@ -16,8 +16,8 @@ from typing import Final, Self
 
 import shmio
 from shmio.config import Address
+from shmio.local.status import InstanceStatus, read_status
 from shmio.segment import Segment
-from shmio.segment.status import InstanceStatus, read_status
 from shmio.testing.ports import reserved_port
 from shmio.testing.proxy import FaultProxy
 from tests.faults.checker import NOTES, Description

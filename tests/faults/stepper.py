@@ -16,9 +16,9 @@ from typing import Final
 import shmio
 from shmio.client import Client, Target
 from shmio.errors import NotRunningError, RemoteError, SegmentError, ShmioError
+from shmio.local.attach import Attachment
+from shmio.local.reading import View
 from shmio.segment import Block
-from shmio.segment.attach import Attachment
-from shmio.segment.view import View
 from tests.faults.step_checks import PARTICIPANTS, Answer, StepCheck
 
 WAYS: Final = ("local", "shmio")

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Final, Self
 
 import shmio
-from shmio.dump.encoding import FRAME, Gap, StepMark
-from shmio.dump.reader import Reader
-from shmio.dump.survey import survey
 from shmio.errors import RecordingError, ShmioError, TimeError
+from shmio.recording.format.encoding import FRAME, Gap, StepMark
+from shmio.recording.reading.reader import Reader
+from shmio.recording.reading.survey import survey
 from shmio.segment import Frame
 from shmio.testing.ports import reserved_port
 from tests.faults.checks import check_restarts

@@ -92,7 +92,7 @@ class Run:
     def check_processes(self, rig: Instance) -> None:
         """No process of the instance but those it shows."""
         deadline_s = time.monotonic() + END_S
-        ours = ("shmio.connectors", "shmio.emulators", "shmio.endpoints", "shmio.recording", "shmio.cli.supervisor up")
+        ours = ("shmio.connectors", "shmio.emulators", "shmio.endpoints", "shmio.recorder", "shmio.cli.supervisor up")
         while True:
             status = rig.status()
             known = {p.pid for p in status.processes} | {status.supervisor.pid if status.supervisor else None}

@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from shmio.dump.encoding import Gap, Reason
 from shmio.layout.model import Layout, Register
-from shmio.recording.output import Output, create
-from shmio.recording.recorder import Recorder
-from shmio.recording.tap import Tap
+from shmio.recorder.output import Output, create
+from shmio.recorder.recorder import Recorder
+from shmio.recorder.tap import Tap
+from shmio.recording.format.encoding import Gap, Reason
 from shmio.segment import BlockSpec, Event, EventKind, Frame, Quality, Record, Segment
 from shmio.segment.events import NO_WRITER
 from tests.faults import recorded

@@ -12,8 +12,8 @@ from itertools import count, islice
 import grpc
 
 from shmio.errors import CommandError
+from shmio.local.attach import Attachment
 from shmio.segment import EventKind
-from shmio.segment.attach import Attachment
 from shmio.wire.simlog_v1_pb2 import PubRequest, ROSMessage, TopicDescriptor
 from shmio.wire.simlog_v1_pb2_grpc import SimlogAPIStub
 from tests.faults.checker import Checker

@@ -10,13 +10,13 @@ import math
 from functools import cache
 
 from shmio.errors import LayoutError, ValueRangeError
-from shmio.layout.codec import Value, codec
 from shmio.layout.compiler import Compiled, Source, compile_sources
-from shmio.layout.framecodec import FrameCodec
 from shmio.layout.image import initial_frame, unread
-from shmio.layout.literal import parse_literal
 from shmio.layout.model import Layout, Register
-from shmio.layout.text import from_text, json_value, to_text
+from shmio.layout.values.codec import Value, codec
+from shmio.layout.values.frame_codec import FrameCodec
+from shmio.layout.values.literal import parse_literal
+from shmio.layout.values.text import from_text, json_value, to_text
 
 SPLIT = b"\x00\xff\x00"  # between the sources of one input
 MAX_DECODED = 10  # registers of a layout that go through the codec

@@ -18,8 +18,8 @@ from typing import Self
 
 import pytest
 
-from shmio.layout.codec import codec
 from shmio.layout.compiler import Source, compile_sources
+from shmio.layout.values.codec import codec
 from shmio.segment import Attributes, BlockSpec, BlockWriter, ProcessSpec, Quality, Segment
 from shmio.segment.clock import ClockMode, ClockState
 

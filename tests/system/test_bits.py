@@ -13,7 +13,7 @@ from google.protobuf.struct_pb2 import ListValue, Value
 
 import shmio
 from shmio.client import connect
-from shmio.segment.attach import Attachment
+from shmio.local.attach import Attachment
 from shmio.testing.cell import PATIENCE_S, Cell, until
 from shmio.wire import simlog_v1_pb2 as v1
 from shmio.wire import simlog_v2_pb2 as v2

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 import shmio
+from shmio.local.attach import Attachment
 from shmio.segment import Cursor, Event, EventKind
-from shmio.segment.attach import Attachment
 from shmio.testing.cell import BIN, PATIENCE_S, Cell, until
 from tests.system.armed import ARMED
 

@@ -15,8 +15,8 @@ import pytest
 from google.protobuf.struct_pb2 import Value
 
 import shmio
+from shmio.local.attach import Attachment
 from shmio.segment import Frame
-from shmio.segment.attach import Attachment
 from shmio.testing.cell import PATIENCE_S, Cell, kill, until
 from shmio.wire import simlog_v1_pb2 as v1
 from shmio.wire import simlog_v2_pb2 as v2

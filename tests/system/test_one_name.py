@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from shmio.cli import dump, supervisor, user
-from shmio.segment.status import read_status
+from shmio.local.status import read_status
 from shmio.testing.cell import Cell, kill
 from shmio.testing.ports import reserved_port
 

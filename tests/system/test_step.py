@@ -15,9 +15,9 @@ import pytest
 
 import shmio
 from shmio.errors import TimeError
+from shmio.local.attach import Attachment
+from shmio.local.time_control import Coordinator
 from shmio.segment import Segment
-from shmio.segment.attach import Attachment
-from shmio.segment.coordinator import Coordinator
 from shmio.testing.cell import BIN, PATIENCE_S, Cell, kill, until
 
 CONFIG = """

@@ -3,24 +3,122 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final
 
-from shmio.connectors.campaign import Blocks
-from shmio.connectors.desk import CommandDesk
-from shmio.connectors.injector import OwnerOf
+from shmio.connectors.commands.processor import CommandDesk
+from shmio.connectors.injection.campaign import Blocks
+from shmio.connectors.injection.processor import OwnerOf
+from shmio.connectors.models.stepped import StepClock
 from shmio.connectors.output import Output
 from shmio.connectors.replay.beginning import Beginning, as_others, stamp
-from shmio.connectors.replay.moving import AHEAD_NS, moved
-from shmio.connectors.replay.player import OVER, STOPPED, Player
-from shmio.connectors.replay.search import Search
+from shmio.connectors.replay.player import OVER, STOPPED, Player, is_told
+from shmio.connectors.replay.recording import MAX_NS
 from shmio.connectors.replay.source import Replay
-from shmio.connectors.stepped import StepClock
-from shmio.connectors.telling import Counters
+from shmio.connectors.replay.tape import Entry, Tape
+from shmio.connectors.source_status import Counters
 from shmio.errors import PathError, SegmentError, ValueRangeError
-from shmio.layout.write import Write
-from shmio.segment import BlockWriter, EventKind, Record, Stamp
-from shmio.segment.playhead import Ask, Find, Found, Move, Play, answered
+from shmio.layout.topic import find, shorten
+from shmio.layout.values.write import Write, bits_of
+from shmio.segment import BlockWriter, Event, EventKind, Frame, Record, Stamp
+from shmio.segment.playhead import MAX_SPEED, MIN_SPEED, Ask, Find, Found, Move, Play, answered
+
+AHEAD_NS: Final = 60_000_000_000
+"""A request may be of a moment that is so far ahead, and of any that has passed: its process may have been held up."""
+
+
+def moved(play: Play, ask: Move, clock_ns: int) -> tuple[Play, int | None]:
+    """How it plays from the request's moment on, and the position that is to be shown; None: it goes on where it is.
+
+    ``clock_ns``: the instance's clock now. ValueRangeError: it cannot be.
+    """
+    if ask.speed is not None and not (math.isfinite(ask.speed) and MIN_SPEED <= ask.speed <= MAX_SPEED):
+        raise ValueRangeError(f"a speed is from {MIN_SPEED:g} to {MAX_SPEED:g}, not {ask.speed:g}")
+    if not -MAX_NS < ask.clock_ns <= clock_ns + AHEAD_NS:
+        raise ValueRangeError("the request makes no sense")
+    play = play.anchored(ask.clock_ns)
+    position_ns, paused = ask.position_ns, play.paused if ask.paused is None else ask.paused
+    if position_ns is None and not paused and play.position_ns >= play.end_ns:
+        position_ns = play.begin_ns  # from the end it goes on at the beginning
+    if position_ns is not None and not play.begin_ns <= position_ns <= play.end_ns:
+        length_s = (play.end_ns - play.begin_ns) / 1e9
+        raise ValueRangeError(f"that is not within what is played, which is {length_s:.3f} s long")
+    at_ns = play.position_ns if position_ns is None else position_ns
+    if ask.until_ns is not None and ask.until_ns < at_ns:
+        at_s = (at_ns - play.begin_ns) / 1e9
+        raise ValueRangeError(f"that is past: it is at {at_s:.3f} s; seek to before that first")
+    until_ns = play.end_ns if ask.until_ns is None else min(ask.until_ns, play.end_ns)
+    if ask.until_ns is None and position_ns is None and (ask.paused is None or play.until_ns > at_ns):
+        until_ns = play.until_ns  # `pause` and `play` keep one that lies ahead
+    play = play._replace(
+        paused=paused,
+        speed=play.speed if ask.speed is None else ask.speed,
+        loop=play.loop if ask.loop is None else ask.loop,
+        position_ns=at_ns,
+        until_ns=until_ns,
+        over=play.over and position_ns is None,
+    )
+    return play, position_ns
+
+
+ANY = "any"
+"""In place of a kind: whatever event is told."""
+SEARCH_PIECE = 256
+"""So many entries between two looks at what else there is to do."""
+
+
+class Search:
+    """A search under way, in pieces, so that what plays meanwhile goes on."""
+
+    def __init__(self, tape: Tape, find: Find, end_ns: int, *, keep: bool) -> None:
+        """Up to before ``end_ns``. ``keep``: as consumers see the recording. PathError: no such register or kind."""
+        self._end_ns = end_ns
+        self._matches = _happened(find.event, keep=keep) if find.event else _changed(tape, find, keep=keep)
+        self._entries: Iterator[Entry] = tape.entries(find.after_ns + 1)
+        self._what = f"event {find.event}" if find.event else f"change of {find.path}"
+
+    def go_on(self) -> Found | None:
+        """Look a piece further; None: it is not over yet."""
+        for _ in range(SEARCH_PIECE):
+            entry = next(self._entries, None)
+            if entry is None or entry.position_ns >= self._end_ns:
+                return Found(f"there is no {self._what} from here to the end of what is played")
+            if self._matches(entry):
+                return Found(position_ns=entry.position_ns)
+        return None
+
+
+def _happened(name: str, *, keep: bool) -> Callable[[Entry], bool]:
+    kinds = {str(kind): kind for kind in EventKind}
+    if name == ANY:
+        return lambda entry: isinstance(entry.item, Event) and is_told(entry.item, keep=keep)
+    if name not in kinds:
+        raise PathError(f"event {shorten(name, 16)!r} is none of {', '.join(kinds)}, {ANY}")
+    return lambda entry: isinstance(entry.item, Event) and entry.item.kind == kinds[name]
+
+
+def _changed(tape: Tape, wanted: Find, *, keep: bool) -> Callable[[Entry], bool]:
+    register = find(tape.block.layout, wanted.path)
+    span = slice(register.offset, register.offset + register.size)
+    bits = bits_of(register)
+
+    def value(frame: Frame) -> bytes:
+        data = (frame.image if keep else frame.raw)[span]
+        return bytes(byte & mask for byte, mask in zip(data, bits, strict=True))
+
+    entry = tape.newest(wanted.after_ns)
+    last = value(entry.item) if entry is not None and isinstance(entry.item, Frame) else None
+
+    def matches(entry: Entry) -> bool:
+        nonlocal last
+        if not isinstance(entry.item, Frame):
+            return False
+        before, last = last, value(entry.item)
+        return before is not None and last != before
+
+    return matches
+
 
 PIECE: Final = 64
 """So many frames and events between two looks at what else there is to do."""

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from shmio.connectors.replay.tape import Tape
-from shmio.dump.damage import Damage
-from shmio.dump.dump import open_dump
 from shmio.errors import RecordingError
+from shmio.local.recording_times import date_ns
+from shmio.recording.dump import open_dump
+from shmio.recording.format.damage import Damage
 from shmio.segment.header import MAX_PROCESSES
-from shmio.segment.moment import date_ns
 
 Moment = float | str
 """Seconds from a recording's begin, or a date and time."""

@@ -6,10 +6,10 @@ import logging
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from shmio.dump.blocks import DumpBlock
-from shmio.dump.damage import Damage
-from shmio.dump.dump import Dump
-from shmio.dump.encoding import Gap
+from shmio.recording.dump import Dump
+from shmio.recording.format.blocks import DumpBlock
+from shmio.recording.format.damage import Damage
+from shmio.recording.format.encoding import Gap
 from shmio.segment import Event, Frame
 
 log = logging.getLogger("shmio.source")

@@ -12,16 +12,16 @@ from collections.abc import Sequence
 
 from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.s7 import pdu
-from shmio.connectors.s7.blockread import BlockRead
-from shmio.connectors.s7.blocksize import SizeProbe
-from shmio.connectors.s7.blockwrite import BlockWrite, ends, waves
+from shmio.connectors.s7.block_read import BlockRead
+from shmio.connectors.s7.block_size import SizeProbe
+from shmio.connectors.s7.block_write import BlockWrite, ends, waves
 from shmio.connectors.s7.explain import OUT_OF_RANGE, RefusedError, explain_size
 from shmio.connectors.s7.mode import ModeQuestion
 from shmio.connectors.s7.options import S7Options
 from shmio.connectors.s7.transport import DroppingOnError, Transport
 from shmio.connectors.s7.window import Operation, Window
 from shmio.errors import ConfigError, ConnectorError
-from shmio.layout.write import Write
+from shmio.layout.values.write import Write
 
 MAX_DEPTH = 4  # reads under way at once; more would only be older when they come
 LONGEST_WRITE_S = 20  # of a batch, however many jobs it is; ``timeout`` if that is longer

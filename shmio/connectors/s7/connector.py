@@ -9,7 +9,7 @@ from shmio.connectors.s7.client import LONGEST_WRITE_S, S7Client
 from shmio.connectors.s7.options import S7Options
 from shmio.errors import ConfigError
 from shmio.layout.model import Layout
-from shmio.layout.write import Write
+from shmio.layout.values.write import Write
 
 
 class S7Connector(Connector):

@@ -13,16 +13,16 @@ import msgspec
 
 from shmio import worker
 from shmio.config import Address, Grpc, load
-from shmio.endpoints.grpc import memory
-from shmio.endpoints.grpc.bells import Bells
-from shmio.endpoints.grpc.doors import Doors
-from shmio.endpoints.grpc.feeds import Feeds
-from shmio.endpoints.grpc.hold import Hold
-from shmio.endpoints.grpc.server import Server
-from shmio.endpoints.grpc.services import Services
+from shmio.endpoints.grpc.server import memory
+from shmio.endpoints.grpc.server.listeners import Doors
+from shmio.endpoints.grpc.server.server import Server
+from shmio.endpoints.grpc.services.services import Services
+from shmio.endpoints.grpc.streams.feeds import Feeds
+from shmio.endpoints.grpc.streams.wakeups import Bells
+from shmio.endpoints.grpc.time.virtual_time import Hold
 from shmio.errors import SegmentError, ShmioError
+from shmio.log_rate_limit import Ration
 from shmio.logs import fields
-from shmio.ration import Ration
 from shmio.worker import BEAT_S, Worker
 
 CALLS_S: Final = 1.0

@@ -9,9 +9,9 @@ import msgspec
 
 from shmio import worker
 from shmio.config import Mqtt
-from shmio.endpoints.mqtt import broker
 from shmio.endpoints.mqtt.bridge import Bridge
-from shmio.ration import Ration
+from shmio.endpoints.mqtt.broker import process
+from shmio.log_rate_limit import Ration
 from shmio.worker import BEAT_S, Worker
 
 BROKER = "broker"
@@ -24,7 +24,7 @@ def run(worker: Worker) -> None:
     log.addFilter(ration)
     try:
         if worker.name == BROKER:
-            broker.run(worker)
+            process.run(worker)
         else:
             _bridge(worker)
     finally:

@@ -16,20 +16,20 @@ import msgspec
 from paho.mqtt.client import MQTTMessage
 
 from shmio.config import Mqtt
+from shmio.endpoints.mqtt.broker.directory import own_socket
 from shmio.endpoints.mqtt.channel import Channel, Gone, Message, Presence, status
 from shmio.endpoints.mqtt.commands import OUTPUTS, Commands, answers, filters, outputs
+from shmio.endpoints.mqtt.connection.command_connection import Intake
+from shmio.endpoints.mqtt.connection.connection import Link, is_watched
+from shmio.endpoints.mqtt.connection.limits import MOST_IN_FLIGHT
+from shmio.endpoints.mqtt.connection.target import Dialling, targets
 from shmio.endpoints.mqtt.feed import Feed
-from shmio.endpoints.mqtt.guard import MOST_WAITING, Guard
-from shmio.endpoints.mqtt.intake import Intake
-from shmio.endpoints.mqtt.limits import MOST_IN_FLIGHT
-from shmio.endpoints.mqtt.link import Link, is_watched
 from shmio.endpoints.mqtt.outbox import Outbox
-from shmio.endpoints.mqtt.place import own_socket
 from shmio.endpoints.mqtt.rules import Rules
 from shmio.endpoints.mqtt.sparkplug.device import Device
 from shmio.endpoints.mqtt.sparkplug.session import Session
 from shmio.endpoints.mqtt.steps import Steps
-from shmio.endpoints.mqtt.target import Dialling, targets
+from shmio.endpoints.mqtt.topic_guard import MOST_WAITING, Guard
 from shmio.layout.topic import shorten
 from shmio.segment import ProcessSlot, Quality, Segment
 from shmio.segment.relay import TURN_NS, Relay

@@ -8,11 +8,11 @@ from typing import Final, NamedTuple, Protocol
 import msgspec
 
 from shmio.config import MqttTopic
-from shmio.layout.codec import Value, codec
 from shmio.layout.model import Register
-from shmio.layout.text import json_value, texts
+from shmio.layout.values.codec import Value, codec
+from shmio.layout.values.text import json_value, texts
+from shmio.local.reading import holds_none, reading
 from shmio.segment import Block, Frame, Quality
-from shmio.segment.view import holds_none, reading
 
 ONLINE: Final = b"online"
 NUMBERS: Final = (int, float)

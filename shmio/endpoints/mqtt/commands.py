@@ -16,8 +16,8 @@ from shmio.endpoints.mqtt.feed import Feed
 from shmio.endpoints.mqtt.rules import Rules
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Register
-from shmio.layout.text import MAX_TEXT, from_text
 from shmio.layout.topic import look_up, parse_topic, shorten
+from shmio.layout.values.text import MAX_TEXT, from_text
 from shmio.segment import DONE, EventKind
 
 REPLIES: Final = "shmio/results"

@@ -3,23 +3,88 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from typing import Final
+from typing import Any, Final
 
 from shmio.config import MqttTopic
-from shmio.endpoints.mqtt.channel import Channel, FramesChannel, RegisterChannel, Shown, StatusChannel
+from shmio.endpoints.mqtt.channel import (
+    Channel,
+    FramesChannel,
+    Message,
+    RegisterChannel,
+    Showing,
+    Shown,
+    StatusChannel,
+    json_payload,
+)
 from shmio.endpoints.mqtt.frames import Frames
 from shmio.endpoints.mqtt.inlet import Inlet
 from shmio.endpoints.mqtt.outbox import Outbox
 from shmio.endpoints.mqtt.rules import Rules
-from shmio.endpoints.mqtt.structure import StructureChannel
 from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
-from shmio.layout.topic import find
-from shmio.layout.write import elements
-from shmio.segment import Block, Frame, Quality
-from shmio.segment.scan import ChangeScan
+from shmio.layout.topic import decode_segment, find
+from shmio.layout.values.codec import codec
+from shmio.layout.values.text import json_value
+from shmio.layout.values.write import elements
+from shmio.local.reading import injected
+from shmio.segment import Block, Frame, Provenance, Quality
+from shmio.segment.changed_registers import ChangeScan
+
+Value = Callable[[bytes], Any]
+"""From an image to what JSON shows of it."""
+
+
+class StructureChannel:
+    """For the bridge's thread."""
+
+    json = True
+
+    def __init__(self, showing: Showing, path: str, registers: Sequence[Register], topic: str, rule: MqttTopic) -> None:
+        """``path``: of the structure that the registers are below; empty: the source."""
+        self.registers = registers
+        self.topic = topic
+        self.limited = rule.max_rate_hz is not None
+        self._showing = showing
+        self._qos, self._retain = rule.qos, rule.retain
+        self._pause_ns = round(1e9 / rule.max_rate_hz) if rule.max_rate_hz else 0
+        depth = path.count("/") + 1 if path else 0
+        parts = [(register.path.split("/")[depth:], register) for register in registers]
+        self._value = _members(parts, showing.block.layout)
+        self.due_ns = 0
+
+    def moved(self, _image: bytes) -> bool:
+        """Every change is one."""
+        return True
+
+    def message(self, *, late: bool = False) -> Message:
+        """As of now; while it is bad, with the values known last."""
+        block, (frame, quality, reason) = self._showing.block, self._showing.shown
+        self.due_ns = block.now_ns() + self._pause_ns
+        value, provenance = None, Provenance.LIVE
+        if frame is not None:
+            provenance = Provenance.INJECTED if injected(block, self.registers, frame) else frame.provenance
+            value = self._value(frame.image) if frame.source_ns else None
+        payload = json_payload(value, quality, reason, str(provenance), frame, late=late)
+        return Message(self.topic, payload, self._qos, self._retain and not late, True, frame.source_ns if frame else 0)
+
+
+def _members(parts: Sequence[tuple[list[str], Register]], layout: Layout) -> Value:
+    """``parts``: the names that lead to each register from here."""
+    groups: dict[str, list[tuple[list[str], Register]]] = {}
+    for (name, *rest), register in parts:
+        groups.setdefault(decode_segment(name), []).append((rest, register))
+    members = {
+        name: _members(inner, layout) if inner[0][0] else _member(inner[0][1], layout) for name, inner in groups.items()
+    }
+    return lambda image: {name: value(image) for name, value in members.items()}
+
+
+def _member(register: Register, layout: Layout) -> Value:
+    decode, element = codec(register, layout.byte_order).decode, register.element
+    return lambda image: json_value(decode(image), element)
+
 
 log = logging.getLogger("shmio.mqtt")
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from shmio.endpoints.pending import MAX_OPEN, Cost, End, Pendings, worst
+from shmio.endpoints.in_flight import MAX_OPEN, Cost, End, Pendings, worst
 from shmio.errors import CommandError
 from shmio.layout.model import Register
-from shmio.layout.write import sizes
+from shmio.layout.values.write import sizes
+from shmio.local.writer import REPLACED, RETIRED, Commander
 from shmio.segment import DONE, Block, EventKind
-from shmio.segment.commander import REPLACED, RETIRED, Commander
 
 Done = Callable[[EventKind, str], None]
 """Called once: what became of a command, and why."""

@@ -10,8 +10,8 @@ from typing import Final
 import msgspec
 
 from shmio.endpoints.mqtt.channel import Message
+from shmio.endpoints.mqtt.connection.connection import Link
 from shmio.endpoints.mqtt.feed import Feed
-from shmio.endpoints.mqtt.link import Link
 from shmio.endpoints.mqtt.outbox import Outbox
 from shmio.segment.clock import ClockPage, ClockState
 

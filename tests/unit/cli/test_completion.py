@@ -16,7 +16,7 @@ from shmio.layout.model import Layout, Register
 from shmio.segment import BlockSpec, ProcessSpec, Segment
 from shmio.testing.cell import BIN
 from tests.unit.cli.terminal import Terminal
-from tests.unit.dump.build import varied
+from tests.unit.recording.build import varied
 
 pytest.importorskip("argcomplete")
 

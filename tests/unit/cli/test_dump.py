@@ -16,12 +16,12 @@ import pytest
 from mcap.opcode import Opcode
 
 from shmio.cli.dump import main
-from shmio.dump.reader import Reader
-from shmio.recording.selection import Selection
-from shmio.recording.tap import Start
+from shmio.recorder.selection import Selection
+from shmio.recorder.tap import Start
+from shmio.recording.reading.reader import Reader
 from shmio.segment import EventKind, Quality, Record, Segment
 from shmio.testing.cell import until
-from tests.unit.recording.harness import OTHER, RING, numbers, publish, recorder, spec
+from tests.unit.recorder.harness import OTHER, RING, numbers, publish, recorder, spec
 
 Output = Callable[[], tuple[list[str], list[str]]]
 

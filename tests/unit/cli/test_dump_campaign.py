@@ -12,7 +12,7 @@ import pytest
 from shmio.cli.dump import main
 from shmio.config.campaign import read_campaign
 from shmio.segment import NO_WRITER, EventKind, Record
-from tests.unit.dump.build import Build, build, image
+from tests.unit.recording.build import Build, build, image
 
 DRIFT: dict[str, Any] = {
     "name": "drift", "target": "cell/speed", "operation": "offset", "value": 2.5,

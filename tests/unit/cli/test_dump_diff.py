@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from shmio.cli.dump import IGNORABLE, main
-from shmio.dump import compare
 from shmio.layout.model import Layout, Register
+from shmio.recording import compare
 from shmio.segment import Provenance, Quality
-from tests.unit.dump.build import Build, build, image, plain, varied
+from tests.unit.recording.build import Build, build, image, plain, varied
 
 
 @pytest.fixture(autouse=True)

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from shmio.cli.dump import main
 from shmio.layout.model import Layout, Register
 from shmio.segment import EventKind, Record, Write
-from tests.unit.dump.build import build, image
+from tests.unit.recording.build import build, image
 
 GRPC, PROGRAM = 4, 0
 BITS = [((6, 8), "cell/on"), ((1, 1), "cell/count.%X0"), ((0, 128), "cell/count.%X15"), ((11, 2), "cell/row/2.%X1")]

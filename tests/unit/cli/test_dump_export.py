@@ -16,11 +16,11 @@ from mcap.reader import make_reader
 
 import shmio
 from shmio.cli.dump import main
-from shmio.cli.dumping.progress import Progress
-from shmio.layout.codec import codec
+from shmio.cli.recordings.progress import Progress
 from shmio.layout.model import Layout, Register
+from shmio.layout.values.codec import codec
 from shmio.segment import Quality
-from tests.unit.dump.build import PERIOD_NS, START_NS, build, image, varied
+from tests.unit.recording.build import PERIOD_NS, START_NS, build, image, varied
 
 parquet: Any = pytest.importorskip("pyarrow.parquet")
 

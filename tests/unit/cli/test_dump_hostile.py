@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 import shmio
 from shmio.cli.dump import main
-from shmio.dump.encoding import Gap
 from shmio.errors import ShmioError
+from shmio.recording.format.encoding import Gap
 from shmio.segment import Frame
-from tests.unit.dump.build import PERIOD_NS, START_NS, varied
+from tests.unit.recording.build import PERIOD_NS, START_NS, varied
 
 any_input = settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from shmio.cli.dump import main
-from shmio.cli.dumping import progress
-from tests.unit.dump.build import plain
+from shmio.cli.recordings import progress
+from tests.unit.recording.build import plain
 
 
 class Terminal(io.StringIO):

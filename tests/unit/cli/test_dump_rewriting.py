@@ -19,13 +19,13 @@ from mcap.reader import make_reader
 
 import shmio
 from shmio.cli.dump import main
-from shmio.cli.dumping.progress import Progress
-from shmio.dump.check import check
-from shmio.dump.encoding import Gap, Reason, StepMark
-from shmio.dump.reader import Reader
-from shmio.dump.records import MAGIC
+from shmio.cli.recordings.progress import Progress
+from shmio.recording.check import check
+from shmio.recording.format.encoding import Gap, Reason, StepMark
+from shmio.recording.format.records import MAGIC
+from shmio.recording.reading.reader import Reader
 from shmio.segment import Event, Frame
-from tests.unit.dump.build import PERIOD_NS, START_NS, build, image, plain, varied
+from tests.unit.recording.build import PERIOD_NS, START_NS, build, image, plain, varied
 
 Output = Callable[[], tuple[list[str], list[str]]]
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from shmio.cli.supervise import exposure
 from shmio.cli.supervisor import main
 from shmio.config import load
+from shmio.plan import exposure
 
 BASE = """
 [instance]

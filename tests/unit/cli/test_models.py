@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from shmio.cli.supervise.prepare import prepare
 from shmio.errors import ConfigError
+from shmio.plan.prepare import prepare
 
 CONFIG = """
 [instance]

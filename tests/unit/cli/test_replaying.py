@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from shmio.cli.supervise.prepare import prepare
-from shmio.cli.supervise.replaying import options
 from shmio.cli.supervisor import main
 from shmio.errors import ConfigError
+from shmio.plan.prepare import prepare
+from shmio.plan.processes import process_names
+from shmio.plan.replay import options
 from shmio.segment import Origin
-from shmio.supervisor.plan import process_names
 from tests.unit.connectors.replay.harness import BEGIN_NS, S, image, recorded
 
 CONFIG = """

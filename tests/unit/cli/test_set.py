@@ -17,7 +17,7 @@ import pytest
 import shmio
 from shmio.cli.set import read_value
 from shmio.cli.user import main
-from shmio.connectors.desk import CommandDesk
+from shmio.connectors.commands.processor import CommandDesk
 from shmio.connectors.output import Output
 from shmio.errors import ConnectorError, ValueRangeError
 from shmio.layout.model import Layout, Register

@@ -14,11 +14,12 @@ from pathlib import Path
 import pytest
 
 from shmio.cli import target
-from shmio.cli.supervise.prepare import prepare
 from shmio.cli.supervisor import main
 from shmio.config import load
 from shmio.layout.model import Layout, Register
-from shmio.segment import Activity, BlockSpec, ProcessSpec, Quality, Report, Segment, instances, status
+from shmio.local import status
+from shmio.plan.prepare import prepare
+from shmio.segment import Activity, BlockSpec, ProcessSpec, Quality, Report, Segment, instances
 from shmio.supervisor import control
 
 ROOT = Path(__file__).parents[3]

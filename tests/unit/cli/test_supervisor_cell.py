@@ -18,8 +18,8 @@ from typing import Any
 
 import pytest
 
+from shmio.local.status import InstanceStatus, ProcessStatus, SourceStatus, read_status
 from shmio.segment import instances
-from shmio.segment.status import InstanceStatus, ProcessStatus, SourceStatus, read_status
 from shmio.testing.cell import until
 
 ROOT = Path(__file__).parents[3]

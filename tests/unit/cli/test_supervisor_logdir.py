@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.cli.supervise.logdir import LOCK_NAME, held
+from shmio.cli.instance.logdir import LOCK_NAME, held
 from shmio.errors import ConfigError
 
 

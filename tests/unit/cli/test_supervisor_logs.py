@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from shmio.cli.supervise.tail import MAX_LINE_BYTES, Follower, last_lines
+from shmio.cli.instance.logs import MAX_LINE_BYTES, Follower, last_lines
 from shmio.cli.supervisor import main
 from shmio.segment import ProcessSpec, Segment
 

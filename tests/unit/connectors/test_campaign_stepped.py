@@ -11,11 +11,11 @@ import msgspec
 import pytest
 
 from shmio.config import Declaration
+from shmio.local.time_control import Coordinator
+from shmio.local.writer import Commander
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
-from shmio.segment.commander import Commander
-from shmio.segment.coordinator import Coordinator
-from shmio.segment.standing import declared_document
-from tests.unit.connectors.test_stepped import GUEST, LAYOUT, MS, PERIOD_NS, Adder, Running
+from shmio.segment.standing_injections import declared_document
+from tests.unit.connectors.models.test_stepped import GUEST, LAYOUT, MS, PERIOD_NS, Adder, Running
 
 CAMPAIGN = {
     "noise": {"target": "two/sum", "operation": "noise", "amplitude": 1000, "seed": 5, "start_s": 0.1, "end_s": 0.3},

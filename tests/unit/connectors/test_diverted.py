@@ -9,14 +9,14 @@ import pytest
 
 import shmio
 from shmio.config import Declaration
-from shmio.connectors.injections import Owner
+from shmio.connectors.injection.layers import Owner
 from shmio.errors import CommandError, PathError
-from shmio.layout.codec import Value
+from shmio.layout.values.codec import Value
+from shmio.local.attach import Attachment
 from shmio.segment import EventKind, Segment
-from shmio.segment.attach import Attachment
-from shmio.segment.standing import Standing, encode
-from tests.unit.connectors import test_injector
-from tests.unit.connectors.test_injector import LAYOUT, Rig
+from shmio.segment.standing_injections import Standing, encode
+from tests.unit.connectors.injection import test_processor as test_injector
+from tests.unit.connectors.injection.test_processor import LAYOUT, Rig
 
 segment = test_injector.segment
 GUEST = 0

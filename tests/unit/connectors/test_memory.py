@@ -9,14 +9,14 @@ from contextlib import contextmanager
 import pytest
 
 from shmio.connectors import registry
-from shmio.connectors.computed import Computed
+from shmio.connectors.models.computed import Computed
+from shmio.connectors.models.stepped import PageClock, SteppedLoop
 from shmio.connectors.schedule import Schedule
-from shmio.connectors.stepped import PageClock, SteppedLoop
 from shmio.errors import CommandError, ConfigError
 from shmio.layout.compiler import Source, compile_sources
+from shmio.local.reading import reading
+from shmio.local.writer import Commander
 from shmio.segment import Attributes, BlockSpec, EventKind, Frame, ProcessSpec, Provenance, Quality, Segment
-from shmio.segment.commander import Commander
-from shmio.segment.view import reading
 
 TABLE = b"""
 [registers]

@@ -4,7 +4,7 @@ import struct
 
 import pytest
 
-from shmio.emulators.counter import Counter, generations
+from shmio.emulators.programs import Counter, generations
 from shmio.layout.model import Layout
 
 

@@ -12,12 +12,12 @@ import snap7
 
 from shmio.config.address import Address
 from shmio.connectors.s7 import S7Client, S7Options
-from shmio.emulators.counter import generations
 from shmio.emulators.emulator import Emulator
+from shmio.emulators.programs import generations
 from shmio.emulators.s7_jobs import Traits
 from shmio.errors import ConfigError, EndpointError
 from shmio.layout.model import Layout
-from shmio.layout.write import Write
+from shmio.layout.values.write import Write
 
 LOOPBACK = Address("127.0.0.1", 0)
 

@@ -36,4 +36,4 @@ def soon_stale(instance: str) -> Iterator[Segment]:
 @pytest.fixture(autouse=True)
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """No command expires because the host is busy."""
-    monkeypatch.setattr("shmio.segment.commander.TIMEOUT_S", TIMEOUT_S)
+    monkeypatch.setattr("shmio.local.writer.TIMEOUT_S", TIMEOUT_S)

@@ -15,14 +15,14 @@ from google.protobuf.struct_pb2 import Value
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from shmio.config import Address
-from shmio.endpoints.grpc.access import Door, Keys
-from shmio.endpoints.grpc.bells import Bells
-from shmio.endpoints.grpc.doors import Listener
-from shmio.endpoints.grpc.feed import Feed
-from shmio.endpoints.grpc.gate import Calls, Limits
-from shmio.endpoints.grpc.hold import Hold
-from shmio.endpoints.grpc.server import Server
-from shmio.endpoints.grpc.services import Services
+from shmio.endpoints.grpc.server.access import Door, Keys
+from shmio.endpoints.grpc.server.call_guard import Calls, Limits
+from shmio.endpoints.grpc.server.listeners import Listener
+from shmio.endpoints.grpc.server.server import Server
+from shmio.endpoints.grpc.services.services import Services
+from shmio.endpoints.grpc.streams.feed import Feed
+from shmio.endpoints.grpc.streams.wakeups import Bells
+from shmio.endpoints.grpc.time.virtual_time import Hold
 from shmio.layout.model import Layout, Register
 from shmio.segment import BlockWriter, Quality, Segment
 from shmio.wire import simlog_v1_pb2 as wire

@@ -6,8 +6,8 @@ import threading
 import time
 from collections.abc import Sequence
 
-from shmio.connectors.desk import CommandDesk
-from shmio.connectors.injections import Owner
+from shmio.connectors.commands.processor import CommandDesk
+from shmio.connectors.injection.layers import Owner
 from shmio.connectors.output import Image, Output
 from shmio.errors import ConnectorError
 from shmio.segment import BlockWriter, Provenance, Quality, Write

@@ -9,8 +9,8 @@ import time
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from shmio.connectors.desk import CommandDesk
-from shmio.connectors.injections import Owner
+from shmio.connectors.commands.processor import CommandDesk
+from shmio.connectors.injection.layers import Owner
 from shmio.connectors.output import Image, Output
 from shmio.layout.model import Layout, Register
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Provenance, Quality, Segment, Write

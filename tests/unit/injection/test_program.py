@@ -17,9 +17,9 @@ from shmio.errors import ConfigError
 from shmio.injection import Program, compile_program
 from shmio.injection.draw import Draw
 from shmio.injection.operations import Moment, Operation
-from shmio.layout.codec import Value, codec
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Layout
+from shmio.layout.values.codec import Value, codec
 
 TABLE = b"""
 [registers]

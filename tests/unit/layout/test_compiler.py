@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 
 from shmio.errors import LayoutError
 from shmio.layout.compiler import Compiled, Source, compile_sources
-from shmio.layout.lexer import MAX_SOURCE_BYTES, MAX_TOKENS
 from shmio.layout.model import Layout, Register
 from shmio.layout.report import MAX_ERRORS
+from shmio.layout.source.lexer import MAX_SOURCE_BYTES, MAX_TOKENS
 
 
 def compile_text(*texts: str) -> Compiled:

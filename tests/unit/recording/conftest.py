@@ -1,36 +1,5 @@
-"""An instance without a supervisor, whose sources the tests play."""
+"""Recordings are made as the recorder makes them."""
 
-from __future__ import annotations
+from tests.unit.recorder.conftest import recording, segment
 
-from collections.abc import Iterator
-from pathlib import Path
-
-import pytest
-
-from shmio.segment import EventKind, ProcessSpec, Record, Segment
-from tests.unit.recording.harness import publish, recorder, spec
-
-
-@pytest.fixture
-def segment(instance: str) -> Iterator[Segment]:
-    """Two sources, with rings of 512 frames, and the recorder's place."""
-    processes = [ProcessSpec("cell", "source"), ProcessSpec("recorder", "recorder")]
-    with Segment.create(instance, [spec("cell"), spec("press")], processes) as segment:
-        yield segment
-        segment.unlink()
-
-
-@pytest.fixture
-def recording(segment: Segment, tmp_path: Path) -> bytes:
-    """The bytes of a file with several chunks."""
-    work = recorder(segment, tmp_path / "whole")
-    writer = segment.writer("cell")
-    for turn in range(4):
-        publish(writer, 10, first=turn * 10)
-        writer.event(Record(EventKind.QUALITY, "so so"))
-        if turn == 1:
-            publish(writer, 1200)
-        work.turn()
-        work._writer.flush()
-    assert work.close()
-    return work.output.path.read_bytes()
+__all__ = ["recording", "segment"]

@@ -12,8 +12,9 @@ import pytest
 import shmio
 from shmio.errors import NotRunningError, PathError, SegmentError
 from shmio.layout.model import Layout, Register
-from shmio.segment import Block, BlockSpec, ProcessSpec, Quality, Segment, _atomics, build, header, sections, shm
-from shmio.segment.view import View
+from shmio.local.reading import View
+from shmio.segment import Block, BlockSpec, ProcessSpec, Quality, Segment, _atomics, build, header, shm
+from shmio.segment import segment as sections
 
 OLD = Layout("DB1", 1, 2, False, (Register("count", "INT", (), 0, None, 2, 1),))
 NEW = Layout(

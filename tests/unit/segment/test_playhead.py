@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from shmio.errors import SegmentError
 from shmio.segment import Attributes, BlockSpec, Segment
 from shmio.segment.playhead import Find, Found, Move, Play, answered
-from tests.unit.recording.harness import LAYOUT
+from tests.unit.recorder.harness import LAYOUT
 
 S = 1_000_000_000
 PLAY = Play(100 * S, 110 * S, 5 * S, 100 * S, 110 * S, 0, 0)

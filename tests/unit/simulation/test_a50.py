@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
-from shmio.cli.supervise.prepare import prepare
-from shmio.emulators.a50 import A50
-from shmio.layout.codec import codec
+from shmio.emulators.programs import A50
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Layout
 from shmio.layout.topic import find
-from shmio.layout.write import encode
+from shmio.layout.values.codec import codec
+from shmio.layout.values.write import encode
+from shmio.plan.prepare import prepare
 from shmio.simulation import ModelRunner, layout_of
 from shmio.simulation.a50 import A50Cell
 

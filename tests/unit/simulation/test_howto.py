@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from shmio.cli.supervise.prepare import prepare
-from shmio.layout.framecodec import FrameCodec
+from shmio.layout.values.frame_codec import FrameCodec
+from shmio.plan.prepare import prepare
 
 PAGE = (Path(__file__).parents[3] / "docs/how-to/write-a-model.md").read_text()
 

@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from shmio.layout.codec import codec
 from shmio.layout.topic import find
-from shmio.layout.write import encode
+from shmio.layout.values.codec import codec
+from shmio.layout.values.write import encode
 from shmio.simulation import ModelRunner, layout_of
 from shmio.simulation.loopback import Loopback
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from shmio.errors import ConfigError, LayoutError, ModelError, PathError, ShmioError, ValueRangeError
-from shmio.layout.codec import codec
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Layout
 from shmio.layout.topic import find
-from shmio.layout.write import Write, encode
+from shmio.layout.values.codec import codec
+from shmio.layout.values.write import Write, encode
 from shmio.simulation import InOut, Input, Model, ModelRunner, Output, Parameter, layout_of
 from tests.unit.simulation.plant import Belt
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from shmio.errors import ConfigError, ModelError
-from shmio.layout.codec import codec
+from shmio.layout.values.codec import codec
 from shmio.simulation import Input, Model, ModelRunner, Output, ServedModel
 from tests.unit.simulation.plant import Belt
 

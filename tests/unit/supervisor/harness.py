@@ -14,8 +14,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from shmio.segment import Segment, leftover
-from shmio.segment.status import InstanceStatus, ProcessStatus, read_status
+from shmio.local.status import InstanceStatus, ProcessStatus, read_status
+from shmio.segment import Segment, stale_segment
 from shmio.supervisor import control
 
 HERE = Path(__file__).parent
@@ -112,7 +112,7 @@ class Launched:
         for stream in (self.process.stdout, self.process.stderr):
             assert stream is not None
             stream.close()
-        leftover.clear(self.instance)
+        stale_segment.clear(self.instance)
 
 
 Launch = Callable[..., Launched]

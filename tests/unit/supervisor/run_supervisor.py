@@ -13,9 +13,9 @@ from typing import Any
 from shmio import logs
 from shmio.errors import ConfigError, ShmioError
 from shmio.layout.model import Layout, Register
+from shmio.plan.processes import Job, Plan
 from shmio.segment import BlockSpec, State
 from shmio.supervisor.main import Supervisor
-from shmio.supervisor.plan import Job, Plan
 from shmio.supervisor.policy import Limits
 from shmio.supervisor.process import Child
 

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from shmio.errors import ControlError
+from shmio.plan.processes import Job
 from shmio.segment import Segment, instances
 from shmio.supervisor.control import Restart, Stop, Where
-from shmio.supervisor.plan import Job
 from tests.unit.supervisor.harness import CELL, DEADLINE_S, HERE, ROOT, Launch, until
 
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
+from shmio.plan.processes import Job
 from shmio.segment import Activity, ProcessSpec, Report, Segment
 from shmio.supervisor import policy
 from shmio.supervisor.managed import Managed
-from shmio.supervisor.plan import Job
 
 
 def test_the_log_tells_what_a_recorder_lost_while_it_was_in_trouble(

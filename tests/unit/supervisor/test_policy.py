@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 
 import pytest
 
+from shmio.local.status import assess
 from shmio.segment import Quality
 from shmio.segment import State as InstanceState
-from shmio.segment.status import assess
 from shmio.supervisor import policy
 from shmio.supervisor.policy import Life, Limits
 from shmio.supervisor.states import GRAPH, Action, Event, State

@@ -10,11 +10,11 @@ from shmio.endpoints.mqtt.frames import Frames
 from shmio.endpoints.mqtt.inlet import Inlet
 from shmio.endpoints.mqtt.sparkplug.metrics import Metric, parts_of
 from shmio.endpoints.mqtt.sparkplug.node import Sample
-from shmio.layout.codec import codec
 from shmio.layout.glob import Glob
 from shmio.layout.model import Register
+from shmio.layout.values.codec import codec
 from shmio.segment import Block, Frame, Quality
-from shmio.segment.scan import ChangeScan
+from shmio.segment.changed_registers import ChangeScan
 
 
 class Kind(Enum):

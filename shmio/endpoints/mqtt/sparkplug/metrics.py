@@ -24,9 +24,9 @@ import numpy as np
 
 from shmio.errors import ValueRangeError
 from shmio.layout.model import Layout, Register
-from shmio.layout.write import elements
+from shmio.layout.values.write import elements
+from shmio.local.reading import holds_none
 from shmio.segment import Quality
-from shmio.segment.view import holds_none
 from shmio.wire import sparkplug_b_pb2 as wire
 
 INT32: Final = 3

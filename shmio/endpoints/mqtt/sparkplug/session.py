@@ -15,29 +15,87 @@ import msgspec
 from paho.mqtt.client import MQTTMessage
 
 from shmio.config import Mqtt, Sparkplug
+from shmio.endpoints.mqtt.broker.directory import own_socket
 from shmio.endpoints.mqtt.channel import Message
+from shmio.endpoints.mqtt.connection.connection import Link
+from shmio.endpoints.mqtt.connection.limits import FEW_IN_FLIGHT
+from shmio.endpoints.mqtt.connection.target import Dialling, targets
 from shmio.endpoints.mqtt.feed import Feed
-from shmio.endpoints.mqtt.limits import FEW_IN_FLIGHT
-from shmio.endpoints.mqtt.link import Link
-from shmio.endpoints.mqtt.place import own_socket
-from shmio.endpoints.mqtt.sparkplug.backlog import Backlog
+from shmio.endpoints.mqtt.outbox import OVERHEAD_BYTES
 from shmio.endpoints.mqtt.sparkplug.device import Device, Kind
-from shmio.endpoints.mqtt.sparkplug.node import EdgeNode
-from shmio.endpoints.mqtt.sparkplug.primary import PrimaryHost
-from shmio.endpoints.mqtt.target import Dialling, targets
+from shmio.endpoints.mqtt.sparkplug.node import NAMESPACE, EdgeNode, Sample
+from shmio.endpoints.mqtt.store import Store
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.glob import Glob
 from shmio.layout.model import Register
 from shmio.layout.topic import shorten
 from shmio.segment import DONE, EventKind, Segment
 
+SAMPLE_BYTES: Final = 96
+"""Of one in memory, about, beside its value."""
+ELEMENT_BYTES: Final = 32
+"""Of a number in memory, with its place in a list."""
+
+
+class Backlog(Store[list[Sample]]):
+    """Of each device what its frames brought, in order."""
+
+    def keep(self, device: str, samples: list[Sample]) -> None:
+        """Keep what one frame brought."""
+        self.put(samples, OVERHEAD_BYTES + sum(map(_size, samples)), row=device, changes=len(samples))
+
+    def take(self, device: str) -> list[Sample]:
+        """The oldest of a device; empty: there is nothing."""
+        return self.pop(device) or []
+
+
+def _size(sample: Sample) -> int:
+    register = sample.metric.register
+    return SAMPLE_BYTES + max(ELEMENT_BYTES * register.count, register.size)
+
+
+AHEAD_MS: Final = 86_400_000
+"""The clock of a host may be ahead of ours, by no more than this."""
+
+log = logging.getLogger("shmio.mqtt")
+
+
+class _State(msgspec.Struct):
+    online: bool
+    timestamp: int | float
+
+
+class PrimaryHost:
+    """What it says on the present connection."""
+
+    def __init__(self, name: str) -> None:
+        self.topic = f"{NAMESPACE}/STATE/{name}"
+        self.online: bool | None = None
+        """None: it has said nothing."""
+        self._at_ms = float("-inf")
+
+    def forget(self) -> None:
+        """There is another connection: each broker has been told at another time."""
+        self.online, self._at_ms = None, float("-inf")
+
+    def hear(self, payload: bytes) -> None:
+        """Take in what it says, unless it is older than what it said before: the late will of a session before."""
+        try:
+            state = msgspec.json.decode(payload, type=_State)
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            log.warning("%s: expected JSON with online, true or false, and a timestamp", self.topic)
+            return
+        if state.timestamp > time.time() * 1000 + AHEAD_MS:  # none that comes would be newer
+            log.warning("%s: the timestamp is more than a day ahead; it is in ms since 1970", self.topic)
+        elif state.timestamp >= self._at_ms:
+            self.online, self._at_ms = state.online, state.timestamp
+
+
 TURN_SAMPLES: Final = 2000
 """So many of those that were kept are sent before what else there is to do has its turn."""
 
 HOST_S: Final = 10.0
 """For a primary host to say at one of several brokers that it is there."""
-
-log = logging.getLogger("shmio.mqtt")
 
 
 class Session:

@@ -11,11 +11,11 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from shmio.connectors.injections import Owner
+from shmio.connectors.injection.layers import Owner
+from shmio.connectors.models.stepped import PageClock
 from shmio.connectors.replay.beginning import begin
 from shmio.connectors.replay.loop import ReplayLoop
 from shmio.connectors.replay.source import Replay
-from shmio.connectors.stepped import PageClock
 from shmio.layout.model import Layout, Register
 from shmio.segment import (
     Attributes,
@@ -31,7 +31,7 @@ from shmio.segment import (
     Segment,
     Stamp,
 )
-from tests.unit.recording.harness import recorder
+from tests.unit.recorder.harness import recorder
 
 LAYOUT = Layout(
     "DB1", 1, 4, False, (Register("count", "INT", (), 0, None, 2, 1), Register("other", "INT", (), 2, None, 2, 1))

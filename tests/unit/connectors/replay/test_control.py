@@ -10,8 +10,9 @@ import pytest
 
 from shmio.connectors.replay.player import GOES_ON, OVER, STOPPED
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
-from shmio.segment import EventKind, Quality, Record, Segment, replays
-from shmio.segment.attach import Attachment, attach
+from shmio.local import replays
+from shmio.local.attach import Attachment, attach
+from shmio.segment import EventKind, Quality, Record, Segment
 from shmio.segment.playhead import Found, Move, Playhead
 from tests.unit.connectors.replay.harness import (
     BEGIN_NS,

@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 
+from shmio.connectors.replay.loop import Search
 from shmio.connectors.replay.player import NOTHING, Player
 from shmio.connectors.replay.recording import Recording
-from shmio.connectors.replay.search import Search
 from shmio.connectors.replay.source import Replay
 from shmio.connectors.replay.tape import Entry, Tape
-from shmio.dump.encoding import Gap, Reason
 from shmio.errors import CommandError, ConfigError, RecordingError
+from shmio.local.attach import attach
+from shmio.local.replays import Wanted
+from shmio.local.time_control import Coordinator
+from shmio.recording.format.encoding import Gap, Reason
 from shmio.segment import EventKind, Quality, Record, Segment
-from shmio.segment.attach import attach
-from shmio.segment.coordinator import Coordinator
 from shmio.segment.playhead import Move
-from shmio.segment.replays import Wanted
 from tests.unit.connectors.replay.harness import (
     BEGIN_NS,
     LAYOUT,
@@ -36,7 +36,7 @@ from tests.unit.connectors.replay.harness import (
     record,
     recorded,
 )
-from tests.unit.dump.build import START_NS, Build
+from tests.unit.recording.build import START_NS, Build
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -9,17 +9,10 @@ from pathlib import Path
 import pytest
 
 from shmio.connectors.replay.player import OVER, STOPPED
-from shmio.segment import (
-    NO_WRITER,
-    EventKind,
-    Origin,
-    Provenance,
-    Quality,
-    Record,
-)
-from shmio.segment.attach import attach
-from shmio.segment.commander import Commander
-from shmio.segment.coordinator import Coordinator
+from shmio.local.attach import attach
+from shmio.local.time_control import Coordinator
+from shmio.local.writer import Commander
+from shmio.segment import NO_WRITER, EventKind, Origin, Provenance, Quality, Record
 from shmio.segment.playhead import Move
 from tests.unit.connectors.replay.harness import (
     BEGIN_NS,

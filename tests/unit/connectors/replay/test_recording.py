@@ -9,8 +9,8 @@ import pytest
 from shmio.connectors.replay.recording import Moment, Recording
 from shmio.connectors.replay.source import Replay
 from shmio.errors import ConfigError, RecordingError
+from shmio.local.time_control import Coordinator
 from shmio.segment import Quality
-from shmio.segment.coordinator import Coordinator
 from tests.unit.connectors.replay.harness import (
     BEGIN_NS,
     PERIOD_NS,

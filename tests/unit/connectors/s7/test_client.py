@@ -19,7 +19,7 @@ from shmio.connectors.s7 import S7Client, S7Options
 from shmio.connectors.s7.pdu import FRAME_OVERHEAD, parse_connect_confirm
 from shmio.emulators.s7 import S7Server
 from shmio.errors import ConfigError, ConnectorError
-from shmio.layout.write import Write
+from shmio.layout.values.write import Write
 from shmio.testing.ports import reserved_port
 from tests.unit.connectors.s7.harness import SIZE, Plc, assert_recovers
 

@@ -10,7 +10,7 @@ import pytest
 from shmio.connectors.s7.client import S7Client
 from shmio.emulators.s7_jobs import Traits
 from shmio.errors import ConnectorError
-from shmio.layout.write import Write
+from shmio.layout.values.write import Write
 from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc, assert_recovers
 
 JOBS = 5  # of one read of DB201 in PDUs of 480 bytes

@@ -16,7 +16,7 @@ from shmio.connectors.s7.options import S7Options
 from shmio.emulators.s7_jobs import Fault, Traits
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
-from shmio.layout.write import Write
+from shmio.layout.values.write import Write
 from tests.unit.connectors.s7.harness import SIZE, MakePlc, Plc, assert_recovers
 
 

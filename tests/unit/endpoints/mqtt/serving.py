@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from shmio.config import Address, Mqtt
-from shmio.endpoints.mqtt import broker
+from shmio.endpoints.mqtt.broker import process as broker
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
 from shmio.testing.ports import reserved_port
 from tests.unit.endpoints.harness import LAYOUT, STALE_NS, WRITABLE, image

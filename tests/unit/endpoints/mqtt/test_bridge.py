@@ -13,7 +13,7 @@ import pytest
 from shmio.config import Mqtt, MqttTopic, Sparkplug
 from shmio.endpoints.mqtt.bridge import Bridge
 from shmio.segment import BlockWriter, ProcessSpec, Provenance, Quality, Segment
-from shmio.segment.standing import Standing, encode
+from shmio.segment.standing_injections import Standing, encode
 from shmio.testing.mosquitto import Mosquitto
 from tests.unit.endpoints.harness import LAYOUT, image
 from tests.unit.endpoints.mqtt.harness import PREFIX, Listener, bridge, listening

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 
 from shmio.config import Mqtt, MqttTopic
-from shmio.connectors.injections import Owner
+from shmio.connectors.injection.layers import Owner
 from shmio.endpoints.mqtt.bridge import Bridge
-from shmio.endpoints.mqtt.limits import FEW_IN_FLIGHT
-from shmio.endpoints.mqtt.pump import PACKETS
+from shmio.endpoints.mqtt.connection.limits import FEW_IN_FLIGHT
+from shmio.endpoints.mqtt.connection.socket_io import PACKETS
 from shmio.segment import Segment
 from shmio.segment.processes import WRITERS
 from shmio.testing.mosquitto import Mosquitto

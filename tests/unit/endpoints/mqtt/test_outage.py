@@ -25,8 +25,8 @@ AWAY = "nothing listens there"
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tests do not wait for a bridge that has given up for a while."""
-    monkeypatch.setattr("shmio.endpoints.mqtt.target.FIRST_WAIT_S", 0.02)
-    monkeypatch.setattr("shmio.endpoints.mqtt.target.MOST_WAIT_S", 0.1)
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.FIRST_WAIT_S", 0.02)
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.MOST_WAIT_S", 0.1)
 
 
 def test_changes_are_kept_while_the_broker_is_away(segment: Segment, broker: Mosquitto) -> None:
@@ -217,7 +217,7 @@ def secret(folder: Path, text: str) -> str:
 def test_a_wrong_password_is_told_and_the_right_one_heals(
     segment: Segment, make_broker: Callable[..., Mosquitto], tmp_path: Path
 ) -> None:
-    from shmio.config.accounts import hashed
+    from shmio.config.mqtt.accounts import hashed
 
     (tmp_path / "accounts").write_text(f"cell:{hashed('right')}\n")
     broker = make_broker("allow_anonymous false", f"password_file {tmp_path / 'accounts'}")
@@ -283,7 +283,7 @@ def test_what_a_broker_says_is_told(segment: Segment, answer: bytes, told: str) 
 
 
 def test_a_host_that_accepts_and_says_nothing_is_given_up(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shmio.endpoints.mqtt.link.CONNECT_S", 0.1)
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.connection.CONNECT_S", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         address = Address("127.0.0.1", silent.getsockname()[1])
         with bridge(segment, address) as running:
@@ -294,7 +294,7 @@ def test_a_file_that_cannot_be_read_at_present_holds_up_nothing(
     segment: Segment, broker: Mosquitto, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """As one on the network whose server is away: here, a pipe that nobody writes to."""
-    monkeypatch.setattr("shmio.endpoints.mqtt.attempt.SLOW_S", 0.1)
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.attempt.SLOW_S", 0.1)
     pipe = tmp_path / "ca.pem"
     os.mkfifo(pipe)
     writer = segment.writer("cell")

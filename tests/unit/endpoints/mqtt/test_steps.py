@@ -8,8 +8,8 @@ from contextlib import contextmanager
 
 import pytest
 
+from shmio.local.time_control import Coordinator
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
-from shmio.segment.coordinator import Coordinator
 from shmio.testing.mosquitto import Mosquitto
 from shmio.testing.proxy import FaultProxy
 from tests.unit.endpoints.harness import STALE_NS

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sys
 
-from shmio.endpoints.mqtt.sparkplug.backlog import Backlog
 from shmio.endpoints.mqtt.sparkplug.metrics import Metric
 from shmio.endpoints.mqtt.sparkplug.node import Sample
+from shmio.endpoints.mqtt.sparkplug.session import Backlog
 from shmio.layout.model import Register
 
 NUMBER = Metric(Register("number", "REAL", (), 0, None, 4, 1), 1)

@@ -18,8 +18,8 @@ from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.sparkplug.metrics import parts_of
 from shmio.endpoints.mqtt.sparkplug.node import MAX_METRICS, REBIRTH, Command, EdgeNode, Sample
 from shmio.errors import CommandError, PathError, ValueRangeError
-from shmio.layout.codec import codec
 from shmio.layout.model import Layout, Register
+from shmio.layout.values.codec import codec
 from shmio.segment import Quality
 from shmio.wire import sparkplug_b_pb2 as wire
 

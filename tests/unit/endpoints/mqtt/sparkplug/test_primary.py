@@ -22,8 +22,8 @@ WAITING = Sparkplug(group="plant", node="a50", primary_host="scada")
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shmio.endpoints.mqtt.target.FIRST_WAIT_S", 0.02)
-    monkeypatch.setattr("shmio.endpoints.mqtt.target.MOST_WAIT_S", 0.1)
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.FIRST_WAIT_S", 0.02)
+    monkeypatch.setattr("shmio.endpoints.mqtt.connection.target.MOST_WAIT_S", 0.1)
 
 
 def say(listener: Listener, payload: Any, topic: str = STATE) -> None:

@@ -1,0 +1,206 @@
+"""``shmio-supervisor logs [NAME]``: the end of the log files."""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import errno
+import heapq
+import os
+import re
+import sys
+from collections import deque
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+from shmio.cli.run import dumps
+from shmio.cli.target import Target, ask, target
+from shmio.config import load
+from shmio.errors import ConfigError, SegmentError
+from shmio.logs import printable
+from shmio.plan.processes import process_names
+from shmio.supervisor import control
+
+MAX_LINE_BYTES: Final = 65536
+_STAMP = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{6}Z ")
+
+# inotify(7): what can happen to a log file as seen from its folder.
+_IN_MODIFY: Final = 0x0002
+_IN_MOVED_TO: Final = 0x0080
+_IN_CREATE: Final = 0x0100
+_EVENT_ROOM: Final = 65536
+
+
+def last_lines(files: Iterable[Path], count: int) -> list[bytes]:
+    """The last ``count`` lines of the files together, in order of their time stamps.
+
+    A line without a stamp, as those of a traceback, stays behind the one before it.
+    """
+    merged = heapq.merge(*(_stamped(file, count) for file in files), key=lambda entry: entry[0])
+    return list(deque((line for _, line in merged), maxlen=count))
+
+
+def _stamped(file: Path, count: int) -> Iterable[tuple[bytes, bytes]]:
+    """The last ``count`` lines of one file, each with its time stamp or that of the line it follows."""
+    try:
+        with file.open("rb") as stream:
+            return deque(_lines(stream), maxlen=count)
+    except OSError:
+        return ()
+
+
+def _lines(stream: BinaryIO) -> Iterator[tuple[bytes, bytes]]:
+    stamp = b""
+    while line := stream.readline(MAX_LINE_BYTES):
+        found = _STAMP.match(line)
+        stamp = found[0] if found else stamp
+        yield stamp, line.rstrip(b"\r\n")
+
+
+class Follower:
+    """What is added to log files from now on; a file that is rotated is read to its end, then anew.
+
+    Waits on inotify, so it costs nothing while nothing is written. Use ``with``.
+    """
+
+    def __init__(self, files: Iterable[Path]) -> None:
+        """OSError: the folder cannot be watched."""
+        self._files: dict[Path, BinaryIO | None] = {}
+        self._partial: dict[Path, bytes] = {}
+        files = list(files)
+        self._fd = _watch({file.parent for file in files})
+        for file in files:
+            stream = _open(file)
+            if stream is not None:
+                stream.seek(0, os.SEEK_END)
+            self._files[file] = stream
+            self._partial[file] = b""
+
+    def __enter__(self) -> Follower:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        os.close(self._fd)
+        for stream in self._files.values():
+            if stream is not None:
+                stream.close()
+
+    def wait(self) -> list[bytes]:
+        """Wait until something happens in the folder; the whole lines that are new."""
+        os.read(self._fd, _EVENT_ROOM)
+        return [line for file in self._files for line in self._new(file)]
+
+    def _new(self, file: Path) -> list[bytes]:
+        data = self._partial[file]
+        stream = self._files[file]
+        if stream is not None:
+            data += stream.read()
+        if _replaced(file, stream):
+            if stream is not None:
+                stream.close()
+            stream = self._files[file] = _open(file)
+            if stream is not None:
+                data += stream.read()
+        *lines, rest = data.split(b"\n")
+        if len(rest) > MAX_LINE_BYTES:
+            lines.append(rest)
+            rest = b""
+        self._partial[file] = rest
+        return lines
+
+
+def _open(file: Path) -> BinaryIO | None:
+    try:
+        return file.open("rb")
+    except FileNotFoundError:
+        return None
+
+
+def _replaced(file: Path, stream: BinaryIO | None) -> bool:
+    """Whether the name leads to another file by now."""
+    try:
+        found = file.stat()
+    except FileNotFoundError:
+        return False
+    return stream is None or found.st_ino != os.fstat(stream.fileno()).st_ino
+
+
+def _watch(folders: Iterable[Path]) -> int:
+    """An inotify descriptor for the folders; the standard library has no binding."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    fd: int = libc.inotify_init1(os.O_CLOEXEC)
+    if fd < 0:
+        raise OSError(ctypes.get_errno(), f"cannot follow files: {os.strerror(ctypes.get_errno())}")
+    for folder in folders:
+        if libc.inotify_add_watch(fd, os.fsencode(folder), _IN_MODIFY | _IN_MOVED_TO | _IN_CREATE) < 0:
+            number = ctypes.get_errno()
+            os.close(fd)
+            hint = "too many watches (fs.inotify.max_user_watches)" if number == errno.ENOSPC else os.strerror(number)
+            raise OSError(number, hint, str(folder))
+    return fd
+
+
+WHERE_S = 5.0
+SUPERVISOR = "supervisor"
+
+_LINE = re.compile(
+    r"(?P<time>[0-9T:.-]+Z) (?P<level>[A-Z]+) +(?P<process>.+?)\[(?P<pid>[0-9]{1,10})\] (?P<text>.*)", re.DOTALL
+)
+"""As shmio.logs writes it."""
+
+
+def execute(arguments: argparse.Namespace) -> int:
+    """Print the last lines, and with ``-f`` what follows until Ctrl-C."""
+    folder, processes = _where(arguments)
+    names = [SUPERVISOR, *processes]
+    if arguments.name is not None:
+        if arguments.name not in names:
+            raise ConfigError(f"no process {arguments.name!r}; there are: {', '.join(names)}")
+        names = [arguments.name]
+    files = [folder / f"{name}.log" for name in names]
+    if not any(file.exists() for file in files):
+        raise ConfigError(f"no log file in {folder} yet")
+    if not arguments.follow:
+        _print(last_lines(files, arguments.lines), as_json=arguments.json)
+        return 0
+    with Follower(files) as follower:
+        _print(last_lines(files, arguments.lines), as_json=arguments.json)
+        while True:
+            _print(follower.wait(), as_json=arguments.json)
+
+
+def _where(arguments: argparse.Namespace) -> tuple[Path, list[str]]:
+    """Folder and processes: as the file says, else as the running instance does, whose file may be gone.
+
+    What runs and is in no file, as a replay's sources may be, is known too.
+    """
+    wanted = target(arguments)
+    if wanted.file is not None:
+        config = load(wanted.file)
+        return config.log_dir, list(dict.fromkeys([*process_names(config), *_running(wanted)]))
+    with wanted.open_supervised() as segment:
+        names = [slot.name for slot in segment.processes]
+        return Path(ask(segment, control.Where(), WHERE_S)["log_dir"]), names
+
+
+def _running(wanted: Target) -> list[str]:
+    with suppress(SegmentError), wanted.open() as segment:
+        return [slot.name for slot in segment.processes]
+    return []
+
+
+def _print(lines: Iterable[bytes], *, as_json: bool) -> None:
+    for line in lines:
+        text = line.decode(errors="replace")
+        print(dumps(_parsed(text)) if as_json else printable(text))
+    sys.stdout.flush()
+
+
+def _parsed(line: str) -> dict[str, Any]:
+    """A line's parts; all but its text are None where it goes on with the one before, as those of a traceback."""
+    found = _LINE.fullmatch(line)
+    if found is None:
+        return {"time": None, "level": None, "process": None, "pid": None, "text": line}
+    return {**found.groupdict(), "pid": int(found["pid"])}

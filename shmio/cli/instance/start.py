@@ -1,0 +1,159 @@
+"""The start of an instance, by the process that is its supervisor from then on."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from shmio import logs
+from shmio.cli.instance import logdir
+from shmio.cli.instance.up import Configured, Failed, Started, Told, headline
+from shmio.cli.run import say
+from shmio.errors import AlreadyRunningError, EndpointError, ShmioError
+from shmio.logs import printable
+from shmio.plan.ports import check_ports
+from shmio.plan.prepare import Prepared, peer, prepare
+from shmio.plan.processes import BROKER, Job, Plan
+from shmio.segment import Segment, State, instances, stale_segment
+from shmio.segment.segment import refuse_second
+from shmio.supervisor.main import Supervisor
+
+
+def foreground(file: Path, mode: str, keys: Mapping[str, Any]) -> int:
+    """Run it; return when it has stopped. ``keys``: of ``[replay]``, from the command line."""
+    prepared = prepare(file, mode, keys)
+    plan = prepared.plan
+    for warning in plan.warnings:
+        say(warning, sys.stderr)
+    _refuse(plan)
+    left_over = plan.instance in instances()
+    say(headline(plan.instance, plan.mode, None if left_over else plan.segment_bytes, plan.log_dir))
+    for line in _processes(prepared):
+        say(line)
+    say("Ctrl-C stops it, and so does closing the terminal")
+    console = logging.StreamHandler(sys.stderr)
+    console.setFormatter(_Console())
+    with logdir.held(plan.log_dir, plan.instance):
+        logs.setup(_log_file(plan), "supervisor")
+        logging.getLogger("shmio.supervisor").addHandler(console)
+        Supervisor(plan, replan=_replan(plan, keys)).run()
+    return 0
+
+
+def detached(file: Path, mode: str, keys: Mapping[str, Any], report: int) -> int:
+    """Run it, and tell who waits for it how the start went, through this descriptor."""
+    told = False
+
+    def tell(message: Told) -> None:
+        nonlocal told
+        if told:
+            return
+        told = not isinstance(message, Configured)
+        with suppress(OSError):  # who waited gave up
+            os.write(report, msgspec.json.encode(message) + b"\n")
+        if told:
+            os.close(report)
+
+    try:
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        prepared = prepare(file, mode, keys)
+        plan = prepared.plan
+        tell(Configured(printable(str(_log_file(plan))), tuple(map(printable, plan.warnings))))
+        _refuse(plan)
+
+        def on_state(state: State) -> None:
+            if state is not State.STOPPING:
+                history, processes = ([*map(printable, lines)] for lines in (supervisor.history, _processes(prepared)))
+                tell(Started(plan.instance, history, processes))
+
+        with logdir.held(plan.log_dir, plan.instance):
+            logs.setup(_log_file(plan), "supervisor", streams=True)
+            with _log_file(plan).open("ab") as log:
+                for stream in (sys.stdout, sys.stderr):
+                    os.dup2(log.fileno(), stream.fileno())
+            supervisor = Supervisor(plan, replan=_replan(plan, keys), on_state=on_state)
+            supervisor.run()
+    except ShmioError as error:
+        tell(Failed("\n".join(map(printable, str(error).split("\n")))))
+        return 1
+    except OSError as error:
+        tell(Failed(printable(f"{error.filename}: {error.strerror}" if error.filename else str(error))))
+        return 1
+    tell(Failed("it was told to stop while it started"))
+    return 0
+
+
+def _log_file(plan: Plan) -> Path:
+    return plan.log_dir / "supervisor.log"
+
+
+def _refuse(plan: Plan) -> None:
+    """AlreadyRunningError; EndpointError when a port is taken, which those that a dead supervisor left may well be."""
+    _refuse_second(plan)
+    if not stale_segment.living(plan.instance):
+        try:
+            check_ports(plan)
+        except EndpointError:
+            _refuse_second(plan)  # one that began meanwhile may have them
+            raise
+
+
+def _refuse_second(plan: Plan) -> None:
+    try:
+        refuse_second(plan.instance)
+    except AlreadyRunningError as error:
+        raise AlreadyRunningError(f"{error}{_whose(plan)}") from None
+
+
+def _whose(plan: Plan) -> str:
+    """From which file the running instance of this name was started, and what to do about it."""
+    down = f"shmio-supervisor down --instance {plan.instance} stops it"
+    with suppress(ShmioError), Segment.open(plan.instance) as segment:
+        if segment.config not in (None, plan.config_file):
+            return f", started from {segment.config}: {down}; or give this one another instance.name"
+    return f"; {down}"
+
+
+def _replan(plan: Plan, keys: Mapping[str, Any]) -> Callable[[], Plan]:
+    """What a reload makes of the same file by then."""
+    return lambda: prepare(plan.config_file, plan.mode, keys).plan
+
+
+def _processes(prepared: Prepared) -> Iterator[str]:
+    """What there will be, a line each, and what to know of it."""
+    jobs = prepared.plan.jobs
+    width = max((len(job.name) for job in jobs), default=0)
+    for job in sorted(jobs, key=lambda job: job.rank):
+        yield f"  {job.name:<{width}}  {job.kind:<8}  {_describe(job, prepared)}"
+    yield from prepared.notes
+
+
+def _describe(job: Job, prepared: Prepared) -> str:
+    config = job.config
+    if job.kind == "source":
+        layout = prepared.layouts[job.name]
+        source = next(source for source in prepared.config.source if source.name == job.name)
+        device = f"{source.connector} {peer(source)}".rstrip()
+        return f"{device}, {layout.name}: {layout.size} bytes every {source.period_ms:g} ms"
+    if job.kind == "emulator":
+        return f"{config['kind']} on {config['listen']}, program {config['program']}"
+    if job.kind == "recorder":
+        return f"to {config['directory']}"
+    if job.kind == "mqtt":
+        return f"{config['broker']} on {config['listen']}" if job.name == BROKER else f"under {config['prefix']}/"
+    return f"on {', '.join(config['listen'])}"
+
+
+class _Console(logging.Formatter):
+    """A record's message alone."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(record.getMessage())

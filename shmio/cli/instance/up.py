@@ -1,0 +1,140 @@
+"""``shmio-supervisor up``: start an instance, in the foreground or detached.
+
+What starts it is in ``start``; who only waits for a detached one imports none of that.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import msgspec
+
+from shmio.cli.run import say
+from shmio.cli.target import config_file, option_for
+from shmio.errors import ControlError
+from shmio.local.status import InstanceStatus, SourceStatus, read_status
+from shmio.plan.replay import given, options
+from shmio.segment import PREFIX
+from shmio.supervisor.process import child_environment
+
+DETACH_S = 120.0
+"""The longest time that the start of a detached instance is waited for."""
+
+
+class Configured(msgspec.Struct, tag=True):
+    """A detached supervisor has read its configuration."""
+
+    log_file: str
+    warnings: tuple[str, ...]
+
+
+class Started(msgspec.Struct, tag=True):
+    """All runs. ``history``: what was found of an earlier supervisor; ``processes``: what there is, a line each."""
+
+    instance: str
+    history: list[str]
+    processes: list[str]
+
+
+class Failed(msgspec.Struct, tag=True):
+    """The start has failed."""
+
+    error: str
+
+
+Told = Configured | Started | Failed
+"""What a detached supervisor tells about its start: a JSON object a line, of printable text."""
+
+
+def execute(arguments: argparse.Namespace) -> int:
+    """Start the instance; return when it has stopped, or with ``--detach`` when it runs."""
+    file, keys = config_file(arguments), given(arguments)
+    if arguments.detach:
+        return _detach(file, arguments.mode, options(keys))
+    from shmio.cli.instance import start  # noqa: PLC0415
+
+    if arguments.report is not None:
+        return start.detached(file, arguments.mode, keys, arguments.report)
+    return start.foreground(file, arguments.mode, keys)
+
+
+def headline(instance: str, mode: str, segment_bytes: int | None, log_dir: Path) -> str:
+    """``segment_bytes``: None before a take-over, of which nobody knows yet what it will find."""
+    size = "" if segment_bytes is None else f" ({segment_bytes / 1e6:.1f} MB)"
+    return f"{instance}: mode {mode}, segment {PREFIX}{instance}{size}, logs in {log_dir}"
+
+
+def _detach(file: Path, mode: str, words: Sequence[str]) -> int:
+    command = (sys.executable, "-P", "-m", "shmio.cli.supervisor", "up")
+    reader, writer = os.pipe()
+    with os.fdopen(reader, "rb") as answers:
+        child = subprocess.Popen(
+            [*command, "-c", str(file), "--mode", mode, "--report", str(writer), *words],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,  # its standard error is ours, until it has its log file
+            pass_fds=(writer,),
+            env=child_environment(),
+            start_new_session=True,
+        )
+        os.close(writer)
+        try:
+            log_file, started = _await(answers.fileno())
+        except BaseException:
+            child.terminate()
+            child.wait()
+            raise
+    child.returncode = 0  # it lives on, which Popen would complain about
+    for line in started.history:
+        say(line)
+    status = read_status(started.instance)
+    say(headline(started.instance, mode, status.segment_bytes, Path(log_file).parent))
+    for line in started.processes:
+        say(line)
+    _tell_how(status, option_for(file))
+    return 0
+
+
+def _await(fd: int) -> tuple[str, Started]:
+    """Its log file, and what it tells when it runs; ControlError with what it says otherwise."""
+    log_file = ""
+    for line in _lines(fd):
+        told = msgspec.json.decode(line, type=Told)
+        if isinstance(told, Started):
+            return log_file, told
+        if isinstance(told, Failed):
+            raise ControlError(told.error)
+        log_file = told.log_file
+        for warning in told.warnings:
+            say(warning, sys.stderr)
+    raise ControlError(f"the supervisor died while it started; see {log_file or 'above'}")
+
+
+def _lines(fd: int) -> Iterator[bytes]:
+    """What comes through the pipe, to its end, if there ever is one."""
+    deadline = time.monotonic() + DETACH_S
+    received = b""
+    while True:
+        ready, _, _ = select.select([fd], [], [], max(0.0, deadline - time.monotonic()))
+        if not ready:
+            raise ControlError(f"the instance is not running after {DETACH_S:g} s and is stopped again")
+        data = os.read(fd, 65536)
+        if not data:
+            return
+        *lines, received = (received + data).split(b"\n")
+        yield from lines
+
+
+def _tell_how(status: InstanceStatus, option: str) -> None:
+    for process in status.processes:
+        if isinstance(process, SourceStatus) and process.quality == "bad":
+            say(f"warning: source {process.name} is bad: {process.reason}", sys.stderr)
+    pid = status.supervisor.pid if status.supervisor else None
+    down = f"shmio-supervisor down {option}".rstrip()
+    say(f"{status.state}, supervisor pid {pid}; {down} stops it")

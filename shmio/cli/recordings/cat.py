@@ -1,0 +1,154 @@
+"""``shmio-dump cat``: what happened, line by line."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+from shmio.cli.recordings.complaints import Complaints
+from shmio.cli.recordings.each import not_closed
+from shmio.cli.recordings.printers import Csv, JsonLines, Printer, Table, View
+from shmio.cli.recordings.progress import Progress
+from shmio.cli.recordings.times import span, time_range
+from shmio.cli.run import room
+from shmio.errors import PathError, RecordingError
+from shmio.layout.glob import named
+from shmio.layout.model import Layout, Register
+from shmio.layout.topic import parse_topic
+from shmio.logs import printable
+from shmio.recording.explain import Explainer
+from shmio.recording.format.channels import Channel
+from shmio.recording.format.encoding import EVENT, FRAME, GAP, PROCESS, STEP, ProcessChange, StepMark
+from shmio.recording.reading.reader import Message, Reader
+from shmio.recording.reading.survey import Survey, survey
+from shmio.segment import Event, Frame
+
+
+def execute(arguments: argparse.Namespace) -> int:
+    """Print a line for each frame in which a chosen value or the quality changed, and for events, gaps and steps.
+
+    1 if something was damaged: all the rest is printed, and where something is lost is told.
+    """
+    complaints = Complaints()
+    with (
+        Reader(arguments.file) as reader,
+        Progress(f"reading {arguments.file}", silent=sys.stdout.isatty()) as progress,
+    ):
+        found = survey(reader)
+        from_ns, to_ns = time_range(arguments, found.begin_ns)
+        channels = [track.channel for track in found.tracks.values()]
+        try:
+            views = _views(reader, channels, arguments.patterns, complaints)
+        except PathError:
+            _one_file(arguments.patterns)
+            raise
+        sources = {view.source for view in views.values()} if arguments.patterns else {c.source for c in channels}
+        printer = _printer(arguments, list(views.values()))
+        wanted = {c.number for c in channels if c.number in views or (c.encoding == EVENT and c.source in sources)}
+        wanted |= {
+            c.number
+            for c in channels
+            if c.encoding == GAP or (c.encoding in (STEP, PROCESS) and not arguments.patterns)
+        }
+        explainers = {c.number: Explainer(c.source, _layout(reader, c)) for c in channels if c.encoding == EVENT}
+        silent = True
+        begin_ns = max(from_ns, found.begin_ns)
+        progress.total = max(1, min(to_ns, found.end_ns) - begin_ns)
+        for message in reader.messages(
+            lambda channel: channel.number in wanted, from_ns, to_ns, partial(complaints.damage, arguments.file)
+        ):
+            progress.at(message.log_ns - begin_ns)
+            for line in _lines(message, views, sources, printer, explainers):
+                print(line)
+                silent = False
+        sys.stdout.flush()
+        if silent:
+            print(printable(f"{reader.file}: {_nothing(found)}"), file=sys.stderr)
+        if not reader.records.closed:
+            print(printable(f"{reader.file}: {not_closed(reader.records.damage)}"), file=sys.stderr)
+    return int(complaints.any)
+
+
+def _printer(arguments: argparse.Namespace, views: Sequence[View]) -> Printer:
+    if arguments.form == "csv":
+        return Csv(views)
+    return JsonLines() if arguments.form == "json" else Table(room(arguments))
+
+
+def _nothing(found: Survey) -> str:
+    """Why nothing was printed."""
+    if not found.begin_ns:
+        return "nothing is recorded in it"
+    return f"nothing of what was asked for is in it then; it goes {span(found.begin_ns, found.end_ns)}"
+
+
+def _views(
+    reader: Reader, channels: Sequence[Channel], patterns: Sequence[str], complaints: Complaints
+) -> dict[int, View]:
+    """By their frames' channels the blocks of which something is to be shown. PathError: a pattern names nothing.
+
+    Of a block whose layout is damaged nothing can be.
+    """
+    blocks = {}
+    for channel in channels:
+        if channel.encoding == FRAME:
+            try:
+                blocks[channel.number] = channel, reader.layout(channel)
+            except RecordingError as error:
+                complaints.say(str(error))
+    if not patterns:
+        return {number: View(*block, block[1].registers) for number, block in blocks.items()}
+    sources = list(dict.fromkeys(channel.source for channel, _ in blocks.values()))
+    default = sources[0] if len(sources) == 1 else None
+    chosen: dict[int, dict[str, Register]] = {}
+    for pattern in patterns:
+        topic = parse_topic(pattern, sources, default)
+        problem, some = PathError(f"{pattern}: no register of this recording has such a path"), False
+        for number, (channel, layout) in blocks.items():
+            if channel.source != topic.source:
+                continue
+            try:
+                registers = {register.path: register for register in named(layout, topic)}
+            except PathError as error:  # it may be in the layout that came after a change
+                problem = error
+            else:
+                some = some or bool(registers)
+                chosen[number] = chosen.get(number, {}) | registers
+        if not some:
+            raise problem
+    return {number: View(*blocks[number], list(registers.values())) for number, registers in chosen.items()}
+
+
+def _one_file(patterns: Sequence[str]) -> None:
+    """PathError for a pattern that is a file, as the shell's ``*.mem`` makes them, with what to do."""
+    for pattern in patterns:
+        if Path(pattern).is_file():
+            raise PathError(f"{pattern} is a file, and cat prints one: shmio-dump merge FILE… -o NEW makes one of them")
+
+
+def _layout(reader: Reader, channel: Channel) -> Layout | None:
+    """None: it is damaged, which is told where frames are to be printed."""
+    try:
+        return reader.layout(channel)
+    except RecordingError:
+        return None
+
+
+def _lines(
+    message: Message, views: dict[int, View], sources: set[str], printer: Printer, explainers: dict[int, Explainer]
+) -> Iterator[str]:
+    channel, time_ns, item = message
+    if isinstance(item, Frame):
+        if views[channel.number].news(item):
+            yield from printer.frame(time_ns, views[channel.number], item)
+    elif isinstance(item, Event):
+        yield printer.event(time_ns, channel.source, item, explainers[channel.number].explain(item))
+    elif isinstance(item, StepMark):
+        yield printer.step(time_ns, item)
+    elif isinstance(item, ProcessChange):
+        yield printer.process(time_ns, item)
+    elif item.source in sources:
+        yield printer.gap(time_ns, item)

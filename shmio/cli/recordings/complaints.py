@@ -1,0 +1,41 @@
+"""What of a recording cannot be read, told where the rest of the output has come to."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from shmio.cli.recordings.times import lost
+from shmio.logs import printable
+from shmio.recording.dump import Dump, open_dump
+from shmio.recording.format.damage import Damage
+
+
+class Complaints:
+    """Tells on standard error."""
+
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    @property
+    def any(self) -> bool:
+        """Whether there was anything to tell."""
+        return bool(self.texts)
+
+    def open(self, files: Sequence[Path]) -> Dump:
+        """Open a recording of which what cannot be read is told. OSError, RecordingError as ``open_dump``."""
+        dump = open_dump(files, self.damage)
+        for text in dump.damage:
+            self.say(text)
+        return dump
+
+    def damage(self, file: Path, damage: Damage) -> None:
+        """A part of a file is lost."""
+        self.say(f"{file}: {lost(damage)}")
+
+    def say(self, text: str) -> None:
+        """One line; the exit status will be 1."""
+        self.texts.append(text)
+        sys.stdout.flush()
+        print(printable(text), file=sys.stderr, flush=True)

@@ -1,0 +1,298 @@
+"""How ``shmio-dump cat`` puts things into lines."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from itertools import chain
+from typing import Any, Final, Protocol
+
+import msgspec
+
+from shmio.cli.readings import shown
+from shmio.cli.recordings.times import iso, local
+from shmio.cli.run import dumps
+from shmio.layout.model import Layout, Register
+from shmio.layout.values.codec import codec
+from shmio.layout.values.text import json_value, to_text
+from shmio.logs import printable
+from shmio.recording.columns import heading
+from shmio.recording.explain import Explained
+from shmio.recording.format.channels import Channel
+from shmio.recording.format.encoding import Gap, ProcessChange, StepMark
+from shmio.segment import Event, EventKind, Frame, Quality
+from shmio.segment.changed_registers import ChangeScan
+
+
+class View:
+    """The chosen registers of one block, and what was shown of them last."""
+
+    def __init__(self, channel: Channel, layout: Layout, registers: Sequence[Register]) -> None:
+        self.source = channel.source
+        self.registers = registers
+        self.codecs = [codec(register, layout.byte_order) for register in registers]
+        self._scan = ChangeScan(registers)
+        self._shown: Frame | None = None
+
+    def news(self, frame: Frame) -> bool:
+        """Whether a value or the quality differs from the frame shown before; if so, this one is shown."""
+        shown = self._shown
+        same = shown is not None and (shown.quality, shown.reason) == (frame.quality, frame.reason)
+        if shown is not None and same and not self._scan.changed(shown.image, frame.image):
+            return False
+        self._shown = frame
+        return True
+
+
+class Printer(Protocol):
+    """How things are put into lines."""
+
+    def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
+        """A frame's chosen values."""
+
+    def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
+        """An event, and what it is about."""
+
+    def gap(self, time_ns: int, gap: Gap) -> str:
+        """What was missed."""
+
+    def step(self, time_ns: int, mark: StepMark) -> str:
+        """The end of a step."""
+
+    def process(self, time_ns: int, change: ProcessChange) -> str:
+        """What has happened to a process."""
+
+
+def kind_of(event: Event) -> str:
+    """What an event is called."""
+    try:
+        return str(EventKind(event.kind))
+    except ValueError:  # of a later version
+        return f"kind {event.kind}"
+
+
+ABOUT: Final = ("path", "value", "direction", "by")
+"""Columns of what an event is about, in tables."""
+MAX_PLACES: Final = 4
+"""So many registers of one event are printed for people."""
+
+
+def object_of(event: Event, explained: Explained) -> dict[str, Any]:
+    """What an event is about, as JSON has it; ``data`` in hexadecimal digits."""
+    places = explained.places
+    return {
+        "by": explained.by,
+        "direction": explained.direction,
+        "paths": [place.path for place in places],
+        "values": {place.path: place.plain for place in places if place.valued},
+        "laid": explained.laid,
+        "injection": event.injection,
+        **{name: getattr(event, name) for name in ("command", "item", "items", "offset", "mask", "size", "text")},
+        "data": event.data.hex(),
+    }
+
+
+def cells_of(explained: Explained) -> tuple[str, ...]:
+    """What an event is about, as tables have it under ABOUT: of several registers the values are a JSON object."""
+    places = explained.places
+    valued = [place for place in places if place.valued]
+    value = dumps({place.path: place.plain for place in valued}) if valued[1:] else "".join(p.text for p in valued)
+    return ", ".join(place.path for place in places), value, explained.direction, explained.by
+
+
+def _where(event: Event, explained: Explained, room: int | None) -> str:
+    """The registers with their direction and values, for people; of what has no name the bytes."""
+    if not explained.places:
+        return f"{event.size} bytes at {event.offset}" if event.size and not event.data.startswith(b"{") else ""
+    way = f"/{explained.direction}" if explained.direction else ""
+    texts = [
+        f"{printable(place.path)}{way}{f' = {shown(place.value, place.register, room)}' if place.valued else ''}"
+        for place in explained.places[:MAX_PLACES]
+    ]
+    more = len(explained.places) - MAX_PLACES
+    return ", ".join(texts) + (f" and {more} more" if more > 0 else "")
+
+
+def _laid(laid: dict[str, Any]) -> str:
+    """How an injection is laid, as a campaign file has it; what its event says already is left out."""
+    return ", ".join(f"{key} = {dumps(value)}" for key, value in laid.items() if key not in ("name", "direction"))
+
+
+class JsonLines:
+    """An object a line, times in UTC."""
+
+    def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
+        """``values`` by path, null for all of them where the source never had any."""
+        known = frame.source_ns != 0
+        values = {
+            register.path: json_value(decode.decode(frame.image), register.element) if known else None
+            for register, decode in zip(view.registers, view.codecs, strict=True)
+        }
+        yield self._line(
+            time_ns,
+            view.source,
+            frame=frame.number,
+            cycle=frame.cycle,
+            quality=str(frame.quality),
+            reason=frame.reason,
+            provenance=str(frame.provenance),
+            values=values,
+        )
+
+    def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
+        """``event`` is its number."""
+        fields = {name: getattr(event, name) for name in ("cycle", "incarnation", "writer")}
+        return self._line(
+            time_ns,
+            source,
+            event=event.number,
+            kind=kind_of(event),
+            after_frame=event.frame,
+            quality=str(event.quality),
+            **fields,
+            **object_of(event, explained),
+        )
+
+    def gap(self, time_ns: int, gap: Gap) -> str:
+        """``missed`` is how many."""
+        return self._line(
+            time_ns, gap.source, missed=gap.count, what=gap.what, first=gap.first, last=gap.last, why=str(gap.reason)
+        )
+
+    def step(self, time_ns: int, mark: StepMark) -> str:
+        """``step`` is its number, ``clock_ns`` the instance's clock after it; it is of no source."""
+        return dumps({"time": iso(time_ns), "step": mark.step, "clock_ns": mark.time_ns, "dt_ns": mark.dt_ns})
+
+    def process(self, time_ns: int, change: ProcessChange) -> str:
+        """As it is in the file."""
+        return dumps({"time": iso(time_ns), "process": msgspec.to_builtins(change)})
+
+    def _line(self, time_ns: int, source: str, **fields: Any) -> str:
+        return dumps({"time": iso(time_ns), "source": source, **fields})
+
+
+class Table:
+    """A line with columns, under headings when the block is another than before."""
+
+    def __init__(self, room: int | None) -> None:
+        """``room``: for so many characters of a value; None: for all."""
+        self._room = room
+        self._view: View | None = None
+        self._widths: list[int] = []
+
+    def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
+        """The values; quality is said unless it is good."""
+        known = frame.source_ns != 0
+        cells = [
+            shown(decode.decode(frame.image) if known else None, register, self._room)
+            for register, decode in zip(view.registers, view.codecs, strict=True)
+        ]
+        if view is not self._view:
+            self._view = view
+            names = [printable(register.path) for register in view.registers]
+            self._widths = [max(map(len, pair)) for pair in zip(names, cells, strict=True)]
+            yield f"{'time':<23}  {view.source}  frame  {self._row(names)}".rstrip()
+        quality = "" if frame.quality is Quality.GOOD else f"  {frame.quality}: {printable(frame.reason)}"
+        yield f"{local(time_ns)}  {view.source}  {frame.number:<5}  {self._row(cells)}{quality}".rstrip()
+
+    def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
+        """Kind and reason; of a command what it is about, and whose it is; of an injection how it is laid."""
+        what = f"{kind_of(event)} {event.quality}" if event.kind == EventKind.QUALITY else kind_of(event)
+        if where := _where(event, explained, self._room):
+            what += f" {where}"
+        if explained.by:
+            what += f" by {explained.by}"
+        if event.command and event.kind != EventKind.NOTED:
+            what += f", command {event.command}.{event.item}"
+        text = f": {printable(event.text)}" if event.text else ""
+        laid = f" {printable(_laid(explained.laid))}" if explained.laid else ""
+        return f"{local(time_ns)}  {source}  event {event.number} after frame {event.frame}: {what}{text}{laid}"
+
+    def gap(self, time_ns: int, gap: Gap) -> str:
+        """How many, which, why."""
+        source = printable(gap.source)
+        return f"{local(time_ns)}  {source}  {gap.count} {gap.what} missed, {gap.first} to {gap.last}: {gap.reason}"
+
+    def step(self, time_ns: int, mark: StepMark) -> str:
+        """Number, and the time after it."""
+        return f"{local(time_ns)}  step {mark.step} of {mark.dt_ns / 1e6:g} ms is done: {mark.time_ns / 1e9:g} s"
+
+    def process(self, time_ns: int, change: ProcessChange) -> str:
+        """Name, what, why."""
+        pid = f", pid {change.pid}" if change.pid else ""
+        why = f": {printable(change.why)}" if change.why else ""
+        return f"{local(time_ns)}  process {printable(change.name)} {change.what}{pid}{why}"
+
+    def _row(self, cells: Sequence[str]) -> str:
+        return "  ".join(cell.ljust(width) for cell, width in zip(cells, self._widths, strict=True))
+
+
+class Csv:
+    """A row for each (RFC 4180) under one heading, times in UTC.
+
+    A column for each register of any block, with its source if there are several, or if another column has its name.
+    Arrays are JSON; a value is empty where the source never had any, or it is of another block.
+    """
+
+    OWN = ("time", "source", "what", "number", "quality", "text", *ABOUT)
+
+    def __init__(self, views: Sequence[View]) -> None:
+        several = len({view.source for view in views}) > 1
+        self._names = [
+            [
+                f"{view.source}/{register.path}" if several else heading(view.source, register.path, self.OWN)
+                for register in view.registers
+            ]
+            for view in views
+        ]
+        self._columns = {name: place for place, name in enumerate(dict.fromkeys(chain(*self._names)))}
+        self._views = list(views)
+        self._begun = False
+
+    def frame(self, time_ns: int, view: View, frame: Frame) -> Iterator[str]:
+        """``what`` is frame, ``text`` the reason."""
+        values = [""] * len(self._columns)
+        if frame.source_ns != 0:
+            names = self._names[self._views.index(view)]
+            for name, register, decode in zip(names, view.registers, view.codecs, strict=True):
+                values[self._columns[name]] = to_text(decode.decode(frame.image), register)
+        yield self._row(time_ns, view.source, "frame", frame.number, str(frame.quality), frame.reason, values)
+
+    def event(self, time_ns: int, source: str, event: Event, explained: Explained) -> str:
+        """``what`` is its kind."""
+        row = time_ns, source, kind_of(event), event.number, str(event.quality), event.text
+        return self._row(*row, about=cells_of(explained))
+
+    def gap(self, time_ns: int, gap: Gap) -> str:
+        """``number`` is the first that is missing."""
+        return self._row(time_ns, gap.source, f"missed {gap.count} {gap.what}", gap.first, "", str(gap.reason))
+
+    def step(self, time_ns: int, mark: StepMark) -> str:
+        """Of no source."""
+        return self._row(time_ns, "", "step", mark.step, "", "")
+
+    def process(self, time_ns: int, change: ProcessChange) -> str:
+        """``number`` is its pid, ``text`` its name and why."""
+        text = f"{change.name}: {change.why}" if change.why else change.name
+        return self._row(time_ns, "", f"process {change.what}", change.pid, "", text)
+
+    def _row(
+        self,
+        time_ns: int,
+        source: str,
+        what: str,
+        number: int,
+        quality: str,
+        text: str,
+        values: Sequence[str] = (),
+        about: Sequence[str] = ("",) * len(ABOUT),
+    ) -> str:
+        lines = io.StringIO(newline="")
+        writer = csv.writer(lines, lineterminator="\n")
+        if not self._begun:
+            self._begun = True
+            writer.writerow([*self.OWN, *self._columns])
+        filled = values or [""] * len(self._columns)
+        writer.writerow([iso(time_ns), source, what, number, quality, text, *about, *filled])
+        return lines.getvalue().removesuffix("\n")

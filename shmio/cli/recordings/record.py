@@ -1,0 +1,132 @@
+"""``shmio-dump record``: record a running instance from outside."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from shmio.cli.interrupt import told_to_stop
+from shmio.cli.run import say, say_json
+from shmio.cli.target import target
+from shmio.config import Recorder as Settings
+from shmio.config import Trigger
+from shmio.errors import ControlError, PathError, RecordingError
+from shmio.recorder.attach import Attachments, ConfigFiles, no_attachments
+from shmio.recorder.selection import Selection
+from shmio.recorder.series import Series
+from shmio.recorder.tap import Start, Tap
+from shmio.recorder.triggered import Triggered
+from shmio.segment import Segment
+from shmio.supervisor import control
+
+BY = "shmio-dump"
+WHERE_S = 2.0
+LOOK_S = 0.5
+"""How often it is looked whether the instance still is, and the disk well."""
+
+
+def execute(arguments: argparse.Namespace) -> int:
+    """Record until Ctrl-C, the time is over, or the instance ends."""
+    logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
+    with target(arguments).open() as segment, told_to_stop() as stopping:
+        sources = arguments.sources
+        selection = Selection(sources, arguments.registers or ())
+        for missing in selection.nothing({name: block.layout for name, block in segment.blocks.items()}):
+            raise PathError(missing)
+        tap = Tap(segment, Start(first=False), selection)
+        news = _News(as_json=arguments.json)
+        work = _work(arguments, tap, _attachments(segment, news))
+        chosen = list(sources or segment.blocks)
+        place = work.file or f"{arguments.directory} whenever {arguments.when}"
+        news.tell(
+            "recording",
+            f"recording {', '.join(chosen)} of {segment.instance} to {place}; Ctrl-C ends it",
+            instance=segment.instance,
+            sources=chosen,
+            file=_name(work.file),
+        )
+        try:
+            whole = _record(segment, work, stopping, arguments.duration_s, news)
+        finally:
+            file = work.file
+            unclosed = work.close()
+        _sum_up(work, file, arguments.directory, news, whole=whole and not unclosed)
+        for text in unclosed:
+            raise RecordingError(text)
+        return 0 if whole else 1
+
+
+def _work(arguments: argparse.Namespace, tap: Tap, attachments: Attachments) -> Series | Triggered:
+    settings = Settings(directory=str(arguments.directory), rotate_min=0, rotate_mb=0)
+    if arguments.when is None:
+        return Series(tap, settings, BY, attachments)
+    seconds = {name: value for name in ("before_s", "after_s") if (value := getattr(arguments, name)) is not None}
+    trigger = Trigger(arguments.when, **seconds)
+    return Triggered(tap, settings, trigger, BY, attachments)
+
+
+def _record(
+    segment: Segment, work: Series | Triggered, stopping: threading.Event, duration_s: float | None, news: _News
+) -> bool:
+    """Whether it went on as long as was asked."""
+    until_s = None if duration_s is None else time.monotonic() + duration_s
+    look_s, more, problem, file = 0.0, False, "", work.file
+    while True:
+        rest_s = work.tap.pause_s if until_s is None else min(work.tap.pause_s, until_s - time.monotonic())
+        if rest_s <= 0 or stopping.wait(0 if more else rest_s):
+            return True
+        more = work.turn()
+        if work.file != file:
+            file = work.file
+            news.tell("file", f"recording to {file}" if file else "waiting for the next time", file=_name(file))
+        if time.monotonic() - look_s < LOOK_S:
+            continue
+        look_s = time.monotonic()
+        work.tend()
+        before, problem = problem, work.problem
+        if bool(problem) != bool(before):
+            news.tell("problem", problem or f"{file} is being written again", text=problem or None)
+        if not segment.shared.current():
+            news.tell("stopped", f"instance {segment.instance!r} has stopped")
+            return until_s is None
+
+
+def _attachments(segment: Segment, news: _News) -> Attachments:
+    """The files of the configuration, if the supervisor says where that is."""
+    try:
+        return ConfigFiles(Path(control.request(segment.header.control, control.Where(), WHERE_S)["config"]))
+    except (ControlError, KeyError) as error:
+        text = f"the configuration is not attached: {error}"
+        news.tell("problem", text, text=text)
+        return no_attachments
+
+
+def _sum_up(work: Series | Triggered, file: Path | None, directory: Path, news: _News, *, whole: bool) -> None:
+    counters = work.counters
+    counts = {"frames": counters.frames, "events": counters.events, "missed": counters.missed}
+    size = f", {work.written / 1e6:.2f} MB" if work.written else ""
+    line = f"{file or directory}: {', '.join(f'{count} {what}' for what, count in counts.items())}{size}"
+    news.tell("ended", line, file=_name(file), **counts, bytes=work.written, whole=whole)
+
+
+def _name(file: Path | None) -> str | None:
+    return None if file is None else str(file)
+
+
+class _News:
+    """Tells what goes on: on standard error in lines, or on standard output as an object a line."""
+
+    def __init__(self, *, as_json: bool) -> None:
+        self._as_json = as_json
+
+    def tell(self, what: str, line: str, **fields: Any) -> None:
+        """Something has happened. A terminal that has gone away does not end the recording."""
+        if self._as_json:
+            say_json({"what": what, **fields})
+        else:
+            say(line, sys.stderr)

@@ -1,0 +1,283 @@
+"""The client for programs with threads: every call waits."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any, Self, Unpack
+
+import grpc
+
+from shmio.client import calls, injection, injections, replay
+from shmio.client.arrays import InjectResponse, ReadResponse, SimulateResponse, SubscribeResponse
+from shmio.client.calls import Clock, Outcome, Target
+from shmio.client.injections import Injection, Lifted
+from shmio.client.layout import BlockLayout, layouts
+from shmio.client.model import PATIENCE_S
+from shmio.client.replay import Wish
+from shmio.client.sync.campaign import Campaign
+from shmio.client.sync.injection import Shadow
+from shmio.client.sync.model import Simulation, Step, serve
+from shmio.client.sync.steps import Steps
+from shmio.client.update import Snapshot, Tables, Update
+from shmio.errors import CommandError
+from shmio.model.replay_status import Playing
+from shmio.wire import shmio_v1_pb2 as wire
+from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
+
+
+class Client:
+    """An instance at the other end of a connection. Several threads may use it. Close it, or use ``with``.
+
+    Errors are those of a local program: PathError, ValueRangeError, CommandError, QualityError; EndpointError: more
+    than the endpoint gives to one client, or all; RemoteError: it cannot be reached, or does not let us.
+    """
+
+    def __init__(self, target: Target, timeout_s: float = 10.0) -> None:
+        """``timeout_s``: of calls that are answered at once."""
+        self.target = target
+        self._timeout_s = timeout_s
+        credentials = target.credentials
+        self._channel = (
+            grpc.insecure_channel(target.address, calls.OPTIONS)
+            if credentials is None
+            else grpc.secure_channel(target.address, credentials, calls.OPTIONS)
+        )
+        self._stub: Any = ShmioStub(self._channel)  # type: ignore[no-untyped-call]
+        self._read = self._channel.unary_unary(
+            f"/{calls.SERVICE}/Read", wire.ReadRequest.SerializeToString, ReadResponse.FromString
+        )
+        self._inject: Any = self._channel.stream_stream(f"/{calls.SERVICE}/Inject", None, InjectResponse.FromString)
+        self._simulate: Any = self._channel.stream_stream(
+            f"/{calls.SERVICE}/Simulate", None, SimulateResponse.FromString
+        )
+        self._closed = False
+        self._subscribe = self._channel.unary_stream(
+            f"/{calls.SERVICE}/Subscribe", wire.SubscribeRequest.SerializeToString, SubscribeResponse.FromString
+        )
+
+    def layouts(self, *sources: str) -> dict[str, BlockLayout]:
+        """The blocks of these sources, or of all, by source. PathError: no such source."""
+        call = self._stub.GetLayouts(
+            wire.GetLayoutsRequest(sources=sources), timeout=self._timeout_s, metadata=self.target.metadata
+        )
+        try:
+            return {block.source: block for block in layouts(call)}
+        except grpc.RpcError as error:
+            self.target.fail(error)
+
+    def status(self) -> dict[str, Any]:
+        """How the instance and its processes are, as ``shmio-supervisor status --json`` has it."""
+        return calls.status(self._call(self._stub.GetStatus, wire.GetStatusRequest()))
+
+    def read(self, *patterns: str, originals: bool = False) -> Snapshot:
+        """Registers as of now: paths, elements, slices, structures, globs, or a source; of each source one frame.
+
+        ``originals``: what the source delivered, too, where an injection shows something else. PathError,
+        ValueRangeError: too much for one call.
+        """
+        tables = Tables()
+        request = calls.read_request(patterns, originals=originals, tables=())
+        return Snapshot(tables.updates(self._call(self._read, request)))
+
+    def __getitem__(self, path: str) -> Any:
+        """A register's good value; PathError, and QualityError with the reason when there is none."""
+        return self.read(path)[path]
+
+    def subscribe(
+        self,
+        *patterns: str,
+        every_frame: bool = False,
+        frames: bool = False,
+        max_rate_hz: float = 0.0,
+        deadband: float = 0.0,
+    ) -> Subscription:
+        """The present values of all, then what changes: see :class:`Update`. PathError comes with the first one.
+
+        ``every_frame``: all frames in order, losses counted; else the newest, at most ``max_rate_hz`` a second of
+        each source, and of numbers only what differs from what came before by more than ``deadband``. ``frames``: raw
+        frames of the sources instead of values.
+        """
+        request = calls.subscribe_request(
+            patterns, every_frame=every_frame, frames=frames, max_rate_hz=max_rate_hz, deadband=deadband
+        )
+        return Subscription(self._subscribe(request, metadata=self.target.metadata), self.target)
+
+    def write(
+        self, values: Mapping[str, object], timeout_s: float | None = None, *, until_accepted: bool = False
+    ) -> list[Outcome]:
+        """Write registers, arrays or elements of one source, all or none; what became of each, by the source.
+
+        ``timeout_s``: how long the source may take until it begins; default: 2 s, or three of its cycles.
+        ``until_accepted``: do not wait for what the device says. PathError, ValueRangeError, CommandError: nothing has
+        been sent.
+        """
+        request = calls.write_request(values, timeout_s, until_accepted=until_accepted)
+        answer = self._call(self._stub.Write, request, (timeout_s or 0) + calls.WRITE_PATIENCE_S)
+        return calls.outcomes(values, answer.outcomes)
+
+    def inject(
+        self,
+        *patterns: str,
+        ranges: injection.Ranges = (),
+        source: str = "",
+        priority: int = 0,
+        keep: bool = False,
+        name: str = "",
+        for_s: float | None = None,
+        originals: bool = False,
+    ) -> Shadow:
+        """Lay a shadow over registers, elements, slices, structures or patterns of one source, all /out or all /in.
+
+        It is lifted when it is closed, at the end of its ``with`` block, when this program ends, or ``for_s`` later;
+        with ``keep`` only when somebody lifts it. ``originals``: iterate over it for what it stands over. ``ranges``:
+        bytes and bits of a frame besides, or alone: then ``source`` says whose, as ``cell`` or ``cell/in``. PathError,
+        ValueRangeError; CommandError: the source refuses it.
+        """
+        first = injection.lay(
+            patterns, ranges=ranges, source=source, priority=priority, keep=keep, name=name, for_s=for_s,
+            originals=originals,
+        )  # fmt: skip
+        return Shadow(self._inject, first, self.target, self._timeout_s)
+
+    def declare(self, declarations: Iterable[Mapping[str, Any]], *, keep: bool = False) -> Campaign:
+        """Lay injections that their sources run by themselves, all or none: tables as ``[[injection]]`` has them.
+
+        They are lifted when it is closed, at the end of its ``with`` block, or when this program ends; with ``keep``
+        when they are over, or somebody lifts them. Iterate over it for what is done with them. ValueRangeError: one
+        that cannot be; CommandError: a source refuses it.
+        """
+        request = injections.declare_request(declarations, keep=keep)
+        return Campaign(self._stub.Declare(request, metadata=self.target.metadata), self, keep=keep)
+
+    def injections(self, *sources: str) -> list[Injection]:
+        """What stands at present, on these sources or all; of each the innermost first."""
+        return injections.injections(self._call(self._stub.ListInjections, wire.ListInjectionsRequest(sources=sources)))
+
+    def lift(self, source: str, number: int) -> None:
+        """Lift an injection, whoever laid it. PathError: there is none; CommandError: the source does not answer."""
+        self._call(self._stub.Lift, wire.LiftRequest(source=source, number=number))
+
+    def lift_all(self, *sources: str) -> list[Lifted]:
+        """The emergency: lift all of these sources, or of all, whoever laid them. CommandError: some still stand."""
+        found = injections.lifted(self._call(self._stub.LiftAll, wire.LiftAllRequest(sources=sources)))
+        if left := [one for one in found if one.failure]:
+            raise CommandError(f"{len(left)} of {len(found)} injections still stand: {left[0].failure}")
+        return found
+
+    def simulation(self, source: str, name: str = "") -> Simulation:
+        """Join a source of the connector ``remote`` as its model, to be told its steps and to answer them.
+
+        ``name``: for messages. PathError: no such source; CommandError: it has no model elsewhere; ConflictError: it
+        has another one already; LostError, RemoteError.
+        """
+        return Simulation(self._simulate, self.target, source, name)
+
+    def simulate(
+        self,
+        source: str,
+        step: Step,
+        *,
+        name: str = "",
+        start: Callable[[Simulation], object] | None = None,
+        patience_s: float = PATIENCE_S,
+    ) -> None:
+        """Be the model of a source until this client is closed, or its thread is interrupted.
+
+        ``step(time_s, dt_s, inputs)`` gives outputs by their paths, all or some; what it raises is the reason why the
+        step failed, which the log of ``shmio.client`` tells, too. ``start`` is called with the :class:`Simulation`
+        whenever it has joined. An instance that is not there, or goes, is waited for ``patience_s``. Errors as of
+        :meth:`simulation`.
+        """
+        serve(lambda: self.simulation(source, name), step, start, patience_s, lambda: self._closed)
+
+    def clock(self) -> Clock:
+        """How time stands."""
+        return Clock.of((self._call(self._stub.GetStatus, wire.GetStatusRequest())).clock)
+
+    def step(self, dt_s: float | None = None) -> Clock:
+        """Take time over, and move it by one step; it returns when all streams have what has changed in it.
+
+        CommandError: the step failed, or another program owns time; ValueRangeError.
+        """
+        request = wire.StepRequest(dt_ns=calls.ns(dt_s))
+        return Clock.of(self._call(self._stub.Step, request, calls.STEP_PATIENCE_S))
+
+    def steps(self, count: int = 0, dt_s: float | None = None) -> Steps:
+        """Take time over, and move it by so many steps, by one call: see :class:`Steps`. ValueRangeError."""
+        return Steps(self._stub.Steps, self.target, count, dt_s)
+
+    def set_step_size(self, dt_s: float) -> Clock:
+        """How far a step goes that does not say it; takes time over. CommandError, ValueRangeError."""
+        return Clock.of(self._call(self._stub.SetStepSize, wire.SetStepSizeRequest(dt_ns=calls.ns(dt_s))))
+
+    def play(self, rate: float = 1.0, dt_s: float | None = None) -> Clock:
+        """Have time step by itself, ``rate`` times as fast as real time. CommandError, ValueRangeError."""
+        return Clock.of(self._call(self._stub.Play, wire.PlayRequest(dt_ns=calls.ns(dt_s), rate=rate)))
+
+    def pause(self) -> Clock:
+        """Have time step no more by itself; takes it over. CommandError."""
+        return Clock.of(self._call(self._stub.Pause, wire.PauseRequest()))
+
+    def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
+        """Move the sources that play recordings (:class:`Wish`); without a wish only tell how they play.
+
+        One that is over begins anew. ValueRangeError: a speed or a time; PathError: a source or a register;
+        CommandError: nothing is played, what is looked for is not there, or a source does not answer.
+        """
+        found = self._call(self._stub.Replay, replay.request(wish), replay.patience_s(wish))
+        return replay.told(found)
+
+    def _call(self, method: Callable[..., Any], request: Any, timeout_s: float | None = None) -> Any:
+        try:
+            return method(request, timeout=timeout_s or self._timeout_s, metadata=self.target.metadata)
+        except grpc.RpcError as error:
+            self.target.fail(error)
+
+    def close(self) -> None:
+        """End all calls, and the connection."""
+        self._closed = True
+        self._channel.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Subscription(Iterator[Update]):
+    """Updates as they come; ends when it, or its client, is closed. For one thread, :meth:`close` for any."""
+
+    def __init__(self, call: Any, target: Target) -> None:
+        self._call = call
+        self._target = target
+        self._tables = Tables()
+        self._waiting: Iterator[Update] = iter(())
+        self._closed = threading.Event()
+
+    def __next__(self) -> Update:
+        """The next one, waited for. The arrays of its table change with the one after it.
+
+        RemoteError: the instance has ended; PathError, ValueRangeError, EndpointError: it refuses.
+        """
+        while True:
+            for update in self._waiting:
+                return update
+            try:
+                self._waiting = self._tables.all_of(next(self._call))
+            except grpc.RpcError as error:
+                if self._closed.is_set() or self._call.cancelled():
+                    raise StopIteration from None
+                self._target.fail(error)
+
+    def close(self) -> None:
+        """End it."""
+        self._closed.set()
+        self._call.cancel()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

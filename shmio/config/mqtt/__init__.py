@@ -1,0 +1,1 @@
+"""``[mqtt]`` of ``supervisor.toml``: its keys, their rules, TLS and accounts."""

@@ -1,0 +1,116 @@
+"""Passwords of MQTT: ours at a broker elsewhere, and those of our own broker's clients."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import hmac
+import re
+import secrets
+from collections.abc import Sequence
+from typing import Final
+
+from shmio.config.mqtt.model import MqttAccount
+from shmio.config.secret_file import read_secret
+from shmio.errors import ConfigError
+
+MAX_BYTES: Final = 1 << 20
+ROUNDS: Final = 101
+"""Of mosquitto's own hashes, as its versions up to 2.0 make them; passwords come once a connection."""
+KEY: Final = "mqtt.password_file"
+_HASH: Final = re.compile(r"\$[0-9a-z-]{1,16}\$")
+"""How a hash begins, of whatever kind."""
+
+
+def read_password(name: str) -> str:
+    """Our password: the file's first line. ConfigError; never says what is in it."""
+    password = _read(name).split("\n", 1)[0].rstrip("\r")
+    if not password:
+        raise ConfigError(f"{KEY}: {name}: its first line, the password, is empty")
+    return password
+
+
+def read_accounts(name: str, roles: Sequence[MqttAccount] = ()) -> dict[str, str]:
+    """Names and hashes of who may connect to our broker.
+
+    A line each: ``name:password``, or ``name:hash`` as mosquitto_passwd writes it. ``roles``: accounts that have to
+    have a line.
+
+    ConfigError names the line that will not do, and never says what is in it.
+    """
+    accounts: dict[str, str] = {}
+    for number, line in enumerate(_read(name).splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        user, colon, secret = line.partition(":")
+        if not colon or not user.strip() or not secret:
+            raise ConfigError(f"{KEY}: {name}: line {number}: expected name:password")
+        if user in accounts:
+            raise ConfigError(f"{KEY}: {name}: line {number}: this name has a line already")
+        if user != user.strip() or secret != secret.strip():
+            raise ConfigError(f"{KEY}: {name}: line {number}: a blank beside the colon, or at an end, would count")
+        known = _parts(secret)
+        if not known and _HASH.match(secret):
+            raise ConfigError(
+                f"{KEY}: {name}: line {number}: a hash of a kind that is not known here, or a damaged one: use "
+                "mosquitto_passwd -H sha512-pbkdf2, or write the password itself"
+            )
+        accounts[user] = secret if known else hashed(secret)
+    if not accounts:
+        raise ConfigError(f"{KEY}: {name}: it has no account: a line each, name:password")
+    for index, account in enumerate(roles):
+        if account.name is not None and account.name not in accounts:
+            raise ConfigError(f"mqtt.account[{index}].name: {account.name!r} has no line in {name}")
+    return accounts
+
+
+def hashed(password: str) -> str:
+    """A hash as mosquitto knows it: PBKDF2 with SHA-512 (mosquitto-passwd(5))."""
+    salt = secrets.token_bytes(12)
+    digest = hashlib.pbkdf2_hmac("sha512", password.encode(), salt, ROUNDS)
+    return f"$7${ROUNDS}${base64.b64encode(salt).decode()}${base64.b64encode(digest).decode()}"
+
+
+def matches(password: str, secret: str) -> bool:
+    """Whether a password is the one of such a hash."""
+    parts = _parts(secret)
+    if parts is None:
+        return False
+    rounds, salt, digest = parts
+    if rounds:
+        found = hashlib.pbkdf2_hmac("sha512", password.encode(), salt, rounds, len(digest))
+    else:
+        found = hashlib.sha512(password.encode() + salt).digest()
+    return hmac.compare_digest(found, digest)
+
+
+def _parts(secret: str) -> tuple[int, bytes, bytes] | None:
+    """(rounds, salt, digest) of a hash; 0 rounds: salted SHA-512 alone. None: it is none."""
+    fields = secret.split("$")
+    try:
+        if fields[:2] == ["", "7"] and len(fields) == 5 and 0 < int(fields[2]) <= 10_000_000:
+            return (
+                int(fields[2]),
+                _bytes(fields[3]),
+                _bytes(fields[4]),
+            )
+        if fields[:2] == ["", "6"] and len(fields) == 4:
+            return 0, _bytes(fields[2]), _bytes(fields[3])
+    except ValueError:
+        return None
+    return None
+
+
+def _bytes(text: str) -> bytes:
+    return base64.b64decode(text, validate=True)
+
+
+def _read(name: str) -> str:
+    key = f"{KEY}: {name}"
+    data = read_secret(key, name, MAX_BYTES + 1, instead="new passwords")
+    if len(data) > MAX_BYTES:
+        raise ConfigError(f"{key}: larger than {MAX_BYTES} bytes")
+    try:
+        return data.decode()
+    except UnicodeDecodeError:
+        raise ConfigError(f"{key}: not UTF-8") from None

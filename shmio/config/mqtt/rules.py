@@ -1,0 +1,191 @@
+"""The rules of ``[mqtt]``: where the broker is, who may reach it and do what there, what topics may be called."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Final
+from unicodedata import category
+
+from shmio.config.address import Address
+from shmio.config.model import Config
+from shmio.config.mqtt.model import Mqtt, MqttTopic
+from shmio.errors import ConfigError
+
+PORT: Final = 1883
+TLS_PORT: Final = 8883
+MAX_PREFIX: Final = 256
+ROLES: Final = ("read", "write")
+"""What an account of our own broker may be allowed: to subscribe, and to publish commands."""
+_ELSEWHERE: Final = ("host", "port", "username")
+"""Keys that say where a broker is that is not ours, and who we are there."""
+
+
+def check_mqtt(config: Config) -> None:
+    """Addresses, what may be reached there in plain text, and the keys that go together. ConfigError."""
+    mqtt = config.mqtt
+    if mqtt is None:
+        return
+    if mqtt.prefix is not None:
+        _check_prefix(mqtt.prefix)
+    for index, rule in enumerate(mqtt.topic):
+        _check_topic(f"mqtt.topic[{index}]", rule)
+    if mqtt.sparkplug is not None:
+        for key in ("group", "node", "primary_host"):
+            if (name := getattr(mqtt.sparkplug, key)) is not None:
+                _check_level(f"mqtt.sparkplug.{key}", name)
+    if mqtt.broker == "external":
+        _check_external(mqtt)
+    else:
+        _check_own(mqtt)
+        _check_accounts(mqtt, config.instance.name)
+
+
+def own_topics(mqtt: Mqtt, instance: str) -> list[str]:
+    """Filters of all topics that are the instance's: where nobody else publishes, and where commands come."""
+    found = [f"{mqtt.prefix or f'shmio/{instance}'}/#"]
+    if mqtt.sparkplug is not None:
+        found.append(f"spBv1.0/{mqtt.sparkplug.group}/+/{mqtt.sparkplug.node or instance}/#")
+    return found
+
+
+def resolve_mqtt(mqtt: Mqtt, config: Config) -> None:
+    """Make the section's paths absolute, and give it its prefix."""
+    mqtt.prefix = mqtt.prefix or f"shmio/{config.instance.name}"
+    if mqtt.password_file is not None:
+        mqtt.password_file = str(config.path(mqtt.password_file))
+    if mqtt.tls:
+        for field in ("ca", "certificate", "key"):
+            if name := getattr(mqtt.tls, field):
+                setattr(mqtt.tls, field, str(config.path(name)))
+
+
+def brokers(mqtt: Mqtt) -> list[Address]:
+    """The external brokers, in the order in which they are tried; ConfigError."""
+    port = mqtt.port or (PORT if mqtt.tls is None else TLS_PORT)
+    hosts = [mqtt.host] if isinstance(mqtt.host, str) else mqtt.host or []
+    found = []
+    for index, host in enumerate(hosts):
+        try:
+            if "/" in host or " " in host:
+                raise ConfigError(f"{host!r}: write the host's name or address, or host:port, and nothing else")
+            found.append(Address.parse(host if _has_port(host) else f"{host}:{port}"))
+        except ConfigError as error:
+            key = "mqtt.host" if isinstance(mqtt.host, str) else f"mqtt.host[{index}]"
+            raise ConfigError(f"{key}: {error}") from None
+    return found
+
+
+def _has_port(host: str) -> bool:
+    return re.search(r"(^|\]|[^:\]]):[0-9]+\Z", host) is not None and (host.count(":") == 1 or "]" in host)
+
+
+def _is_no_text(part: str) -> bool:
+    """Whether it has what brokers end a connection for: controls, and what is no character (MQTT 5.0, 1.5.4)."""
+    return any(category(one) == "Cc" or 0xFDD0 <= ord(one) <= 0xFDEF or ord(one) & 0xFFFE == 0xFFFE for one in part)
+
+
+def _check_level(key: str, name: str) -> None:
+    if len(name) > MAX_PREFIX or set("/+#").intersection(name) or _is_no_text(name):
+        raise ConfigError(
+            f"{key}: {name!r} is a part of a topic: at most {MAX_PREFIX} characters, all of them text, and no / + #"
+        )
+
+
+def _check_prefix(prefix: str) -> None:
+    bad = prefix.startswith("$") or "" in prefix.split("/") or set("+#").intersection(prefix)
+    if bad or len(prefix) > MAX_PREFIX or _is_no_text(prefix):
+        raise ConfigError(
+            f"mqtt.prefix: {prefix!r} cannot begin a topic: at most {MAX_PREFIX} characters, all of them text, no + "
+            "and #, no $ at its beginning, no / at its ends and no two of them together; such as shmio/a50"
+        )
+
+
+def _check_topic(key: str, rule: MqttTopic) -> None:
+    if rule.payload in ("structure", "frames"):
+        for name in ("deadband", "elements"):
+            if getattr(rule, name):
+                raise ConfigError(f'{key}.{name}: is for single registers, not for payload = "{rule.payload}"')
+
+
+def _check_external(mqtt: Mqtt) -> None:
+    if mqtt.account:
+        raise ConfigError("mqtt.account: an external broker has accounts of its own; leave it out")
+    if mqtt.listen is not None:
+        raise ConfigError('mqtt.listen: an external broker listens by itself; leave it out, or broker = "embedded"')
+    if mqtt.host is None:
+        raise ConfigError(
+            'mqtt.host: broker = "external" needs it: the broker\'s host, or host:port, or a list of them'
+        )
+    for address in brokers(mqtt):
+        if not (address.loopback or mqtt.tls or mqtt.insecure):
+            _refuse_plain_text("mqtt.host", f"{address} would be spoken to in plain text over the network")
+    if mqtt.password_file is not None and mqtt.username is None:
+        raise ConfigError("mqtt.username: a password_file needs it: the password is this user's")
+    if mqtt.tls and (mqtt.tls.certificate is None) != (mqtt.tls.key is None):
+        raise ConfigError("mqtt.tls: certificate and key go together")
+
+
+def _check_own(mqtt: Mqtt) -> None:
+    for key in _ELSEWHERE:
+        if getattr(mqtt, key) is not None:
+            raise ConfigError(f'mqtt.{key}: is for broker = "external"; with "{mqtt.broker}" there is listen')
+    if mqtt.listen is None:
+        raise ConfigError(f"mqtt.listen: this key is needed, such as 127.0.0.1:{PORT}")
+    try:
+        address = Address.parse(mqtt.listen)
+    except ConfigError as error:
+        raise ConfigError(f"mqtt.listen: {error}") from None
+    if not address.port:
+        raise ConfigError(f"mqtt.listen: {address} has no port; the usual one is {PORT}")
+    if not (address.loopback or mqtt.tls or mqtt.insecure):
+        _refuse_plain_text("mqtt.listen", f"{address} can be reached from other hosts in plain text")
+    if mqtt.tls:
+        for key in ("certificate", "key"):
+            if getattr(mqtt.tls, key) is None:
+                raise ConfigError(f"mqtt.tls.{key}: this key is needed: the broker shows its clients a certificate")
+
+
+def _refuse_plain_text(key: str, why: str) -> None:
+    raise ConfigError(f"{key}: {why}; that needs a [mqtt.tls] table, or insecure = true beside it")
+
+
+def _check_accounts(mqtt: Mqtt, instance: str) -> None:
+    names: dict[str | None, str] = {}
+    for index, account in enumerate(mqtt.account):
+        key = f"mqtt.account[{index}]"
+        if account.name in names:
+            whose = "one without a name, for who shows no account," if account.name is None else repr(account.name)
+            raise ConfigError(f"{key}.name: {whose} is already {names[account.name]}")
+        names[account.name] = key
+        if account.name is not None and mqtt.password_file is None:
+            raise ConfigError(f"{key}.name: {account.name!r} needs a password, in a line of mqtt.password_file")
+        for place, role in enumerate(account.roles):
+            if role not in ROLES:
+                raise ConfigError(f"{key}.roles[{place}]: no role {role!r}; there are: {', '.join(ROLES)}")
+        if account.publish and "write" not in account.roles:
+            raise ConfigError(f"{key}.publish: needs the role write")
+        for place, topics in enumerate(account.publish):
+            _check_filter(f"{key}.publish[{place}]", topics, own_topics(mqtt, instance))
+
+
+def _check_filter(key: str, topics: str, own: Sequence[str]) -> None:
+    levels = topics.split("/")
+    wild = any(set("+#").intersection(level) and level not in ("+", "#") for level in levels)
+    if wild or "#" in levels[:-1] or topics.startswith("$") or len(topics) > MAX_PREFIX or _is_no_text(topics):
+        raise ConfigError(
+            f"{key}: {topics!r} is no filter of topics: at most {MAX_PREFIX} characters, no $ at its beginning, + and "
+            "# as a whole level each, and # as the last; such as homeassistant/#"
+        )
+    for one in own:
+        if _overlap(levels, one.split("/")):
+            raise ConfigError(f"{key}: {topics!r} would have others publish on the instance's own topics, {one}")
+
+
+def _overlap(one: Sequence[str], other: Sequence[str]) -> bool:
+    """Whether there may be a topic that both filters match."""
+    if ["#"] in (list(one[:1]), list(other[:1])):
+        return True
+    if not one or not other:
+        return not one and not other
+    return (one[0] == other[0] or "+" in (one[0], other[0])) and _overlap(one[1:], other[1:])

@@ -1,0 +1,305 @@
+"""The declared injections of one source: taken up from commands and from the configuration, and looked at each cycle.
+
+Nothing here waits. What a cycle costs is bounded by what may be declared, and is nothing while nothing is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import secrets
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Final
+
+import msgspec
+
+from shmio.config import Declaration
+from shmio.config.declaration import complaints
+from shmio.connectors.injection.declared import MAX_HELD, Declared, declared, resumed
+from shmio.connectors.injection.layers import Bits, Now, Owner
+from shmio.connectors.injection.published import Chain, about, in_parts, lost
+from shmio.connectors.output import Image
+from shmio.errors import ConfigError, SegmentError
+from shmio.injection import Program, compile_program
+from shmio.injection.activation import State
+from shmio.injection.expression import Number
+from shmio.injection.program import NEVER, compile_condition
+from shmio.layout.values.write import Write
+from shmio.segment import NO_WRITER, Block, Command, EventKind, Frame, Quality, Record
+from shmio.segment.standing_injections import Running, Standing
+
+
+class Readings:
+    """Images of sources as of one cycle; each is fetched once, and only if a condition asks for it.
+
+    All are what the sources delivered, before any injection, so that none feeds back upon itself. Nothing is known of
+    a source whose quality is bad.
+    """
+
+    def __init__(self, own: str, image: Image, blocks: Mapping[str, Block], before: int | None) -> None:
+        """``own``: the source whose next image this is.
+
+        ``before``: the step that this is, if it is one: of others that take part in it, the image of the step before is
+        read, whoever is faster.
+        """
+        self._blocks = blocks
+        self._before = before
+        known = image.quality is not Quality.BAD and image.source_ns != 0
+        self._images: dict[str, bytes | None] = {own: image.raw if known else None}
+
+    def of(self, program: Program) -> Sequence[Number | None]:
+        """The values that a program's condition reads; None: not known."""
+        if program.condition is None:
+            return ()
+        values: list[Number | None] = []
+        for source, codec in program.condition.reads:
+            image = self._image(source)
+            value = None if image is None else codec.decode(image)
+            values.append(value if isinstance(value, bool | int | float) else None)
+        return values
+
+    def _image(self, source: str) -> bytes | None:
+        if source not in self._images:
+            block = self._blocks.get(source)
+            self._images[source] = None if block is None else _newest(block, self._before)
+        return self._images[source]
+
+
+def _newest(block: Block, before: int | None) -> bytes | None:
+    try:
+        frame = block.latest()
+        while frame is not None and before is not None and block.came_with(frame, before):
+            frame = block.read(frame.number - 1)
+    except SegmentError:
+        return None
+    if frame is None or block.retired or frame.source_ns == 0:
+        return None
+    return None if block.assess(frame)[0] is Quality.BAD else frame.raw
+
+
+SEED_BITS: Final = 53
+"""Of a seed that is drawn: any JSON reader keeps it."""
+CONFIGURED: Final = Owner(NO_WRITER, 0)
+"""Who lays what the configuration declares."""
+
+Blocks = Callable[[], Mapping[str, Block]]
+"""All blocks of the instance as of now."""
+
+_DECODER: Final = msgspec.json.Decoder(Declaration)
+
+log = logging.getLogger("shmio.source")
+
+
+class Campaign:
+    """What is declared for one source. :meth:`release` and :meth:`forget` are for the loop's thread."""
+
+    def __init__(self, chain: Chain, blocks: Blocks) -> None:
+        self._chain = chain
+        self._output = chain.output
+        self._own = chain.output.writer.block
+        self._blocks_of = blocks
+        self._blocks = dict(blocks())
+        self._configuration: int | None = None
+        self._layers: list[Declared] = []
+
+    @property
+    def crowded(self) -> str:
+        """Why no write can be taken at present; empty if one can."""
+        full = next((layer for layer in self._layers if layer.crowded), None)
+        return f"the delay of injection {full.name} holds {MAX_HELD} values already" if full else ""
+
+    @property
+    def looks_elsewhere(self) -> bool:
+        """Whether a condition reads other sources, which a reload may change."""
+        return any(layer.program.foreign for layer in self._layers)
+
+    def seen(self, frame: Frame) -> None:
+        """The last frame of the process before this one."""
+        time_ns = self._time_ns(frame.cycle) if self._own.playhead is None else frame.clock_ns
+        self._chain.injections.now = Now(frame.cycle, time_ns, frame.raw)
+
+    def resume(self, standing: Standing, running: Running, seen: Bits) -> None:
+        """Go on with one of the process before this one; ``seen``: the image that consumers saw last."""
+        owner = Owner(standing.writer, standing.pid)
+        try:
+            program = self._program(running.declaration)
+            layer = resumed(declared(standing.id, program, owner, running.seed, keep=standing.keep), running, seen)
+        except (ConfigError, ValueError) as error:
+            log.warning("injection %s is not gone on with: %s", standing.name, error)
+            return
+        self._chain.restore(layer)
+        self._settle()
+
+    def declare(self, command: Command, owner: Owner) -> str:
+        """Lay what a command declares; why not, or empty."""
+        try:
+            declaration = _DECODER.decode(b"".join(write.data for write in command.writes))
+            for complaint in complaints(declaration):
+                return complaint
+            program = self._program(declaration)
+        except (msgspec.MsgspecError, ConfigError, RecursionError) as error:
+            return str(error)
+        layer = declared(command.id, program, owner, _seed(declaration), keep=command.keep)
+        return self._lay(layer, command)
+
+    def lift(self, layer: Declared, command: Command) -> str:
+        """Lift one of the configuration's, until that changes; why not, or empty."""
+        if layer.activation.state is State.LIFTED:
+            return f"the injection {layer.name} was lifted already"
+        with self._output.turn:
+            layer.activation.state = State.LIFTED
+            self._chain.tell()
+            held = list(lost(layer, "the injection was lifted"))
+            self._output.show([*held, about(EventKind.LIFTED, layer, "lifted", command)])
+        return ""
+
+    def follow(self) -> None:
+        """Take over what has changed in the configuration and in other sources."""
+        sequence = self._own.declared.sequence
+        if sequence == self._configuration or sequence % 2:  # odd: it is just being written, and a bell follows
+            return
+        self._configuration = sequence
+        wanted = {declaration.name: declaration for declaration in self._own.declared.read()}
+        stale = {x.id for x in self._layers if x.configured and wanted.get(x.name) != x.program.declaration}
+        if stale:
+            self._chain.lift(lambda layer: layer.id in stale, "the configuration has it no more, or otherwise")
+            self.settle()
+        there = {layer.name for layer in self._layers if layer.configured}
+        for declaration in wanted.values():
+            if declaration.name not in there:
+                self._lay_configured(declaration)
+
+    def settle(self) -> None:
+        """Take notice that layers were laid or lifted."""
+        with self._output.turn:
+            self._settle()
+
+    def _settle(self) -> None:
+        self._layers = [layer for layer in self._chain.injections.layers if isinstance(layer, Declared)]
+        self._output.advance = self._advance if self._layers else None
+
+    def _lay_configured(self, declaration: Declaration) -> None:
+        try:
+            program = self._program(declaration)
+        except ConfigError as error:
+            log.warning("injection %s: %s", declaration.name, error)
+            return
+        document = msgspec.json.encode(declaration)
+        number = int.from_bytes(hashlib.sha256(document).digest()[:8], "little") | 1
+        layer = declared(number, program, CONFIGURED, _seed(declaration), keep=True)
+        if reason := self._lay(layer, None):
+            log.warning("injection %s: %s", declaration.name, reason)
+
+    def _lay(self, layer: Declared, command: Command | None) -> str:
+        with self._output.turn:
+            if reason := self._chain.lay(layer):
+                return reason
+            if self._output.advance is None:  # it is looked at from the next cycle on
+                injections = self._chain.injections
+                injections.now = injections.now._replace(cycle=self._output.cycle)
+            self._settle()
+            for record in _told(layer, command):  # it changes nothing yet, so there is no frame to be shown before
+                self._output.writer.event(record)
+        return ""
+
+    def _program(self, declaration: Declaration) -> Program:
+        """ConfigError."""
+        self._blocks = dict(self._blocks_of())
+        layouts = {source: block.layout for source, block in self._blocks.items()}
+        periods_ns = {source: block.period_ns for source, block in self._blocks.items()}
+        program = compile_program(declaration, layouts, periods_ns)
+        if program.source != self._own.source:
+            raise ConfigError(f"target: it is of source {program.source}, this is {self._own.source}")
+        return program
+
+    def rebind(self) -> None:
+        """Find the registers of conditions anew in sources that a reload has changed."""
+        if not self.looks_elsewhere:
+            return
+        blocks = dict(self._blocks_of())
+        before, self._blocks = self._blocks, blocks
+        layouts = {source: block.layout for source, block in blocks.items()}
+        for layer in self._layers:
+            if all(before.get(source) is blocks.get(source) for source in layer.program.foreign):
+                continue
+            try:
+                condition = compile_condition(layer.program.declaration.when or "", layouts)
+            except ConfigError as error:
+                log.warning("injection %s waits for ever, until the configuration is changed: %s", layer.name, error)
+                condition = NEVER
+            with self._output.turn:
+                layer.program = replace(layer.program, condition=condition)
+                layer.memory.seen.clear()
+
+    # -- in the loop's thread ------------------------------------------------------------------------------------------
+
+    def _advance(self, image: Image) -> list[Record]:
+        """Look at the next image, with the output's ``turn`` held; the events of what has changed with it.
+
+        Of several in one cycle the first is looked at: how many there are depends on how fast their writers were.
+        """
+        looked = self._chain.injections.now.cycle
+        time_ns = image.at.clock_ns if image.at else self._time_ns(image.cycle)
+        now = self._chain.injections.now = Now(image.cycle, time_ns, image.raw)
+        if image.cycle == looked:
+            return []
+        state = self._own.clock.read()
+        step = state.step if self._own.attributes.stepped and state.virtual else None
+        readings = Readings(self._own.source, image, self._blocks, step)
+        before = {layer.id: layer.active for layer in self._layers}
+        changed = [layer for layer in self._layers if layer.advance(now, readings.of(layer.program))]
+        if changed:
+            self._chain.tell()
+        turned = [_turned(layer) for layer in changed if layer.active is not before[layer.id]]
+        return [*self._chain.computed(image.base), *turned, *self._lift_finished()]
+
+    def _lift_finished(self) -> list[Record]:
+        """Lift what is over, in the cycle in which it comes to that: nobody sees anything else by it."""
+        over = {layer.id for layer in self._layers if _finished(layer)}
+        if not over:
+            return []
+        told = self._chain.removed(lambda layer: layer.id in over, "over")
+        self._settle()
+        return told
+
+    def release(self, cycle: int) -> list[tuple[Declared, Write]]:
+        """What delays over ``/in`` have held long enough, for the cycle that is about to write."""
+        if not any(layer.held for layer in self._layers):
+            return []
+        now = Now(cycle, self._time_ns(cycle), b"")
+        with self._output.turn:
+            return [(layer, write) for layer in self._layers for write in layer.due(now)]
+
+    def forget(self, reason: str) -> None:
+        """The device is gone: what delays hold is not sent later."""
+        if any(layer.held for layer in self._layers):
+            with self._output.turn:
+                records = [record for layer in self._layers for record in lost(layer, reason)]
+            for record in records:
+                self._output.writer.event(record)
+
+    def _time_ns(self, cycle: int) -> int:
+        """The instance's clock at a cycle: in wall time as the schedule has it, however punctual the cycle was."""
+        state = self._own.clock.read()
+        return state.time_ns if state.virtual else cycle * self._own.period_ns
+
+
+def _seed(declaration: Declaration) -> int:
+    return secrets.randbits(SEED_BITS) if declaration.seed is None else declaration.seed
+
+
+def _finished(layer: Declared) -> bool:
+    """Whether it can be lifted: those of the configuration stay in the list."""
+    return layer.activation.state is State.OVER and not layer.configured and not layer.held
+
+
+def _turned(layer: Declared) -> Record:
+    kind = EventKind.ACTIVATED if layer.active else EventKind.DEACTIVATED
+    return about(kind, layer, layer.name)._replace(item=layer.activation.runs)
+
+
+def _told(layer: Declared, command: Command | None) -> Iterator[Record]:
+    """The events of one that is laid: its declaration with its seed, in parts."""
+    document = msgspec.json.encode(msgspec.structs.replace(layer.program.declaration, seed=layer.seed))
+    return in_parts(about(EventKind.INJECTED, layer, layer.name, command), document)

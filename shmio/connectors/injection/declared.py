@@ -1,0 +1,163 @@
+"""A declared injection as it runs in its source's process: a layer with an operation in place of a client's values."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from shmio.connectors.injection.layers import Bits, Injection, Now, Owner, parts_of
+from shmio.injection import Program
+from shmio.injection.activation import Activation, State
+from shmio.injection.draw import Draw
+from shmio.injection.expression import Memory, Number
+from shmio.injection.operations import Delay, Drop, Moment, Operation
+from shmio.layout.values.write import Write
+from shmio.segment import NO_WRITER, Direction
+from shmio.segment.standing_injections import Running
+
+MAX_HELD: Final = 256
+"""Values that a delay over ``/in`` holds before writes are rejected."""
+
+
+class Held(NamedTuple):
+    """A write that a delay holds, and when it came."""
+
+    write: Write
+    cycle: int
+    time_ns: int
+
+
+@dataclass(kw_only=True)
+class Declared(Injection):
+    """The layer. ``writes`` counts those that have met it, over ``/in``, since it became active."""
+
+    program: Program
+    seed: int
+    activation: Activation
+    draw: Draw
+    operation: Operation
+    memory: Memory = field(default_factory=Memory)
+    writes: int = 0
+    held: deque[Held] = field(default_factory=deque)
+
+    @property
+    def given(self) -> bool:
+        """It has no client: its values come from its operation."""
+        return False
+
+    @property
+    def active(self) -> bool:
+        """Whether it changes what it covers at present."""
+        return self.activation.state is State.ACTIVE
+
+    @property
+    def configured(self) -> bool:
+        """Whether it is declared in the configuration."""
+        return self.owner.writer == NO_WRITER
+
+    @property
+    def crowded(self) -> bool:
+        """Whether it holds as much as it can."""
+        return len(self.held) >= MAX_HELD
+
+    @property
+    def running(self) -> Running:
+        """How it is, for all to see."""
+        now = self.activation
+        declaration = self.program.declaration
+        return Running(declaration, now.state.value, self.seed, now.runs, now.cycle, now.time_ns)
+
+    def advance(self, now: Now, values: Sequence[Number | None]) -> bool:
+        """Look at the next image, with the values that its condition reads; whether its state has changed."""
+        condition = self.program.condition
+        holds = condition is None or condition.expression.holds(values, self.memory)
+        runs = self.activation.runs
+        changed = self.activation.advance(now.time_ns, now.cycle, holds=holds)
+        if self.activation.runs != runs:
+            self.operation.begin()
+            self.writes = 0
+        return changed
+
+    def show(self, image: Bits, now: Now) -> None:
+        """Put into an image what the operation makes of the covered bits."""
+        at = self._moment(now.cycle - self.activation.cycle, now)
+        if not self._happens(at):
+            self.operation.passed(image, at)
+            return
+        changed = image.copy()
+        self.operation.apply(changed, at)
+        image ^= (image ^ changed) & self.cover
+
+    def meet(self, write: Write, bits: Bits, now: Now) -> bytes | None:
+        """What becomes of these bits of a write toward the device: changed, lost, or held to be sent later."""
+        at = self._moment(self.writes, now)
+        self.writes += 1
+        if not self._happens(at):
+            return write.data
+        if isinstance(self.operation, Drop):
+            return None
+        if isinstance(self.operation, Delay):
+            self.held += (Held(part, now.cycle, now.time_ns) for part in parts_of(write, bits))
+            return None
+        span = slice(write.offset, write.offset + len(write.data))
+        image = np.frombuffer(now.raw, np.uint8).copy()
+        old = np.frombuffer(write.data, np.uint8)
+        image[span] ^= (image[span] ^ old) & (write.mask or 0xFF)
+        self.operation.apply(image, at)
+        return bytes(old ^ (old ^ image[span]) & bits)
+
+    def due(self, now: Now) -> list[Write]:
+        """What it has held long enough; ``now`` is the cycle that is about to write."""
+        due: list[Write] = []
+        if not isinstance(self.operation, Delay):
+            return due
+        at = self._moment(0, now)
+        while self.held:
+            write, cycle, time_ns = self.held[0]
+            # Without the delay, the cycle after the one that it came in would have written it.
+            if at.cycle <= cycle or not self.operation.due(cycle + 1, time_ns, at):
+                break
+            due.append(write)
+            self.held.popleft()
+        return due
+
+    def _moment(self, place: int, now: Now) -> Moment:
+        return Moment(self.activation.runs, place, now.cycle, now.time_ns)
+
+    def _happens(self, at: Moment) -> bool:
+        probability = self.program.declaration.probability
+        return probability is None or self.draw.happens(probability, at.run, at.place)
+
+
+def declared(number: int, program: Program, owner: Owner, seed: int, *, keep: bool) -> Declared:
+    """A layer that nobody has seen yet."""
+    declaration = program.declaration
+    draw = Draw(seed, declaration.name)
+    return Declared(
+        number,
+        Direction.IN if program.direction == "in" else Direction.OUT,
+        declaration.priority,
+        keep,
+        declaration.name,
+        owner,
+        program.cover,
+        np.empty(0, np.uint8),
+        program=program,
+        seed=seed,
+        activation=Activation(program.window),
+        draw=draw,
+        operation=program.operate(draw),
+    )
+
+
+def resumed(layer: Declared, running: Running, seen: Bits) -> Declared:
+    """The layer as the process before this one had it; ``seen``: the image that consumers saw last."""
+    state = State(running.state)
+    layer.activation = Activation(layer.program.window, state, running.runs, running.cycle, running.time_ns)
+    if layer.active and layer.direction is Direction.OUT:
+        layer.operation.resume(seen)
+    return layer

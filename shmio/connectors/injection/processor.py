@@ -1,0 +1,154 @@
+"""Carries out the commands about injections, in the thread that judges commands; lifts those whose client is gone."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from shmio.connectors.injection.campaign import Blocks, Campaign
+from shmio.connectors.injection.declared import Declared
+from shmio.connectors.injection.layers import Injection, Injections, Owner, covering, shadow
+from shmio.connectors.injection.published import Chain, about, pieces
+from shmio.connectors.output import Output
+from shmio.segment import Command, CommandKind, Direction, EventKind
+
+LOOK_NS: Final = 400_000_000
+"""How often it is looked whether the clients are still there: a shadow is to go within a second."""
+
+OwnerOf = Callable[[int], Owner | None]
+"""The process that has a command queue at present; None: nobody."""
+
+
+class Injector:
+    """Lays, feeds and lifts the injections of one source."""
+
+    def __init__(self, output: Output, writable: bytes, refuse_in: str, owner_of: OwnerOf, blocks: Blocks) -> None:
+        """``writable``: the bits that commands may write; ``refuse_in``: why nothing may be laid over ``/in``."""
+        self._output = output
+        self._writer = output.writer
+        self._owner_of = owner_of
+        self._look_ns = 0  # of CLOCK_MONOTONIC, whatever clock the source has: clients live by that
+        self._chain = Chain(output, writable, refuse_in)
+        self.campaign = Campaign(self._chain, blocks)
+        self._resume()
+        self.campaign.follow()
+
+    @property
+    def injections(self) -> Injections:
+        """All there are."""
+        return self._output.injections
+
+    @property
+    def patience_ns(self) -> int:
+        """How long until :meth:`look` has something to do; negative: there is nothing to look after."""
+        if all(layer.keep for layer in self.injections.layers) and not self.campaign.looks_elsewhere:
+            return -1
+        return max(0, self._look_ns - time.monotonic_ns())
+
+    def toward_device(self, command: Command) -> Injection | None:
+        """The injection over ``/in`` whose values a command carries; None: it carries no such values."""
+        layer = self.injections.find(command.injection) if command.kind is CommandKind.SHADOW else None
+        if layer is None or layer.direction is not Direction.IN or isinstance(layer, Declared):
+            return None
+        return layer
+
+    def take(self, command: Command) -> str:
+        """Carry out INJECT, DECLARE, LIFT, or SHADOW for what lies over ``/out``; why not, or empty."""
+        if command.kind in (CommandKind.INJECT, CommandKind.DECLARE):
+            owner = self._owner_of(command.writer)
+            if owner is None:
+                return "nobody has the command queue that it came by"
+            if command.kind is CommandKind.DECLARE:
+                return self.campaign.declare(command, owner)
+            return self._lay(command, owner)
+        layer = self.injections.find(command.injection)
+        if layer is None:
+            return f"there is no injection {command.injection}; it may have been lifted"
+        if command.kind is not CommandKind.LIFT:
+            return self._shadow(layer, command)
+        if isinstance(layer, Declared) and layer.configured:
+            return self.campaign.lift(layer, command)
+        self._chain.lift(lambda other: other is layer, "lifted", command)
+        self.campaign.settle()
+        return ""
+
+    def look(self) -> None:
+        """Follow the configuration; at most every ``LOOK_NS`` see what others have done.
+
+        Lift what nobody keeps and whose client is gone; find anew what conditions read in sources that have changed.
+        """
+        self.campaign.follow()
+        if self.patience_ns != 0:
+            return
+        self._look_ns = time.monotonic_ns() + LOOK_NS
+        self.campaign.rebind()
+        gone = {
+            layer.id
+            for layer in self.injections.layers
+            if not layer.keep and self._owner_of(layer.owner.writer) != layer.owner
+        }
+        if gone:
+            self._chain.lift(lambda layer: layer.id in gone, "its client is gone")
+            self.campaign.settle()
+
+    def _lay(self, command: Command, owner: Owner) -> str:
+        try:
+            cover = covering(self._writer.block.layout.size, command.writes)
+        except ValueError as error:
+            return str(error)
+        with self._output.turn:
+            layer = Injection(
+                command.id, command.direction, command.priority, command.keep, command.name, owner, cover, cover
+            )
+            if reason := self._chain.lay(layer):
+                return reason
+            layer.values = self.injections.before(self._output.base, layer)
+            above = [layer, *self.injections.outer(layer)] if layer.direction is Direction.OUT else []
+            end = about(EventKind.INJECTED, layer, command.name)
+            self._output.show([*self._chain.beneath(above, end), *self._chain.laid(layer, end)])
+        return ""
+
+    def _shadow(self, layer: Injection, command: Command) -> str:
+        if isinstance(layer, Declared):
+            return f"the injection {layer.name} is declared: it takes no values from others"
+        with self._output.turn:
+            if reason := shadow(layer, command.writes):
+                return reason
+            diverted = [
+                record
+                for place, write in enumerate(command.writes)
+                for other, parts in self.injections.onward(self._output.base, layer, write)
+                for record in pieces(EventKind.DIVERTED, command, place, parts, other)
+            ]
+            shadowed = [
+                record
+                for place, write in enumerate(command.writes)
+                for record in pieces(EventKind.SHADOWED, command, place, [write], layer)
+            ]
+            self._output.show(diverted + shadowed)
+        return ""
+
+    def _resume(self) -> None:
+        """Go on with what stood when the source's process before this one ended: consumers see the same values on."""
+        block = self._writer.block
+        last = block.latest()
+        seen = np.frombuffer(last.image if last else bytes(block.layout.size), np.uint8)
+        if last is not None:
+            self.campaign.seen(last)
+        for standing in block.standing.read():
+            if standing.running is not None:
+                self.campaign.resume(standing, standing.running, seen)
+                continue
+            cover = np.zeros(block.layout.size, np.uint8)
+            for offset, size, mask in standing.ranges:
+                cover[offset : offset + size] = mask
+            direction = Direction.IN if standing.direction == "in" else Direction.OUT
+            self._chain.restore(
+                Injection(
+                    standing.id, direction, standing.priority, standing.keep, standing.name,
+                    Owner(standing.writer, standing.pid), cover, seen.copy(),
+                )
+            )  # fmt: skip

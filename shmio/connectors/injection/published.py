@@ -1,0 +1,198 @@
+"""The injections of one source as all others see them: what stands in the segment, and events when that changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from shmio.connectors.commands.batch import Item
+from shmio.connectors.injection.declared import Declared
+from shmio.connectors.injection.layers import Injection, Injections
+from shmio.connectors.output import Output
+from shmio.layout.values.write import Write
+from shmio.segment import NO_WRITER, Command, Direction, EventKind, Record
+from shmio.segment.events import EVENT_DATA_SIZE
+from shmio.segment.standing_injections import Standing, encode, ranges_of
+
+GROWTH: Final = 64
+"""What an injection may take in the segment beyond what it did when it was laid: its numbers grow."""
+
+
+class Chain:
+    """Lays and lifts, whoever asks for it."""
+
+    def __init__(self, output: Output, writable: bytes, refuse_in: str) -> None:
+        """``writable``: the bits that commands may write; ``refuse_in``: why nothing may be laid over ``/in``."""
+        self.output = output
+        self._writable = np.frombuffer(writable, np.uint8)
+        self._refuse_in = refuse_in
+        self._shown: dict[int, tuple[object, bytes]] = {}  # by number: what it was made from, and the JSON
+        self._ranges: dict[int, tuple[tuple[int, int, int], ...]] = {}
+        self._computed: dict[int, list[Write]] = {}  # by number: what was told last of what declared ones give it
+
+    @property
+    def injections(self) -> Injections:
+        """All there are."""
+        return self.output.injections
+
+    def lay(self, layer: Injection) -> str:
+        """Add a layer, with the output's ``turn`` held; why not, or empty."""
+        if layer.direction is Direction.IN:
+            if self._refuse_in:
+                return self._refuse_in
+            if (layer.cover & ~self._writable).any():
+                return "it covers what is not writable; name that in the source's `writable`"
+        if reason := self.injections.lay(layer):
+            return reason
+        self._ranges[layer.id] = ranges_of(layer.cover.tobytes())
+        try:
+            self.tell(growth=GROWTH * len(self.injections.layers))
+        except ValueError as error:
+            self.injections.lift(lambda other: other is layer)
+            return str(error)
+        return ""
+
+    def restore(self, layer: Injection) -> None:
+        """Go on with a layer of the process before this one, of which everybody knows."""
+        self._ranges[layer.id] = ranges_of(layer.cover.tobytes())
+        self.injections.lay(layer)
+
+    def lift(self, which: Callable[[Injection], bool], reason: str, command: Command | None = None) -> None:
+        """Remove layers and tell why."""
+        with self.output.turn:
+            self.output.show(self.removed(which, reason, command))
+
+    def removed(self, which: Callable[[Injection], bool], reason: str, command: Command | None = None) -> list[Record]:
+        """Remove layers, with the output's ``turn`` held; the events that tell why."""
+        gone = [layer for layer in self.injections.layers if which(layer)]
+        above = {other.id for layer in gone for other in self.injections.outer(layer)}
+        self.injections.lift(which)
+        for layer in gone:
+            self._shown.pop(layer.id, None)
+            self._ranges.pop(layer.id, None)
+            self._computed.pop(layer.id, None)
+        self.tell()
+        ends = [about(EventKind.LIFTED, layer, reason, command) for layer in gone]
+        held = [record for layer in gone if isinstance(layer, Declared) for record in lost(layer, reason)]
+        left = [layer for layer in self.injections.layers if layer.id in above]
+        return [*held, *self.beneath(left, ends[0]), *ends] if ends else []
+
+    def beneath(self, layers: Iterable[Injection], end: Record) -> Iterator[Record]:
+        """What clients' layers over ``/out`` get by now from those further in.
+
+        It is told before ``end``, which is why it changed.
+        """
+        for layer in layers:
+            told = Record(EventKind.DIVERTED, layer.name, end.writer, end.command, injection=layer.id)
+            yield from _parts(told, self.injections.beneath(self.output.base, layer))
+
+    def computed(self, base: bytes) -> Iterator[Record]:
+        """What clients' layers over ``/out`` get by now from declared ones further in, if it has changed.
+
+        No command brings it: its number is 0, and each event is the item-th of so many items.
+        """
+        for layer in self.injections.layers:
+            inner = self.injections.inner(layer) if layer.given else []
+            if not any(isinstance(one, Declared) and (one.cover & layer.cover).any() for one in inner):
+                self._computed.pop(layer.id, None)
+                continue
+            writes = self.injections.beneath(base, layer)
+            if writes != self._computed.get(layer.id):
+                self._computed[layer.id] = writes
+                parts = list(_parts(Record(EventKind.DIVERTED, layer.name, injection=layer.id), writes))
+                yield from (part._replace(item=item, items=len(parts)) for item, part in enumerate(parts))
+
+    def laid(self, layer: Injection, end: Record) -> Iterator[Record]:
+        """The events that a client's layer was laid: which way, over what, for how long."""
+        how = {
+            "direction": layer.direction.name.lower(),
+            "priority": layer.priority,
+            "keep": layer.keep,
+            "ranges": self._ranges[layer.id],
+        }
+        return in_parts(end, msgspec.json.encode(how))
+
+    def tell(self, growth: int = 0) -> None:
+        """Say in the segment what stands, with the output's ``turn`` held.
+
+        ValueError: it is too much, or would be with so many bytes more.
+        """
+        items = (self._item(layer) for layer in self.injections.layers)
+        self.output.writer.block.standing.write(encode(items, growth))
+
+    def _item(self, layer: Injection) -> bytes:
+        running = layer.running if isinstance(layer, Declared) else None
+        shown = self._shown.get(layer.id)
+        if shown is None or shown[0] != running:
+            standing = Standing(
+                layer.id, layer.direction.name.lower(), layer.priority, layer.keep, layer.name,
+                layer.owner.writer, layer.owner.pid, self._ranges[layer.id], running,
+            )  # fmt: skip
+            shown = self._shown[layer.id] = running, msgspec.json.encode(standing)
+        return shown[1]
+
+
+def meet(
+    output: Output, command: Command, above: Injection | None
+) -> tuple[list[tuple[Item, Injection | None]], list[Item]]:
+    """Let a command's items meet the injections below ``above``, and tell of what these get.
+
+    What is left for the device, each with the injection whose values these are by now, if one's; and the items of which
+    nothing is left.
+    """
+    left: list[tuple[Item, Injection | None]] = []
+    taken: list[Item] = []
+    for place, write in enumerate(command.writes):
+        if not output.injections.layers:
+            left.append((Item(command, place), None))
+            continue
+        with output.turn:
+            met, bits, data, by = output.injections.divert(write, above)
+        for layer, parts in met:
+            for record in pieces(EventKind.DIVERTED, command, place, parts, layer):
+                output.writer.event(record)
+        if not met:
+            left.append((Item(command, place), above))
+        elif any(bits):
+            changed_by = (by.name or str(by.id)) if by and data != write.data else ""
+            left.append((Item(command, place, bits, data, changed_by), by or above))
+        else:
+            taken.append(Item(command, place))
+    return left, taken
+
+
+def lost(layer: Declared, reason: str) -> Iterator[Record]:
+    """The events of what a delay held and will not send."""
+    reason = f"a delay held it: {reason}"
+    while layer.held:
+        offset, mask, data = layer.held.popleft().write
+        yield Record(EventKind.EXPIRED, reason, NO_WRITER, layer.id, 0, 1, offset, mask, len(data), b"", layer.id)
+
+
+def pieces(
+    kind: EventKind, command: Command, place: int, writes: Iterable[Write], layer: Injection | None
+) -> Iterator[Record]:
+    """Events that tell of parts of an item with their data; several if these are long."""
+    name, number = (layer.name, layer.id) if layer else ("", 0)
+    return _parts(Record(kind, name, command.writer, command.id, place, 1, injection=number), writes)
+
+
+def _parts(told: Record, writes: Iterable[Write]) -> Iterator[Record]:
+    for offset, mask, data in writes:
+        for start in range(0, len(data), EVENT_DATA_SIZE):
+            part = data[start : start + EVENT_DATA_SIZE]
+            yield told._replace(offset=offset + start, mask=mask, size=len(part), data=part)
+
+
+def in_parts(told: Record, document: bytes) -> Iterator[Record]:
+    """The events of an injection that is laid: how, as JSON in parts."""
+    yield from _parts(told, [Write(0, 0, document)])
+
+
+def about(kind: EventKind, layer: Injection, text: str, command: Command | None = None) -> Record:
+    """An event about an injection; with the command that asked for it, if it was not the injection's own."""
+    writer, number = (layer.owner.writer, layer.id) if command is None else (command.writer, command.id)
+    return Record(kind, text, writer, number, 0, 1, injection=layer.id)

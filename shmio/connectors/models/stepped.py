@@ -1,0 +1,267 @@
+"""The loop that runs what is computed: on its schedule in wall time, step by step in virtual time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from typing import Final, Protocol
+
+from shmio.connectors.commands.processor import CommandDesk
+from shmio.connectors.injection.campaign import Blocks
+from shmio.connectors.injection.processor import OwnerOf
+from shmio.connectors.models.computed import Computed
+from shmio.connectors.models.inputs import Inputs
+from shmio.connectors.output import Image, Output
+from shmio.connectors.schedule import Schedule
+from shmio.connectors.source_status import Condition, Counters
+from shmio.errors import ShmioError
+from shmio.layout.values.write import Write
+from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
+from shmio.segment.clock import ClockPage
+
+RESTARTED: Final = "its process was started anew within this step; it goes on with the next one"
+
+
+class StepClock(Protocol):
+    """Time and news as the loop sees them; tests bring their own."""
+
+    def now_ns(self) -> int:
+        """CLOCK_MONOTONIC."""
+
+    def wait_ns(self, duration_ns: int | None) -> bool:
+        """Wait for news, at most so long; True as soon as the loop is to stop."""
+
+    def nudge(self) -> None:
+        """There is news; from any thread."""
+
+
+class PageClock:
+    """The loop's clock in a live instance; news come by the bell that the clock page has for the process."""
+
+    def __init__(self, page: ClockPage, slot: int) -> None:
+        self._bell = page.slot_bell(slot)
+        self._seen = self._bell.value()
+        self._stopped = False
+
+    def now_ns(self) -> int:
+        """CLOCK_MONOTONIC."""
+        return time.monotonic_ns()
+
+    def wait_ns(self, duration_ns: int | None) -> bool:
+        """Wait for news, at most so long; True as soon as the loop is to stop.
+
+        What rings while the loop looks at the news of one wait ends the next.
+        """
+        if not self._stopped and (duration_ns is None or duration_ns > 0):
+            self._seen = self._bell.wait(self._seen, -1 if duration_ns is None else duration_ns)
+        return self._stopped
+
+    def nudge(self) -> None:
+        """End a wait."""
+        self._bell.ring()
+
+    def stop(self) -> None:
+        """Make the loop stop; from any thread."""
+        self._stopped = True
+        self.nudge()
+
+
+class SteppedLoop:
+    """Runs one source that is computed: publishes its frames, and hands on what is to be written.
+
+    In virtual time the frame of a step is the answer to it, so there is always one; a bad one says why it failed.
+    """
+
+    def __init__(
+        self,
+        source: Computed,
+        writer: BlockWriter,
+        schedule: Schedule,
+        clock: StepClock,
+        writable: Iterable[str] = (),
+        *,
+        allow_nonfinite: Iterable[str] = (),
+        inputs: Inputs | None = None,
+        owner_of: OwnerOf = lambda _: None,
+        blocks: Blocks | None = None,
+    ) -> None:
+        """``writable``: patterns of what commands may write. ``inputs``: of the source's connections, if it has any."""
+        self._source = source
+        source.attach(writer)
+        self._writer = writer
+        self._page = writer.block.clock
+        writer.utc_ns = self._page.utc_ns
+        self._schedule = schedule
+        self._clock = clock
+        self._inputs = inputs
+        self._output = Output(writer, clock.now_ns)
+        # Whatever is injected here reaches no plant, so that no arming is needed.
+        self.desk = CommandDesk(
+            self._output, writable, clock.now_ns, allow_nonfinite=allow_nonfinite, armed=True, owner_of=owner_of,
+            blocks=blocks, accepted=clock.nudge,
+        )  # fmt: skip
+        self._condition = Condition(writer)
+        self._handled = 0  # the last step computed, or passed over
+        self._cycle: int | None = None  # the last one computed in wall time
+        self._published = False
+        self.counters = Counters()
+
+    @property
+    def note(self) -> str:
+        """Why quality is not good; empty if it is."""
+        return self._condition.note
+
+    def run(self) -> None:
+        """Compute until the clock says stop; then tell the readers."""
+        try:
+            self._begin()
+            while not (self._live() if self._page.read().virtual else self._free_run()):
+                pass
+        finally:
+            self.desk.stop()
+            reason = "the source was stopped"
+            self.desk.close(reason)
+            self._fail(self._writer.cycle, reason)
+            self._writer.event(Record(EventKind.STOPPED))
+
+    def _begin(self) -> None:
+        """Go on from what the process before this one has left."""
+        last = self._writer.block.latest()
+        if self._output.source_ns:
+            self._source.resume(self._output.raw)
+        self.desk.open()
+        self.counters.connects += 1
+        state = self._page.read()
+        if not state.virtual:
+            return
+        self._writer.cycle, self._handled = state.step, state.step
+        self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
+        if state.stepping and last is None:
+            self._handled -= 1  # nothing is lost: it takes part
+        elif state.stepping and last is not None and last.cycle < state.step:
+            self._fail(state.step, RESTARTED)
+        else:
+            self._show(state.step)
+
+    # ---- wall time -----------------------------------------------------------------------------------------------
+
+    def _free_run(self) -> bool:
+        """Wait for the next cycle of the schedule and compute it; True: told to stop."""
+        due = self._schedule.next(self._clock.now_ns())
+        self.counters.overruns += due.skipped
+        while (now_ns := self._clock.now_ns()) < due.due_ns:
+            wait_ns = due.due_ns - now_ns
+            if self._source.prompt and self.desk.waiting:
+                if now_ns >= self._output.next_ns:
+                    self._writer.cycle = max(0, due.cycle - 1)
+                    self._carry_out()
+                    continue
+                wait_ns = min(wait_ns, self._output.next_ns - now_ns)
+            if self._clock.wait_ns(wait_ns):
+                return True
+            if self._page.read().virtual:
+                return False
+        if self._clock.wait_ns(0):
+            return True
+        if self._page.read().virtual:  # looked at after the time: see Coordinator.take_over
+            return False
+        if now_ns >= self._schedule.due_ns(due.cycle + 1):  # held up while it waited
+            self.counters.overruns += 1
+            return False
+        period_ns = self._writer.block.period_ns
+        passed = 1 if self._cycle is None else due.cycle - self._cycle
+        self._cycle = due.cycle
+        self._compute(due.cycle, due.cycle * period_ns, passed * period_ns)
+        return False
+
+    # ---- virtual time --------------------------------------------------------------------------------------------
+
+    def _live(self) -> bool:
+        """Do the step that is asked for, or what came between two; else wait. True: told to stop."""
+        state = self._page.read()
+        if state.stepping and state.step != self._handled:
+            self._handled = state.step
+            self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
+            self._compute(state.step, state.time_ns, state.dt_ns)
+        elif not state.stepping:
+            self._handled = self._writer.cycle = state.step
+            self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
+            if self._source.news():
+                self._show(state.step)
+        wait_ns = None
+        if self.desk.waiting:
+            wait_ns = max(0, self._output.next_ns - self._clock.now_ns()) if self._source.prompt else 0
+            if not wait_ns:
+                self._carry_out()
+        return self._clock.wait_ns(wait_ns)
+
+    # ---- both ----------------------------------------------------------------------------------------------------
+
+    def _compute(self, cycle: int, time_ns: int, dt_ns: int) -> None:
+        """One cycle, or one step."""
+        self._writer.cycle = cycle
+        self._published = False
+        self.desk.release(cycle)
+        self._carry_out()
+        if self._published:
+            return  # a source that shows at once what is written has no more to say
+        begun_ns, asked_ns = self._clock.now_ns(), self._writer.now_ns()
+        try:
+            raw, doubt = self.counters.watch(self._clock.now_ns, lambda: self._step(time_ns, dt_ns))
+        except ShmioError as error:
+            self.counters.failures += 1
+            self._fail(cycle, str(error))
+        else:
+            self.counters.round_trip_us = (self._clock.now_ns() - begun_ns) // 1000
+            self._publish(raw, asked_ns, doubt)
+
+    def _step(self, time_ns: int, dt_ns: int) -> tuple[bytes, str]:
+        doubt = ""
+        if self._inputs is not None:
+            values, doubt = self._inputs.read(self._handled if self._in_virtual_time else None)
+            self._source.connect(values, doubt)
+        return self._source.step(time_ns, dt_ns), doubt
+
+    @property
+    def _in_virtual_time(self) -> bool:
+        return self._writer.at_ns is not None
+
+    def _show(self, cycle: int) -> None:
+        """Publish how the source is without a step."""
+        try:
+            self._publish(self._source.begin(), self._writer.now_ns())
+        except ShmioError as error:
+            self._fail(cycle, str(error))
+
+    def _carry_out(self) -> None:
+        """Hand over all that was accepted."""
+        self.desk.settle()
+        if self.desk.waiting:
+            self.desk.carry_out(self._write)
+
+    def _write(self, writes: Sequence[Write]) -> list[str]:
+        """Hand over what is to be written; of a prompt source the frame that shows it comes before the outcomes."""
+        refusals = self._source.write(writes)
+        if self._source.prompt:
+            self._publish(self._source.begin(), self._writer.now_ns())
+        return refusals
+
+    def _publish(self, raw: bytes, asked_ns: int, doubt: str = "") -> None:
+        quality = Quality.UNCERTAIN if doubt else Quality.GOOD
+        cycle = self._writer.cycle
+        self._condition.tell(quality, doubt, cycle)
+        image = Image(raw, cycle, self._utc_ns(), quality, Provenance.SIMULATED, doubt, asked_ns)
+        self._output.publish(image)
+        self._published = True
+        self.counters.polls += 1
+
+    def _fail(self, cycle: int, reason: str) -> None:
+        """Publish a bad frame with the last image: in virtual time always, else for each new reason."""
+        new = self._condition.tell(Quality.BAD, reason, cycle)
+        if new or self._in_virtual_time:
+            raw, source_ns = self._output.raw, self._output.source_ns
+            self._output.publish(Image(raw, cycle, source_ns, Quality.BAD, Provenance.SIMULATED, reason))
+
+    def _utc_ns(self) -> int:
+        """The time of an image: of its step, not of when that was computed."""
+        return time.time_ns() if self._writer.at_ns is None else self._page.utc_ns(self._writer.at_ns)

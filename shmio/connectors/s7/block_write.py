@@ -1,0 +1,197 @@
+"""A batch of writes as jobs of several items, and what came of each write. No I/O.
+
+Jobs under way at once may be served in any order. So writes that touch the same bits never are: the batch is cut into
+waves, each of which is confirmed before the next is sent. What is in no other's way goes out at once.
+
+Nothing is sorted: items fill the jobs in the order of the writes, and jobs are sent in that order.
+"""
+
+from __future__ import annotations
+
+import struct
+from bisect import bisect_right, insort
+from collections.abc import Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+from snap7.datatypes import S7Area, S7WordLen
+from snap7.s7protocol import S7Protocol
+
+from shmio.connectors.base import Lost
+from shmio.connectors.s7 import pdu
+from shmio.connectors.s7.explain import ITEM_OK, RefusedError, explain_write
+from shmio.errors import ConnectorError
+from shmio.layout.values.write import Write
+
+MAX_ITEMS = 20  # in one job, as all known controllers take
+JOB_OVERHEAD = 12  # of a request within its PDU: header 10, parameters 2
+ITEM_OVERHEAD = 16  # address 12, head of the value 4
+_WRITE = 0x05
+_ONE_ITEM = slice(12, 24)  # the address in python-snap7's request for one item, of which the rest is the value
+
+
+def byte_item(db_number: int, start: int, data: bytes) -> tuple[bytes, bytes]:
+    """Encode address and value of bytes."""
+    return _split(S7Protocol().build_write_request(S7Area.DB, db_number, start, S7WordLen.BYTE, data))
+
+
+def bit_item(db_number: int, start: int, bit: int, value: bool) -> tuple[bytes, bytes]:
+    """Encode address and value of a single bit, which leaves the others of its byte alone."""
+    place = 8 * start + bit
+    return _split(S7Protocol().build_write_request(S7Area.DB, db_number, place, S7WordLen.BIT, bytes((value,))))
+
+
+def _split(request: bytes) -> tuple[bytes, bytes]:
+    address, value = request[_ONE_ITEM], request[_ONE_ITEM.stop :]
+    if address[:3] != b"\x12\x0a\x10" or request[10:12] != b"\x05\x01":
+        raise AssertionError("python-snap7 encodes write requests in another way than shmio knows")
+    return address, value
+
+
+def write_request(reference: int, items: Sequence[tuple[bytes, bytes]]) -> bytes:
+    """Build a job that writes these items, as ``byte_item`` and ``bit_item`` made them."""
+    parameters = bytes((_WRITE, len(items))) + b"".join(address for address, _ in items)
+    values = b"".join(value + b"\0" * (len(value) & 1) for _, value in items[:-1]) + items[-1][1]
+    header = struct.pack(">BBHHHH", 0x32, 1, 0, reference, len(parameters), len(values))
+    return pdu.data_frame(header + parameters + values)
+
+
+def parse_write_answer(frame: memoryview, count: int) -> bytes:
+    """Check the answer to a write of ``count`` items; the return code of each. RefusedError: the whole job was."""
+    data_length = pdu.check_answer(frame)
+    codes = frame[pdu.HEADER_END + 2 :]
+    if len(frame) < pdu.HEADER_END + 2 or len(codes) != data_length or frame[pdu.HEADER_END] != _WRITE:
+        raise ConnectorError("not an answer to a write")
+    if frame[pdu.HEADER_END + 1] != count or data_length != count:
+        raise ConnectorError(f"answer with {data_length} return codes, {count} items were written")
+    return bytes(codes)
+
+
+class _Item(NamedTuple):
+    write: int
+    """Index of the write it is a part of."""
+    last: int
+    """The last byte it touches."""
+    encoded: tuple[bytes, bytes]
+
+
+class BlockWrite:
+    """Jobs that may all be under way at once. Says into ``outcomes`` what the controller refused."""
+
+    def __init__(self, db_number: int, pdu_size: int, items: Sequence[_Item], outcomes: list[str]) -> None:
+        self._db_number = db_number
+        self._outcomes = outcomes
+        self._jobs = list(_fill(items, pdu_size))
+        self.count = len(self._jobs)
+        self.sent = 0
+        self._answered: set[int] = set()
+
+    @property
+    def complete(self) -> bool:
+        """Whether every job is answered."""
+        return len(self._answered) == self.count
+
+    def take(self, count: int, first: int) -> bytes:
+        """Give the next requests, with the references from ``first`` on (16 bits, wrapping)."""
+        begin, self.sent = self.sent, self.sent + count
+        return b"".join(
+            write_request((first + place) & 0xFFFF, [item.encoded for item in job])
+            for place, job in enumerate(self._jobs[begin : self.sent])
+        )
+
+    def accept(self, index: int, frame: memoryview) -> None:
+        """Take the answer to request ``index``; ConnectorError if it is not exactly one."""
+        job = self._jobs[index]
+        try:
+            codes = parse_write_answer(frame, len(job))
+        except RefusedError as refusal:
+            for item in job:
+                self._refuse(item, str(refusal))
+        else:
+            for item, code in zip(job, codes, strict=True):
+                if code != ITEM_OK:
+                    self._refuse(item, explain_write(code, self._db_number, item.last))
+        self._answered.add(index)
+
+    def unanswered(self) -> Iterator[tuple[int, Lost | None]]:
+        """For each item, the index of its write, and what is known of it if it has no answer."""
+        for index, job in enumerate(self._jobs):
+            known = None if index in self._answered else Lost.UNKNOWN if index < self.sent else Lost.UNSENT
+            for item in job:
+                yield item.write, known
+
+    def _refuse(self, item: _Item, reason: str) -> None:
+        self._outcomes[item.write] = self._outcomes[item.write] or reason
+
+
+def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list[str]) -> Iterator[BlockWrite]:
+    """Cut a batch into waves, in order. ``outcomes``: a text for each write, in which refusals are put down."""
+    wave: list[_Item] = []
+    spans: list[tuple[int, int]] = []  # of bits of the block that the wave touches, in order
+    for place, write in enumerate(writes):
+        span = _span(write)
+        if wave and _touches(spans, span):
+            yield BlockWrite(db_number, pdu_size, wave, outcomes)
+            wave, spans = [], []
+        insort(spans, span)
+        wave += _items(db_number, pdu_size, place, write)
+    if wave:
+        yield BlockWrite(db_number, pdu_size, wave, outcomes)
+
+
+def ends(outcomes: Sequence[str], begun: Iterable[BlockWrite]) -> list[str | Lost]:
+    """What became of each write of a batch when the session was lost in the last of the waves that were begun."""
+    parts: list[set[Lost | None]] = [set() for _ in outcomes]
+    for wave in begun:
+        for write, known in wave.unanswered():
+            parts[write].add(known)
+    return [_end(text, known) for text, known in zip(outcomes, parts, strict=True)]
+
+
+def _end(text: str, parts: set[Lost | None]) -> str | Lost:
+    if Lost.UNKNOWN in parts:
+        return Lost.UNKNOWN
+    if not text and None in parts and Lost.UNSENT in parts:  # done in part: neither written nor surely not
+        return Lost.UNKNOWN
+    return text if None in parts else Lost.UNSENT
+
+
+def _span(write: Write) -> tuple[int, int]:
+    if write.mask:
+        bit = 8 * write.offset + write.mask.bit_length() - 1
+        return bit, bit + 1
+    return 8 * write.offset, 8 * (write.offset + len(write.data))
+
+
+def _touches(spans: list[tuple[int, int]], span: tuple[int, int]) -> bool:
+    """Whether a span has a bit in common with any of these, which have none among them."""
+    after = bisect_right(spans, span)
+    return (after > 0 and spans[after - 1][1] > span[0]) or (after < len(spans) and spans[after][0] < span[1])
+
+
+def _items(db_number: int, pdu_size: int, place: int, write: Write) -> Iterator[_Item]:
+    if write.mask:
+        bit = write.mask.bit_length() - 1
+        value = bool(write.data[0] & write.mask)
+        yield _Item(place, write.offset, bit_item(db_number, write.offset, bit, value))
+        return
+    most = pdu_size - JOB_OVERHEAD - ITEM_OVERHEAD
+    for start in range(0, len(write.data), most):
+        data = write.data[start : start + most]
+        offset = write.offset + start
+        yield _Item(place, offset + len(data) - 1, byte_item(db_number, offset, data))
+
+
+def _fill(items: Sequence[_Item], pdu_size: int) -> Iterator[list[_Item]]:
+    """Put as many items into each job as its PDU holds, in order."""
+    job: list[_Item] = []
+    size = JOB_OVERHEAD
+    for item in items:
+        address, value = item.encoded
+        size += size & 1  # values begin at even places
+        if job and (size + len(address) + len(value) > pdu_size or len(job) == MAX_ITEMS):
+            yield job
+            job, size = [], JOB_OVERHEAD
+        job.append(item)
+        size += len(address) + len(value)
+    if job:
+        yield job

@@ -1,1 +1,0 @@
-"""What a recording holds, and reading it (docs/reference/dump-format.md). It is written by `shmio.recording`."""

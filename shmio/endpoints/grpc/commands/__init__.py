@@ -1,0 +1,1 @@
+"""Commands from gRPC clients: paths resolved, values sent to sources, outcomes returned."""

@@ -1,0 +1,240 @@
+"""The way into one block: sends values and what is to become of injections, and tells what became of each."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Unpack
+
+import msgspec
+
+from shmio.config import Declaration
+from shmio.endpoints.grpc.commands.event_follower import Ear
+from shmio.endpoints.grpc.commands.followers import Follower, Followers
+from shmio.endpoints.grpc.commands.write_subscriptions import Echo
+from shmio.endpoints.grpc.streams.wakeups import Bells
+from shmio.endpoints.in_flight import MAX_OPEN, Cost, Done, Pendings
+from shmio.errors import CommandError
+from shmio.layout.model import Register
+from shmio.layout.topic import find
+from shmio.layout.values.write import Write, merge, sizes
+from shmio.local.writer import RETIRED, Commander, Ticket
+from shmio.segment import Block, Event, EventKind
+from shmio.segment.commands import Laid
+
+
+class Inlet:
+    """Sends commands to a block's source, in order, and keeps no more under way than it can hear the end of.
+
+    For the event loop's thread.
+    """
+
+    def __init__(
+        self,
+        block: Block,
+        writer: int,
+        bells: Bells,
+        stamp: Callable[[Event], tuple[int, int]],
+    ) -> None:
+        """``writer``: the command queue of this process. ``stamp``: see :class:`Echo`."""
+        self.block = block
+        self.stamp = stamp
+        self.echo = Echo(block, stamp)
+        self.followers = Followers()
+        self._loop = asyncio.get_running_loop()
+        self._commander = Commander(block, writer)
+        self._prepared = False
+        self._preparing = asyncio.Lock()
+        self._pending = Pendings(writer)
+        self._silent = False
+        self._turn = asyncio.Lock()  # who waits for room is served in order
+        self._freed: asyncio.Future[None] | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._ear = Ear(block, bells, heed=self._heed, heeded=self._free, missed=self._missed, retired=self._retired)
+
+    @property
+    def alive(self) -> bool:
+        """Whether the block's events are being followed, as long as there are any."""
+        return self._ear.alive or self.block.retired
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing is left of it: it follows no events, and has no value under way and no stream."""
+        return not (self._ear.alive or self._pending or self._turn.locked() or self.echo.busy or self.followers.busy)
+
+    def start(self) -> None:
+        """Begin to follow the events."""
+        self._ear.start()
+
+    def stop(self) -> None:
+        """Follow them no more."""
+        self._ear.stop()
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def catch_up(self) -> None:
+        """Deliver what has been told so far, to those who listen to what is written too."""
+        self._ear.catch_up()
+
+    def ready(self, values: Mapping[str, object]) -> bool:
+        """Whether :meth:`send`, or :meth:`give`, would not have to wait."""
+        return self._prepared and not self._turn.locked() and self._has_room(self._cost(values))
+
+    async def writable(self, registers: Iterable[Register]) -> bool:
+        """Whether the configuration lets all of them be written."""
+        await self._prepare()
+        return all(map(self._commander.is_writable, registers))
+
+    async def send(
+        self,
+        values: Mapping[str, object],
+        done: Done,
+        accepted: Callable[[], None] | None = None,
+        *,
+        timeout_s: float | None = None,
+        until_accepted: bool = False,
+    ) -> None:
+        """Send values of registers, by path, as one command as soon as there is room.
+
+        ``done`` is called once, when the end of all is known, a bounded time later; ``accepted`` before, if the source
+        accepts them. CommandError: one is not writable, or the source is silent; ValueRangeError: neither is called.
+        """
+        submit = partial(self._commander.submit, values, timeout_s)
+        await self._send(submit, self._cost(values), done, accepted, until_accepted=until_accepted)
+
+    async def give(
+        self,
+        injection: int,
+        values: Mapping[str, object],
+        done: Done,
+        accepted: Callable[[], None] | None = None,
+        *,
+        raw: Sequence[Write] = (),
+    ) -> None:
+        """The same for values, and ``raw`` bytes, as an injection's; items are not values.
+
+        ``accepted`` is called of one over ``/in`` only.
+        """
+        writes = self._commander.joined(values, raw)
+        cost = Cost.of([len(write.data) for write in writes])
+        await self._send(partial(self._commander.give, injection, writes), cost, done, accepted)
+
+    def lay(self, bits: bytes, follower: Follower, done: Done, **laid: Unpack[Laid]) -> int:
+        """Have an injection laid over these bits; its number. Never waits. CommandError: not sent."""
+        writes = merge(bits, bits, [(0, len(bits))])
+        cost = Cost.of([len(write.data) for write in writes], laid.get("name", ""))
+        return self._lay(self._commander.lay(writes, **laid), cost, follower, done)
+
+    def declare(self, declaration: Declaration, follower: Follower, done: Done, *, keep: bool) -> int:
+        """Have an injection laid that the source runs by itself; its number. Never waits. CommandError: not sent."""
+        cost = Cost.of([len(msgspec.json.encode(declaration))], declaration.name)
+        return self._lay(self._commander.ask_to_declare(declaration, keep=keep), cost, follower, done)
+
+    def _lay(self, ticket: Ticket, cost: Cost, follower: Follower, done: Done) -> int:
+        self._follow_up(ticket, cost, done)
+        self.followers.add(ticket.number, follower)
+        return ticket.number
+
+    def lift(self, injection: int, done: Done) -> None:
+        """Have an injection lifted. Never waits. CommandError: not sent."""
+        self._follow_up(self._commander.ask_to_lift(injection), Cost.of(()), done)
+
+    async def _send(
+        self,
+        submit: Callable[[], Ticket],
+        cost: Cost,
+        done: Done,
+        accepted: Callable[[], None] | None,
+        *,
+        until_accepted: bool = False,
+    ) -> None:
+        async with self._turn:
+            await self._prepare()
+            while not self._has_room(cost):
+                self._freed = self._loop.create_future()
+                await self._freed
+            if self.block.retired:
+                raise CommandError(RETIRED)
+            if self._silent and self._pending:  # one at a time asks whether it is back
+                raise CommandError(
+                    f"source {self.block.source} does not answer; shmio-supervisor status says how it fares"
+                )
+            self._follow_up(submit(), cost, done, accepted, until_accepted=until_accepted)
+
+    def _follow_up(
+        self,
+        ticket: Ticket,
+        cost: Cost,
+        done: Done,
+        accepted: Callable[[], None] | None = None,
+        *,
+        until_accepted: bool = False,
+    ) -> None:
+        self._pending.add(ticket, cost, done, accepted, until_accepted=until_accepted)
+        if self._timer is None:
+            self._set_timer()
+
+    async def _prepare(self) -> None:
+        if not self._prepared:
+            async with self._preparing:  # not on the loop: for a big layout it takes seconds
+                await asyncio.to_thread(self._commander.prepare)
+                self._prepared = True
+
+    def _cost(self, values: Collection[str]) -> Cost:
+        """What a command with these costs; PathError."""
+        return Cost.of([size for path in values for size in sizes(find(self.block.layout, path))])
+
+    def _has_room(self, cost: Cost) -> bool:
+        pending = self._pending
+        fits = pending.untaken_bytes + cost.record_bytes <= self.block.commands.capacity
+        return self._silent or not pending or (fits and pending.open_events + cost.events <= MAX_OPEN)
+
+    # ---- what the source says --------------------------------------------------------------------------------
+
+    def _heed(self, event: Event) -> None:
+        for channel, message in self.echo.follow(event):
+            for listener in channel.listeners:
+                listener.deliver(message)
+        for item in self.followers.gather(event):
+            self.followers.tell(item)
+        if self._pending.hear(event):
+            self._silent = False
+            if event.kind == EventKind.STARTED:
+                self._set_timer()
+
+    def _missed(self, count: int) -> None:
+        """Ends of commands may be among it, too: these are not waited for longer than it takes to come."""
+        reason = f"{count} events of source {self.block.source} were missed"
+        self.echo.skip()
+        self.followers.skip()
+        self.echo.fail(reason)
+        self.followers.fail(reason)
+        self._pending.hurry()
+        self._set_timer()
+
+    def _retired(self) -> None:
+        self._pending.end(RETIRED)
+        self.followers.end(RETIRED)
+        self._free()
+
+    def _free(self) -> None:
+        if self._freed is not None and not self._freed.done():
+            self._freed.set_result(None)
+
+    # ---- and what it does not say ----------------------------------------------------------------------------
+
+    def _set_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        due_ns = self._pending.due_ns
+        if due_ns is not None:
+            self._timer = self._loop.call_later(max(0.0, (due_ns - time.monotonic_ns()) / 1e9), self._expire)
+
+    def _expire(self) -> None:
+        self._timer = None
+        self._silent |= self._pending.expire()
+        self._free()
+        self._set_timer()

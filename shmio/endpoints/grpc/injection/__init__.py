@@ -1,0 +1,1 @@
+"""Injections by gRPC clients of all wire versions."""

@@ -1,0 +1,1 @@
+"""The gRPC server: listeners, TLS, the guard every call passes, access, health."""

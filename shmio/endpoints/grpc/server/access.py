@@ -1,0 +1,221 @@
+"""Who is there, and what they may do: tokens, certificates and the roles of an address."""
+
+from __future__ import annotations
+
+import hmac
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Final, NamedTuple
+
+import grpc
+
+from shmio.config import Grpc
+from shmio.config.model import ROLES, Client
+from shmio.config.tokens import Secret, digest, read_tokens
+from shmio.endpoints.grpc.server.connections import peer_of
+from shmio.errors import ShmioError
+
+READ: Final = "read"
+WRITE: Final = "write"
+INJECT: Final = "inject"
+CONTROL: Final = "control"
+
+_SERVICES: Final[Mapping[str, Mapping[str, str]]] = {
+    "simulation.server.SimlogAPI": {
+        READ: "GetTopic Subscribe",
+        WRITE: "Publish",
+        INJECT: "Inject",
+        CONTROL: "setStepSize step",
+    },
+    "simlog.server.SimlogAPI": {
+        READ: "GetTopicInfo CreateSubscriber Subscribe Read",
+        WRITE: "Publish Write PublishSynch",
+        INJECT: "Inject",
+    },
+    "shmio.v1.Shmio": {
+        READ: "GetLayouts GetStatus Read Subscribe ListInjections WatchClock",
+        WRITE: "Write Simulate",
+        INJECT: "Inject Declare Lift LiftAll",
+        CONTROL: "Step Steps SetStepSize Play Pause Replay",
+    },
+    "com.ttsnetwork.simulator3.SimServerAPI": {
+        READ: "subscribe",
+        CONTROL: "step start stop pause",
+    },
+    "grpc.health.v1.Health": {READ: "Check Watch List"},
+    "grpc.reflection.v1alpha.ServerReflection": {READ: "ServerReflectionInfo"},
+}
+"""Services, and in each the calls of a role."""
+
+
+def _calls() -> Iterator[tuple[str, str]]:
+    for service, roles in _SERVICES.items():
+        for role, names in roles.items():
+            for name in names.split():
+                yield f"/{service}/{name}", role
+
+
+NEEDS: Final[Mapping[str, str]] = dict(_calls())
+"""The role that a call needs, by its full name."""
+
+
+_SCHEME: Final = "bearer "
+_NAMES: Final = ("x509_common_name", "x509_subject_alternative_name")
+_LOCAL: Final = ("unix:", "ipv4:127.", "ipv6:%5B::1%5D:", "ipv6:[::1]:")
+
+
+class DeniedError(ShmioError):
+    """A call is refused before anything of it is done; says what to do."""
+
+    def __init__(self, code: grpc.StatusCode, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+class Credentials(NamedTuple):
+    """What a client shows: the hash of its token, and the names in its certificate."""
+
+    token: bytes | None = None
+    names: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls, metadata: Iterable[tuple[str, str | bytes]], shown: Mapping[str, Iterable[bytes]] | None
+    ) -> Credentials:
+        """``metadata`` of the call, ``shown`` by the connection (its authentication context)."""
+        token = None
+        for key, value in metadata:
+            if key == "authorization":
+                text = value if isinstance(value, str) else value.decode("latin-1")
+                # An other scheme is no token of ours: it is hashed as a whole, and fits none.
+                bare = text[len(_SCHEME) :] if text.lower().startswith(_SCHEME) else text
+                token = digest(bare.strip().encode())
+        if not shown:
+            return cls(token)
+        names = [value.decode("utf-8", "replace") for key in _NAMES for value in shown.get(key, ())]
+        return cls(token, tuple(name for name in dict.fromkeys(names) if name))
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """Who is known: tokens and patterns of certificates' names. A reload replaces it."""
+
+    secrets: Sequence[Secret] = ()
+    clients: Sequence[Client] = ()
+
+    @classmethod
+    def of(cls, config: Grpc) -> Keys:
+        """Read them; ConfigError."""
+        return cls(read_tokens(config.token), tuple(config.client))
+
+    def secret(self, shown: bytes) -> Secret | None:
+        """The token of this hash; it takes as long for a wrong one as for a right one."""
+        found = None
+        for secret in self.secrets:
+            if hmac.compare_digest(secret.digest, shown):
+                found = secret
+        return found
+
+    def roles(self, names: Sequence[str]) -> frozenset[str]:
+        """Those of a certificate with these names."""
+        return frozenset(
+            role
+            for client in self.clients
+            for role in client.roles
+            if any(fnmatchcase(name, pattern) for pattern in client.patterns for name in names)
+        )
+
+
+class Door:
+    """One listening address: who may call what there. ``keys`` may be replaced at any time."""
+
+    def __init__(self, keys: Keys, anonymous: Iterable[str] = ROLES, *, takes_tokens: bool = True) -> None:
+        """``anonymous``: roles of clients that show nothing. ``takes_tokens``: False where others could read them."""
+        self.keys = keys
+        self.anonymous = frozenset(anonymous)
+        self._takes_tokens = takes_tokens
+
+    def admit(self, method: str, shown: Credentials) -> str | None:
+        """The name of the token with which a call may be made, None without one; DeniedError."""
+        needed = NEEDS.get(method)
+        if needed is None:
+            raise DeniedError(
+                grpc.StatusCode.PERMISSION_DENIED, f"{method}: this call has no role that could allow it; nobody may"
+            )
+        secret = None if shown.token is None else self._secret(shown.token)
+        if needed in self.anonymous:
+            return secret.name if secret else None
+        by_name = self.keys.roles(shown.names)
+        if needed in by_name or (secret is not None and needed in secret.roles):
+            return secret.name if secret else None
+        raise self._denial(method, needed, secret, shown, by_name)
+
+    def _secret(self, shown: bytes) -> Secret | None:
+        if not self.keys.secrets:
+            return None  # nobody asked for it
+        if not self._takes_tokens:
+            raise DeniedError(
+                grpc.StatusCode.UNAUTHENTICATED,
+                "this address is plain text that others can read, and takes no tokens: use the one with TLS, and have "
+                "this token replaced, for it is known by now",
+            )
+        secret = self.keys.secret(shown)
+        if secret is None:
+            raise DeniedError(
+                grpc.StatusCode.UNAUTHENTICATED,
+                "the token is none of [[grpc.token]]: send authorization: Bearer TOKEN with one that is; after a "
+                "change of its file, shmio-supervisor reload takes it",
+            )
+        return secret
+
+    def _denial(
+        self, method: str, needed: str, secret: Secret | None, shown: Credentials, by_name: frozenset[str]
+    ) -> DeniedError:
+        call = method.rpartition("/")[2]
+        if secret is not None:
+            who, roles, where = f"token {secret.name!r}", secret.roles | by_name, "roles in [[grpc.token]]"
+        elif by_name:
+            who, roles, where = f"the certificate of {shown.names[0]!r}", by_name, "roles in [[grpc.client]]"
+        elif self._takes_tokens and self.keys.secrets:
+            gives = f"gives {_listed(self.anonymous)}" if self.anonymous else "gives nothing"
+            return DeniedError(
+                grpc.StatusCode.UNAUTHENTICATED,
+                f"{call} needs the role {needed}, and this address {gives} without a token: send "
+                "authorization: Bearer TOKEN with one of [[grpc.token]]",
+            )
+        elif shown.names:
+            who, roles, where = f"the certificate of {shown.names[0]!r}", self.anonymous, "an entry in [[grpc.client]]"
+        else:
+            who, roles, where = "this address", self.anonymous, "its roles in [[grpc.address]]"
+        return DeniedError(
+            grpc.StatusCode.PERMISSION_DENIED,
+            f"{call} needs the role {needed}; {who} has {_listed(roles)}: {where} would have to name it",
+        )
+
+
+def holder_of(
+    peer: str, metadata: Iterable[tuple[str, str | bytes]], shown: Mapping[str, Iterable[bytes]] | None
+) -> object:
+    """Who holds what a name of its own choice stands for: who shows a token or a certificate, by that; else its host.
+
+    Equal for two connections of one client: which of its ports it came by says nothing.
+    """
+    credentials = Credentials.of(metadata, shown)
+    if credentials.token or credentials.names:
+        return credentials
+    address = peer_of(peer)
+    if peer.startswith("unix:") or (address is not None and address[0].is_loopback):
+        return "this host"
+    return peer if address is None else address[0]
+
+
+def client_of(peer: str, token: str | None) -> str:
+    """Who shares the limits of a client: a token's users; a host; on this one, a connection."""
+    if token is not None:
+        return f"token {token}"
+    return peer if peer.startswith(_LOCAL) else peer.rpartition(":")[0]
+
+
+def _listed(roles: Iterable[str]) -> str:
+    return ", ".join(role for role in ROLES if role in roles) or "none"

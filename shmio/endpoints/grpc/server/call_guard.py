@@ -1,0 +1,219 @@
+"""What every call of every service passes: who is there, how many calls there are, whether its message is one."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import aclosing
+from dataclasses import dataclass
+from typing import Any
+
+import grpc
+from google.protobuf.message import DecodeError
+
+from shmio.endpoints.grpc.server.access import Credentials, DeniedError, Door, client_of
+from shmio.endpoints.grpc.server.rejected_calls import Refusals
+
+Context = grpc.aio.ServicerContext[Any, Any]
+Handler = Any
+Decode = Callable[[bytes], Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Of calls, and connections, that are open at once, on all addresses together.
+
+    When fewer than ``reserve`` are free, only a client with fewer than ``share`` gets another: one that opens thousands
+    leaves room for the others.
+    """
+
+    connections: int = 2048
+    calls: int = 4096
+    reserve: int = 1024
+    share: int = 64
+    message_s: float = 10.0
+    """The longest time that a call may take to send the one message it consists of."""
+
+
+class _Call:
+    """One that is open. ``denial``: why it has to end, if it has to."""
+
+    __slots__ = ("client", "denial", "door", "method", "shown", "task")
+
+    def __init__(self, method: str, door: Door, shown: Credentials, client: str) -> None:
+        self.method = method
+        self.door = door
+        self.shown = shown
+        self.client = client
+        self.task = asyncio.current_task()
+        self.denial: DeniedError | None = None
+
+    def end(self, denial: DeniedError) -> None:
+        """Have it end with this."""
+        self.denial = denial
+        if self.task is not None:
+            self.task.cancel()
+
+
+class Calls:
+    """All calls that are open, whichever address they came by; for the event loop's thread."""
+
+    def __init__(self, limits: Limits | None = None) -> None:
+        self.limits = limits or Limits()
+        self.refusals = Refusals("call refused", "call")
+        self._open: set[_Call] = set()
+        self._by_client: Counter[str] = Counter()
+        self._silent: dict[_Call, float] = {}  # whose one message is waited for, and until when: the first is due first
+        self._timer: asyncio.TimerHandle | None = None
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+    def enter(self, method: str, door: Door, context: Context) -> _Call:
+        """Admit one, or DeniedError. It has to :meth:`leave`."""
+        peer = context.peer()
+        shown = Credentials.of(context.invocation_metadata() or (), context.auth_context())
+        try:
+            client = client_of(peer, door.admit(method, shown))
+            self._check(client)
+        except DeniedError as error:
+            self.refusals.add(str(error), method, peer)
+            raise
+        call = _Call(method, door, shown, client)
+        self._open.add(call)
+        self._by_client[client] += 1
+        return call
+
+    def leave(self, call: _Call) -> None:
+        """It has ended."""
+        self._open.discard(call)
+        self._by_client[call.client] -= 1
+        if not self._by_client[call.client]:
+            del self._by_client[call.client]
+
+    async def message(self, call: _Call, context: Context) -> Any:
+        """The one message of a call, or EOF. One that does not come in time ends the call."""
+        loop = asyncio.get_running_loop()
+        self._silent[call] = due_s = loop.time() + self.limits.message_s
+        if self._timer is None:  # one for all: nearly every message comes at once
+            self._timer = loop.call_at(due_s, self._end_silent)
+        try:
+            return await context.read()
+        finally:
+            self._silent.pop(call, None)
+
+    def _end_silent(self) -> None:
+        loop = asyncio.get_running_loop()
+        self._timer = None
+        for call, due_s in list(self._silent.items()):
+            if due_s > loop.time():
+                self._timer = loop.call_at(due_s, self._end_silent)
+                return
+            del self._silent[call]
+            limit = f"no message came within {self.limits.message_s:g} s"
+            call.end(DeniedError(grpc.StatusCode.DEADLINE_EXCEEDED, f"{call.method}: {limit}"))
+
+    def review(self) -> int:
+        """End the calls that would not be admitted any more; how many."""
+        ended = 0
+        for call in self._open:
+            try:
+                call.door.admit(call.method, call.shown)
+            except DeniedError as error:
+                call.end(error)
+                ended += 1
+        return ended
+
+    def _check(self, client: str) -> None:
+        limits, count = self.limits, len(self._open)
+        if count >= limits.calls:
+            raise DeniedError(
+                grpc.StatusCode.RESOURCE_EXHAUSTED,
+                f"{limits.calls} calls are open at once, which is the most: try again when others have ended",
+            )
+        if count >= limits.calls - limits.reserve and self._by_client[client] >= limits.share:
+            raise DeniedError(
+                grpc.StatusCode.RESOURCE_EXHAUSTED,
+                f"this client has {self._by_client[client]} calls open, and the last {limits.reserve} of {limits.calls}"
+                f" are for clients with fewer than {limits.share}: version 2 has one stream for all topics",
+            )
+
+
+class Gate(grpc.aio.ServerInterceptor):
+    """Stands before all calls of one listening address.
+
+    To gRPC each call is one with a stream of requests, so that who calls is known, and counted, before the first
+    message has come; and bytes that are no message end the call with a word, and nothing in the log.
+    """
+
+    def __init__(self, door: Door, calls: Calls) -> None:
+        self._door = door
+        self._calls = calls
+        self._handlers: dict[str, Handler] = {}
+
+    async def intercept_service(
+        self, continuation: Callable[[Any], Awaitable[Handler]], handler_call_details: Any
+    ) -> Handler:
+        """The call's handler, behind the gate."""
+        method: str = handler_call_details.method
+        if method not in self._handlers:
+            self._handlers[method] = self._guarded(method, await continuation(handler_call_details))
+        return self._handlers[method]
+
+    def _guarded(self, method: str, handler: Handler) -> Handler:
+        found: Any = handler  # what it has depends on its kind
+        behaviour = found.stream_stream or found.stream_unary or found.unary_stream or found.unary_unary
+        decode = handler.request_deserializer
+        many = inspect.isasyncgenfunction(behaviour)
+
+        async def run(messages: AsyncIterator[bytes], context: Context) -> Any:
+            try:
+                call = self._calls.enter(method, self._door, context)
+            except DeniedError as error:
+                await context.abort(error.code, str(error))
+            try:
+                request: Any = messages
+                if not handler.request_streaming:
+                    request = await self._message(call, decode, context)
+                elif decode is not None:
+                    request = _decoded(method, decode, messages, context)
+                if not many:
+                    return await behaviour(request, context)
+                async with aclosing(behaviour(request, context)) as responses:
+                    async for response in responses:
+                        await context.write(response)
+            except asyncio.CancelledError:
+                if call.denial is None:
+                    raise
+                await context.abort(call.denial.code, str(call.denial))
+            except grpc.aio.InternalError:  # nothing can be sent any more: its client is gone, which is no news
+                raise asyncio.CancelledError from None
+            finally:
+                self._calls.leave(call)
+
+        if handler.response_streaming:
+            return grpc.stream_stream_rpc_method_handler(run, None, handler.response_serializer)
+        return grpc.stream_unary_rpc_method_handler(run, None, handler.response_serializer)
+
+    async def _message(self, call: _Call, decode: Decode | None, context: Context) -> Any:
+        """The one message of a call."""
+        data = await self._calls.message(call, context)
+        if data is grpc.aio.EOF:
+            await context.abort(grpc.StatusCode.INVALID_ARGUMENT, f"{call.method}: the call has no message")
+        return await _parsed(call.method, decode, data, context)
+
+
+async def _decoded(method: str, decode: Decode, messages: AsyncIterator[bytes], context: Context) -> AsyncIterator[Any]:
+    async for data in messages:
+        yield await _parsed(method, decode, data, context)
+
+
+async def _parsed(method: str, decode: Decode | None, data: bytes, context: Context) -> Any:
+    try:
+        return data if decode is None else decode(data)
+    except DecodeError:
+        await context.abort(
+            grpc.StatusCode.INVALID_ARGUMENT, f"{method}: {len(data)} bytes are no message of this call"
+        )

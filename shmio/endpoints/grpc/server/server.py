@@ -1,0 +1,165 @@
+"""The server: listening addresses, TLS, limits, health and reflection."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Sequence
+from typing import Any, Final
+from urllib.parse import quote
+
+import grpc
+from grpc_health.v1 import health, health_pb2_grpc
+from grpc_reflection.v1alpha import reflection
+
+from shmio.config import Address, Tls, UnixAddress
+from shmio.config.tls import read_tls
+from shmio.config.unix_socket import SocketFile, clear
+from shmio.endpoints.grpc.server.aio_server import CoreServer
+from shmio.endpoints.grpc.server.call_guard import Calls, Gate
+from shmio.endpoints.grpc.server.descriptors import room, shortage
+from shmio.endpoints.grpc.server.health import Health
+from shmio.endpoints.grpc.server.listeners import Listener
+from shmio.endpoints.grpc.services.services import Services
+from shmio.errors import EndpointError
+
+MAX_REQUEST_BYTES = 1 << 20
+GRACE_S: Final = 0.2
+"""How long calls that are open may take to end by themselves when the endpoint stops."""
+STOP_S: Final = 2.5
+"""How long all of a stop may take: well below the time after which the supervisor kills."""
+
+log = logging.getLogger("shmio.grpc")
+
+OPTIONS = [
+    ("grpc.so_reuseport", 0),  # else a second server would take the same port in silence
+    ("grpc.max_receive_message_length", MAX_REQUEST_BYTES),
+    # A call that waited for its turn is not cancelled for it: its client knows how long it wants to wait.
+    ("grpc.server_max_unrequested_time_in_server", 3600),
+    # A client whose host vanished is noticed within half a minute.
+    ("grpc.keepalive_time_ms", 20_000),
+    ("grpc.keepalive_timeout_ms", 10_000),
+    ("grpc.http2.min_ping_interval_without_data_ms", 5_000),
+]
+
+
+class Server:
+    """All services on each of the addresses, each behind a gate."""
+
+    def __init__(self, services: Services, calls: Calls | None = None) -> None:
+        self.calls = Calls() if calls is None else calls
+        """Those that are open, on all addresses."""
+        self._services = services
+        self._health = Health()
+        self._servers: list[CoreServer] = []
+        self._files: dict[str, SocketFile] = {}
+        self._connections = 1
+        """How many each address may have."""
+        self.shortage = ""
+        """What is wrong though it serves: it has room for few."""
+        logging.getLogger("grpc._cython.cygrpc").addFilter(_is_news)
+
+    @property
+    def alive(self) -> bool:
+        """Whether all addresses are served. If not, the process has to end: a server made anew corrupts its memory."""
+        return all(server.alive for server in self._servers)
+
+    @property
+    def unknown(self) -> int:
+        """Calls of unknown names, since the start; all were refused."""
+        return sum(server.refused for server in self._servers)
+
+    async def start(self, listeners: Sequence[Listener], tls: Tls | None = None, gid: int | None = None) -> list[int]:
+        """Listen on all addresses; the ports, for those that were 0.
+
+        ``gid``: the group that may open UNIX sockets, too. ConfigError: a file of ``tls`` cannot be used.
+        EndpointError names the address in the way.
+        """
+        credentials = _credentials(tls) if tls else None
+        wanted = self.calls.limits.connections
+        connections = room(wanted)
+        if connections < wanted:
+            log.warning("at most %d connections, not %d: the hard limit of open files is too low", connections, wanted)
+        self.shortage = shortage(connections, wanted)
+        self._connections = max(1, connections // len(listeners))
+        ports = []
+        for listener in listeners:
+            server = self._server(Gate(listener.door, self.calls))
+            ports.append(self._bind(server, listener, credentials, gid))
+            self._servers.append(server)
+        for server in self._servers:
+            await server.start()
+        for service in (health.OVERALL_HEALTH, *self._services.calls):
+            self._health.set(service, serving=True)
+        return ports
+
+    async def set_source(self, source: str, good: bool) -> None:
+        """Show a source's quality as the health of ``source.<name>``."""
+        self._health.set(f"source.{source}", serving=good)
+
+    async def stop(self) -> None:
+        """Say so, end all streams, close. It takes no longer than ``STOP_S``, whatever clients do."""
+        self._health.end()
+        ends = [asyncio.create_task(server.stop(GRACE_S)) for server in self._servers]
+        if ends and (await asyncio.wait(ends, timeout=STOP_S))[1]:
+            log.warning("some calls did not end within %g s; they end with the process", STOP_S)
+        for file in self._files.values():
+            file.remove()
+
+    def _bind(
+        self, server: CoreServer, listener: Listener, credentials: grpc.ServerCredentials | None, gid: int | None
+    ) -> int:
+        address = listener.address
+        if isinstance(address, UnixAddress):
+            clear(address.path)  # gRPC itself would take it from a living process
+        try:
+            if isinstance(address, Address):
+                if credentials and listener.encrypted:
+                    port = server.add_secure_port(str(address), credentials)
+                else:
+                    port = server.add_insecure_port(str(address))
+            else:
+                self._files[address.path] = file = SocketFile(address.path, gid)
+                with file.binding() as place:
+                    port = server.add_insecure_port(f"unix:{quote(place)}")
+        except RuntimeError:
+            raise EndpointError(
+                f"grpc: cannot listen on {address}: another program has it (ss -ltnp shows which), or this host has no "
+                "such address"
+            ) from None
+        return int(port)
+
+    def _server(self, gate: Gate) -> CoreServer:
+        # No connection is told to have room for more than all calls. When 1000 wait to be looked at, gRPC breaks off
+        # some at random: clients that begin with thousands of subscriptions at once would lose some. Each method has
+        # its own queue; that of unknown names may fill up, and then is what a flood of them costs in memory.
+        most = self.calls.limits.calls
+        pending = "grpc.server.max_pending_requests"
+        options: list[tuple[str, Any]] = [
+            *OPTIONS,
+            ("grpc.max_concurrent_streams", most),
+            ("grpc.max_allowed_incoming_connections", self._connections),
+            (pending, most),
+            (f"{pending}_hard_limit", most + most // 4),
+        ]
+        server = CoreServer(options, gate)
+        for name, calls in self._services.calls.items():
+            server.add_registered_method_handlers(name, calls)
+        health_pb2_grpc.add_HealthServicer_to_server(self._health, server)
+        names = [*self._services.calls, health.SERVICE_NAME, reflection.SERVICE_NAME]
+        reflection.enable_server_reflection(names, server)
+        return server
+
+
+def _credentials(tls: Tls) -> grpc.ServerCredentials:
+    files = read_tls(tls)
+    return grpc.ssl_server_credentials(
+        [(files.key, files.certificate)],
+        root_certificates=files.client_ca,
+        require_client_auth=files.client_ca is not None,
+    )
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """What gRPC says, with a traceback, of headers that are not UTF-8 is none: any client may send them."""
+    return not str(record.msg).startswith("Invalid encoding on ")

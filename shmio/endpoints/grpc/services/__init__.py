@@ -1,0 +1,1 @@
+"""SimlogAPI versions 1 and 2, SimServerAPI, and the table of all services."""

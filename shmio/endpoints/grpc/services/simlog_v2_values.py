@@ -1,0 +1,267 @@
+"""Registers and structures as version 2 shows them: values of ``google.protobuf.Value``.
+
+A message is put together of serialised fields, which may be concatenated: what all who listen share is made once.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterable, Mapping
+from functools import lru_cache
+from typing import Any, Final
+
+import numpy as np
+from google.protobuf.struct_pb2 import NULL_VALUE, ListValue
+from google.protobuf.struct_pb2 import Value as WireValue
+
+from shmio.endpoints.grpc.commands.path_kind import Shape
+from shmio.endpoints.grpc.commands.topics import Mark
+from shmio.endpoints.grpc.streams.encoding import delimited, varint
+from shmio.endpoints.grpc.streams.subject import Picture, Subject
+from shmio.endpoints.grpc.time.virtual_time import Moment
+from shmio.errors import ValueRangeError
+from shmio.layout.model import Layout, Register
+from shmio.layout.topic import decode_segment, encode_segment, shorten
+from shmio.layout.values.codec import Value, codec
+from shmio.layout.values.scalar import scalar_codec
+from shmio.layout.values.text import from_text, wire_type
+from shmio.wire import simlog_v2_pb2 as wire
+
+MAX_ELEMENTS: Final = 1 << 16
+"""Numbers, bits or texts in one value."""
+MAX_MEMBERS: Final = 4096
+"""Registers in one structure."""
+MAX_LEVELS: Final = 24
+"""Structures within each other: the messages that hold them are three times as deep, and readers stop at 100."""
+
+_DOUBLE: Final = struct.Struct("<Bd")
+_TYPES: Final = {"bool": wire.BOOL, "double": wire.NUMBER, "int": wire.NUMBER, "string": wire.STRING}
+
+
+class Encoded:
+    """A SimlogMessage without its path: the time stamp of its header, and the fields after that."""
+
+    __slots__ = ("_last", "rest", "stamp")
+
+    def __init__(self, stamp: bytes, rest: bytes) -> None:
+        self.stamp = stamp
+        self.rest = rest
+        self._last: tuple[bytes | None, bytes] = None, b""
+
+    def __len__(self) -> int:
+        return len(self.stamp) + len(self.rest)
+
+    def under(self, path: bytes) -> bytes:
+        """The whole message; ``path``: as :func:`path_field` has it."""
+        last, whole = self._last
+        if last != path:  # most who listen say it in the same way
+            header = self.stamp + path
+            whole = b"\x0a" + varint(len(header)) + header + self.rest
+            self._last = path, whole
+        return whole
+
+
+def value_type(found: Shape) -> wire.ValueType:
+    """The type of its values."""
+    if not found.whole:
+        return wire.STRUCT
+    (register,) = found.registers
+    return wire.LIST if register.dims else _TYPES[wire_type(register)]
+
+
+def subject(found: Shape, layout: Layout) -> Subject:
+    """What to listen to for it; ValueRangeError as of :func:`encoder`."""
+    return Subject("v2", found.path, found.registers, encoder(found, layout))
+
+
+def encoder(found: Shape, layout: Layout) -> Callable[[Picture], Encoded | None]:
+    """A function from a frame to the message; None where the bytes hold no value.
+
+    ValueRangeError: it is too large, or too deep, for a message.
+    """
+    members, elements = len(found.registers), found.elements
+    if members > MAX_MEMBERS or elements > MAX_ELEMENTS:
+        raise ValueRangeError(
+            f"{shorten(found.path)}: {members} registers with {elements} elements are too much for one value, "
+            f"{MAX_MEMBERS} with {MAX_ELEMENTS} are the most; its members are topics, too"
+        )
+    head = wire.SimlogMessage(type=value_type(found)).SerializeToString() + b"\x1a"
+    serialise = _whole(found.registers[0], layout) if found.whole else _structure(found, layout)
+
+    def encode(picture: Picture) -> Encoded | None:
+        value = serialise(picture.image)
+        return None if value is None else Encoded(time_stamp(picture.clock_ns), head + delimited(value))
+
+    return encode
+
+
+def path_field(path: str) -> bytes:
+    """The path in a header."""
+    return b"\x12" + delimited(path.encode())
+
+
+@lru_cache(maxsize=64)  # a frame or two for each feed
+def time_stamp(clock_ns: int) -> bytes:
+    """The time in a header, from ns of the instance's clock."""
+    seconds, nanos = divmod(clock_ns, 1_000_000_000)
+    whole = b"\x08" + varint(seconds) if seconds else b""
+    return b"\x0a" + delimited(whole + b"\x10" + varint(nanos) if nanos else whole)
+
+
+def nothing(stamp: bytes) -> Encoded:
+    """The message of a value that there is none of."""
+    return Encoded(stamp, wire.SimlogMessage(type=wire.NULL, value=to_wire(None)).SerializeToString())
+
+
+def marked(mark: Mark, moment: Moment) -> Encoded:
+    """The message of a topic of time: a step's number, or seconds."""
+    value = moment.number if mark is Mark.STEP else moment.clock_ns / 1e9
+    message = wire.SimlogMessage(type=wire.NUMBER, value=to_wire(value))
+    return Encoded(time_stamp(moment.clock_ns), message.SerializeToString())
+
+
+def repeated(messages: Iterable[bytes]) -> bytes:
+    """A message whose field 1 is repeated."""
+    return b"".join(b"\x0a" + delimited(message) for message in messages)
+
+
+def to_wire(value: Value) -> WireValue:
+    """A decoded value: numbers are doubles, and what has no value is null."""
+    found = WireValue()
+    _put(value, found)
+    return found
+
+
+def from_wire(value: WireValue, found: Shape) -> dict[str, object]:
+    """What a client sent, by the registers' paths; of a structure, for the members that it names. ValueRangeError.
+
+    A text for what is none is read as in version 1: so all digits of a number of 64 bits arrive.
+    """
+    if found.whole:
+        (register,) = found.registers
+        return {register.path: _read(value, register)}
+    values: dict[str, object] = {}
+    by_path = {register.path: register for register in found.registers}
+    _read_members(value, found.path, by_path, values)
+    if not values:
+        raise ValueRangeError(f"{found.path}: expected a structure with some of its members, found none")
+    return values
+
+
+def _read_members(value: WireValue, path: str, by_path: Mapping[str, Register], values: dict[str, object]) -> None:
+    """Collect what a structure gives; no deeper than the registers' paths are."""
+    if value.WhichOneof("kind") != "struct_value":
+        raise ValueRangeError(f"{path}: expected a structure")
+    for name, member in value.struct_value.fields.items():
+        inner = f"{path}/{encode_segment(name)}"
+        if inner in by_path:
+            values[inner] = _read(member, by_path[inner])
+        elif any(other.startswith(f"{inner}/") for other in by_path):
+            _read_members(member, inner, by_path, values)
+        else:
+            raise ValueRangeError(f"{shorten(inner)}: the structure has no such member")
+
+
+def _read(value: WireValue, register: Register) -> object:
+    kind = value.WhichOneof("kind")
+    if kind == "string_value" and (register.dims or wire_type(register) != "string"):
+        return from_text(value.string_value, register)
+    return _plain(value, register.path)
+
+
+def _plain(value: WireValue, name: str) -> object:
+    kind = value.WhichOneof("kind")
+    if kind == "list_value":
+        return [_plain(item, name) for item in value.list_value.values]
+    if kind in ("number_value", "bool_value", "string_value"):
+        plain: object = getattr(value, kind)
+        return plain
+    raise ValueRangeError(f"{name}: expected a value, found {'a structure' if kind == 'struct_value' else 'none'}")
+
+
+def _whole(register: Register, layout: Layout) -> Callable[[bytes], bytes | None]:
+    """A function from an image to a serialised Value; None for bytes that are no value."""
+    element, order = register.element, layout.byte_order
+    code = "" if element.base == "BOOL" else scalar_codec(element, order).plain
+    if code and len(register.dims) == 1:
+        return _numbers(register, np.dtype(code).newbyteorder(order))
+    decode = codec(register, order).decode
+    if code and not register.dims:
+        return lambda image: _DOUBLE.pack(0x11, decode(image))  # field 1 of a Value
+
+    def serialise(image: bytes) -> bytes | None:
+        value = decode(image)
+        return None if value is None else to_wire(value).SerializeToString()
+
+    return serialise
+
+
+def _numbers(register: Register, kind: np.dtype[Any]) -> Callable[[bytes], bytes]:
+    """The same for a row of numbers: all at once, a hundred times as fast as one by one."""
+    one = ListValue(values=[WireValue(number_value=0)]).SerializeToString()  # ends in its double
+    size = register.count * len(one)
+    head = b"\x32" + varint(size)
+    template = np.zeros(register.count, [("head", f"V{len(one) - 8}"), ("value", "<f8")])
+    template["head"] = np.void(one[:-8])
+
+    def serialise(image: bytes) -> bytes:
+        values = template.copy()
+        values["value"] = np.frombuffer(image, kind, register.count, register.offset)
+        return head + values.tobytes()
+
+    return serialise
+
+
+def _structure(found: Shape, layout: Layout) -> Callable[[bytes], bytes]:
+    """The same for a structure; ValueRangeError: too deep."""
+    start = len(found.path) + 1
+    fill = _members([(register.path[start:].split("/"), register) for register in found.registers], layout, MAX_LEVELS)
+
+    def serialise(image: bytes) -> bytes:
+        value = WireValue()
+        fill(image, value)
+        return value.SerializeToString(deterministic=True)  # equal values are equal bytes: maps have no order
+
+    return serialise
+
+
+def _members(
+    parts: list[tuple[list[str], Register]], layout: Layout, levels: int
+) -> Callable[[bytes, WireValue], None]:
+    """``parts``: the names that lead to each register from here."""
+    if not levels:
+        raise ValueRangeError(f"{shorten(parts[0][1].path)}: more than {MAX_LEVELS} structures within each other")
+    groups: dict[str, list[tuple[list[str], Register]]] = {}
+    for (name, *rest), register in parts:
+        groups.setdefault(decode_segment(name), []).append((rest, register))
+    members: list[tuple[str, Callable[[bytes, WireValue], None]]] = []
+    for name, inner in groups.items():
+        rest, register = inner[0]
+        members.append((name, _members(inner, layout, levels - 1) if rest else _member(register, layout)))
+
+    def fill(image: bytes, value: WireValue) -> None:
+        fields = value.struct_value.fields
+        for name, put in members:
+            put(image, fields[name])
+
+    return fill
+
+
+def _member(register: Register, layout: Layout) -> Callable[[bytes, WireValue], None]:
+    decode = codec(register, layout.byte_order).decode
+    return lambda image, value: _put(decode(image), value)
+
+
+def _put(item: Value, value: WireValue) -> None:
+    if isinstance(item, bool):
+        value.bool_value = item
+    elif isinstance(item, int | float):
+        value.number_value = item
+    elif isinstance(item, str):
+        value.string_value = item
+    elif item is None:
+        value.null_value = NULL_VALUE
+    else:
+        values = value.list_value.values
+        for inner in item:
+            _put(inner, values.add())

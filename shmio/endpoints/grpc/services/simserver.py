@@ -1,0 +1,109 @@
+"""SimServerAPI, package ``com.ttsnetwork.simulator3``: stepping and playing, and how time stands."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Awaitable
+from functools import partial
+from typing import Any, Final
+
+import grpc
+from google.protobuf.empty_pb2 import Empty
+
+from shmio.endpoints.grpc.services.error_status import Context, refuse
+from shmio.endpoints.grpc.streams.outbox import StateLane
+from shmio.endpoints.grpc.streams.outboxes import Outboxes
+from shmio.endpoints.grpc.time.stepper import Stepper
+from shmio.endpoints.grpc.time.virtual_time import Status
+from shmio.errors import ShmioError
+from shmio.wire import simserver_pb2 as wire
+
+SERVICE: Final = wire.DESCRIPTOR.services_by_name["SimServerAPI"].full_name
+
+_MS: Final = 1_000_000
+
+
+class SimServer:
+    """Serves the instance's time to those who drive it."""
+
+    name = SERVICE
+
+    def __init__(self, stepper: Stepper, outboxes: Outboxes) -> None:
+        self._stepper = stepper
+        self._outboxes = outboxes
+        self._lanes: dict[StateLane, None] = {}  # of those who follow the status
+        stepper.timeline.watch(self._tell)
+
+    def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
+        """The service's calls, for a server."""
+        unary = grpc.unary_unary_rpc_method_handler
+        status = wire.SimStatus.SerializeToString
+        calls: dict[str, grpc.RpcMethodHandler[Any, Any]] = {
+            "step": unary(self.step, wire.StepRequest.FromString, status),
+            "start": unary(self.start, wire.StartRequest.FromString, status),
+            "stop": unary(self.stop, Empty.FromString, status),
+            "pause": unary(self.pause, Empty.FromString, status),
+            "subscribe": grpc.unary_stream_rpc_method_handler(self.subscribe, Empty.FromString),
+        }
+        return calls
+
+    async def step(self, request: wire.StepRequest, context: Context) -> wire.SimStatus:
+        """Move time on; answered when all streams have taken the step.
+
+        INVALID_ARGUMENT: no step goes so far; FAILED_PRECONDITION: the step failed, or time is not ours to move.
+        """
+        try:
+            step = await self._stepper.step(_ns(request.deltaTime), context.peer())
+        except ShmioError as error:
+            await refuse(context, error)
+        return _wire(self._stepper.timeline.status._replace(clock_ns=step.time_ns, dt_ns=step.dt_ns))
+
+    async def start(self, request: wire.StartRequest, context: Context) -> wire.SimStatus:
+        """Step in real time from now on; errors as of :meth:`step`."""
+        return await self._answer(self._stepper.play(_ns(request.deltaTime)), context)
+
+    async def stop(self, _: Empty, context: Context) -> wire.SimStatus:
+        """Step no more by itself, and say that it is not alive until somebody moves time again."""
+        return await self._answer(self._stepper.pause(end=True), context)
+
+    async def pause(self, _: Empty, context: Context) -> wire.SimStatus:
+        """Step no more by itself."""
+        return await self._answer(self._stepper.pause(), context)
+
+    async def subscribe(self, _: Empty, context: Context) -> AsyncIterator[bytes]:
+        """Stream how time stands: a message for each step and each change.
+
+        RESOURCE_EXHAUSTED: a step has waited too long for it to be read.
+        """
+        with self._outboxes.opened() as outbox:
+            lane = StateLane(outbox)
+            self._lanes[lane] = None
+            outbox.on_failure = partial(self._lanes.pop, lane, None)
+            try:
+                await context.send_initial_metadata(())  # who waits for it misses nothing from then on
+                while (message := await outbox.pop()) is not None:
+                    yield message
+            finally:
+                self._lanes.pop(lane, None)
+            await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, outbox.failure)
+
+    async def _answer(self, call: Awaitable[Status], context: Context) -> wire.SimStatus:
+        try:
+            return _wire(await call)
+        except ShmioError as error:
+            await refuse(context, error)
+
+    def _tell(self, status: Status) -> None:
+        if self._lanes:
+            message = _wire(status).SerializeToString()
+            for lane in self._lanes:
+                lane.keep(message)
+
+
+def _ns(delta_ms: int) -> int | None:
+    return delta_ms * _MS or None
+
+
+def _wire(status: Status) -> wire.SimStatus:
+    return wire.SimStatus(
+        clock=status.clock_ns // _MS, deltaTime=status.dt_ns // _MS, alive=status.alive, playing=status.playing
+    )

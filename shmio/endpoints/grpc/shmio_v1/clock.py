@@ -1,0 +1,170 @@
+"""The calls of shmio.v1 about time: Step, Steps, SetStepSize, Play, Pause, WatchClock."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import AsyncIterator, Awaitable
+from typing import Any, Final
+
+import grpc
+
+from shmio.endpoints.grpc.services.error_status import Context, refuse
+from shmio.endpoints.grpc.streams.encoding import field
+from shmio.endpoints.grpc.time.stepper import Stepper
+from shmio.endpoints.grpc.time.virtual_time import Status
+from shmio.errors import EndpointError, ShmioError, ValueRangeError
+from shmio.segment import Segment
+from shmio.segment.clock import ClockState
+from shmio.wire import shmio_v1_pb2 as wire
+
+MAX_ANSWERS: Final = 1024
+"""Of so many that wait to be read the next step waits, too."""
+
+STEPS: Final = wire.StepsResponse.DESCRIPTOR.fields_by_name["steps"].number
+
+
+class Steps:
+    """One call of Steps."""
+
+    def __init__(self, stepper: Stepper, peer: str) -> None:
+        """``peer``: whose it is."""
+        self._stepper = stepper
+        self._peer = peer
+        self._answers: list[bytes] = []
+        self._news = asyncio.Event()  # there is an answer, or there will be no more
+        self._room = asyncio.Event()
+
+    async def messages(self, requests: AsyncIterator[wire.StepsRequest]) -> AsyncIterator[bytes]:
+        """Serialised StepsResponses: what is done while one is sent shares the next. Time goes on meanwhile.
+
+        TimeError: a step has failed, after the answers to those before it; ValueRangeError.
+        """
+        working = asyncio.get_running_loop().create_task(self._work(requests))
+        working.add_done_callback(lambda _: self._news.set())
+        try:
+            while self._answers or not working.done():
+                if not self._answers:
+                    self._news.clear()
+                    await self._news.wait()
+                    continue
+                answers, self._answers = self._answers, []
+                self._room.set()
+                yield b"".join(answers)
+            working.result()
+        finally:
+            working.cancel()
+
+    async def _work(self, requests: AsyncIterator[wire.StepsRequest]) -> None:
+        async for request in requests:
+            for _ in range(request.count or 1):
+                while len(self._answers) >= MAX_ANSWERS:
+                    self._room.clear()
+                    await self._room.wait()
+                step = await self._stepper.step(request.dt_ns or None, self._peer)
+                answer = wire.Step(number=step.number, time_ns=step.time_ns)
+                self._answers.append(field(STEPS, answer.SerializeToString()))
+                self._news.set()
+
+
+MAX_WATCHERS = 256
+"""WatchClock calls that may be open at once."""
+
+
+class Clocks:
+    """A part of the service."""
+
+    def __init__(self, segment: Segment, stepper: Stepper) -> None:
+        self._segment = segment
+        self._stepper = stepper
+        self._watchers: set[asyncio.Event] = set()
+        stepper.timeline.watch(self._tell)
+
+    def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
+        """Its calls, by name."""
+        unary, clock = grpc.unary_unary_rpc_method_handler, wire.Clock.SerializeToString
+        return {
+            "Step": unary(self.step, wire.StepRequest.FromString, clock),
+            "Steps": grpc.stream_stream_rpc_method_handler(self.steps, wire.StepsRequest.FromString),
+            "SetStepSize": unary(self.set_step_size, wire.SetStepSizeRequest.FromString, clock),
+            "Play": unary(self.play, wire.PlayRequest.FromString, clock),
+            "Pause": unary(self.pause, wire.PauseRequest.FromString, clock),
+            "WatchClock": grpc.unary_stream_rpc_method_handler(self.watch, wire.WatchClockRequest.FromString, clock),
+        }
+
+    async def step(self, request: wire.StepRequest, context: Context) -> wire.Clock:
+        """Move time by one step; answered when every stream has what has changed in it.
+
+        INVALID_ARGUMENT: no step goes so far; FAILED_PRECONDITION: it failed, or time is not ours to move.
+        """
+        try:
+            step = await self._stepper.step(request.dt_ns or None, context.peer())
+        except ShmioError as error:
+            await refuse(context, error)
+        found = clock(self._segment.clock.read())
+        found.step, found.time_ns = step.number, step.time_ns
+        return found
+
+    async def steps(self, requests: AsyncIterator[wire.StepsRequest], context: Context) -> AsyncIterator[bytes]:
+        """The same, without a call for each; the first that fails ends it. Errors as of :meth:`step`."""
+        try:
+            async for message in Steps(self._stepper, context.peer()).messages(requests):
+                yield message
+        except ShmioError as error:
+            await refuse(context, error)
+
+    async def set_step_size(self, request: wire.SetStepSizeRequest, context: Context) -> wire.Clock:
+        """How far a step goes that does not say it; errors as of :meth:`step`."""
+        return await self._do(self._stepper.set_step_size(request.dt_ns), context)
+
+    async def play(self, request: wire.PlayRequest, context: Context) -> wire.Clock:
+        """Step by itself from now on; errors as of :meth:`step`."""
+        rate = request.rate or 1.0
+        if not 1e-3 <= rate <= 1e3 or math.isnan(rate):
+            await refuse(context, ValueRangeError(f"rate: {rate} is not from 0.001 to 1000"))
+        return await self._do(self._stepper.play(request.dt_ns or None, rate), context)
+
+    async def pause(self, _: wire.PauseRequest, context: Context) -> wire.Clock:
+        """Step no more by itself; FAILED_PRECONDITION: time is not ours to move."""
+        return await self._do(self._stepper.pause(), context)
+
+    async def watch(self, _: wire.WatchClockRequest, context: Context) -> AsyncIterator[wire.Clock]:
+        """How time stands: at once, then after each step and change; who does not keep up sees the newest.
+
+        RESOURCE_EXHAUSTED: too many streams.
+        """
+        if len(self._watchers) >= MAX_WATCHERS:
+            await refuse(context, EndpointError(f"{MAX_WATCHERS} calls of WatchClock are open, the most there may be"))
+        news = asyncio.Event()
+        self._watchers.add(news)
+        try:
+            while True:
+                news.clear()
+                yield clock(self._segment.clock.read())
+                await news.wait()
+        finally:
+            self._watchers.discard(news)
+
+    async def _do(self, work: Awaitable[object], context: Context) -> wire.Clock:
+        try:
+            await work
+        except ShmioError as error:
+            await refuse(context, error)
+        return clock(self._segment.clock.read())
+
+    def _tell(self, _: Status) -> None:
+        for news in self._watchers:
+            news.set()
+
+
+def clock(state: ClockState) -> wire.Clock:
+    """What the clock page says."""
+    return wire.Clock(
+        virtual=state.virtual,
+        step=state.done,
+        time_ns=state.present_ns,
+        step_size_ns=state.step_size_ns,
+        playing=state.playing,
+        rate=state.rate,
+        note=state.note,
+    )

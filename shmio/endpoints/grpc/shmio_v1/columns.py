@@ -1,0 +1,307 @@
+"""From images of a block to packed arrays by type, with numpy; and which elements differ between two images."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from shmio.endpoints.grpc.streams.encoding import field
+from shmio.layout.model import ByteOrder, Register, bit_positions
+from shmio.layout.types import ElementType
+from shmio.layout.values.date_types import Buffer
+from shmio.layout.values.scalar import Scalar, scalar_codec
+
+Array = np.ndarray[Any, np.dtype[Any]]
+
+
+class Column(IntEnum):
+    """As ``Column`` of the wire. The columns' fields in ``Values`` have the same numbers."""
+
+    BOOL = 1
+    INT32 = 2
+    INT64 = 3
+    UINT64 = 4
+    FLOAT = 5
+    DOUBLE = 6
+    TEXT = 7
+
+
+_COLUMNS: Final = {
+    **dict.fromkeys("bBhHi", Column.INT32),
+    **dict.fromkeys("Iq", Column.INT64),
+    "Q": Column.UINT64,
+    "f": Column.FLOAT,
+    "d": Column.DOUBLE,
+}
+_BY_BASE: Final = {
+    "BOOL": Column.BOOL, "TIME_OF_DAY": Column.INT32, "S5TIME": Column.INT32, "LTOD": Column.INT64,
+}  # fmt: skip
+KINDS: Final[Mapping[Column, np.dtype[Any]]] = {
+    Column.BOOL: np.dtype("u1"),
+    Column.INT32: np.dtype("<i4"),
+    Column.INT64: np.dtype("<i8"),
+    Column.UINT64: np.dtype("<u8"),
+    Column.FLOAT: np.dtype("<f4"),
+    Column.DOUBLE: np.dtype("<f8"),
+}
+"""How the elements of a column lie in its packed field."""
+_BITS: Final = {column: np.dtype(f"<u{kind.itemsize}") for column, kind in KINDS.items()}
+
+
+def column_of(element: ElementType) -> Column:
+    """Where values of a type go."""
+    return _BY_BASE.get(element.base) or _COLUMNS.get(scalar_codec(element).plain, Column.TEXT)
+
+
+class Decoded(NamedTuple):
+    """All elements of an image. ``invalid``: places of the registers of which some bytes are no value."""
+
+    arrays: Mapping[Column, Array]
+    texts: tuple[str, ...]
+    invalid: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Numbers:
+    """Elements of one type: ``bytes`` says, by element, where its bytes are, the least significant first."""
+
+    slots: slice
+    bytes: Array
+    kind: np.dtype[Any]
+
+
+@dataclass(frozen=True, slots=True)
+class _Other:
+    """An element that is not just a number; ``register``: its place."""
+
+    column: Column
+    slot: int
+    register: int
+    decode: Callable[[Buffer, int], Scalar]
+    offset: int
+    size: int
+
+
+class _Rest(NamedTuple):
+    """Elements that are not just numbers. ``invalid``: those that are no value, of the registers at ``places``."""
+
+    numbers: Mapping[Column, Mapping[int, Any]]
+    texts: tuple[str, ...]
+    invalid: frozenset[int]
+    places: tuple[int, ...]
+
+
+class Columns:
+    """How registers lie in columns; built once. Decoding remembers what does not change, and is for one thread."""
+
+    def __init__(self, registers: Sequence[Register], order: ByteOrder) -> None:
+        self.places: list[tuple[Column, int]] = [(Column.TEXT, 0)] * len(registers)
+        """Column and first slot of each register."""
+        self.sizes = dict.fromkeys(Column, 0)
+        """Slots of each column."""
+        self._numbers: list[tuple[Column, _Numbers]] = []
+        self._others: list[_Other] = []
+        groups: dict[tuple[Column, str], list[int]] = {}
+        for place, register in enumerate(registers):
+            column = column_of(register.element)
+            code = "" if column is Column.BOOL else scalar_codec(register.element).plain
+            groups.setdefault((column, code), []).append(place)
+        for (column, code), members in groups.items():
+            first = self.sizes[column]
+            for place in members:
+                self.places[place] = column, self.sizes[column]
+                self.sizes[column] += registers[place].count
+            chosen = [registers[place] for place in members]
+            if column is Column.BOOL:
+                self._bits = _bits(chosen)
+            elif code:
+                where = slice(first, self.sizes[column])
+                self._numbers.append((column, _numbers(chosen, code, order, where)))
+            else:
+                self._others += self._others_of(members, chosen, order)
+        sizes = [other.size for other in self._others]
+        starts = np.repeat([other.offset for other in self._others], sizes).astype(np.intp)
+        before = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes) if sizes else np.zeros(0, np.intp)
+        self._watched = starts + np.arange(len(starts)) - before
+        self._owners = np.repeat(np.arange(len(sizes)), sizes)  # whose each of the watched bytes is
+        self._seen: tuple[Array, _Rest] | None = None
+
+    def _others_of(self, members: Sequence[int], registers: Sequence[Register], order: ByteOrder) -> Iterable[_Other]:
+        for place, register in zip(members, registers, strict=True):
+            column, first = self.places[place]
+            decode = scalar_codec(register.element, order).decode
+            for flat in range(register.count):
+                at = register.offset + flat * register.element.stride
+                yield _Other(column, first + flat, place, decode, at, register.element.size)
+
+    def place(self, column: Column, slot: int) -> int | None:
+        """Place of the register that has a slot; None: there is no such slot."""
+        if not 0 <= slot < self.sizes[column]:
+            return None
+        firsts, places = self._starts[column]
+        return places[bisect_right(firsts, slot) - 1]
+
+    @cached_property
+    def _starts(self) -> Mapping[Column, tuple[list[int], list[int]]]:
+        """First slots of the registers of each column, ascending, and their places."""
+        found: dict[Column, tuple[list[int], list[int]]] = {column: ([], []) for column in Column}
+        for place, (column, slot) in sorted(enumerate(self.places), key=lambda pair: pair[1][1]):
+            found[column][0].append(slot)
+            found[column][1].append(place)
+        return found
+
+    def touched(self, mask: bytes) -> dict[Column, Array]:
+        """Slots of the elements that any of the bits set in a mask of the block belongs to."""
+        arrays = self.decode_numbers(mask)
+        found = {column: array.view(_BITS[column]) != 0 for column, array in arrays.items()}
+        if self.sizes[Column.TEXT]:
+            found[Column.TEXT] = np.zeros(self.sizes[Column.TEXT], bool)
+        for other in self._others:
+            found[other.column][other.slot] = any(mask[other.offset : other.offset + other.size])
+        return {column: np.flatnonzero(hit) for column, hit in found.items() if hit.any()}
+
+    def decode_numbers(self, image: bytes) -> dict[Column, Array]:
+        """The columns of numbers and bits; elements that are not just that are 0."""
+        data = np.frombuffer(image, np.uint8)
+        arrays = {column: np.zeros(self.sizes[column], kind) for column, kind in KINDS.items() if self.sizes[column]}
+        if Column.BOOL in arrays:
+            where, shifts = self._bits
+            np.bitwise_and(data[where] >> shifts, 1, out=arrays[Column.BOOL])
+        for column, part in self._numbers:
+            arrays[column][part.slots] = data[part.bytes].view(part.kind)[:, 0]
+        return arrays
+
+    def encode(self, column: Column, slots: Array, values: Array, image: bytearray) -> Array:
+        """Put values at slots, which there are, into an image; which ``slots`` are no plain numbers, or do not fit."""
+        data, left = np.frombuffer(image, np.uint8), np.full(len(slots), column is not Column.BOOL)
+        if column is Column.BOOL:
+            slots, last = np.unique(slots[::-1], return_index=True)
+            where, shifts = (part[slots] for part in self._bits)
+            np.bitwise_and.at(data, where, ~(np.uint8(1) << shifts))
+            np.bitwise_or.at(data, where, values[::-1][last].astype(np.uint8) << shifts)
+        for part in (part for other, part in self._numbers if other is column):
+            mine = (slots >= part.slots.start) & (slots < part.slots.stop)
+            if part.kind.kind != "f":
+                mine &= (values >= np.iinfo(part.kind).min) & (values <= np.iinfo(part.kind).max)
+            numbers = values[mine].astype(part.kind)[:, None]
+            data[part.bytes[slots[mine] - part.slots.start]] = numbers.view(np.uint8)
+            left &= ~mine
+        return np.flatnonzero(left)
+
+    def decode(self, image: bytes) -> Decoded:
+        """All elements of an image of the block."""
+        arrays = self.decode_numbers(image)
+        if not self._others:
+            return Decoded(arrays, (), ())
+        rest = self._rest(image, np.frombuffer(image, np.uint8))
+        for column, found in rest.numbers.items():
+            for slot, value in found.items():
+                arrays[column][slot] = value
+        return Decoded(arrays, rest.texts, rest.places)
+
+    def _rest(self, image: bytes, data: Array) -> _Rest:
+        """What is decoded one by one; not again while its bytes stay the same."""
+        watched = data[self._watched]
+        if self._seen is None:
+            changed, before = range(len(self._others)), _Rest({}, ("",) * self.sizes[Column.TEXT], frozenset(), ())
+        else:
+            seen, before = self._seen
+            changed = np.unique(self._owners[watched != seen]).tolist()
+            if not changed:
+                return before
+        numbers = {column: dict(found) for column, found in before.numbers.items()}
+        texts, invalid = list(before.texts), set(before.invalid)
+        for index in changed:
+            other = self._others[index]
+            value = other.decode(image, other.offset)
+            (invalid.add if value is None else invalid.discard)(index)
+            if other.column is Column.TEXT:
+                texts[other.slot] = "" if value is None else str(value)
+            else:
+                numbers.setdefault(other.column, {})[other.slot] = 0 if value is None else value
+        places = tuple(sorted({self._others[index].register for index in invalid}))
+        self._seen = watched, _Rest(numbers, tuple(texts), frozenset(invalid), places)
+        return self._seen[1]
+
+
+def pack(new: Decoded, old: Decoded | None = None, deadband: float = 0.0) -> bytes:
+    """A serialised ``Values`` of what differs, by its bits; of all without an ``old``; empty: nothing does.
+
+    ``deadband``: numbers that differ by no more are left out.
+    """
+    parts = []
+    for column, values in new.arrays.items():
+        if old is None:
+            parts.append(field(column, field(2, values.tobytes())))
+            continue
+        slots = _differing(column, old.arrays[column], values, deadband)
+        if len(slots) == len(values):
+            parts.append(field(column, field(2, values.tobytes())))
+        elif len(slots):
+            parts.append(field(column, field(1, slots.astype("<u4").tobytes()) + field(2, values[slots].tobytes())))
+    if old is None and new.texts:
+        parts.append(field(Column.TEXT, _texts(new.texts)))
+    elif old is not None and new.texts is not old.texts:
+        pairs = enumerate(zip(new.texts, old.texts, strict=True))
+        changed = [slot for slot, (now, before) in pairs if now != before]
+        if changed:
+            where = field(1, np.array(changed, "<u4").tobytes())
+            parts.append(field(Column.TEXT, where + _texts(new.texts[slot] for slot in changed)))
+    return b"".join(parts)
+
+
+def pack_slots(values: Decoded, chosen: Mapping[Column, Array]) -> bytes:
+    """A serialised ``Values`` of these slots."""
+    parts = []
+    for column, slots in chosen.items():
+        where = field(1, slots.astype("<u4").tobytes())
+        if column is Column.TEXT:
+            parts.append(field(column, where + _texts(values.texts[slot] for slot in slots)))
+        else:
+            parts.append(field(column, where + field(2, values.arrays[column][slots].tobytes())))
+    return b"".join(parts)
+
+
+def merge(new: Decoded, old: Decoded, deadband: float) -> Decoded:
+    """What somebody has after :func:`pack`: of a number that was left out, the old one."""
+    arrays = {}
+    for column, values in new.arrays.items():
+        slots = _differing(column, old.arrays[column], values, deadband)
+        arrays[column] = old.arrays[column].copy()
+        arrays[column][slots] = values[slots]
+    return Decoded(arrays, new.texts, new.invalid)
+
+
+def _differing(column: Column, old: Array, new: Array, deadband: float) -> Array:
+    """Slots that differ: compared by bits, for a NaN that stays has not changed, and 0.0 that becomes -0.0 has."""
+    differs = old.view(_BITS[column]) != new.view(_BITS[column])
+    if deadband and column is not Column.BOOL:
+        with np.errstate(invalid="ignore", over="ignore"):
+            distance = np.abs(new.astype(np.float64) - old.astype(np.float64))
+        differs &= ~(distance <= deadband)  # a NaN is never within it
+    return np.flatnonzero(differs)
+
+
+def _texts(texts: Iterable[str]) -> bytes:
+    return b"".join(field(2, text.encode()) for text in texts)
+
+
+def _numbers(registers: Sequence[Register], code: str, order: ByteOrder, slots: slice) -> _Numbers:
+    kind = np.dtype(f"<{code}")
+    starts = [register.offset + np.arange(register.count) * register.element.stride for register in registers]
+    within = np.arange(kind.itemsize)
+    where = np.concatenate(starts)[:, None] + (within[::-1] if order == "big" else within)
+    return _Numbers(slots, where.astype(np.intp), kind)
+
+
+def _bits(registers: Sequence[Register]) -> tuple[Array, Array]:
+    """Byte and shift of each bit."""
+    places = [(register.offset + byte, bit) for register in registers for byte, bit in bit_positions(register)]
+    where, shifts = zip(*places, strict=True)
+    return np.array(where, np.intp), np.array(shifts, np.uint8)

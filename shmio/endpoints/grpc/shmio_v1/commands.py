@@ -1,0 +1,208 @@
+"""The calls of shmio.v1 that have a source do something: Write, Inject, Declare, and those about injections."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Collection, Coroutine, Mapping
+from typing import Any, Final
+
+import grpc
+
+from shmio.endpoints.grpc.commands import command_client
+from shmio.endpoints.grpc.commands.topics import Topics
+from shmio.endpoints.grpc.services.error_status import Context, refuse
+from shmio.endpoints.grpc.shmio_v1 import describe
+from shmio.endpoints.grpc.shmio_v1.declare import Campaign
+from shmio.endpoints.grpc.shmio_v1.inject import Injection
+from shmio.endpoints.grpc.shmio_v1.selection import Selections
+from shmio.endpoints.grpc.shmio_v1.values import assigned, outcome
+from shmio.endpoints.grpc.streams.feed import Feed
+from shmio.endpoints.grpc.streams.wakeups import Bells
+from shmio.errors import CommandError, EndpointError, PathError, ShmioError, ValueRangeError
+from shmio.layout.topic import shorten
+from shmio.segment import Block
+from shmio.segment.standing_injections import Standing
+from shmio.wire import shmio_v1_pb2 as wire
+
+MAX_INJECTIONS: Final = 256
+"""Calls of Inject and Declare that may be open at once."""
+MAX_TIMEOUT_MS: Final = 86_400_000
+
+
+class Orders:
+    """A part of the service."""
+
+    def __init__(self, topics: Topics, feeds: Mapping[str, Feed], selections: Selections, bells: Bells) -> None:
+        self._topics = topics
+        self._feeds = feeds
+        self._selections = selections
+        self._bells = bells
+        self._open: set[Injection | Campaign] = set()
+        self._turn = asyncio.Lock()
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
+        """Its calls, by name."""
+        unary = grpc.unary_unary_rpc_method_handler
+        return {
+            "Write": unary(self.write, wire.WriteRequest.FromString, wire.WriteResponse.SerializeToString),
+            "Inject": grpc.stream_stream_rpc_method_handler(self.inject, wire.InjectRequest.FromString),
+            "Declare": grpc.unary_stream_rpc_method_handler(self.declare, wire.DeclareRequest.FromString),
+            "ListInjections": unary(
+                self.list_injections,
+                wire.ListInjectionsRequest.FromString,
+                wire.ListInjectionsResponse.SerializeToString,
+            ),
+            "Lift": unary(self.lift, wire.LiftRequest.FromString, wire.LiftResponse.SerializeToString),
+            "LiftAll": unary(self.lift_all, wire.LiftAllRequest.FromString, wire.LiftResponse.SerializeToString),
+        }
+
+    async def write(self, request: wire.WriteRequest, context: Context) -> wire.WriteResponse:
+        """Write registers of one source, all or nothing; what became of each, by the source.
+
+        NOT_FOUND: no such register; INVALID_ARGUMENT: no value of its type, several sources, too many;
+        FAILED_PRECONDITION: not writable, or the source takes nothing. Nothing has been sent then.
+        """
+        try:
+            if request.timeout_ms > MAX_TIMEOUT_MS:
+                raise ValueRangeError(f"timeout_ms: at most {MAX_TIMEOUT_MS}, a day")
+            source, values = await assigned(request.values, self._topics)
+            timeout_s = request.timeout_ms / 1000 or None
+            inlet = self._topics.feed(source).inlet
+            ends = await command_client.write(inlet, values, timeout_s, until_accepted=request.until_accepted)
+            return wire.WriteResponse(outcomes=[outcome(*end) for end in ends])
+        except ShmioError as error:
+            await refuse(context, error)
+
+    async def inject(self, requests: AsyncIterator[wire.InjectRequest], context: Context) -> AsyncIterator[bytes]:
+        """Lay an injection as long as the stream is open, or for good; originals down, other values up.
+
+        NOT_FOUND: no such register; INVALID_ARGUMENT: no injection, or values that are none of it; FAILED_PRECONDITION:
+        the source refuses it, and says why; RESOURCE_EXHAUSTED: too many streams; ABORTED: somebody else has lifted
+        it, or what is written is not read.
+        """
+        opening: asyncio.Task[bytes] | None = None
+        taking: asyncio.Task[None] | None = None
+        try:
+            injection = await self._injection(requests)
+            opening = asyncio.get_running_loop().create_task(injection.open())
+            yield await asyncio.shield(opening)
+            taking = asyncio.get_running_loop().create_task(injection.take(requests))
+            taking.add_done_callback(injection.taken)
+            async for message in injection.messages():
+                yield message
+            taking.cancel()
+            await asyncio.shield(self._spawn(self._close(injection, opening)))  # who sees the end sees it lifted
+            opening = None
+        except ShmioError as error:
+            await refuse(context, error)
+        finally:
+            if taking is not None:
+                taking.cancel()
+            if opening is not None:
+                self._spawn(self._close(injection, opening))
+        if injection.failure is not None:
+            await refuse(context, injection.failure)
+        if injection.over:
+            await context.abort(grpc.StatusCode.ABORTED, f"{injection.source}: {injection.over}")
+
+    async def _injection(self, requests: AsyncIterator[wire.InjectRequest]) -> Injection:
+        """What the first message asks for. PathError, ValueRangeError, EndpointError."""
+        self._check_room()
+        async for request in requests:
+            if request.WhichOneof("what") == "lay":
+                injection = Injection(self._topics, self._selections, self._bells, request.lay)
+                self._open.add(injection)
+                return injection
+            break
+        raise ValueRangeError("the first message of Inject lays an injection, all others give values")
+
+    def _check_room(self) -> None:
+        """EndpointError."""
+        if len(self._open) >= MAX_INJECTIONS:
+            raise EndpointError(f"{MAX_INJECTIONS} calls of Inject and Declare are open, the most there may be")
+
+    async def _close(self, one: Injection | Campaign, opening: asyncio.Task[bytes]) -> None:
+        try:
+            await asyncio.wait((opening,))
+            if not opening.cancelled() and opening.exception() is None:
+                await one.close()
+        finally:
+            self._open.discard(one)
+
+    async def declare(self, request: wire.DeclareRequest, context: Context) -> AsyncIterator[bytes]:
+        """Lay injections that their sources run, all or none, as long as the stream is open, or for good; their record.
+
+        INVALID_ARGUMENT: what is wrong with which key; FAILED_PRECONDITION: a source refuses it, and says why;
+        RESOURCE_EXHAUSTED: too many streams; ABORTED: the record is not read, or would have a gap.
+        """
+        opening: asyncio.Task[bytes] | None = None
+        try:
+            self._check_room()
+            campaign = Campaign(self._feeds, request, self._turn)
+            self._open.add(campaign)
+            opening = asyncio.get_running_loop().create_task(campaign.open())
+            yield await asyncio.shield(opening)
+            async for message in campaign.messages():
+                yield message
+        except ShmioError as error:
+            await refuse(context, error)
+        finally:
+            if opening is not None:
+                campaign.abandon()
+                self._spawn(self._close(campaign, opening))
+        if campaign.over:
+            await context.abort(grpc.StatusCode.ABORTED, campaign.over)
+
+    async def list_injections(
+        self, request: wire.ListInjectionsRequest, context: Context
+    ) -> wire.ListInjectionsResponse:
+        """What stands at present. NOT_FOUND: no such source."""
+        found = wire.ListInjectionsResponse()
+        try:
+            for block in self.blocks(request.sources):
+                found.injections.extend(describe.injection(block, one) for one in block.standing.read())
+        except ShmioError as error:
+            await refuse(context, error)
+        return found
+
+    async def lift(self, request: wire.LiftRequest, context: Context) -> wire.LiftResponse:
+        """Lift one. NOT_FOUND: there is no such injection; FAILED_PRECONDITION: the source does not answer."""
+        try:
+            (block,) = self.blocks([request.source])
+            standing = [one for one in block.standing.read() if one.id == request.number and not one.lifted]
+            if not standing:
+                raise PathError(f"{request.source}: there is no injection {request.number}; ListInjections lists them")
+            lifted = await self._lift(block, standing[0])
+            if lifted.failure:
+                raise CommandError(f"{request.source}: {lifted.failure}")
+            return wire.LiftResponse(lifted=[lifted])
+        except ShmioError as error:
+            await refuse(context, error)
+
+    async def lift_all(self, request: wire.LiftAllRequest, context: Context) -> wire.LiftResponse:
+        """Lift all, at once; of one that still stands it is said why. NOT_FOUND: no such source."""
+        try:
+            blocks = self.blocks(request.sources)
+        except ShmioError as error:
+            await refuse(context, error)
+        standing = [(block, one) for block in blocks for one in block.standing.read() if not one.lifted]
+        lifted = await asyncio.gather(*(self._lift(block, one) for block, one in standing))
+        return wire.LiftResponse(lifted=lifted)
+
+    async def _lift(self, block: Block, one: Standing) -> wire.Lifted:
+        failure = await command_client.lift(self._feeds[block.source].inlet, one.id)
+        return wire.Lifted(source=block.source, number=one.id, name=one.name, failure=failure)
+
+    def blocks(self, sources: Collection[str]) -> list[Block]:
+        """The blocks of these sources, or of all; PathError."""
+        for source in sources:
+            if source not in self._feeds:
+                raise PathError(f"no source {shorten(source)!r}; there are: {', '.join(self._feeds)}")
+        return [self._feeds[source].block for source in dict.fromkeys(sources) or self._feeds]
+
+    def _spawn(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task

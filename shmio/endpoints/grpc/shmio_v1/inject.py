@@ -1,0 +1,386 @@
+"""Inject: a stream that lays an injection, is shown what it stands over, and gives other values instead."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Collection, Iterable, Iterator, Mapping, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from shmio.endpoints.grpc.commands import command_client
+from shmio.endpoints.grpc.commands.followers import Follower
+from shmio.endpoints.grpc.commands.topics import Topics
+from shmio.endpoints.grpc.injection.injection_base import Beneath
+from shmio.endpoints.grpc.shmio_v1.columns import Array, pack, pack_slots
+from shmio.endpoints.grpc.shmio_v1.selection import MAX_PATTERNS, Place, Selections
+from shmio.endpoints.grpc.shmio_v1.values import MAX_VALUES, assigned, outcome, packed
+from shmio.endpoints.grpc.shmio_v1.views import VALUES, head
+from shmio.endpoints.grpc.shmio_v1.waiting import Waiting
+from shmio.endpoints.grpc.shmio_v1.written import head_of
+from shmio.endpoints.grpc.streams.encoding import field
+from shmio.endpoints.grpc.streams.wakeups import Bells
+from shmio.endpoints.in_flight import End, worst
+from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
+from shmio.layout.topic import Topic, shorten
+from shmio.layout.values.write import Write, covering, merge
+from shmio.segment import Direction, EventKind, Frame
+from shmio.segment.commands import MAX_NAME_BYTES
+from shmio.segment.pending_commands import Diverted, apply
+from shmio.wire import shmio_v1_pb2 as wire
+
+_RANGES: Final = wire.Table.DESCRIPTOR.fields_by_name["ranges"].number
+_PIECES: Final = wire.Update.DESCRIPTOR.fields_by_name["pieces"].number
+
+
+class Target(NamedTuple):
+    """A place, the topics that patterns name in it, and ranges."""
+
+    place: Place
+    topics: tuple[Topic, ...]
+    ranges: tuple[wire.Range, ...]
+
+
+def target_of(topics: Topics, lay: wire.Lay) -> Target:
+    """What it is to stand over. PathError, ValueRangeError."""
+    if not (lay.patterns or lay.ranges):
+        raise ValueRangeError("no pattern is given, and no range: an injection stands over something")
+    for name, given in (("patterns", len(lay.patterns)), ("ranges", len(lay.ranges))):
+        if given > MAX_PATTERNS:
+            raise ValueRangeError(f"{given} {name}, {MAX_PATTERNS} are the most: use stars, or structures")
+    found = tuple(dict.fromkeys(topics.topic(pattern) for pattern in lay.patterns))
+    places = {Place(topic.source, topic.direction == "in") for topic in found}
+    if len({place.source for place in places}) > 1:
+        raise PathError("one injection is over one source: lay one for each, with a stream each")
+    if len(places) > 1:
+        raise PathError(f"{shorten(lay.patterns[0])}, …: an injection is over /out or over /in, not over both")
+    if lay.direction not in wire.Direction.values():
+        raise ValueRangeError(f"direction: {lay.direction} is none; 0 is /out, 1 is /in")
+    if lay.source:
+        topic = topics.topic(lay.source)
+        if topic.path or topic.direction:
+            raise PathError(f"source: {shorten(lay.source)} is not a source's name")
+        places.add(Place(topic.source, places.pop().inward if places else lay.direction == wire.DIRECTION_IN))
+    if len(places) != 1:
+        raise PathError("source: ranges without a pattern need to be told whose bytes they are")
+    return Target(places.pop(), found, tuple(lay.ranges))
+
+
+class Ranges:
+    """The bytes and bits that an injection is over besides registers."""
+
+    def __init__(self, ranges: Iterable[wire.Range], size: int) -> None:
+        """``size``: of the block. ValueRangeError: beyond it, or no range."""
+        self._spans: list[tuple[slice, int]] = []
+        self._bits = np.zeros(size, np.uint8)
+        for one in ranges:
+            if not one.size or one.offset + one.size > size:
+                raise ValueRangeError(
+                    f"ranges: {one.size} bytes from byte {one.offset} on are none, or not all in the block, which has "
+                    f"{size}"
+                )
+            if one.mask > 0xFF:
+                raise ValueRangeError(f"ranges: the mask {one.mask} has bits that a byte has not")
+            span, mask = slice(one.offset, one.offset + one.size), one.mask or 0xFF
+            self._spans.append((span, mask))
+            self._bits[span] |= mask
+
+    @property
+    def bits(self) -> bytes:
+        """An image of the block in which they are set."""
+        return self._bits.tobytes()
+
+    @property
+    def table(self) -> bytes:
+        """What a serialised ``Table`` has of them."""
+        return b"".join(
+            field(_RANGES, wire.Range(offset=span.start, size=span.stop - span.start, mask=mask).SerializeToString())
+            for span, mask in self._spans
+        )
+
+    def differing(self, image: bytes, before: bytes | None) -> bytes:
+        """What an ``Update`` has of them: of each from the first byte that differs to the last; else all of them."""
+        new = np.frombuffer(image, np.uint8)
+        changed = np.full(len(image), 0xFF, np.uint8) if before is None else new ^ np.frombuffer(before, np.uint8)
+        return b"".join(self._pieces(new, changed))
+
+    def touched(self, image: bytes, mask: bytes) -> bytes:
+        """The same of what a mask of the block has bits of."""
+        return b"".join(self._pieces(np.frombuffer(image, np.uint8), np.frombuffer(mask, np.uint8)))
+
+    def _pieces(self, image: Array, changed: Array) -> Iterator[bytes]:
+        for span, mask in self._spans:
+            places = np.flatnonzero(changed[span] & mask)
+            if len(places):
+                start, stop = span.start + int(places[0]), span.start + int(places[-1]) + 1
+                data = (image[start:stop] & mask).tobytes()
+                yield field(_PIECES, wire.Piece(offset=start, data=data, mask=mask).SerializeToString())
+
+
+def raw_writes(pieces: Collection[wire.Piece], bits: bytes) -> list[Write]:
+    """What raw bytes that a client gives write; ``bits``: what its injection is over.
+
+    ValueRangeError: it is not over all of them, or they are too many.
+    """
+    if len(pieces) > MAX_VALUES:
+        raise ValueRangeError(f"{len(pieces)} pieces, {MAX_VALUES} are the most: join neighbours, or give less at once")
+    cover = np.frombuffer(bits, np.uint8)
+    image, given = np.zeros(len(bits), np.uint8), np.zeros(len(bits), np.uint8)
+    spans = []
+    for piece in pieces:
+        span = slice(piece.offset, piece.offset + len(piece.data))
+        wanted = cover[span] & (piece.mask or 0xFF if piece.mask <= 0xFF else 0)
+        if not piece.data or span.stop > len(bits) or not wanted.all():
+            raise ValueRangeError(
+                f"pieces: the injection is not over all of the {len(piece.data)} bytes from byte {piece.offset} on"
+            )
+        image[span] ^= (image[span] ^ np.frombuffer(piece.data, np.uint8)) & wanted
+        given[span] |= wanted
+        spans.append((span.start, span.stop))
+    return merge(image.tobytes(), given.tobytes(), spans)
+
+
+MAX_OPEN: Final = 32
+"""Values of one stream that are under way; what comes beyond waits."""
+MAX_LIFETIME_MS: Final = 86_400_000
+
+_ORIGINALS, _ANSWERS = (wire.InjectResponse.DESCRIPTOR.fields_by_name[name].number for name in ("originals", "answers"))
+
+
+class Injection(Follower):
+    """One call of Inject."""
+
+    def __init__(self, topics: Topics, selections: Selections, bells: Bells, lay: wire.Lay) -> None:
+        """PathError, ValueRangeError: as of the request."""
+        _check(lay)
+        self._topics = topics
+        self._selections = selections
+        self._bells = bells
+        self._lay = lay
+        self.over = ""
+        """Why it has to end, if it was somebody else who lifted it, or nobody reads what it stands over."""
+        self._lifted = self._ended = False
+        self._lifting: asyncio.Task[None] | None = None
+        self._target = target_of(topics, lay)
+        self._news = asyncio.Event()
+        self._waiting = Waiting()  # serialised fields of an InjectResponse
+        self.failure: ShmioError | None = None
+        """What is wrong with what the client sends."""
+        self._giving: set[asyncio.Task[None]] = set()
+        self._room = asyncio.Semaphore(MAX_OPEN)
+        self._shown: Frame | None = None
+        self._shown_image = b""
+        self._timer: asyncio.TimerHandle | None = None
+        self._in_order = asyncio.Lock()
+
+    @property
+    def source(self) -> str:
+        """Whose registers it stands over."""
+        return self._target.place.source
+
+    @property
+    def _inward(self) -> bool:
+        return self._target.place.inward
+
+    async def open(self) -> bytes:
+        """Lay it; the first message. PathError, ValueRangeError, CommandError, EndpointError."""
+        self._view = view = await self._selections.registers({self._target.place: self._target.topics})
+        size = view.block.layout.size
+        self._ranges = Ranges(self._target.ranges, size)
+        registers = covering(view.registers, size)
+        self._bits = bytes(a | b for a, b in zip(registers, self._ranges.bits, strict=True))
+        self._beneath = Beneath(view.block)
+        self._inlet = self._selections.inlet(self.source)
+        if self._inlet.block is not view.block:
+            raise CommandError(f"{self.source}: it was changed by a reload in this very moment; try again")
+        lay = self._lay
+        self._beneath.number = await command_client.lay(
+            self._inlet,
+            self._bits,
+            self,
+            direction=Direction.IN if self._inward else Direction.OUT,
+            priority=lay.priority,
+            keep=lay.keep,
+            name=lay.name,
+        )
+        self.restack()
+        if lay.lifetime_ms:
+            self._timer = asyncio.get_running_loop().call_later(lay.lifetime_ms / 1000, self._end)
+        if self._originals:
+            self._bells.join(view.block, self._news.set)
+        laid = wire.Laid(number=self._beneath.number).SerializeToString()
+        return field(1, laid + field(2, view.table + self._ranges.table))
+
+    @property
+    def _originals(self) -> bool:
+        """Whether it looks at frames."""
+        return not (self._inward or self._lay.quiet)
+
+    async def close(self) -> None:
+        """Lift it, unless it is to be kept. It goes on until the source has: nobody else would."""
+        for task in self._giving:
+            task.cancel()
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._originals:
+            self._bells.leave(self._view.block, self._news.set)
+        number = self._beneath.number
+        if self._lay.keep or self._lifted:
+            self._inlet.followers.remove(number)
+        else:
+            self._lifting = self._lifting or self._lift()
+            await self._lifting
+
+    def _lift(self) -> asyncio.Task[None]:
+        name = f"{self.source}: {self._lay.name}"
+        return asyncio.get_running_loop().create_task(
+            command_client.have_lifted(self._inlet, self._beneath.number, name)
+        )
+
+    def _end(self) -> None:
+        self._ended = True
+        self._news.set()
+
+    async def messages(self) -> AsyncIterator[bytes]:
+        """Serialised InjectResponses, until it is over or its time is."""
+        while True:
+            self._news.clear()  # before looking
+            if self._waiting:
+                yield self._waiting.all()
+            elif original := self._original():
+                yield field(_ORIGINALS, original)
+            elif self._ended or self.over:
+                return
+            else:
+                await self._news.wait()
+
+    # ---- up: what the client gives -----------------------------------------------------------------------------
+
+    async def take(self, requests: AsyncIterator[wire.InjectRequest]) -> None:
+        """Take the client's values in order. ValueRangeError, PathError: a message that cannot be answered is wrong."""
+        async for request in requests:
+            if request.WhichOneof("what") != "shadow":
+                raise ValueRangeError("an injection is laid by the first message, all others give values")
+            await self._room.acquire()
+            task = asyncio.get_running_loop().create_task(self._give(request.shadow))
+            self._giving.add(task)
+            task.add_done_callback(self._given)
+        await asyncio.gather(*self._giving, return_exceptions=True)
+        self._end()
+
+    def _given(self, task: asyncio.Task[None]) -> None:
+        self._room.release()
+        self._giving.discard(task)
+        self.taken(task)
+
+    def taken(self, task: asyncio.Task[None]) -> None:
+        """A task that takes values has ended: with an error, so has the stream."""
+        if not task.cancelled() and isinstance(error := task.exception(), ShmioError):
+            self.failure = error
+            self._end()
+
+    async def _give(self, shadow: wire.Shadow) -> None:
+        try:
+            async with self._in_order:  # a large message takes turns, in which those behind it must not pass
+                values, raw = await self._values(shadow)
+            ends: Sequence[End] = await command_client.give(self._inlet, self._beneath.number, values, raw)
+        except ShmioError as error:
+            if not shadow.sequence:
+                raise
+            self._answer(shadow, (EventKind.REJECTED, str(error)))
+            return
+        if shadow.sequence:
+            self._answer(shadow, worst(ends))
+
+    def _answer(self, shadow: wire.Shadow, end: End) -> None:
+        answer = wire.Answer(sequence=shadow.sequence, outcome=outcome(*end))
+        self._tell(field(_ANSWERS, answer.SerializeToString()))
+
+    async def _values(self, shadow: wire.Shadow) -> tuple[Mapping[str, object], Sequence[Write]]:
+        values = packed(shadow.values, self._view) if shadow.HasField("values") else {}
+        if shadow.assignments:
+            source, named = await assigned(shadow.assignments, self._topics)
+            if source != self.source:
+                raise PathError(f"the injection is over {self.source}, the values are for {source}")
+            values |= named
+        raw = raw_writes(shadow.pieces, self._bits)
+        if not (values or raw):
+            raise ValueRangeError("no value is given")
+        return values, raw
+
+    # ---- down: what it stands over -----------------------------------------------------------------------------
+
+    def _original(self) -> bytes | None:
+        """Over ``/out``: what differs in the newest image beneath it from the one shown before."""
+        if not self._originals:
+            return None
+        block, shown = self._view.block, self._shown
+        frame = block.latest() if shown is None or block.ring.head() != shown.number else shown
+        if frame is None:
+            return None
+        image = self._beneath.image(frame.raw)
+        if shown is not None and image == self._shown_image and frame.quality == shown.quality:
+            self._shown = frame
+            return None
+        before = self._shown_image if shown is not None and shown.source_ns else None
+        body = b""
+        if frame.source_ns:
+            columns = self._view.columns
+            values = pack(columns.decode(image), None if before is None else columns.decode(before))
+            body = (field(VALUES, values) if values else b"") + self._ranges.differing(image, before)
+        quality = shown is None or frame.quality != shown.quality
+        self._shown, self._shown_image = frame, image
+        return head(self._view.number, frame, whole=before is None) + body if body or quality else None
+
+    def divert(self, diverted: Diverted) -> None:
+        """A command's values went to it: over ``/in`` what was written, over ``/out`` what others further in give."""
+        self._beneath.divert(diverted.writes)
+        if not self._inward:
+            self.restack()
+        elif not self._lay.quiet:
+            mask = bytearray(len(self._bits))
+            apply(mask, (write._replace(data=b"\xff" * len(write.data)) for write in diverted.writes))
+            image, touched = bytes(self._beneath.given), bytes(mask)
+            columns = self._view.columns
+            values = pack_slots(columns.decode(image), columns.touched(touched))
+            body = (field(VALUES, values) if values else b"") + self._ranges.touched(image, touched)
+            self._tell(field(_ORIGINALS, head_of(self._view.number, diverted.event) + body))
+
+    def _tell(self, message: bytes) -> None:
+        if not self.over and (reason := self._waiting.add(message)):
+            self._give_up(reason)
+        self._news.set()
+
+    def _give_up(self, reason: str) -> None:
+        """Have it lifted at once: a client that does not read holds up the stream's end."""
+        self.over = self.over or reason
+        if self._beneath.number and not (self._lay.keep or self._lifted):
+            self._lifting = self._lifting or self._lift()
+        self._news.set()
+
+    def restack(self) -> None:
+        """An injection was laid or lifted, on the same source."""
+        if not self._inward:
+            self._beneath.restack()
+            self._news.set()
+
+    def lifted(self, reason: str) -> None:
+        """It was lifted, and not by this stream."""
+        self._lifted = True
+        self.over = f"it was lifted: {reason}" if reason != "lifted" else "somebody has lifted it"
+        self._news.set()
+
+    def fail(self, reason: str) -> None:
+        """What comes next is not all there was: over ``/out`` frames have it."""
+        if self._inward and not self._lay.quiet:
+            self._give_up(reason)
+
+
+def _check(lay: wire.Lay) -> None:
+    """ValueRangeError: options that are none, or do not go together."""
+    if len(lay.name.encode()) > MAX_NAME_BYTES:
+        raise ValueRangeError(f"name: at most {MAX_NAME_BYTES} bytes")
+    if lay.lifetime_ms > MAX_LIFETIME_MS:
+        raise ValueRangeError(f"lifetime_ms: at most {MAX_LIFETIME_MS}, a day")
+    if lay.keep and lay.lifetime_ms:
+        raise ValueRangeError("keep and lifetime_ms: what is kept stays until somebody lifts it")

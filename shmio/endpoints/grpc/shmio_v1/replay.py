@@ -1,0 +1,79 @@
+"""The call of shmio.v1 that moves replays: Replay."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import threading
+from typing import Any, Final
+
+import grpc
+
+from shmio.endpoints.grpc.services.error_status import Context, refuse
+from shmio.errors import ShmioError, ValueRangeError
+from shmio.local.replays import Replays, Wanted
+from shmio.model.replay_status import Playing
+from shmio.segment import Segment
+from shmio.wire import shmio_v1_pb2 as wire
+
+MAX_TEXT: Final = 4096
+MAX_SOURCES: Final = 256
+
+
+class Moves:
+    """A part of the service."""
+
+    def __init__(self, segment: Segment) -> None:
+        self._replays = Replays(segment)
+        self._turn = asyncio.Lock()
+
+    def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
+        """Its calls, by name."""
+        request, response = wire.ReplayRequest.FromString, wire.ReplayResponse.SerializeToString
+        return {"Replay": grpc.unary_unary_rpc_method_handler(self.replay, request, response)}
+
+    async def replay(self, request: wire.ReplayRequest, context: Context) -> wire.ReplayResponse:
+        """Move the replays; one call after the other. A search ends with its call.
+
+        INVALID_ARGUMENT: a speed or a time; NOT_FOUND: a source or a register; FAILED_PRECONDITION: nothing is played,
+        what is looked for is not there, or a source does not answer.
+        """
+        try:
+            wanted = _wanted(request)
+            if wanted.nothing:
+                found = await asyncio.to_thread(self._replays.status, wanted.sources)
+            else:
+                found = await self._change(wanted)
+        except ShmioError as error:
+            await refuse(context, error)
+        return wire.ReplayResponse(sources=map(_playing, found))
+
+    async def _change(self, wanted: Wanted) -> list[Playing]:
+        over = threading.Event()
+        async with self._turn:
+            try:
+                return await asyncio.to_thread(self._replays.change, wanted, over.is_set)
+            finally:
+                over.set()  # its thread goes on when the call is cancelled
+
+
+def _wanted(request: wire.ReplayRequest) -> Wanted:
+    """ValueRangeError: more than anybody means."""
+    texts = (request.seek, request.until, request.change, request.event, *request.sources)
+    if len(request.sources) > MAX_SOURCES or any(len(text) > MAX_TEXT for text in texts):
+        raise ValueRangeError(f"at most {MAX_SOURCES} sources, and {MAX_TEXT} characters of each text, can be given")
+    return Wanted(
+        request.paused if request.HasField("paused") else None,
+        request.speed if request.HasField("speed") else None,
+        request.seek,
+        request.until,
+        request.loop if request.HasField("loop") else None,
+        request.change,
+        request.event,
+        request.jump,
+        tuple(request.sources),
+    )
+
+
+def _playing(play: Playing) -> wire.Playing:
+    return wire.Playing(**dataclasses.asdict(play))

@@ -1,0 +1,175 @@
+"""What the patterns of a call name: a view of each block, made once for all clients who name the same."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+from weakref import WeakValueDictionary
+
+from shmio.endpoints.grpc.commands.block_commands import Inlet
+from shmio.endpoints.grpc.commands.topics import Topics
+from shmio.endpoints.grpc.shmio_v1.views import Frames, Selection, View
+from shmio.errors import EndpointError, PathError, ValueRangeError
+from shmio.layout.glob import named
+from shmio.layout.model import Register
+from shmio.layout.topic import Topic, shorten
+from shmio.segment import Block
+
+MAX_PATTERNS: Final = 256
+MAX_REGISTERS: Final = 16_384
+MAX_ELEMENTS: Final = 262_144
+"""Of one call."""
+MAX_MATCHES: Final = 1_000_000
+"""Patterns with a star times registers that they are held against, in one call: some seconds."""
+MAX_ALL_ELEMENTS: Final = 1 << 22
+"""Of what all clients have open; equal patterns count once."""
+KEPT: Final = 16
+"""Views that are kept though nobody has them, for who reads the same again and again."""
+
+
+class Place(NamedTuple):
+    """A source, and which way: ``inward``, what is written to it."""
+
+    source: str
+    inward: bool = False
+
+
+Wanted = Mapping[Place, Sequence[Topic]]
+
+_Key = tuple[int, bool, tuple[str, ...]]
+
+
+class Selections:
+    """Those that clients have at present."""
+
+    def __init__(self, topics: Topics) -> None:
+        self._topics = topics
+        self._numbers = itertools.count(1)
+        self._known: WeakValueDictionary[_Key, View] = WeakValueDictionary()
+        self._kept: OrderedDict[_Key, View] = OrderedDict()
+        self._turn = asyncio.Lock()
+
+    def resolve(self, patterns: Sequence[str], *, inward: bool = False) -> Wanted:
+        """What a call's patterns say; ``inward``: whether ``/in`` may be among them. PathError, ValueRangeError."""
+        if not patterns:
+            raise ValueRangeError("no pattern is given: a path, structure, glob, or a source's name for all it has")
+        if len(patterns) > MAX_PATTERNS:
+            raise ValueRangeError(f"{len(patterns)} patterns, {MAX_PATTERNS} are the most: use stars, or structures")
+        wanted: dict[Place, dict[Topic, None]] = {}
+        for pattern in patterns:
+            topic = self._topics.topic(pattern)
+            if topic.direction == "in" and not inward:
+                raise PathError(f"{shorten(pattern)}: what goes into a source is not read here; leave out /in")
+            wanted.setdefault(Place(topic.source, topic.direction == "in"), {})[topic] = None
+        return {place: tuple(topics) for place, topics in wanted.items()}
+
+    def inlet(self, source: str) -> Inlet:
+        """The way into a source as of now; PathError: a reload has removed it."""
+        return self._topics.feed(source).inlet
+
+    async def select(self, wanted: Wanted, *, frames: bool = False) -> list[View]:
+        """One for each place, in this order; ``frames``: raw ones.
+
+        PathError: no such register; ValueRangeError: too much for one call; EndpointError: for all clients together.
+        """
+        views = []
+        budget = _Budget()
+        for place, topics in wanted.items():
+            views.append(view := await self._view(place, () if frames else topics, budget))
+            budget.take(view)
+        return views
+
+    async def registers(self, wanted: Wanted) -> Selection:
+        """That of the one place there is; of no registers, if no topic is named."""
+        ((place, topics),) = wanted.items()
+        if not topics:
+            block = self._topics.feed(place.source).block
+            return Selection(next(self._numbers), block, (), inward=place.inward)
+        view = await self._view(place, topics, _Budget())
+        if not isinstance(view, Selection):  # as raw frames are: of no topics
+            raise PathError(f"{place.source}: no register is named")
+        return view
+
+    async def _view(self, place: Place, topics: Sequence[Topic], budget: _Budget) -> View:
+        """``topics``: none for raw frames."""
+        block = self._topics.feed(place.source).block
+        key = block.section, place.inward, tuple(topic.path for topic in topics)
+        if (view := self._known.get(key)) is None:
+            async with self._turn:  # one at a time, and not on the loop: a large layout and its patterns take seconds
+                view = self._known.get(key)
+                if view is None:
+                    view = self._known[key] = await self._make(block, topics, budget, inward=place.inward)
+        self._kept[key] = view
+        self._kept.move_to_end(key)
+        while len(self._kept) > KEPT:
+            self._kept.popitem(last=False)
+        return view
+
+    async def _make(self, block: Block, topics: Sequence[Topic], budget: _Budget, *, inward: bool) -> View:
+        number = next(self._numbers)
+        if not topics:
+            return Frames(number, block)
+        view = await asyncio.to_thread(_select, number, block, topics, budget, inward=inward)
+        if self._elements + view.elements > MAX_ALL_ELEMENTS:
+            self._kept.clear()
+        if self._elements + view.elements > MAX_ALL_ELEMENTS:
+            raise EndpointError(
+                f"all clients together have {self._elements} elements open, {MAX_ALL_ELEMENTS} are the most: name "
+                "less, or take raw frames"
+            )
+        return view
+
+    @property
+    def _elements(self) -> int:
+        return sum(view.elements for view in self._known.values())
+
+
+class _Budget:
+    """What is left of a call's limits."""
+
+    def __init__(self) -> None:
+        self.registers, self.elements, self.matches = MAX_REGISTERS, MAX_ELEMENTS, MAX_MATCHES
+
+    def take(self, view: View) -> None:
+        if isinstance(view, Selection):
+            self.check(len(view.registers), view.elements)
+            self.registers -= len(view.registers)
+            self.elements -= view.elements
+
+    def check(self, registers: int, elements: int) -> None:
+        """ValueRangeError: too many."""
+        if registers > self.registers or elements > self.elements:
+            raise ValueRangeError(
+                f"the patterns name more than {MAX_REGISTERS} registers or {MAX_ELEMENTS} elements, the most of one "
+                "call: name less, make several calls, or take raw frames"
+            )
+
+    def match(self, registers: int) -> None:
+        """ValueRangeError: too many patterns with a star for so large a block."""
+        self.matches -= registers
+        if self.matches < 0:
+            raise ValueRangeError(
+                f"patterns with a star times registers are more than {MAX_MATCHES}: use fewer of them, or structures"
+            )
+
+
+def _select(number: int, block: Block, topics: Sequence[Topic], budget: _Budget, *, inward: bool) -> Selection:
+    chosen: dict[str, Register] = {}
+    elements = 0
+    for topic in topics:
+        if "*" in topic.path:
+            budget.match(len(block.layout.registers))
+        found = named(block.layout, topic)
+        if not found:
+            raise PathError(f"{shorten(str(topic))}: no register of {block.source} has such a path")
+        for register in found:
+            if register.path not in chosen:
+                chosen[register.path] = register
+                elements += register.count
+        budget.check(len(chosen), elements)
+    selection = Selection(number, block, list(chosen.values()), inward=inward)
+    _ = selection.table
+    return selection

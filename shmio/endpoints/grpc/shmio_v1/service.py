@@ -1,0 +1,169 @@
+"""The service ``shmio.v1.Shmio`` (docs/reference/shmio-v1.md)."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Collection, Mapping
+from typing import Any, Final
+
+import grpc
+
+from shmio.endpoints.grpc.commands.topics import Topics
+from shmio.endpoints.grpc.services.error_status import Context, refuse
+from shmio.endpoints.grpc.shmio_v1 import describe
+from shmio.endpoints.grpc.shmio_v1.clock import Clocks
+from shmio.endpoints.grpc.shmio_v1.commands import Orders
+from shmio.endpoints.grpc.shmio_v1.follow import aged
+from shmio.endpoints.grpc.shmio_v1.replay import Moves
+from shmio.endpoints.grpc.shmio_v1.selection import Selections
+from shmio.endpoints.grpc.shmio_v1.simulate import Simulations
+from shmio.endpoints.grpc.shmio_v1.subscribe import Subscription
+from shmio.endpoints.grpc.shmio_v1.views import AGE_NS, ORIGINALS, Selection, View
+from shmio.endpoints.grpc.streams.encoding import field, number
+from shmio.endpoints.grpc.streams.feed import Feed
+from shmio.endpoints.grpc.streams.wakeups import Bells
+from shmio.endpoints.grpc.time.audience import Audience
+from shmio.endpoints.grpc.time.delivery import PATIENCE_S
+from shmio.endpoints.grpc.time.stepper import Stepper
+from shmio.errors import EndpointError, ShmioError
+from shmio.local.time_control import Step
+from shmio.segment import Segment
+from shmio.wire import shmio_v1_pb2 as wire
+
+SERVICE: Final = wire.DESCRIPTOR.services_by_name["Shmio"].full_name
+MAX_STREAMS: Final = 256
+"""Subscribe calls that may be open at once."""
+
+
+class NativeService:
+    """Serves the registers of all sources typed and packed."""
+
+    name = SERVICE
+
+    def __init__(
+        self,
+        topics: Topics,
+        feeds: Mapping[str, Feed],
+        bells: Bells,
+        segment: Segment,
+        stepper: Stepper,
+        audience: Audience,
+    ) -> None:
+        """``audience``: what its streams are a part of."""
+        self._feeds = feeds
+        self._segment = segment
+        self._selections = Selections(topics)
+        self._bells = bells
+        self._clocks = Clocks(segment, stepper)
+        self._hold = stepper.timeline.hold
+        self._audience = audience
+        stepper.timeline.also(self)
+        self._orders = Orders(topics, feeds, self._selections, self._bells)
+        self._simulations = Simulations(feeds, segment)
+        self._moves = Moves(segment)
+        self._open: set[Subscription] = set()
+        self._ended_updates = 0
+
+    @property
+    def streams(self) -> int:
+        """Subscribe calls that are open."""
+        return len(self._open)
+
+    @property
+    def updates(self) -> int:
+        """Updates sent on them since the start."""
+        return self._ended_updates + sum(subscription.updates for subscription in self._open)
+
+    def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
+        """The service's calls, for a server. Values are serialised where they are made, and once."""
+        unary, streaming = grpc.unary_unary_rpc_method_handler, grpc.unary_stream_rpc_method_handler
+        calls: dict[str, grpc.RpcMethodHandler[Any, Any]] = {
+            "GetLayouts": streaming(
+                self.get_layouts, wire.GetLayoutsRequest.FromString, wire.LayoutPart.SerializeToString
+            ),
+            "GetStatus": unary(self.get_status, wire.GetStatusRequest.FromString, wire.Status.SerializeToString),
+            "Read": unary(self.read, wire.ReadRequest.FromString),
+            "Subscribe": streaming(self.subscribe, wire.SubscribeRequest.FromString),
+        }
+        for part in (self._orders, self._simulations, self._clocks, self._moves):
+            calls |= part.handlers()
+        return calls
+
+    async def get_layouts(self, request: wire.GetLayoutsRequest, context: Context) -> AsyncIterator[wire.LayoutPart]:
+        """The layouts of these sources, or of all. NOT_FOUND: no such source."""
+        try:
+            blocks = self._orders.blocks(request.sources)
+        except ShmioError as error:
+            await refuse(context, error)
+        for block in blocks:
+            for part in describe.layout_parts(block):
+                yield part
+
+    async def get_status(self, _: wire.GetStatusRequest, __: Context) -> wire.Status:
+        """As ``shmio-supervisor status --json`` has it."""
+        return describe.status(self._segment)
+
+    async def read(self, request: wire.ReadRequest, context: Context) -> bytes:
+        """The present values, those of one source from one frame.
+
+        NOT_FOUND: no such register, INVALID_ARGUMENT: too many, RESOURCE_EXHAUSTED: too many of all clients together.
+        """
+        try:
+            views = await self._selections.select(self._selections.resolve(request.patterns))
+            known = set(request.tables)
+            tables = [field(1, view.table) for view in views if view.number not in known]
+            return b"".join(tables + [field(2, _reading(view, originals=request.originals)) for view in views])
+        except ShmioError as error:
+            await refuse(context, error)
+
+    async def subscribe(self, request: wire.SubscribeRequest, context: Context) -> AsyncIterator[bytes]:
+        """The present values, then what changes, or every frame.
+
+        NOT_FOUND: no such register, INVALID_ARGUMENT: too many, or options that are none; RESOURCE_EXHAUSTED: too many
+        streams, or registers of all clients together.
+        """
+        try:
+            if len(self._open) >= MAX_STREAMS:
+                raise EndpointError(
+                    f"{MAX_STREAMS} calls of Subscribe are open, the most there may be: one takes many patterns"
+                )
+            subscription = Subscription(self._selections, self._bells, self._hold, request)
+        except ShmioError as error:
+            await refuse(context, error)
+        self._open.add(subscription)
+        try:
+            with self._audience.joined():
+                yield await subscription.open()
+                async for message in subscription.messages():
+                    yield message
+        except ShmioError as error:
+            await refuse(context, error)
+        finally:
+            self._open.discard(subscription)
+            self._ended_updates += subscription.updates
+            subscription.close()
+
+    async def deliver(self, step: Step) -> None:
+        """Have all streams send what has changed in a step, and then say so; wait until they have."""
+        marks = {subscription.mark(step): subscription for subscription in self._open}
+        if marks:
+            _, late = await asyncio.wait(marks, timeout=PATIENCE_S)
+            for mark in late:
+                marks[mark].give_up()
+
+    def move(self, sources: Collection[str]) -> None:
+        """Have the streams of these sources go over to the blocks that there are by now."""
+        self._simulations.move()
+        for subscription in self._open:
+            subscription.move(sources)
+
+
+def _reading(view: View, *, originals: bool) -> bytes:
+    """A serialised ``Update`` of the newest frame."""
+    frame = view.block.latest()
+    if frame is None:
+        return wire.Update(table=view.number, reason="no data yet", whole=True).SerializeToString()
+    update = b"".join(view.update(frame)) + aged(view.block, frame)
+    if originals and isinstance(view, Selection) and frame.effective is not None and frame.source_ns:
+        update += field(ORIGINALS, view.originals(frame))
+    return update + number(AGE_NS, max(0, frame.age_ns(view.block.now_ns())))

@@ -1,0 +1,370 @@
+"""Simulate: a stream on which a program elsewhere computes a source, step by step."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Mapping
+from functools import partial
+from typing import Any
+
+import grpc
+import numpy as np
+
+from shmio.endpoints.grpc.server.turns import turns
+from shmio.endpoints.grpc.services.error_status import Context, refuse
+from shmio.endpoints.grpc.shmio_v1.clock import clock
+from shmio.endpoints.grpc.shmio_v1.columns import KINDS, Column, Decoded, pack
+from shmio.endpoints.grpc.shmio_v1.selection import MAX_ELEMENTS, MAX_REGISTERS
+from shmio.endpoints.grpc.shmio_v1.values import FIELDS, MAX_VALUES, index_of, plain
+from shmio.endpoints.grpc.shmio_v1.views import Selection
+from shmio.endpoints.grpc.streams.encoding import field
+from shmio.endpoints.grpc.streams.feed import Feed
+from shmio.endpoints.grpc.streams.wakeups import Bell
+from shmio.errors import CommandError, ConflictError, PathError, SegmentError, ShmioError, ValueRangeError
+from shmio.layout.image import initial_frame
+from shmio.layout.model import Register
+from shmio.layout.topic import find, holders, parse_topic, shorten
+from shmio.layout.values.codec import RegisterCodec, codec
+from shmio.logs import printable
+from shmio.segment import Block, Segment
+from shmio.segment.model_channel import MAX_NAME_BYTES, Ask, Link, ends_of
+from shmio.wire import shmio_v1_pb2 as wire
+
+
+class Fill:
+    """Those of one table. What was found out about a slot or a path is kept."""
+
+    def __init__(self, selection: Selection) -> None:
+        self._selection = selection
+        self._by_path = {register.path: register for register in selection.registers}
+        self._slots: dict[tuple[Column, int], tuple[str, RegisterCodec]] = {}
+        self._paths: dict[str, Register] = {}
+
+    async def packed(self, values: wire.Values, image: bytearray) -> None:
+        """Values by slots, in turns. ValueRangeError: not of this table, or of a register's type."""
+        for column, name in FIELDS.items():
+            if not values.HasField(name):
+                continue
+            part = getattr(values, name)
+            columns = self._selection.columns
+            most = columns.sizes[column]
+            slots = np.fromiter(part.slots or range(most), np.int64)
+            if len(slots) != len(part.values):
+                raise ValueRangeError(f"{name}: {len(part.values)} values for {len(slots)} slots")
+            if len(slots) > max(1, most):  # else one message could hold up everybody
+                raise ValueRangeError(f"{name}: {len(slots)} values, the table has {most}: give each once")
+            if len(wrong := np.flatnonzero(slots >= most)):
+                raise ValueRangeError(f"{name}: the table has no slot {slots[wrong[0]]}")
+            left = np.arange(len(slots))
+            if column in KINDS:
+                left = columns.encode(column, slots, np.fromiter(part.values, KINDS[column]), image)
+            async for at in turns(left.tolist()):
+                self._put(*self._at(column, int(slots[at])), part.values[at], image)
+
+    async def assigned(self, assignments: Any, image: bytearray) -> None:
+        """Values by paths, in turns. PathError: no such register in the table; ValueRangeError."""
+        if len(assignments) > (most := self._selection.elements):
+            raise ValueRangeError(f"assignments: {len(assignments)} values, the table has {most}: give each once")
+        if len(assignments) > MAX_VALUES:  # each is put in by itself
+            raise ValueRangeError(
+                f"assignments: {len(assignments)} values, {MAX_VALUES} are the most by path: give them by slots"
+            )
+        order = self._selection.block.layout.byte_order
+        async for assignment in turns(assignments):
+            register = self._paths.get(assignment.path)
+            if register is None:
+                register = self._find(assignment.path)
+                if len(self._paths) < self._selection.elements + len(self._by_path):
+                    self._paths[assignment.path] = register
+            self._put(register.path, codec(register, order), plain(assignment.value, register), image)
+
+    @staticmethod
+    def _put(path: str, encoder: RegisterCodec, value: object, image: bytearray) -> None:
+        try:
+            encoder.encode_into(value, image)
+        except ValueRangeError as error:
+            text = str(error)
+            raise ValueRangeError(text if text.startswith(f"{path}:") else f"{path}: {text}") from None
+
+    def _at(self, column: Column, slot: int) -> tuple[str, RegisterCodec]:
+        found = self._slots.get((column, slot))
+        if found is None:
+            columns, layout = self._selection.columns, self._selection.block.layout
+            place = columns.place(column, slot)
+            if place is None:
+                raise ValueRangeError(f"{FIELDS[column]}: the table has no slot {slot}")
+            register = self._selection.registers[place]
+            if register.dims:
+                register = layout.element(register, tuple(index_of(register, slot - columns.places[place][1])))
+            found = self._slots[column, slot] = register.path, codec(register, layout.byte_order)
+        return found
+
+    def _find(self, text: str) -> Register:
+        block = self._selection.block
+        topic = parse_topic(text, (block.source,), block.source)
+        if topic.source != block.source:
+            raise PathError(f"{shorten(text)}: {topic.source} is reserved; begin the path with {block.source}")
+        register = find(block.layout, topic.path)
+        if self._by_path.keys().isdisjoint(holders(register.path)) or topic.direction == "in":
+            raise PathError(f"{shorten(text)}: it is none of the outputs of {block.source}")
+        return register
+
+
+_JOINED, _WORK = (wire.SimulateResponse.DESCRIPTOR.fields_by_name[name].number for name in ("joined", "work"))
+_INPUTS, _OUTPUTS, _PRESENT = (
+    wire.Joined.DESCRIPTOR.fields_by_name[name].number for name in ("inputs", "outputs", "values")
+)
+_VALUES, _INVALID = (wire.Do.DESCRIPTOR.fields_by_name[name].number for name in ("values", "invalid"))
+
+
+class Simulations:
+    """A part of the service: the models that are connected, one for a source at most."""
+
+    def __init__(self, feeds: Mapping[str, Feed], segment: Segment) -> None:
+        self._feeds = feeds
+        self._segment = segment
+        self._open: dict[int, Simulation] = {}  # by the section of their block
+        for block in segment.blocks.values():
+            if block.link is not None:  # the process before this one may have died with its model
+                self._ring(block)
+
+    def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
+        """Its calls, by name."""
+        decode = wire.SimulateRequest.FromString
+        return {"Simulate": grpc.stream_stream_rpc_method_handler(self.simulate, decode)}
+
+    async def simulate(self, requests: AsyncIterator[wire.SimulateRequest], context: Context) -> AsyncIterator[bytes]:
+        """Hand the source's steps to the client, and its outputs to the source.
+
+        NOT_FOUND: no such source; FAILED_PRECONDITION: no model can join it; ALREADY_EXISTS: another one has;
+        INVALID_ARGUMENT: it does not join, or answers what was not asked; UNAVAILABLE: a reload has changed the source.
+        """
+        taking: asyncio.Task[None] | None = None
+        simulation: Simulation | None = None
+        try:
+            simulation = await self._joining(requests, context.peer())
+            first = await simulation.join()
+            self._ring(simulation.block)
+            taking = asyncio.get_running_loop().create_task(simulation.take(requests))
+            taking.add_done_callback(simulation.taken)
+            taking.add_done_callback(partial(self._release, simulation))  # however long nobody reads that it is over
+            yield first
+            async for message in simulation.messages():
+                yield message
+        except ShmioError as error:
+            await refuse(context, error)
+        finally:
+            if taking is not None:
+                taking.cancel()
+            if simulation is not None:
+                self._release(simulation)
+        if simulation.failure is not None:
+            await refuse(context, simulation.failure)
+
+    async def _joining(self, requests: AsyncIterator[wire.SimulateRequest], peer: str) -> Simulation:
+        """What the first message asks for. PathError, CommandError, ConflictError, ValueRangeError."""
+        async for request in requests:
+            if request.WhichOneof("what") == "join":
+                block, name = self._block(request.join.source), request.join.name or peer
+                if len(name.encode()) > MAX_NAME_BYTES:
+                    raise ValueRangeError(f"name: at most {MAX_NAME_BYTES} bytes")
+                if before := self._open.get(block.section):
+                    raise ConflictError(_taken(block, before.name, before.peer))
+                simulation = self._open[block.section] = Simulation(block, self._segment, printable(name), peer)
+                return simulation
+            break
+        raise ValueRangeError("the first message of Simulate joins, all others answer steps")
+
+    def _block(self, source: str) -> Block:
+        if source not in self._feeds:
+            raise PathError(f"no source {shorten(source)!r}; there are: {', '.join(self._feeds)}")
+        block = self._feeds[source].block
+        if block.link is None:
+            can = ", ".join(name for name, feed in self._feeds.items() if feed.block.link is not None) or "none"
+            raise CommandError(
+                f"{source}: no model can join it, for its connector is {block.attributes.connector!r}, not 'remote'; "
+                f"those that one can join: {can}"
+            )
+        return block
+
+    def _release(self, simulation: Simulation, _: object = None) -> None:
+        """Have its source free for another one, if it is not yet."""
+        if self._open.get(simulation.block.section) is simulation:
+            del self._open[simulation.block.section]
+            simulation.leave()
+            self._ring(simulation.block)
+
+    def _ring(self, block: Block) -> None:
+        """Have the source look who is connected."""
+        for slot in self._segment.processes:
+            if slot.name == block.source:
+                self._segment.clock.slot_bell(slot.index).ring()
+
+    def move(self) -> None:
+        """A reload has ended some blocks."""
+        for simulation in self._open.values():
+            if simulation.block.retired:
+                source = simulation.block.source
+                simulation.end(SegmentError(f"{source} was changed or removed by a reload: join again"))
+
+
+class Simulation:
+    """One call of Simulate."""
+
+    def __init__(self, block: Block, segment: Segment, name: str, peer: str) -> None:
+        self.block = block
+        self.name = name
+        self.peer = peer
+        self.failure: ShmioError | None = None
+        """Why it is over, if its client is to be told."""
+        self._segment = segment
+        self._joined = False
+        self._over = False
+        self._news = asyncio.Event()
+        self._bell: Bell | None = None  # rings when the source has asked for a step
+        self._handed = 0
+        self._asked: Ask | None = None  # what the model has in hand
+        self._given: Decoded | None = None
+        self._image: bytearray | None = None  # with the outputs as the model has set them
+        self._refused = ""
+
+    @property
+    def _link(self) -> Link:
+        if self.block.link is None:
+            raise SegmentError(f"{self.block.source}: its block has no link")
+        return self.block.link
+
+    async def join(self) -> bytes:
+        """Take the link; the first message. ConflictError, ValueRangeError."""
+        self._inputs, self._outputs = await asyncio.to_thread(_tables, self.block)  # takes seconds for a large layout
+        self._fill = Fill(self._outputs)
+        link = self._link
+        self._handed = link.asked.head()  # before it is taken: what was asked then is not for this model
+        if not link.join(self.name):
+            before = link.model()
+            name, who = (before.name, f"pid {before.pid}") if before else ("another", "which is leaving")
+            raise ConflictError(_taken(self.block, name, who))
+        self._joined = True
+        self._bell = Bell(link.asked, f"asked-{self.block.source}")
+        self._bell.listeners[self._news.set] = None
+        frame = self.block.latest()
+        image = frame.raw if frame is not None and frame.source_ns else bytes(initial_frame(self.block.layout)[0])
+        joined = wire.Joined(
+            computed=link.computed(), clock=clock(self._segment.clock.read()), period_ns=self.block.period_ns
+        )
+        parts = (
+            field(_INPUTS, self._inputs.table)
+            + field(_OUTPUTS, self._outputs.table)
+            + field(_PRESENT, pack(self._outputs.columns.decode(image)))
+        )
+        return field(_JOINED, joined.SerializeToString() + parts)
+
+    def leave(self) -> None:
+        """Give the link back."""
+        self._over = True
+        if self._joined:
+            self._link.leave()
+        if self._bell is not None:
+            self._bell.stop()
+
+    def end(self, failure: ShmioError | None = None) -> None:
+        """Have the stream end."""
+        self.failure = self.failure or failure
+        self._over = True
+        self._news.set()
+
+    # ---- down: what is to be done ------------------------------------------------------------------------------
+
+    async def messages(self) -> AsyncIterator[bytes]:
+        """Serialised SimulateResponses, until it is over."""
+        while not self._over:
+            self._news.clear()  # before looking
+            if self._asked is None and (ask := self._newest()) is not None:
+                self._asked = ask
+                yield field(_WORK, self._work(ask))
+            else:
+                await self._news.wait()
+
+    def _newest(self) -> Ask | None:
+        """The step that the source waits for, unless it has been handed out."""
+        link = self._link
+        if link.asked.head() == self._handed or (ask := link.newest()) is None:
+            return None
+        self._handed = ask.number
+        return ask if ask.until_ns > time.monotonic_ns() else None
+
+    def _work(self, ask: Ask) -> bytes:
+        """A serialised ``Do``: all inputs at first, then those that differ from what the model has."""
+        before, now = self._given, self._inputs.columns.decode(ask.commanded)
+        self._given = now
+        work = wire.Do(
+            step=ask.step, time_ns=ask.time_ns, dt_ns=ask.dt_ns, doubt=ask.doubt, refused=self._refused
+        ).SerializeToString()
+        if values := pack(now, before):
+            work += field(_VALUES, values)
+        if before is None or now.invalid != before.invalid:
+            work += field(_INVALID, field(1, np.array(now.invalid, "<u4").tobytes()))
+        return work
+
+    # ---- up: what has become of it -----------------------------------------------------------------------------
+
+    async def take(self, requests: AsyncIterator[wire.SimulateRequest]) -> None:
+        """Take the model's answers, until it half-closes. ValueRangeError: one to what was not asked."""
+        async for request in requests:
+            if request.WhichOneof("what") != "done":
+                raise ValueRangeError("a model joins once, by the first message; all others answer steps")
+            await self._take(request.done)
+        self.end()
+
+    def taken(self, task: asyncio.Task[None]) -> None:
+        """The task of :meth:`take` has ended."""
+        if not task.cancelled():
+            error = task.exception()
+            self.end(error if isinstance(error, ShmioError) else None)
+
+    async def _take(self, done: wire.Done) -> None:
+        ask = self._asked
+        if ask is None or done.step != ask.step:
+            asked = "none is to be done" if ask is None else f"step {ask.step} is to be done"
+            raise ValueRangeError(f"an answer to step {done.step}, and {asked}")
+        self._refused = ""
+        image = bytearray(ask.shown if self._image is None else self._image)
+        failure = " ".join(done.failure.split()) if done.HasField("failure") else None
+        if failure is None:
+            try:
+                await self._fill.packed(done.values, image)
+                await self._fill.assigned(done.assignments, image)
+            except (PathError, ValueRangeError) as error:
+                failure = str(error)
+                self._refused = f"step {ask.step}: {failure}"
+            else:
+                self._image = image
+        late_ns = (now_ns := time.monotonic_ns()) - ask.until_ns
+        if late_ns < 0:
+            self._link.answer(ask, now_ns, image, None if failure is None else printable(failure))
+        else:  # not given: a source that looks late, too, might take it still
+            self._refused = self._refused or f"step {ask.step}: the answer came {late_ns // 1_000_000} ms too late"
+        self._asked = None
+        self._news.set()
+
+
+def _tables(block: Block) -> tuple[Selection, Selection]:
+    """Inputs and outputs. ValueRangeError: they are too many; ConfigError."""
+    ends = ends_of(block.layout, block.attributes.outputs, block.attributes.inouts)
+    tables = Selection(1, block, ends.inputs), Selection(2, block, ends.outputs)
+    for table in tables:
+        if len(table.registers) > MAX_REGISTERS or table.elements > MAX_ELEMENTS:
+            raise ValueRangeError(
+                f"{block.source} has more than {MAX_REGISTERS} registers or {MAX_ELEMENTS} elements, the most of a "
+                "model: make several sources of it"
+            )
+        _ = table.table
+    return tables
+
+
+def _taken(block: Block, name: str, who: str) -> str:
+    return (
+        f"{block.source}: model {name!r} ({who}) is connected already, and a source has one: end that one first, or "
+        "name another source"
+    )

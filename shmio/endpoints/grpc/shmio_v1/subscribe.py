@@ -1,0 +1,226 @@
+"""Subscribe: one stream over any number of blocks."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections import deque
+from collections.abc import AsyncIterator, Collection
+from functools import partial
+from typing import Final
+
+from shmio.endpoints.grpc.shmio_v1.follow import EveryFrame, Follower, Latest
+from shmio.endpoints.grpc.shmio_v1.selection import Place, Selections
+from shmio.endpoints.grpc.shmio_v1.views import Selection, View
+from shmio.endpoints.grpc.shmio_v1.written import Inward
+from shmio.endpoints.grpc.streams.encoding import field
+from shmio.endpoints.grpc.streams.wakeups import Bells, Ring
+from shmio.endpoints.grpc.time.virtual_time import Hold
+from shmio.errors import EndpointError, PathError, ValueRangeError
+from shmio.local.time_control import Step
+from shmio.wire import shmio_v1_pb2 as wire
+
+BATCH_BYTES: Final = 1 << 18
+"""What has come of all blocks goes out in one message up to this size."""
+BATCH_UPDATES: Final = 256
+"""And up to so many of frames, however small, which takes milliseconds: then others have their turn."""
+MAX_RATE_HZ: Final = 1e6
+
+TABLES, UPDATES, ENDED, STEP = (
+    wire.SubscribeResponse.DESCRIPTOR.fields_by_name[name].number for name in ("tables", "updates", "ended", "step")
+)
+
+
+def check(request: wire.SubscribeRequest) -> None:
+    """ValueRangeError: options that are none, or do not go together."""
+    if request.mode not in wire.Mode.values() or request.format not in wire.Format.values():
+        raise ValueRangeError(f"mode {request.mode}, format {request.format}: this version has 0 and 1 of each")
+    for name, value, most in (
+        ("max_rate_hz", request.max_rate_hz, MAX_RATE_HZ),
+        ("deadband", request.deadband, math.inf),
+    ):
+        if not 0 <= value <= most or math.isinf(value):
+            raise ValueRangeError(
+                f"{name}: {value} is not a number from 0 on{'' if math.isinf(most) else f', at most {most:g}'}"
+            )
+    if request.mode == wire.MODE_EVERY_FRAME and (request.max_rate_hz or request.deadband):
+        raise ValueRangeError("max_rate_hz and deadband are for the mode LATEST: every frame is every frame")
+    if request.format == wire.FORMAT_FRAMES and request.deadband:
+        raise ValueRangeError("deadband is for the format VALUES")
+
+
+class Subscription:
+    """One call of Subscribe."""
+
+    def __init__(self, selections: Selections, bells: Bells, hold: Hold, request: wire.SubscribeRequest) -> None:
+        """``hold``: virtual time. PathError, ValueRangeError: as of the request."""
+        check(request)
+        self.updates = 0
+        self.late = False
+        """Whether a step has waited too long for it; see :meth:`give_up`."""
+        self._hold = hold
+        self._opened = False
+        self._marks: deque[tuple[Step, asyncio.Future[None]]] = deque()
+        self._selections = selections
+        self._bells = bells
+        self._request = request
+        self._wanted = selections.resolve(request.patterns, inward=True)
+        if request.format == wire.FORMAT_FRAMES and any(place.inward for place in self._wanted):
+            raise ValueRangeError("what is written has no raw frames: leave out /in, or ask for the format VALUES")
+        self._followers: dict[Place, Follower] = {}
+        self._inward: dict[Place, Inward] = {}
+        self._rings: dict[Place, Ring] = {}  # what their bells call
+        self._moved: dict[Place, None] = {}
+        self._turn = 0
+        self._news = asyncio.Event()
+        self._clock = asyncio.get_running_loop().time
+
+    async def open(self) -> bytes:
+        """Join all blocks; the tables. PathError, ValueRangeError, EndpointError."""
+        views = await self._selections.select(self._wanted, frames=self._request.format == wire.FORMAT_FRAMES)
+        self._opened = True
+        return b"".join(map(self._join, self._wanted, views))
+
+    def close(self) -> None:
+        """Leave them."""
+        while self._marks:
+            _set(self._marks.popleft()[1])
+        for place in self._wanted:
+            self._leave(place)
+
+    def give_up(self) -> None:
+        """Nothing waits for it any more, and it ends as soon as its client reads again; what it holds goes at once."""
+        self.late = True
+        self.close()
+        self._news.set()
+
+    def move(self, sources: Collection[str]) -> None:
+        """A reload has changed these sources."""
+        self._moved |= dict.fromkeys(place for place in self._wanted if place.source in sources)
+        self._news.set()
+
+    def mark(self, step: Step) -> asyncio.Future[None]:
+        """Say that a step is over, when all that has changed in it is sent; what is done then, or when this ends.
+
+        Before the tables are there, which takes seconds for a large layout, it is done at once.
+        """
+        sent = asyncio.get_running_loop().create_future()
+        if self.late or not self._opened:
+            sent.set_result(None)
+        else:
+            self._marks.append((step, sent))
+            self._news.set()
+        return sent
+
+    async def messages(self) -> AsyncIterator[bytes]:
+        """Serialised SubscribeResponses, without end.
+
+        EndpointError: a step, or what was written, has waited too long to be read.
+        """
+        while not self.late:
+            for inward in self._inward.values():
+                if inward.failure:
+                    raise EndpointError(inward.failure)
+            self._news.clear()  # before looking
+            batch, whole = self._batch()
+            if self._marks and whole and not self._moved:
+                step, sent = self._marks.popleft()
+                try:
+                    yield batch + field(STEP, wire.Step(number=step.number, time_ns=step.time_ns).SerializeToString())
+                finally:
+                    _set(sent)
+            elif batch:
+                yield batch
+            elif self._moved:
+                place = next(iter(self._moved))
+                del self._moved[place]
+                yield await self._go_over(place)
+            else:
+                await self._wait()
+        raise EndpointError("a step has waited too long to be read: this client is too slow for how time is stepped")
+
+    def _batch(self) -> tuple[bytes, bool]:
+        """What there is at present, up to a bound, first what was written, then of each block in turn.
+
+        And whether it is all there is.
+        """
+        parts: list[bytes] = []
+        size, now_s = 0, self._clock()
+        for inward in self._inward.values():
+            while size < BATCH_BYTES and (written := inward.next()) is not None:
+                self.updates += 1
+                size += len(written)
+                parts.append(field(UPDATES, written))
+        waiting = deque(follower for follower in self._followers.values() if self._open(follower))
+        waiting.rotate(self._turn)
+        self._turn += 1  # else one with long updates would hide the others
+        most = len(parts) + BATCH_UPDATES
+        while waiting and size < BATCH_BYTES and len(parts) < most:
+            update = waiting[0].next(now_s)
+            if update is None:
+                waiting.popleft()
+                continue
+            waiting.rotate(-1)
+            self.updates += 1
+            size += len(update)
+            parts.append(field(UPDATES, update))
+        return b"".join(parts), not (waiting or any(inward.waits for inward in self._inward.values()))
+
+    def _open(self, follower: Follower) -> bool:
+        """Whether a block may be shown now: on the instance's clock, in virtual time, only when a step is over."""
+        held = self._hold.on and follower.view.block.attributes.stepped
+        return not held or bool(self._marks) or not follower.begun
+
+    def _ring(self, follower: Follower) -> None:
+        """Its block has something new."""
+        if self._open(follower):
+            self._news.set()
+
+    async def _wait(self) -> None:
+        due_s = min((follower.due_s for follower in self._followers.values()), default=math.inf)
+        if math.isinf(due_s):
+            await self._news.wait()
+            return
+        handle = asyncio.get_running_loop().call_at(due_s, self._news.set)
+        try:
+            await self._news.wait()
+        finally:
+            handle.cancel()
+
+    async def _go_over(self, place: Place) -> bytes:
+        """Follow the block that a source has by now, or say that it has none; all of the old one was sent."""
+        self._leave(place)
+        try:
+            (view,) = await self._selections.select(
+                {place: self._wanted[place]}, frames=self._request.format == wire.FORMAT_FRAMES
+            )
+            return self._join(place, view)
+        except PathError as error:
+            direction = wire.DIRECTION_IN if place.inward else wire.DIRECTION_OUT
+            ended = wire.Ended(source=place.source, reason=str(error), direction=direction)
+            return field(ENDED, ended.SerializeToString())
+
+    def _join(self, place: Place, view: View) -> bytes:
+        request = self._request
+        if place.inward and isinstance(view, Selection):
+            self._inward[place] = Inward(view.writes, self._selections.inlet(place.source), self._news.set)
+            return field(TABLES, view.table)
+        if request.mode == wire.MODE_EVERY_FRAME:
+            follower: Follower = EveryFrame(view)
+        else:
+            follower = Latest(view, 1 / request.max_rate_hz if request.max_rate_hz else 0.0, request.deadband)
+        self._followers[place] = follower
+        ring = self._rings[place] = partial(self._ring, follower)
+        self._bells.join(view.block, ring)
+        return field(TABLES, view.table)
+
+    def _leave(self, place: Place) -> None:
+        if inward := self._inward.pop(place, None):
+            inward.leave()
+        if follower := self._followers.pop(place, None):
+            self._bells.leave(follower.view.block, self._rings.pop(place))
+
+
+def _set(sent: asyncio.Future[None]) -> None:
+    if not sent.done():
+        sent.set_result(None)

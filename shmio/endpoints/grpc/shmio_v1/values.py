@@ -1,0 +1,106 @@
+"""Values that clients send: one by one by path, or packed by a table's slots."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Final
+
+from shmio.endpoints.grpc.commands.topics import Topics
+from shmio.endpoints.grpc.server.turns import turns
+from shmio.endpoints.grpc.shmio_v1.columns import Column
+from shmio.endpoints.grpc.shmio_v1.views import Selection
+from shmio.errors import CommandError, ValueRangeError
+from shmio.layout.model import Register
+from shmio.layout.topic import shorten
+from shmio.layout.values.text import from_text, wire_type
+from shmio.messages import value_from_wire
+from shmio.segment import EventKind
+from shmio.wire import shmio_v1_pb2 as wire
+
+MAX_VALUES: Final = 4096
+"""Of one command."""
+
+FIELDS: Final = {column: wire.Values.DESCRIPTOR.fields_by_number[column].name for column in Column}
+_OUTCOMES: Final = {
+    EventKind.WRITTEN: wire.Outcome.KIND_WRITTEN,
+    EventKind.TAKEN: wire.Outcome.KIND_TAKEN,
+    EventKind.REJECTED: wire.Outcome.KIND_REJECTED,
+    EventKind.REFUSED: wire.Outcome.KIND_REFUSED,
+    EventKind.EXPIRED: wire.Outcome.KIND_EXPIRED,
+    EventKind.SHADOWED: wire.Outcome.KIND_SHADOWED,
+    EventKind.ACCEPTED: wire.Outcome.KIND_ACCEPTED,
+}
+
+
+def outcome(kind: EventKind, reason: str) -> wire.Outcome:
+    """What became of a value, for the client."""
+    return wire.Outcome(kind=_OUTCOMES.get(kind, wire.Outcome.KIND_UNKNOWN), reason=reason)
+
+
+async def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, object]]:
+    """The source, and values by path, found in turns. PathError, ValueRangeError; CommandError: ``/out``."""
+    if len(assignments) > MAX_VALUES:  # before looking at any
+        raise ValueRangeError(
+            f"{len(assignments)} values, {MAX_VALUES} are the most: write whole arrays, or less at once"
+        )
+    values: dict[str, object] = {}
+    sources: dict[str, None] = {}
+    async for assignment in turns(assignments):
+        topic = topics.topic(assignment.path)
+        register = topics.register(topic)
+        if topic.direction == "out":
+            raise CommandError(f"{shorten(assignment.path)}: what comes out of a source is not written; leave out /out")
+        if register.path in values:
+            raise ValueRangeError(f"{shorten(assignment.path)}: given twice")
+        values[register.path] = plain(assignment.value, register)
+        sources[topic.source] = None
+    if not values:
+        raise ValueRangeError("no value is given")
+    if len(sources) > 1:
+        raise ValueRangeError(f"one call is for one source, these values are for {', '.join(sorted(sources))}")
+    return next(iter(sources)), values
+
+
+def plain(value: wire.Value, register: Register) -> object:
+    """A value as Python has it; ValueRangeError: there is none, or no text of its type."""
+    if value.WhichOneof("kind") == "text" and (register.dims or wire_type(register) != "string"):
+        return from_text(value.text, register)
+    return value_from_wire(value, register.path)
+
+
+def packed(values: wire.Values, selection: Selection) -> dict[str, object]:
+    """Values by path, of registers or of arrays' elements. ValueRangeError: not of this table."""
+    found: dict[str, object] = {}
+    for column, name in FIELDS.items():
+        if not values.HasField(name):
+            continue
+        part = getattr(values, name)
+        slots = part.slots or range(selection.columns.sizes[column])
+        if len(slots) != len(part.values):
+            raise ValueRangeError(f"{name}: {len(part.values)} values for {len(slots)} slots")
+        if len(found) + len(slots) > MAX_VALUES:
+            raise ValueRangeError(f"more than {MAX_VALUES} values: send less at once")
+        for slot, value in zip(slots, part.values, strict=True):
+            found[_path(selection, column, slot)] = value
+    return found
+
+
+def _path(selection: Selection, column: Column, slot: int) -> str:
+    """The path of the register or element at a slot; ValueRangeError."""
+    place = selection.columns.place(column, slot)
+    if place is None:
+        raise ValueRangeError(f"{column.name.lower()}s: the table has no slot {slot}")
+    register = selection.registers[place]
+    if not register.dims:
+        return register.path
+    flat = slot - selection.columns.places[place][1]
+    return "/".join((register.path, *map(str, index_of(register, flat))))
+
+
+def index_of(register: Register, flat: int) -> Iterator[int]:
+    """The declared indices of an array's element."""
+    indices = []
+    for low, high in reversed(register.dims):
+        flat, rest = divmod(flat, high - low + 1)
+        indices.append(low + rest)
+    return reversed(indices)

@@ -1,0 +1,217 @@
+"""What patterns name on one block as one table, and the block's frames as messages of it."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from shmio.endpoints.grpc.shmio_v1.columns import Column, Columns, Decoded, column_of, merge, pack
+from shmio.endpoints.grpc.shmio_v1.written import Writes
+from shmio.endpoints.grpc.streams.encoding import field
+from shmio.layout.model import Register
+from shmio.segment import Block, Frame
+from shmio.wire import shmio_v1_pb2 as wire
+
+VALUES, ORIGINALS, INVALID, INJECTED, IMAGE, ORIGINAL, QUALITY, REASON, MISSED, AGE_NS = (
+    wire.Update.DESCRIPTOR.fields_by_name[name].number
+    for name in (
+        "values", "originals", "invalid", "injected", "image", "original", "quality", "reason", "missed", "age_ns",
+    )
+)  # fmt: skip
+
+_CACHED: Final = 8
+_NO_MARKS: Final = np.zeros(0, "<u4")
+
+Marks = np.ndarray[Any, np.dtype[Any]]
+
+
+class Message(NamedTuple):
+    """A serialised ``Update`` in two parts. ``body``: what has changed; empty, if nothing has."""
+
+    head: bytes
+    body: bytes
+
+
+class Selection:
+    """Registers of one block as one table, and what becomes of its frames. For the event loop's thread, once made."""
+
+    def __init__(self, number: int, block: Block, registers: Sequence[Register], *, inward: bool = False) -> None:
+        """``inward``: it is about what is written to them."""
+        self.number = number
+        self.inward = inward
+        self.block = block
+        self.registers = tuple(registers)
+        self.elements = sum(register.count for register in registers)
+        self.columns = Columns(registers, block.layout.byte_order)
+        self._decoded: OrderedDict[int, Decoded] = OrderedDict()
+        self._updates: OrderedDict[tuple[int, int], Message] = OrderedDict()
+        self._marks: OrderedDict[int, Marks] = OrderedDict()
+
+    @cached_property
+    def writes(self) -> Writes:
+        """What becomes of what is written to them."""
+        return Writes(self.number, self.block, self.registers, self.columns)
+
+    @cached_property
+    def table(self) -> bytes:
+        """The serialised ``Table``."""
+        table = wire.Table(
+            number=self.number,
+            source=self.block.source,
+            section=self.block.section,
+            hash=self.block.layout.hash,
+            size=self.block.layout.size,
+            slots=[0, *self.columns.sizes.values()],
+            direction=wire.DIRECTION_IN if self.inward else wire.DIRECTION_OUT,
+        )
+        for register, (column, slot) in zip(self.registers, self.columns.places, strict=True):
+            describe(register, table.registers.add(), column, slot)
+        return table.SerializeToString()
+
+    def decode(self, frame: Frame) -> Decoded:
+        """All elements of a frame as consumers see it."""
+        found = self._decoded.get(frame.number)
+        if found is None:
+            found = self._decoded[frame.number] = self.columns.decode(frame.image)
+            _trim(self._decoded)
+        return found
+
+    def update(self, frame: Frame, before: Frame | None = None) -> Message:
+        """An ``Update``: what differs from the frame before; all of it, if there is none.
+
+        Its quality is that which the frame was published with.
+        """
+        if before is not None and not before.source_ns:
+            before = None
+        key = frame.number, before.number if before else 0
+        found = self._updates.get(key)
+        if found is None:
+            old = self.decode(before) if before else None
+            found = self._updates[key] = self._update(frame, before, self.decode(frame), old)
+            _trim(self._updates)
+        return found
+
+    def update_beyond(self, frame: Frame, before: Frame, sent: Decoded, deadband: float) -> tuple[Message, Decoded]:
+        """The same with a dead-band, for who was sent that much; and what it has then."""
+        new = self.decode(frame)
+        return self._update(frame, before, new, sent, deadband), merge(new, sent, deadband)
+
+    def _update(
+        self, frame: Frame, before: Frame | None, new: Decoded, old: Decoded | None, deadband: float = 0.0
+    ) -> Message:
+        parts = []
+        if frame.source_ns:
+            if values := pack(new, old, deadband):
+                parts.append(field(VALUES, values))
+            if old is None or new.invalid != old.invalid:
+                parts.append(field(INVALID, field(1, np.array(new.invalid, "<u4").tobytes())))
+        now = self.injected(frame)
+        if before is None or (now is not (was := self.injected(before)) and not np.array_equal(now, was)):
+            parts.append(field(INJECTED, field(1, now.tobytes())))
+        return Message(head(self.number, frame, whole=before is None), b"".join(parts))
+
+    def originals(self, frame: Frame) -> bytes:
+        """The serialised ``Values`` that the source delivered."""
+        return pack(self.columns.decode(frame.raw))
+
+    def injected(self, frame: Frame) -> Marks:
+        """Places of the registers that are under an injection over ``/out``, by what stood when it was asked first."""
+        if frame.effective is None:
+            return _NO_MARKS
+        found = self._marks.get(frame.event)  # nothing is laid or lifted without an event
+        if found is None:
+            found = self._marks[frame.event] = self._under_injections()
+            _trim(self._marks)
+        return found
+
+    def _under_injections(self) -> Marks:
+        cover = np.zeros(self.block.layout.size, np.uint8)
+        for standing in self.block.standing.read():
+            if standing.direction == "out" and standing.active:
+                for offset, size, mask in standing.ranges:
+                    cover[offset : offset + size] |= mask
+        starts, stops, masks = self._extents
+        covered = np.concatenate(([0], np.cumsum(cover != 0)))
+        hit = np.where(masks, cover[starts] & masks, covered[stops] - covered[starts])
+        return np.flatnonzero(hit).astype("<u4")
+
+    @cached_property
+    def _extents(self) -> tuple[Marks, ...]:
+        """First byte, the one after the last, and of a single bit its mask, by register."""
+        starts = [register.offset for register in self.registers]
+        stops = [register.offset + register.size for register in self.registers]
+        masks = [0 if register.bit is None or register.dims else 1 << register.bit for register in self.registers]
+        return tuple(np.array(numbers, np.intp) for numbers in (starts, stops, masks))
+
+
+class Frames:
+    """A block of which somebody wants raw frames; as a :class:`Selection` of no registers."""
+
+    def __init__(self, number: int, block: Block) -> None:
+        self.number = number
+        self.block = block
+        self.elements = 0
+        self._updates: OrderedDict[int, Message] = OrderedDict()
+
+    @cached_property
+    def table(self) -> bytes:
+        """The serialised ``Table``."""
+        layout = self.block.layout
+        return wire.Table(
+            number=self.number,
+            source=self.block.source,
+            section=self.block.section,
+            hash=layout.hash,
+            size=layout.size,
+        ).SerializeToString()
+
+    def update(self, frame: Frame, before: Frame | None = None) -> Message:  # noqa: ARG002  a frame is always whole
+        """An ``Update`` with both images, if they are two."""
+        found = self._updates.get(frame.number)
+        if found is None:
+            body = field(IMAGE, frame.image) if frame.source_ns else b""
+            if frame.source_ns and frame.effective is not None:
+                body += field(ORIGINAL, frame.raw)
+            found = self._updates[frame.number] = Message(head(self.number, frame, whole=True), body)
+            _trim(self._updates)
+        return found
+
+
+View = Selection | Frames
+
+
+def head(table: int, frame: Frame, *, whole: bool = False) -> bytes:
+    """A serialised ``Update`` without values."""
+    return wire.Update(
+        table=table,
+        frame=frame.number,
+        cycle=frame.cycle,
+        incarnation=frame.incarnation,
+        clock_ns=frame.clock_ns,
+        source_ns=frame.source_ns,
+        quality=int(frame.quality),  # type: ignore[arg-type]  # enums of the wire are its own to mypy
+        reason=frame.reason,
+        provenance=int(frame.provenance),  # type: ignore[arg-type]
+        whole=whole,
+    ).SerializeToString()
+
+
+def describe(register: Register, found: wire.Register, column: Column | None = None, slot: int = 0) -> None:
+    """Fill in a register's description."""
+    found.path, found.type = register.path, register.type
+    found.offset, found.size, found.count = register.offset, register.size, register.count
+    found.column = int(column or column_of(register.element))  # type: ignore[assignment]
+    found.slot = slot
+    if register.bit is not None:
+        found.bit = register.bit
+    for low, high in register.dims:
+        found.dims.add(low=low, high=high)
+
+
+def _trim(cache: OrderedDict[Any, Any]) -> None:
+    while len(cache) > _CACHED:
+        cache.popitem(last=False)

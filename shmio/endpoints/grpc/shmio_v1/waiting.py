@@ -1,0 +1,39 @@
+"""Messages that wait to be read by one client, of which none may be left out."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final
+
+from shmio.endpoints.grpc.streams.back_pressure import Load, Total
+
+MAX_WAITING: Final = 4096
+
+
+class Waiting:
+    """Up to a number of them, and of bytes."""
+
+    def __init__(self) -> None:
+        self._messages: deque[bytes] = deque()
+        self._load = Load(Total())
+
+    def __bool__(self) -> bool:
+        return bool(self._messages)
+
+    def add(self, message: bytes) -> str:
+        """Add one; why not, or empty."""
+        if self._load.full(message, MAX_WAITING):
+            return f"{self._load.count} messages wait to be read: the client is too slow for what is told"
+        self._load.add(message)
+        self._messages.append(message)
+        return ""
+
+    def pop(self) -> bytes:
+        """The oldest."""
+        message = self._messages.popleft()
+        self._load.remove(message)
+        return message
+
+    def all(self) -> bytes:
+        """All that wait, one behind the other."""
+        return b"".join([self.pop() for _ in range(len(self._messages))])

@@ -1,0 +1,298 @@
+"""Follows one block: one change scan for each frame, one encoding for each change, whoever listens."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable, Iterable, Sized
+
+from shmio.endpoints.grpc.commands.block_commands import Inlet
+from shmio.endpoints.grpc.streams.back_pressure import Crowd
+from shmio.endpoints.grpc.streams.channel import Channel, Listener, Table
+from shmio.endpoints.grpc.streams.subject import Subject
+from shmio.endpoints.grpc.streams.wakeups import Bells
+from shmio.endpoints.grpc.time.virtual_time import Hold, Moment, Still
+from shmio.segment import Block, Event, Frame, Quality
+
+log = logging.getLogger("shmio.grpc")
+
+TURN_FRAMES = 8
+"""So many are shown before streams have their turn."""
+
+
+class Feed:
+    """Delivers the changes of one block's registers to listeners while quality is good.
+
+    On recovery from bad quality every register is delivered again. While it is held, which a block on the instance's
+    clock is in virtual time, nothing is delivered but by :meth:`step`. For the event loop's thread.
+    """
+
+    def __init__(
+        self,
+        block: Block,
+        writer: int,
+        bells: Bells,
+        on_quality: Callable[[str, bool], None],
+        hold: Hold | None = None,
+    ) -> None:
+        """``writer``: the command queue of this process. ``hold``: virtual time; default: there is none."""
+        self.block = block
+        self.inlet = Inlet(block, writer, bells, self._stamp)
+        """The other direction."""
+        self.messages = 0
+        self._hold = hold or Hold()
+        self._held = self._hold.on and block.attributes.stepped
+        self._stepped = False  # since it is held
+        self._shown: Frame | Still | None = None  # what listeners have seen; None while quality is bad
+        self._good = False  # as last told
+        self._loop = asyncio.get_running_loop()
+        self._bells = bells
+        self._on_quality = on_quality
+        self._channels: dict[Subject, Channel] = {}
+        self._crowd = Crowd(block, self._refill)
+        self._free: list[int] = []  # slots
+        self._table = Table.of((), 0)
+        self._outdated = False
+        self._owed: dict[Listener, Channel] = {}  # joined while there was no good value
+        _ = block.layout.members("")  # builds what paths are looked up in, before the first client waits for it
+        self._cursor = block.cursor()
+        self._following = False
+        self._again = False  # whether the loop is about to look without a bell
+
+    @property
+    def alive(self) -> bool:
+        """Whether the block is being followed, as long as there is something to come."""
+        return (self._following or self.block.retired) and self.inlet.alive
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing is left of it: neither does it follow the block, nor has it a stream."""
+        return not (self._following or self._channels) and self.inlet.over
+
+    def start(self) -> None:
+        """Begin to follow the block."""
+        newest = self.block.latest()
+        if self._held:
+            self._adopt(newest)
+        self._cursor = self.block.cursor(after=newest.number - 1 if newest else 0)
+        self._following = True
+        self.inlet.start()  # it hears first: what was written before a frame is told before it
+        self._bells.join(self.block, self._look)
+
+    def stop(self) -> None:
+        """Follow it no more."""
+        self._end()
+        self.inlet.stop()
+
+    def listen(self, subject: Subject, listener: Listener) -> None:
+        """Join a subject's listeners; the current value is delivered at once, or as soon as it is good."""
+        channel = self._channels.get(subject)
+        if channel is None:
+            slot = self._free.pop() if self._free else len(self._channels)
+            channel = self._channels[subject] = Channel(subject, slot)
+            self._rebuild()
+        channel.listeners[listener] = None
+        self._crowd.join(listener.stream)
+        listener.since = 0
+        self._owed[listener] = channel
+        self._settle()
+
+    def leave(self, subject: Subject, listener: Listener) -> None:
+        """Leave; the last listener takes the channel with it."""
+        self._owed.pop(listener, None)
+        channel = self._channels[subject]
+        del channel.listeners[listener]
+        self._crowd.leave(listener.stream)
+        if not channel.listeners:
+            del self._channels[subject]
+            self._free.append(channel.slot)
+            if not self._outdated:  # once for all who leave together
+                self._outdated = True
+                self._loop.call_soon(self._rebuild)
+
+    def tell_again(self, subject: Subject) -> None:
+        """Deliver a subject's value again: it has become another one without a frame that shows it."""
+        if channel := self._channels.get(subject):
+            self._owed |= dict.fromkeys(channel.listeners, channel)
+            self._settle()
+
+    def hold(self) -> None:
+        """Show nothing any more but by :meth:`step`, if the block is on the instance's clock."""
+        self._held = self.block.attributes.stepped
+
+    def step(self) -> None:
+        """Show what differs between the values shown last and the newest frame, as of the step that is delivered.
+
+        The order is that of the block, whoever listens. SegmentError: no frame can be read.
+        """
+        if not self._held:
+            return
+        self._stepped = True
+        frame = self.block.latest()
+        if frame is None or frame.quality is Quality.BAD:
+            self._shown = None
+            return
+        shown, self._shown = self._shown, Still(*self._hold.moment, frame.image, frame.raw)
+        for channel in sorted(self._news(shown, frame), key=lambda channel: channel.order):
+            self._keep(channel.listeners, channel.encode(self._shown))
+        self._settle()
+
+    def _keep(self, listeners: Iterable[Listener], message: Sized | None) -> None:
+        if message is not None:
+            self.messages += 1
+            for listener in listeners:
+                self._owed.pop(listener, None)
+                listener.keep(message)
+
+    def _adopt(self, frame: Frame | None) -> None:
+        """Before the first step the first good image is shown as it is."""
+        if self._held and not self._stepped and self._shown is None and frame and frame.quality is not Quality.BAD:
+            self._shown = Still(*self._hold.moment, frame.image, frame.raw)
+            self._settle()
+
+    def _settle(self) -> None:
+        """Give those who are owed a value the newest one that is shown, if it is good."""
+        if self._held:
+            if self._shown is not None:
+                for listener, channel in list(self._owed.items()):
+                    self._keep([listener], channel.encode(self._shown))
+                self._owed.clear()
+            return
+        frame = self.block.latest() if self._owed else None
+        if frame is None or self.block.assess(frame)[0] is Quality.BAD:
+            return
+        for listener, channel in self._owed.items():
+            listener.since = frame.number
+            message = channel.encode(frame)
+            if message is not None:
+                listener.deliver(message, frame.publish_ns / 1e9)
+        self._owed.clear()
+
+    def _turn_bad(self, frame: int) -> None:
+        """Quality is bad from ``frame`` on, for all who have not joined later."""
+        for channel in self._channels.values():
+            for listener in channel.listeners:
+                if listener.since < frame:
+                    listener.lose()
+                    listener.since = 0  # it may have lost this very value
+
+    def _rebuild(self) -> None:
+        self._table = Table.of(self._channels.values(), len(self._channels) + len(self._free))
+        self._outdated = False
+
+    # ---- what the source publishes -----------------------------------------------------------------------------
+
+    def _end(self) -> None:
+        if self._following:
+            self._following = False
+            self._bells.leave(self.block, self._look)
+
+    def _look(self) -> None:
+        """Take the frames that have come, a few at a time; if there are none, look at the age of the last one."""
+        if not self._following:
+            return  # it has left while the bell rang
+        if not self._held and self._crowd.passes():
+            self._bells.rest(self.block, self._look)
+        else:
+            self._read()
+
+    def _read(self) -> None:
+        try:
+            self._follow()
+        except Exception:
+            log.exception("the feed of %s failed", self.block.source)
+            self._end()
+
+    def _look_again(self) -> None:
+        self._again = False
+        self._look()
+
+    def _refill(self) -> None:
+        """A stream that was too slow has asked for more: what is newest, though it may have that of others by now."""
+        if self._following:
+            self._read()
+            if not self._crowd.passes():
+                self._bells.resume(self.block, self._look)
+
+    def _follow(self) -> None:
+        block = self.block
+        if not self._held:  # else nothing that is shown is read here
+            self._cursor = self._crowd.look(self._cursor)
+        retired = block.retired  # before looking: what was published before the end is still shown
+        take = self._regard if self._held else self._take
+        for count in range(TURN_FRAMES):
+            frame = self._cursor.poll()
+            if frame is not None:
+                take(frame)
+                continue
+            if not count:
+                take(None)
+            if retired:
+                self._end()
+            return
+        if not self._again:
+            self._again = True
+            self._loop.call_soon(self._look_again)
+
+    def _take(self, frame: Frame | None) -> None:
+        """Show a frame if it is good, and turn bad if it is not, or none came for too long."""
+        block, shown = self.block, self._shown
+        good = frame is not None and block.assess(frame)[0] is not Quality.BAD
+        # Age by the next frame's time, if there is one: it may have been stale while nobody was awake to see it.
+        until_ns = frame.publish_ns if frame else block.now_ns()
+        known = shown is None or frame is None or frame.number == shown.number + 1  # not if some were passed over
+        stale = known and isinstance(shown, Frame) and shown.age_ns(until_ns) > block.stale_ns
+        if shown is not None and (stale or (frame is not None and not good)):
+            since = shown.number + 1 if frame is None else frame.number
+            shown = self._shown = None
+            self._turn_bad(since)
+            self._tell(good=False)
+        if frame is not None and good:
+            self._tell(good=True)
+            self._show(shown, frame)
+            self._shown = frame
+
+    def _regard(self, frame: Frame | None) -> None:
+        """Tell quality at once also while values wait for a step."""
+        if frame is not None:
+            self._tell(good=frame.quality is not Quality.BAD)
+            self._adopt(frame)
+
+    def _tell(self, *, good: bool) -> None:
+        if good != self._good:
+            self._good = good
+            self._on_quality(self.block.source, good)
+
+    def _show(self, shown: Frame | Still | None, frame: Frame) -> None:
+        """Give what has changed since the frame shown before, or everything, to all who have not seen the frame yet."""
+        for channel in self._news(shown, frame):
+            message = channel.encode(frame)
+            if message is None:
+                continue
+            self.messages += 1
+            for listener in channel.listeners:
+                if frame.number > listener.since:
+                    self._owed.pop(listener, None)
+                    listener.deliver(message, frame.publish_ns / 1e9)
+        if self._owed:
+            self._settle()
+
+    def _news(self, shown: Frame | Still | None, frame: Frame) -> list[Channel]:
+        """The channels whose bytes have changed since then; all, if nothing was shown."""
+        slots, scan, apart = self._table
+        if shown is None:
+            return [channel for channel in slots if channel]
+        news = [channel for slot in scan.changed(shown.image, frame.image) if (channel := slots[slot])]
+        return news + [channel for channel in apart if channel.changed and channel.changed(shown, frame)]
+
+    def present(self) -> Frame | Still | None:
+        """What would be shown to who listens now; None: nothing good."""
+        if self._held:
+            self._hold.look()
+            return self._shown
+        frame = self.block.latest()
+        return None if frame is None or self.block.assess(frame)[0] is Quality.BAD else frame
+
+    def _stamp(self, event: Event) -> tuple[int, int]:
+        """Number and time of what is told of an event: the frame before it, in virtual time the step before."""
+        return self._hold.moment if self._held else Moment(event.frame, event.clock_ns)

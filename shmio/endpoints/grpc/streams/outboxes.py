@@ -1,0 +1,64 @@
+"""What waits between sources and all clients."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from shmio.endpoints.grpc.streams.back_pressure import Total
+from shmio.endpoints.grpc.streams.outbox import Outbox
+from shmio.endpoints.grpc.time.audience import Audience
+
+
+class Outboxes:
+    """Those of all open streams, counted."""
+
+    def __init__(self, audience: Audience | None = None) -> None:
+        """``audience``: what they are a part of."""
+        self._audience = Audience() if audience is None else audience
+        self._open: set[Outbox] = set()
+        self._dropped = 0
+        self._total = Total()
+
+    @property
+    def waiting_bytes(self) -> int:
+        """Of all messages that wait."""
+        return self._total.size
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+    @property
+    def dropped(self) -> int:
+        """Messages dropped on streams too slow for them, since the start."""
+        return self._dropped + sum(outbox.dropped for outbox in self._open)
+
+    @contextmanager
+    def opened(self) -> Iterator[Outbox]:
+        """One for a stream as long as that is open."""
+        outbox = Outbox(self._total)
+        self._open.add(outbox)
+        self._total.streams += 1
+        try:
+            with self._audience.joined():
+                yield outbox
+        finally:
+            self._open.discard(outbox)
+            self._total.streams -= 1
+            self._dropped += outbox.dropped
+            outbox.close()
+
+    async def taken(self, patience_s: float) -> None:
+        """Wait until all clients have taken what they are owed; the streams of those that do not in time end."""
+        owing = [outbox for outbox in self._open if outbox.owing]
+        if not owing:
+            return
+        try:
+            async with asyncio.timeout(patience_s):
+                for outbox in owing:
+                    await outbox.taken()
+        except TimeoutError:
+            for outbox in owing:
+                if outbox.owing:
+                    outbox.fail(f"the client has not taken the values of a step within {patience_s:g} s")

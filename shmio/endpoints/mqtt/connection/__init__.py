@@ -1,0 +1,1 @@
+"""Connections to the broker: connecting, retrying, reading and writing the socket."""

@@ -1,0 +1,161 @@
+"""One attempt to connect, in a thread of its own: files, names, TCP and TLS take their time."""
+
+from __future__ import annotations
+
+import socket
+import ssl
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, Final, cast
+
+from paho.mqtt.client import Client, MQTTv5
+from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+
+from shmio.config.mqtt.accounts import read_password
+from shmio.config.mqtt.tls import client_context
+from shmio.endpoints.mqtt.broker.access import BRIDGE, secret_id
+from shmio.endpoints.mqtt.broker.directory import secret_of
+from shmio.endpoints.mqtt.channel import Message
+from shmio.endpoints.mqtt.connection.failure import ended, why
+from shmio.endpoints.mqtt.connection.target import Dialling
+from shmio.errors import ConfigError
+
+CONNECT_S: Final = 4.0
+"""For a connection, its TLS, and for the broker's answer to who we are; each."""
+SLOW_S: Final = 15.0
+SLOW: Final = "no answer yet: it is slow, or the name server, or the file system of mqtt.tls or mqtt.password_file"
+MAX_PACKET_BYTES: Final = 1 << 21
+"""Of what a broker may send us, as far as it can be told so: with MQTT 5."""
+
+
+class BrokerClient(Client):
+    """paho's, which tells more of why a connection has ended."""
+
+    tls_error: ssl.SSLError | None = None
+    """What TLS said against the connection after it was made, if that is why it has ended."""
+
+
+class _TlsClient(BrokerClient):
+    def _sock_recv(self, bufsize: int) -> bytes:
+        try:
+            return super()._sock_recv(bufsize)
+        except ssl.SSLError as error:  # with TLS 1.3 a broker says only then that it does not take our certificate
+            self.tls_error = error
+            raise
+
+
+class Attempt:
+    """Begins at once, with the broker whose turn it is."""
+
+    def __init__(
+        self,
+        dialling: Dialling,
+        protocol: MQTTProtocolVersion,
+        will: Message | None,
+        most: int,
+        wake: Callable[[], object],
+    ) -> None:
+        """``most``: messages that the broker may send us before they are acknowledged, as far as it can be told so.
+
+        ``wake``: called by its thread when it is over, if anybody wants it then.
+        """
+        self.target = dialling.next()
+        self._begun_s = time.monotonic()
+        self.over = False
+        """Whether ``client``, ``socket`` and ``problem`` are what has come of it."""
+        self.client: BrokerClient | None = None
+        self.socket: socket.socket | None = None
+        """A connection, on which nothing was read yet."""
+        self.offered = False
+        """Whether a broker may have been told who we are, and our will."""
+        self.problem = ""
+        """Why there is none."""
+        self._dialling, self._protocol, self._will, self._most, self._wake = dialling, protocol, will, most, wake
+        self._handing = threading.Lock()
+        self._unwanted = False
+        threading.Thread(target=self._run, name="connect", daemon=True).start()
+
+    @property
+    def slow(self) -> bool:
+        """Whether it has taken longer than any should."""
+        return time.monotonic() >= self._begun_s + SLOW_S
+
+    def abandon(self) -> None:
+        """Nobody wants it any more: what it makes is closed, and nobody is woken."""
+        with self._handing:
+            self._unwanted = True
+        if self.over:
+            self._close()
+
+    def _run(self) -> None:
+        try:
+            self._connect()
+        except ConfigError as error:
+            self.problem = str(error)
+        except (OSError, ValueError) as error:  # ValueError: a name with an empty part
+            tls = self._dialling.settings.tls is not None
+            self.problem = f"broker {self.target}: {why(error, self.target, tls=tls)}"
+        if self.problem:
+            self._close()
+        with self._handing:
+            if not self._unwanted:
+                self.over = True
+                self._wake()
+                return
+        self._close()
+
+    def _connect(self) -> None:
+        """ConfigError: a file that is needed for it will not do."""
+        settings, target, new = self._dialling.settings, self.target, self._protocol == MQTTv5
+        own = secret_of(target.host) if target.transport == "unix" else None
+        client_id = self._dialling.client_id
+        # A client of its own for each attempt: what one has not got rid of is none of the next one's business.
+        client = self.client = (BrokerClient if settings.tls is None else _TlsClient)(
+            CallbackAPIVersion.VERSION2,
+            client_id if own is None else secret_id(client_id, own),
+            clean_session=None if new else not settings.session_expiry_s,
+            protocol=self._protocol,
+            transport=target.transport,
+            reconnect_on_failure=False,
+        )
+        client.connect_timeout = CONNECT_S
+        client.max_inflight_messages_set(0)  # we count them ourselves
+        if self._will is not None:
+            client.will_set(self._will.topic, self._will.payload, self._will.qos, self._will.retain)
+        if own is not None:
+            client.username_pw_set(BRIDGE, own)
+        else:
+            if settings.username is not None:
+                password = read_password(settings.password_file) if settings.password_file else None
+                client.username_pw_set(settings.username, password)
+            if settings.tls is not None:
+                client.tls_set_context(client_context(settings.tls))
+        options: dict[str, Any] = {}
+        if new:
+            properties = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+            properties.SessionExpiryInterval = settings.session_expiry_s
+            properties.MaximumPacketSize = MAX_PACKET_BYTES
+            properties.ReceiveMaximum = self._most
+            options = {"properties": properties, "clean_start": not settings.session_expiry_s}
+        client.connect(target.host, target.port, settings.keep_alive_s, **options)
+        self.offered = True
+        self.socket = cast("socket.socket | None", client.socket())
+        if self.socket is None:
+            self.problem = f"broker {target}: {ended(client.tls_error, up=False, tls=settings.tls is not None)}"
+
+    def _close(self) -> None:
+        if self.client is not None:
+            hang_up(self.client)
+
+
+def hang_up(client: Client) -> None:
+    """Close its socket, whatever state it is in."""
+    client.on_disconnect = None
+    made = client.socket()
+    if made is not None:
+        with suppress(OSError):
+            made.close()

@@ -1,0 +1,329 @@
+"""The connection to the broker: made anew whenever it is lost, with growing waits, and never waited for."""
+
+from __future__ import annotations
+
+import logging
+import selectors
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage, MQTTv5, MQTTv311
+from paho.mqtt.packettypes import PacketTypes
+from paho.mqtt.properties import Properties
+from paho.mqtt.reasoncodes import ReasonCode
+
+from shmio.endpoints.mqtt.channel import Message
+from shmio.endpoints.mqtt.connection.attempt import CONNECT_S, SLOW, Attempt, BrokerClient
+from shmio.endpoints.mqtt.connection.failure import Complaints, ended, refusal
+from shmio.endpoints.mqtt.connection.limits import Limits, subscription
+from shmio.endpoints.mqtt.connection.socket_io import Pump
+from shmio.endpoints.mqtt.connection.target import Dialling, Target
+from shmio.endpoints.mqtt.connection.write_batches import BATCH
+from shmio.layout.topic import shorten
+
+STABLE_S: Final = 5.0
+"""Who was connected so long has put his failures behind him."""
+MOST_TOLD: Final = 300
+"""Characters of what is wrong with all brokers."""
+WITH_WILL: Final = "Disconnect with will message"
+
+_WATCHED: Final = 1
+"""The number of the subscription to our own topics."""
+
+log = logging.getLogger("shmio.mqtt")
+
+
+def is_watched(message: MQTTMessage) -> bool:
+    """Whether it is somebody else's, on one of our own topics."""
+    return _WATCHED in (vars(message.properties) if message.properties else {}).get("SubscriptionIdentifier", ())
+
+
+class Link:
+    """For the bridge's thread: it registers its socket with ``selector``, to have ``data`` called when it is ready."""
+
+    def __init__(
+        self,
+        dialling: Dialling,
+        selector: selectors.BaseSelector,
+        wake: Callable[[], object],
+        will: Callable[[], Message | None],
+        most: int,
+    ) -> None:
+        """``wake``: any thread has it turned so. ``will``: asked for each CONNECT. ``most``: in flight, each way."""
+        self.up = False
+        self.admit: Callable[[], bool] = lambda: True
+        """Asked, from when the broker has let us in, until it says so: whether the connection is ``up`` by now."""
+        self.came_up = False
+        """Set when a connection has been made; who has greeted it takes it back."""
+        self.on_lost: Callable[[list[Message]], None] = lambda _: None
+        """Called when a connection is gone, with what it has not taken for certain."""
+        self.complaints = Complaints()
+        self.connects = 0
+        self.subscribed = False
+        """Whether the broker has answered to what was subscribed to last."""
+        self._dialling, self._selector, self._wake, self._will, self._most = dialling, selector, wake, will, most
+        self.on_message: Callable[[MQTTMessage], None] = lambda _: None
+        """Called with each message that comes."""
+        self._client: BrokerClient | None = None
+        self._pump: Pump | None = None
+        self._target: Target | None = None
+        self._faults: dict[Target | None, str] = {}
+        """What was wrong with each broker that was tried since the last connection."""
+        self._attempt: Attempt | None = None
+        self._protocol = MQTTv5
+        self._until_s: float | None = None
+        """When the broker must have answered."""
+        self._retry_s = self._up_s = self._misc_s = 0.0
+        self._new_will: Message | None = None  # that no broker was told yet
+        self._in_flight: dict[int, Message] = {}
+        self._limits = Limits()
+        self._needed = 0  # the subscription to commands
+
+    @property
+    def problem(self) -> str:
+        """Why there is no connection, or what the broker refuses; empty: all is well."""
+        return self.complaints.problem
+
+    @property
+    def at(self) -> Target | None:
+        """The broker that has let us in."""
+        return None if self._client is None or self._until_s is not None else self._target
+
+    @property
+    def mqtt5(self) -> bool:
+        """Whether the broker speaks version 5."""
+        return self.up and self._protocol == MQTTv5
+
+    @property
+    def room(self) -> int:
+        """How many messages it takes now, and does not only put into its memory."""
+        blocked = not self.up or self._pump is None or self._pump.writing
+        return 0 if blocked else min(BATCH, self._limits.in_flight - len(self._in_flight))
+
+    @property
+    def in_flight(self) -> int:
+        """Messages that the broker has not acknowledged."""
+        return len(self._in_flight)
+
+    # ---- a turn ------------------------------------------------------------------------------------------------------
+
+    def turn(self) -> float:
+        """Do what is due; in how many seconds there is more to do."""
+        now_s = time.monotonic()
+        if self._attempt is not None and self._attempt.over:
+            self._take(self._attempt)
+        if self._attempt is None and self._client is None:
+            if now_s < self._retry_s:
+                return self._retry_s - now_s
+            self._new_will = self._new_will or self._will()
+            self._attempt = Attempt(self._dialling, self._protocol, self._new_will, self._most, self._wake)
+            self._target = self._attempt.target
+        if self._client is None:
+            if self._attempt is not None and self._attempt.slow:
+                self.complaints.say(f"broker {self._target}: {SLOW}")
+            return CONNECT_S
+        if self._until_s is not None:
+            if now_s >= self._until_s:
+                self.drop("it does not answer")
+        else:
+            if not self.up and self.admit():
+                self.complaints.clear()
+                self._faults.clear()
+                self.up, self.came_up, self._up_s = True, True, now_s
+                self.connects += 1
+            if now_s >= self._misc_s:
+                self._misc_s = now_s + 1.0
+                self._client.loop_misc()
+        return 1.0 if self._pump is None else self._pump.turn()
+
+    def _take(self, attempt: Attempt) -> None:
+        """A connection was made, or was not."""
+        self._attempt = None
+        client, made = attempt.client, attempt.socket
+        self._new_will = None if attempt.offered else self._new_will
+        if client is None or made is None:
+            self._fail(attempt.problem)
+            return
+        self._until_s = time.monotonic() + CONNECT_S
+        client.on_connect = self._connected
+        client.on_disconnect = self._disconnected
+        client.on_subscribe = self._subscribed
+        self._client, self._pump = client, Pump(client, made, self._selector, self.drop)
+        client.on_publish = self._pump.counting(self._acknowledged)
+        client.on_message = self._pump.counting(self._come)
+
+    # ---- what the broker says ----------------------------------------------------------------------------------------
+
+    def _connected(
+        self, client: Client, _data: Any, _flags: ConnectFlags, code: ReasonCode, properties: Properties | None
+    ) -> None:
+        if client is not self._client:
+            return
+        if code.is_failure:
+            if self._protocol == MQTTv5 and str(code) == "Unsupported protocol version":
+                self._step_back()
+            else:
+                self._fail(f"broker {self._target}: {refusal(code, self._dialling)}")
+            return
+        self._limits = Limits.told(properties, self._most)
+        self._until_s, self._misc_s = None, time.monotonic() + 1.0
+        version = "5" if self._protocol == MQTTv5 else "3.1.1"
+        log.info("connected to broker %s as %s, MQTT %s", self._target, self._dialling.client_id, version)
+
+    def _disconnected(
+        self, client: Client, _data: Any, flags: DisconnectFlags, code: ReasonCode, _properties: Properties | None
+    ) -> None:
+        if self._client is None or client is not self._client:
+            return
+        tls, told = self._dialling.settings.tls is not None, flags.is_disconnect_packet_from_server
+        why = ended(self._client.tls_error, up=self.at is not None, tls=tls)
+        self.drop(refusal(code, self._dialling) if told else why)
+
+    def _acknowledged(
+        self, client: Client, _data: Any, mid: int, code: ReasonCode, _properties: Properties | None
+    ) -> None:
+        message = self._in_flight.pop(mid, None) if client is self._client else None
+        if message is not None and code.is_failure:
+            self.complaints.refuse(f"broker {self._target} refuses messages: {code}: {message.topic}")
+        else:
+            self.complaints.taken()
+
+    def _come(self, client: Client, _data: Any, message: MQTTMessage) -> None:
+        if client is self._client:
+            self.on_message(message)
+
+    def _subscribed(
+        self, client: Client, _data: Any, mid: int, codes: Sequence[ReasonCode], _properties: Properties | None
+    ) -> None:
+        if client is not self._client or mid != self._needed:
+            return
+        self.subscribed = True
+        if refused := [code for code in codes if code.is_failure]:
+            self.complaints.deaf(f"broker {self._target} does not let us subscribe: no command can come: {refused[0]}")
+
+    # ---- its end -----------------------------------------------------------------------------------------------------
+
+    def drop(self, problem: str, *, politely: bool = False) -> None:
+        """Give a connection up, or half of one, that does not do what it should.
+
+        ``politely``: take leave, so that the will is not published. Not when called by what has come.
+        """
+        problem = f"broker {self._target}: {problem}"
+        if politely and self._client is not None:
+            self._client.on_disconnect = None
+            self._client.disconnect()
+            self._client.loop_write()
+        if self.up:
+            lost = list(self._in_flight.values())
+            if time.monotonic() - self._up_s >= STABLE_S:
+                self._dialling.forgive()
+            self._fail(self.complaints.lost(problem, self._dialling.client_id))
+            self.on_lost(lost)
+        elif self._protocol == MQTTv5 and self._until_s is not None:
+            self._step_back()  # some brokers that do not know version 5 say nothing
+        else:
+            self._fail(problem)
+
+    def _step_back(self) -> None:
+        """Try version 3.1.1, with the same broker, at once."""
+        self._close()
+        self._protocol = MQTTv311
+        self._dialling.repeat()
+        self._retry_s = 0.0
+        self._wake()
+
+    def _fail(self, problem: str) -> None:
+        self._close()
+        self._protocol = MQTTv5
+        # Of each broker the last one: who looks at the status wants to know about all that are tried in turn.
+        self._faults[self._target] = problem
+        self.complaints.say(shorten("; ".join(self._faults[one] for one in sorted(self._faults, key=str)), MOST_TOLD))
+        self._retry_s = time.monotonic() + self._dialling.wait_s()
+
+    def _close(self) -> None:
+        pump, self._pump, self._client = self._pump, None, None
+        self.up, self.came_up, self.subscribed, self._until_s = False, False, False, None
+        self._in_flight = {}
+        if pump is not None:
+            pump.close()
+
+    # ---- what goes out -----------------------------------------------------------------------------------------------
+
+    def send(self, message: Message, properties: Properties | None = None) -> None:
+        """Have one ready to go, if there is a connection."""
+        client, limits = self._client, self._limits
+        if client is None or not self.up:
+            return
+        if limits.packet_bytes is not None and not limits.fit(message):
+            self.complaints.refuse(f"broker {self._target} takes {limits.packet_bytes} bytes: {message.topic} has more")
+            return
+        qos, retain = message.qos and limits.qos, message.retain and limits.retain
+        info = client.publish(message.topic, message.payload, qos, retain, properties if self.mqtt5 else None)
+        if qos:
+            self._in_flight[info.mid] = message
+        else:
+            self.complaints.taken()
+
+    def push(self) -> None:
+        """Have go what is ready."""
+        if self._pump is not None:
+            self._pump.push()
+
+    def owes(self, message: Message) -> bool:
+        """Whether this very message was sent, and the broker has not acknowledged it."""
+        return any(one is message for one in self._in_flight.values())
+
+    def subscribe(self, filters: Sequence[str], *, retained: bool = False) -> None:
+        """Ask for what is sent to these; unless ``retained``, what was there before is not sent, or has its flag.
+
+        So has, with version 5, what comes from another broker that had it before: to ours it is new.
+        """
+        client = self._client
+        self.subscribed = not filters
+        if client is None or not filters:
+            return
+        new = self._protocol == MQTTv5
+        options: Any = subscription(retained=retained) if new else 1
+        _, mid = client.subscribe([(one, options) for one in filters])
+        self._needed = self._needed if retained or mid is None else mid
+
+    def watch(self, filters: Sequence[str]) -> None:
+        """Ask for what others publish on our own topics from now on; see :func:`is_watched`. With version 5 alone."""
+        if self._client is None or not (filters and self.mqtt5 and self._limits.identifiers):
+            return  # we would hear ourselves, and could not tell it from what the broker had before
+        properties = Properties(PacketTypes.SUBSCRIBE)  # type: ignore[no-untyped-call]
+        properties.SubscriptionIdentifier = _WATCHED
+        options: Any = subscription(retained=False)
+        self._client.subscribe([(one, options) for one in filters], properties=properties)
+
+    def unwatch(self, filters: Sequence[str]) -> None:
+        """The reverse."""
+        if self._client is not None and filters and self.mqtt5:
+            self._client.unsubscribe(list(filters))
+
+    def recall(self, filters: Sequence[str]) -> None:
+        """Have what is retained on these sent once."""
+        self.subscribe(filters, retained=True)
+        if self._client is not None and filters:
+            self._client.unsubscribe(list(filters))
+
+    def open(self) -> None:
+        """Connect, after :meth:`close`."""
+        self._protocol, self._retry_s = MQTTv5, 0.0
+        self.complaints.clear()
+        self._faults.clear()
+
+    def close(self, *, will: bool = False) -> None:
+        """Take leave; what was sent before is on its way. ``will``: have the will published, as far as that can be."""
+        if self._client is not None:
+            self._client.on_disconnect = None
+            if self.up:
+                reason = ReasonCode(PacketTypes.DISCONNECT, WITH_WILL) if will and self.mqtt5 else None
+                self._client.disconnect(reason)
+                self._client.loop_write()
+        self._close()
+        self._retry_s = float("inf")
+        if self._attempt is not None:
+            self._attempt.abandon()
+            self._attempt = None

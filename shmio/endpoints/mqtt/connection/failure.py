@@ -1,0 +1,120 @@
+"""Why there is no connection, in words that tell what to look at."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import ssl
+import time
+from collections import deque
+from typing import TYPE_CHECKING, Final
+
+from paho.mqtt.reasoncodes import ReasonCode
+
+if TYPE_CHECKING:
+    from shmio.endpoints.mqtt.connection.target import Dialling, Target
+
+# MQTT 5.0, section 2.4; paho gives those of 3.1.1 the same numbers.
+_WHO: Final = frozenset({0x86, 0x87})
+_BUSY: Final = frozenset({0x88, 0x89, 0x97, 0x9F})
+_TAKEN_OVER: Final = 0x8E
+
+OFTEN: Final = 4
+OFTEN_S: Final = 60.0
+"""Who loses so many connections in so long is told what may be behind it: not all brokers say."""
+REFUSED_S: Final = 10.0
+"""So long it is told that a broker refuses messages, though it has taken others since."""
+
+log = logging.getLogger("shmio.mqtt")
+
+
+class Complaints:
+    """What is wrong with a connection at present, once each in the log."""
+
+    def __init__(self) -> None:
+        self.problem = ""
+        """Empty: all is well."""
+        self.refused = 0
+        """Messages that the broker did not take."""
+        self._refused_s = 0.0
+        self._deaf = ""
+        self._lost_s: deque[float] = deque(maxlen=OFTEN)
+
+    def say(self, problem: str) -> None:
+        """There is something else wrong now."""
+        if problem != self.problem:
+            log.warning("%s", problem)
+        self.problem = problem
+
+    def lost(self, problem: str, client_id: str) -> str:
+        """A connection that had been made is gone; what is to be said of it."""
+        self._lost_s.append(time.monotonic())
+        if len(self._lost_s) < OFTEN or self._lost_s[-1] - self._lost_s[0] > OFTEN_S:
+            return problem
+        return f"{problem}, again and again; does another client connect as {client_id} (mqtt.client_id)?"
+
+    def clear(self) -> None:
+        """There is a connection."""
+        self.problem = self._deaf = ""
+
+    def deaf(self, problem: str) -> None:
+        """By this connection no command can come."""
+        self._deaf = problem
+        self.say(problem)
+
+    def refuse(self, problem: str) -> None:
+        """A message was not taken."""
+        self.refused += 1
+        self._refused_s = time.monotonic()
+        if not self.problem:  # the first stands for all that follow
+            self.say(problem)
+
+    def taken(self) -> None:
+        """A message was taken."""
+        if self.problem and time.monotonic() >= self._refused_s + REFUSED_S:
+            self.problem = self._deaf
+
+
+def refusal(code: ReasonCode, dialling: Dialling) -> str:
+    """What a broker's code means here."""
+    if code.value in _WHO:
+        return f"it does not let us in ({code}): check mqtt.username, mqtt.password_file and the broker's own accounts"
+    if code.value in _BUSY:
+        return f"it takes no more at present ({code})"
+    if code.value == _TAKEN_OVER:
+        return f"another client has connected as {dialling.client_id}: give one of them another mqtt.client_id"
+    return f"it refuses: {code}"
+
+
+def ended(error: ssl.SSLError | None, *, up: bool, tls: bool) -> str:
+    """Why a connection has ended. ``error``: what TLS said; ``up``: the broker had let us in; ``tls``: it has TLS."""
+    if error is not None:
+        return _tls(error)
+    lost = "the connection was lost"
+    missing = "wants a certificate of ours (mqtt.tls.certificate and key)" if tls else "expects TLS there (mqtt.tls)"
+    return lost if up else f"{lost} before it let us in: it is full, or {missing}, or is no broker"
+
+
+def why(error: Exception, target: Target, *, tls: bool) -> str:
+    """Why no connection could be made. ``tls``: with TLS."""
+    if isinstance(error, ssl.SSLError):
+        return _tls(error)
+    if isinstance(error, socket.gaierror):
+        return f"no host of this name is known ({error.strerror})"
+    if isinstance(error, TimeoutError):
+        return "it does not answer"
+    if isinstance(error, ConnectionRefusedError | FileNotFoundError):
+        if target.transport == "unix":
+            return "it does not run at present; shmio-supervisor logs broker says why"
+        return "nothing listens there"
+    if isinstance(error, ConnectionError):
+        return "it closed the connection" + (": it may speak no TLS there (mqtt.tls, and the port)" if tls else "")
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
+
+
+def _tls(error: ssl.SSLError) -> str:
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return f"its certificate is not to be trusted ({error.verify_message}): check mqtt.tls.ca, and the host's name"
+    if "_ALERT_" in (error.reason or ""):
+        return f"it refuses our TLS ({error.reason}): check mqtt.tls.certificate and key: it may want some, or others"
+    return f"no TLS with it ({error.reason or 'it ended the connection'}): check mqtt.tls, and the port"

@@ -1,0 +1,78 @@
+"""Where the broker is, and when it is tried again."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from shmio.config import Mqtt
+from shmio.config.mqtt.rules import brokers
+
+FIRST_WAIT_S: Final = 0.25
+MOST_WAIT_S: Final = 15.0
+OWN_WAIT_S: Final = 0.5
+"""At most for our own broker: it is on this host, and is started again at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """One broker. ``host``: the socket's path if ``transport`` is unix."""
+
+    host: str
+    port: int = 1883
+    transport: Literal["tcp", "unix"] = "tcp"
+    name: str = ""
+
+    def __str__(self) -> str:
+        return self.name
+
+
+def targets(settings: Mqtt, own_socket: str) -> list[Target]:
+    """The brokers, in the order in which they are tried. ``own_socket``: where ours is, if there is no external one."""
+    if settings.broker != "external":
+        return [Target(own_socket, transport="unix", name="of this instance")]
+    return [Target(address.host, address.port, "tcp", str(address)) for address in brokers(settings)]
+
+
+class Dialling:
+    """Which broker is tried next, and when."""
+
+    def __init__(self, settings: Mqtt, client_id: str, there: Sequence[Target]) -> None:
+        self.settings = settings
+        self.client_id = client_id
+        self._targets = there
+        self._next = 0
+        self._failures = 0
+
+    @property
+    def count(self) -> int:
+        """How many brokers there are."""
+        return len(self._targets)
+
+    def turn_to(self, target: Target) -> None:
+        """From now on this one alone."""
+        self._targets = [target]
+        self.forgive()
+
+    def repeat(self) -> None:
+        """Try the last one again."""
+        self._next -= 1
+
+    def next(self) -> Target:
+        """The next one."""
+        self._next += 1
+        return self._targets[(self._next - 1) % len(self._targets)]
+
+    def wait_s(self) -> float:
+        """How long to wait after a failure: longer after each."""
+        most_s = OWN_WAIT_S if all(target.transport == "unix" for target in self._targets) else MOST_WAIT_S
+        wait_s: float = min(most_s, FIRST_WAIT_S * 2 ** min(self._failures // self.count, 16))
+        self._failures += 1
+        # Not all bridges of a plant at once, when their broker is back.
+        return wait_s * random.uniform(0.5, 1.5)  # noqa: S311  not a secret
+
+    def forgive(self) -> None:
+        """The failures so far do not count any more."""
+        self._failures = 0

@@ -1,0 +1,1 @@
+"""From declarations to registers with offsets, by Siemens' placement rules."""

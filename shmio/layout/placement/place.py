@@ -1,0 +1,251 @@
+"""Placement: declarations to offsets, by Siemens' rules for blocks with standard access.
+
+- BOOL takes the next bit; anything else begins at the next whole byte.
+- One-byte types take the next byte; all wider types, strings included, begin at an even byte.
+- Arrays and structures begin at an even byte and are padded to an even length.
+- In an instance of a function block, so does each section: inputs, outputs, in-outs, static members. An in-out
+  of a structured type is a POINTER to what the caller gave.
+
+A type is placed once, however often it is used; how much its expansion would need is known, and bounded, before
+anything is expanded. ``docs/reference/layout-rules.md`` gives the rules with their evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+from shmio.layout.model import MAX_BLOCK_BYTES, MAX_DEPTH, MAX_ELEMENTS, MAX_REGISTERS, MAX_STRUCTURES, Dims, array_size
+from shmio.layout.placement import system_types
+from shmio.layout.placement.placed import Cost, Field, Group, Leaf, Repeat, extent_of, round_up
+from shmio.layout.report import Report
+from shmio.layout.source.constants import BoundFault, Constants
+from shmio.layout.source.syntax import Array, Bounds, Member, Named, Position, Section, Struct, Type, TypeDeclaration
+from shmio.layout.topic import encode_segment
+from shmio.layout.types import BYTE, POINTER, STRUCTURED, ElementType, element_type, string_limit
+
+MAX_NAME = 128  # characters, as in TIA Portal
+MAX_TEXT = 32 << 20  # characters of all expanded paths, comments and initial values together
+
+
+_OPAQUE = (
+    "the system type '{name}' is kept as {size} bytes without meaning, for the places of its members are not public; "
+    'if you know them, give it as a PLC data type: TYPE "{name}" STRUCT … END_STRUCT; END_TYPE'
+)
+_SIZE = 'type_bytes = {{ "{name}" = … }} in the configuration, --type-bytes "{name}=…" of shmio-layout'
+
+
+class Placer:
+    """Places structures; types of users are looked up by name and placed at first use."""
+
+    def __init__(
+        self,
+        types: Mapping[str, TypeDeclaration],
+        constants: Constants,
+        report: Report,
+        type_bytes: Mapping[str, int] | None = None,
+    ) -> None:
+        self._types = types
+        self._type_bytes = {name.lower(): size for name, size in (type_bytes or {}).items()}
+        self._global = self._constants = constants
+        self._report = report
+        self.placed: dict[str, Group | None] = {}
+        """What became of each type, by its name in lower case."""
+        self._open: dict[str, str] = {}  # the types that are being placed, by key: their names
+
+    def block(self, struct: Struct, constants: Constants) -> Group | None:
+        """Place the body of a block that has constants of its own."""
+        self._constants = constants
+        return self.struct(struct)
+
+    def struct(self, struct: Struct, depth: int = 0) -> Group | None:
+        """Place a structure; None if anything in it is wrong, which then has been reported.
+
+        Only the body of a block may have no members: the parser has refused any other.
+        """
+        if depth and not struct.members:
+            return None
+        if depth >= MAX_DEPTH:
+            self._refuse(struct.position, f"structures are nested more than {MAX_DEPTH} deep")
+            return None
+        fields: dict[str, Field] = {}
+        bits = height = 0
+        cost = Cost()
+        good = True
+        section: Section | None = None
+        for member in struct.members:
+            if member.section is not section:
+                section, bits = member.section, round_up(bits, 16)
+            if _takes_no_room(member):
+                continue
+            placed = self._member(member, fields, depth)
+            if placed is None:
+                good = False
+                continue
+            extent = extent_of(placed)
+            if isinstance(placed, Leaf) and placed.element.base == "BOOL" and not placed.dims:
+                offset, bit = divmod(bits, 8)
+                bits += 1
+            else:
+                offset, bit = round_up(round_up(bits, 8) // 8, extent.align), None
+                bits = (offset + extent.size) * 8
+            segment = encode_segment(member.name)
+            initial = self._constants.substitute(member.initial)
+            own = len(segment) + 1 + len(member.comment) + (len(initial or "") if isinstance(placed, Leaf) else 0)
+            cost = cost.plus(extent.cost, 1, own)
+            height = max(height, extent.height + 1)
+            known = member if initial == member.initial else replace(member, initial=initial)
+            fields[member.name.lower()] = Field(segment, known, placed, offset, bit)
+            good = good and self._fits(member.position, round_up(bits, 8) // 8, cost, height)
+        return Group(fields, round_up(round_up(bits, 8) // 8, 2), cost, height) if good else None
+
+    def named(self, name: Named) -> ElementType | Group | None:
+        """Look a type up: an elementary one, else a user's; None if it cannot be had, which is reported."""
+        try:
+            return self._named(name, 0)
+        except BoundFault as fault:
+            self._report.add(fault.diagnostic)
+            return None
+
+    def _named(self, name: Named, depth: int) -> ElementType | Group | None:
+        if not name.quoted and (element := self._elementary(name)):
+            return element
+        key = name.name.lower()
+        if key not in self.placed and key in self._type_bytes:
+            self.placed[key] = opaque(name, self._type_bytes[key])
+        if key in self._open:
+            keys = [*self._open]
+            chain = " → ".join([*keys[keys.index(key) :], key])
+            self._refuse(name.position, f"the type {name.name!r} contains itself: {chain}")
+            return None
+        if key not in self.placed:
+            declaration = self._types.get(key) or system_types.declarations().get(key)
+            if declaration is not None:
+                self.placed[key] = self._declared(key, declaration, depth)
+            elif size := system_types.length(name.name):
+                self._report.add(name.position.warning(_OPAQUE.format(name=name.name, size=size)))
+                self.placed[key] = opaque(name, size)
+            else:
+                self._refuse(name.position, self._unknown(name))
+                return None
+        return self.placed[key]
+
+    def _declared(self, key: str, declaration: TypeDeclaration, depth: int) -> Group | None:
+        for fault in declaration.faults:
+            self._report.add(fault)
+        if declaration.faults and declaration.is_function_block:
+            return None
+        if not declaration.body.members:  # a function block that keeps nothing
+            return Group({}, 0, Cost(), 0)
+        outside, self._constants = self._constants, Constants(declaration.constants, self._global)
+        self._open[key] = declaration.name
+        group = self.struct(declaration.body, max(depth, 1))
+        del self._open[key]
+        self._constants = outside
+        return group
+
+    def _elementary(self, name: Named) -> ElementType | None:
+        if name.length is None:
+            return element_type(name.name)
+        length = self._constants.number(name.length)
+        if not 1 <= length <= string_limit(name.name):
+            what = f"expected a {name.name} length of 1 to {string_limit(name.name)}, found {length}"
+            raise BoundFault(name.position.error(what))
+        return element_type(f"{name.name}[{length}]")
+
+    def _member(self, member: Member, fields: dict[str, Field], depth: int) -> Leaf | Group | Repeat | None:
+        first = fields.get(member.name.lower())
+        if first is not None:
+            where = f"line {first.member.position.line}"
+            self._refuse(member.position, f"expected a new name, found {member.name!r} again ({where})")
+            return None
+        if len(member.name) > MAX_NAME:
+            self._refuse(member.position, f"a name is at most {MAX_NAME} characters long")
+            return None
+        if member.section is Section.IN_OUT and _is_structured(member.type):
+            return Leaf(POINTER, (), POINTER.size)
+        try:
+            return self._type(member.type, depth + 1)
+        except BoundFault as fault:
+            self._report.add(fault.diagnostic)
+            return None
+
+    def _type(self, type_: Type, depth: int) -> Leaf | Group | Repeat | None:
+        inner = type_.element if isinstance(type_, Array) else type_
+        dims = self._dims(type_.bounds, type_.position) if isinstance(type_, Array) else ()
+        found = self._named(inner, depth) if isinstance(inner, Named) else self.struct(inner, depth)
+        if isinstance(found, Group):
+            return Repeat(found, dims) if dims else found
+        if found is None:
+            return None
+        leaf = Leaf(found, dims, 0)
+        return Leaf(found, dims, array_size(found, leaf.shape))
+
+    def _dims(self, bounds: Bounds, position: Position) -> Dims:
+        if not bounds:
+            raise BoundFault(position.error("expected the bounds of the array, found '*', which has no fixed size"))
+        dims = tuple((self._constants.number(low), self._constants.number(high)) for low, high in bounds)
+        for low, high in dims:
+            if low > high:
+                raise BoundFault(position.error(f"expected a lower bound not above the upper, found {low}..{high}"))
+        return dims
+
+    def _fits(self, position: Position, size: int, cost: Cost, height: int) -> bool:
+        for what, value, limit in (
+            ("bytes", size, MAX_BLOCK_BYTES),
+            ("registers", cost.registers, MAX_REGISTERS),
+            ("elements of arrays", cost.elements, MAX_ELEMENTS),
+            ("structures", cost.structures, MAX_STRUCTURES),
+            ("characters of names, comments and values", cost.text, MAX_TEXT),
+            ("levels of structures", height, MAX_DEPTH),
+        ):
+            if value > limit:
+                where = f" in the type {[*self._open.values()][-1]!r}" if self._open else ""
+                self._refuse(position, f"expected at most {limit} {what}{where}; up to this member there are {value}")
+                return False
+        return True
+
+    def _unknown(self, name: Named) -> str:
+        if reason := system_types.refusal(name.name):
+            return (
+                f"the system type {name.name} is not supported: {reason}; if you know its members, give it as a PLC "
+                f'data type: TYPE "{name.name}" STRUCT … END_STRUCT; END_TYPE; if you know its size alone, declare '
+                f"that: {_SIZE.format(name=name.name)}"
+            )
+        return (
+            f"expected a known type, found {name.name!r}; if it is a PLC data type or a function block, name its "
+            "source (.udt, .scl, .awl) as well; if you know its size alone, declare that: "
+            + _SIZE.format(name=name.name)
+        )
+
+    def _refuse(self, position: Position, message: str) -> None:
+        """Report an error."""
+        self._report.add(position.error(message))
+
+
+def opaque(name: Named, size: int) -> Group:
+    """A structure of which the size alone is known."""
+    at = name.position
+    member = Member("bytes", Array(((0, size - 1),), Named("BYTE", False, at), at), "", None, at)
+    leaf = Leaf(BYTE, ((0, size - 1),), size)
+    cost = Cost().plus(extent_of(leaf).cost, 1, len(member.name) + 1)
+    return Group({member.name: Field(member.name, member, leaf, 0, None)}, round_up(size, 2), cost, 1, opaque=True)
+
+
+def _is_structured(type_: Type) -> bool:
+    """Whether an in-out of this type is handed over as a pointer."""
+    if not isinstance(type_, Named) or type_.quoted or type_.length is not None:
+        return True
+    element = element_type(type_.name)
+    return element is None or element.base in STRUCTURED
+
+
+def _takes_no_room(member: Member) -> bool:
+    """Whether it is a VARIANT parameter: a reference that an instance does not hold."""
+    type_ = member.type
+    return (
+        member.section in (Section.INPUT, Section.IN_OUT)
+        and isinstance(type_, Named)
+        and not type_.quoted
+        and type_.name.upper() == "VARIANT"
+    )

@@ -1,0 +1,229 @@
+"""The registers of a tag table: from entries to places in a block, one after the other."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from pathlib import PurePath
+from typing import Annotated, Final, Literal
+
+import msgspec
+
+from shmio.config.wording import explain
+from shmio.errors import PathError, ValueRangeError
+from shmio.layout.model import (
+    MAX_BLOCK_BYTES,
+    MAX_DIMENSIONS,
+    MAX_ELEMENTS,
+    MAX_REGISTERS,
+    ByteOrder,
+    Diagnostic,
+    Dims,
+    Layout,
+    Register,
+    array_size,
+)
+from shmio.layout.report import Report, TooManyErrors
+from shmio.layout.source.lists import split_array
+from shmio.layout.structures import CONTENTS, members
+from shmio.layout.topic import MAX_TOPIC, canonical_path, shorten
+from shmio.layout.types import ElementType, element_type
+from shmio.layout.values.literal import parse_literal
+from shmio.logs import printable
+
+MAX_ALIGN: Final = 8
+
+_ARRAY = re.compile(r"ARRAY\s*\[([^\]]*)\]\s*OF\s+(\S+)", re.IGNORECASE)
+_BOUNDS = re.compile(r"\s*(-?[0-9]{1,9})\s*\.\.\s*(-?[0-9]{1,9})\s*")
+_TEXTS: Final = frozenset({"STRING", "WSTRING", "CHAR", "WCHAR"})
+
+_Scalar = bool | int | float | str
+
+
+class _Tag(msgspec.Struct, forbid_unknown_fields=True):
+    type: str
+    initial: _Scalar | list[_Scalar] | None = None
+    comment: Annotated[str, msgspec.Meta(max_length=1000)] = ""
+
+
+class Table(msgspec.Struct, forbid_unknown_fields=True):
+    """A tag table as its file has it."""
+
+    registers: Annotated[dict[str, object], msgspec.Meta(min_length=1, max_length=MAX_REGISTERS)]
+    name: Annotated[str, msgspec.Meta(min_length=1, max_length=128)] = ""
+    byte_order: ByteOrder = "little"
+
+
+def place_tags(name: str, registers: Mapping[str, object], byte_order: ByteOrder = "little") -> Layout:
+    """Place registers that a program declares, each as a table has it: its type, or a dict of the keys of one.
+
+    LayoutError: ``diagnostics`` has everything found, each beginning with the path.
+    """
+    places = {path: place for place, path in enumerate(registers, 1)}
+    return place_table(name, Table(dict(registers), name, byte_order), Report([name]), places.__getitem__)
+
+
+def place_table(file: str, table: Table, report: Report, line_of: Callable[[str], int]) -> Layout:
+    """Place a table's registers; ``line_of`` a key, for diagnostics. LayoutError."""
+    placer = _Placer(file, report, line_of)
+    with suppress(TooManyErrors):
+        placer.place(table)
+    report.raise_errors()
+    return placer.layout(table)
+
+
+class _Placer:
+    """Places one table's registers one after the other."""
+
+    def __init__(self, file: str, report: Report, line_of: Callable[[str], int]) -> None:
+        self._file = file
+        self._report = report
+        self._line_of = line_of
+        self._registers: dict[str, Register] = {}
+        self._keys: dict[str, str] = {}  # of the paths, as the file has them
+        self._end = 0
+        self._elements = 0
+
+    def place(self, table: Table) -> None:
+        """Place all registers; TooManyErrors."""
+        for key, given in table.registers.items():
+            try:
+                self._place_all(key, _tag(key, given))
+            except (PathError, ValueRangeError, ValueError) as error:
+                self._complain(key, str(error))
+        in_lower_case: dict[str, str] = {}
+        for path in self._registers:
+            first = in_lower_case.setdefault(path.lower(), path)
+            if first != path:
+                problem = f"only the case of letters tells it from {shorten(first)}"
+                self._complain(self._keys[path], problem, "warning")
+            head = path.rpartition("/")[0]
+            while head:
+                if head in self._registers:
+                    self._complain(self._keys[path], f"{shorten(head)} is a value itself")
+                head = head.rpartition("/")[0]
+        if self._end > MAX_BLOCK_BYTES or self._elements > MAX_ELEMENTS:
+            most = f"{MAX_BLOCK_BYTES} bytes and {MAX_ELEMENTS} elements"
+            self._report.add(Diagnostic(self._file, 1, 1, f"expected at most {most}, found more"))
+
+    def layout(self, table: Table) -> Layout:
+        """What came of it."""
+        name = table.name or PurePath(self._file).stem
+        return Layout(name, None, self._end, False, tuple(self._registers.values()), table.byte_order)
+
+    def _complain(self, key: str, problem: str, severity: Literal["error", "warning"] = "error") -> None:
+        message = f"{shorten(printable(key))}: {problem}"
+        self._report.add(Diagnostic(self._file, self._line_of(key), 1, message, severity))
+
+    def _place_all(self, key: str, tag: _Tag) -> None:
+        """Place a register, or the members of a structure."""
+        if key.rpartition("/")[2] in ("in", "out"):
+            raise PathError("it ends in a direction; leave it out, each register has both")
+        inside = members(tag.type)
+        if inside is None:
+            self._place(key, key, tag)
+            return
+        if tag.initial is not None:
+            raise ValueError("initial: a structure has none; name its members one by one to give them values")
+        for name, kind in inside.items():
+            self._place(key, f"{key}/{name}", _Tag(kind, None, tag.comment))
+
+    def _place(self, key: str, name: str, tag: _Tag) -> None:
+        path = canonical_path(name)
+        if len(path) > MAX_TOPIC:
+            raise PathError(f"a path is at most {MAX_TOPIC} characters long")
+        if path in self._registers:
+            raise PathError("it is there twice")
+        if len(self._registers) >= MAX_REGISTERS:
+            self._complain(key, f"expected at most {MAX_REGISTERS} registers, structures' members included")
+            raise TooManyErrors
+        element, dims = _type(tag.type)
+        shape = tuple(high - low + 1 for low, high in dims)
+        bit = 0 if element.base == "BOOL" else None
+        size, align = array_size(element, shape), _align(element)
+        offset = -(-self._end // align) * align
+        initial = None if tag.initial is None else _literal(tag.initial, element)
+        register = Register(path, element.name, dims, offset, bit, size, math.prod(shape), tag.comment, initial)
+        if initial is not None:
+            parse_literal(initial, register)
+            _check_length(initial, shape)
+        self._registers[path] = register
+        self._keys[path] = key
+        self._end = offset + size
+        self._elements += register.count
+
+
+def _tag(key: str, given: object) -> _Tag:
+    """One register's entry; ValueError."""
+    if isinstance(given, str):
+        return _Tag(given)
+    if isinstance(given, dict) and (others := given.keys() - set(_Tag.__struct_fields__)):
+        other = min(others)
+        known = ", ".join(_Tag.__struct_fields__)
+        raise ValueError(
+            f"there is no {shorten(printable(other))!r} here, only {known}; a path with a dot is written in quotes, "
+            f'"{shorten(printable(f"{key}.{other}"))}"'
+        )
+    try:
+        return msgspec.convert(given, _Tag)
+    except msgspec.ValidationError as error:
+        if isinstance(given, dict) and _is_nested(given.get("initial")):
+            raise ValueError(
+                "initial: expected one list, in which the last index runs fastest, found lists in it"
+            ) from None
+        raise ValueError(explain(error)) from None
+
+
+def _is_nested(initial: object) -> bool:
+    return isinstance(initial, list) and any(isinstance(value, list) for value in initial)
+
+
+def _check_length(initial: str, shape: tuple[int, ...]) -> None:
+    """Refuse more values than the array has elements; ValueError."""
+    if shape:
+        runs = split_array(initial, (shape[0] + 1, *shape[1:]))
+        if runs and runs[-1][0] + runs[-1][1] > math.prod(shape):
+            raise ValueError(f"initial: expected at most {math.prod(shape)} values, found more")
+
+
+def _type(text: str) -> tuple[ElementType, Dims]:
+    """Type of the elements and bounds; ValueError."""
+    dims: list[tuple[int, int]] = []
+    if array := _ARRAY.fullmatch(text.strip()):
+        for part in array[1].split(","):
+            bounds = _BOUNDS.fullmatch(part)
+            if bounds is None or int(bounds[1]) > int(bounds[2]):
+                raise ValueError(f"expected bounds as in ARRAY[1..8] OF BOOL, found [{array[1]}]")
+            dims.append((int(bounds[1]), int(bounds[2])))
+        if len(dims) > MAX_DIMENSIONS:
+            raise ValueError(f"expected at most {MAX_DIMENSIONS} dimensions, found {len(dims)}")
+        text = array[2]
+    if math.prod(high - low + 1 for low, high in dims) > MAX_ELEMENTS:
+        raise ValueError(f"expected at most {MAX_ELEMENTS} elements")
+    element = element_type(text.strip())
+    if element is None:
+        raise ValueError(
+            f"there is no type {text!r}; there are BOOL, INT, DINT, REAL, LREAL, STRING[20] and the like, and the "
+            f"structures {', '.join(CONTENTS)}"
+        )
+    return element, tuple(dims)
+
+
+def _align(element: ElementType) -> int:
+    return min(element.size, MAX_ALIGN) if element.size & element.size - 1 == 0 else element.align
+
+
+def _literal(value: _Scalar | list[_Scalar], element: ElementType) -> str:
+    """An initial value as S7 has it. Text for a number or a time is such a literal already."""
+    if isinstance(value, list):
+        return f"[{', '.join(_literal(item, element) for item in value)}]"
+    if isinstance(value, str):
+        if element.base not in _TEXTS:
+            return value
+        escaped = value.replace("$", "$$").replace("'", "$'")
+        return f"{'W' + element.base.removeprefix('W') + '#' if element.base.startswith('W') else ''}'{escaped}'"
+    if isinstance(value, int) and abs(value) >> 64:
+        raise ValueError("initial: expected a number of at most 64 bits, found a larger one")
+    return str(value).upper() if isinstance(value, bool) else repr(value)

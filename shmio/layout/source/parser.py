@@ -1,0 +1,421 @@
+"""Tokens to declarations, by recursive descent: files, blocks and what is assigned after BEGIN.
+
+A syntax error is reported and the parser goes on at the next ``;`` or ``END_…``, so that one run finds them all.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+
+from shmio.layout.model import MAX_DEPTH
+from shmio.layout.report import MAX_ERRORS, Report, TooManyErrors
+from shmio.layout.source.expression import bound, bounds, integer, string_length
+from shmio.layout.source.lexer import Kind, Token
+from shmio.layout.source.syntax import (
+    Array,
+    Assignment,
+    BlockDeclaration,
+    ConstantDeclaration,
+    Member,
+    Named,
+    Position,
+    Section,
+    Struct,
+    Type,
+    TypeDeclaration,
+    Unit,
+)
+from shmio.layout.source.token_cursor import Cursor, SyntaxFault
+
+TOP = ("DATA_BLOCK", "TYPE", "FUNCTION", "FUNCTION_BLOCK", "ORGANIZATION_BLOCK")
+INTERFACE = {section.value: section for section in Section}
+SECTIONS = (*INTERFACE, "VAR_RETAIN", "VAR_TEMP", "CONST", "LABEL")
+BLOCK_SECTIONS = ("VAR", "VAR_RETAIN")
+_SECTION_WORDS = ("RETAIN", "NON_RETAIN", "DB_SPECIFIC")
+STOPS = ("END_STRUCT", "END_VAR", "END_CONST", "END_TYPE", "END_DATA_BLOCK", "END_FUNCTION_BLOCK", "BEGIN", *TOP)
+_NUMBERED_TYPES = ("UDT", "FB", "SFB")
+_SPACED = "the name {!r} has spaces and no quotes (as in print, where underscores can be lost); it is kept as written"
+_PLAIN = re.compile(r"\w+")
+
+
+class Declarations:
+    """Reads declarations at a cursor. ``interface``: those of a function block, whose names have no spaces."""
+
+    def __init__(self, cursor: Cursor) -> None:
+        self.at = cursor
+        self.interface = False
+
+    def sections(self) -> tuple[Struct, tuple[ConstantDeclaration, ...]]:
+        """Read a body: one STRUCT, or sections one after the other; return its members and its constants.
+
+        The members of a function block come in the order of its instances.
+        """
+        position = self.at.position
+        if self.at.accept_word("STRUCT"):
+            return Struct(self.members("END_STRUCT", 0), position), ()
+        members: list[Member] = []
+        constants: list[ConstantDeclaration] = []
+        while self.at.token.is_word(*(SECTIONS if self.interface else BLOCK_SECTIONS)):
+            keyword = self.at.advance().text.upper()
+            if keyword in ("VAR_TEMP", "LABEL"):  # they take no room in an instance
+                end = "END_VAR" if keyword == "VAR_TEMP" else "END_LABEL"
+                if not self.at.skip_to(end):
+                    raise self.at.expected(end)
+                self.at.advance()
+            elif keyword == "CONST" or (self.at.token.is_word("CONSTANT") and not self.at.names_member()):
+                self.at.accept_word("CONSTANT")
+                constants += self.constants("END_CONST" if keyword == "CONST" else "END_VAR")
+            else:
+                while self.at.token.is_word(*_SECTION_WORDS) and not self.at.names_member():
+                    self.at.advance()
+                section = INTERFACE.get(keyword, Section.STATIC) if self.interface else None
+                members += (replace(member, section=section) for member in self.members("END_VAR", 0))
+            self.at.accept(";")
+        if self.interface:
+            order = list(Section)
+            members.sort(key=lambda member: order.index(member.section or Section.STATIC))
+        return Struct(tuple(members), position), tuple(constants)
+
+    def constants(self, end: str) -> list[ConstantDeclaration]:
+        """Read constants up to the END of their section."""
+        constants: list[ConstantDeclaration] = []
+        while not self.at.accept_word(end):
+            if self.stops():
+                raise self.at.expected(f"a constant or {end}")
+            self.recovering(lambda: self._constant(constants))
+        return constants
+
+    def _constant(self, constants: list[ConstantDeclaration]) -> None:
+        if self.at.accept(";"):
+            return
+        name, position, _ = self._name()
+        if self.at.token.is_punct("{"):
+            self.attributes()
+        if self.at.accept(":"):  # classic SCL gives no type
+            self._type(0)
+        self.at.expect(":=", "':=' and the constant's value")
+        start, number = self.at.index, None
+        with suppress(SyntaxFault):  # a constant of another kind
+            number = bound(self.at, "a number")
+        if not self.at.token.is_punct(";"):
+            number = None
+        self.at.rewind(start)
+        value = self.at.value()
+        self.at.expect(";", "';' after the value")
+        constants.append(ConstantDeclaration(name, value, number, position))
+
+    def members(self, end: str, depth: int) -> tuple[Member, ...]:
+        """Read members up to the END of their structure or section."""
+        members: list[Member] = []
+        while self.at.names_member() or not self.at.accept_word(end):
+            if self.stops():
+                raise self.at.expected(f"a member or {end}")
+            self.recovering(lambda: self._member(members, depth))
+        return tuple(members)
+
+    def stops(self) -> bool:
+        """Whether a list of members ends here for want of its END."""
+        token = self.at.token
+        return token.kind is Kind.END or (token.is_word(*STOPS) and not self.at.names_member())
+
+    def recovering(self, read: Callable[[], None]) -> None:
+        """Run one production; on a fault report it and skip to the end of the statement."""
+        start = self.at.index
+        try:
+            read()
+        except SyntaxFault as fault:
+            self.at.report.add(fault.diagnostic)
+            if self.at.index == start:
+                self.at.advance()
+            depth = 0
+            while not (self.stops() if depth == 0 else self.at.token.kind is Kind.END):
+                token = self.at.advance()
+                depth += token.is_word("STRUCT") - token.is_word("END_STRUCT")
+                if token.is_punct(";") and depth == 0:
+                    return
+
+    def attributes(self) -> dict[str, str]:
+        """Read ``{ name := 'value'; … }``; names in upper case, values without quotes."""
+        opening = self.at.advance()
+        values: dict[str, str] = {}
+        while not self.at.accept("}"):
+            token = self.at.token
+            if token.kind is Kind.END or token.is_punct("{") or token.is_word(*STOPS):
+                raise self.at.fault(opening, "the attributes that begin here have no '}'")
+            self.at.advance()
+            if token.kind in (Kind.WORD, Kind.QUOTED) and self.at.accept(":="):
+                values[token.text.upper()] = self.at.token.text.strip("'")
+        return values
+
+    def _member(self, members: list[Member], depth: int) -> None:
+        if self.at.accept(";"):
+            return
+        names = [self._name()]
+        while self.at.accept(","):
+            names.append(self._name())
+        if self.at.token.is_punct("{"):
+            self.attributes()
+        is_view = self.interface and self.at.accept_word("AT")  # another view of a member: it takes no room
+        if is_view:
+            self._name()
+        self.at.expect(":", "':' and the type")
+        for name, position, quoted in names:
+            if not quoted and not _PLAIN.fullmatch(name):
+                self.at.report.add(position.warning(_SPACED.format(name)))
+        first = self.at.index
+        type_ = self._type(depth)
+        if self.at.token.is_punct("{"):
+            self.attributes()
+        initial = self.at.value() if self.at.accept(":=") else None
+        closing = self.at.token
+        inner = isinstance(type_, Struct) or (isinstance(type_, Array) and isinstance(type_.element, Struct))
+        if not self.at.accept(";") and not (inner and initial is None):
+            raise self.at.expected("';' at the end of the declaration")
+        comment = "" if inner else closing.comment or self.at.last_comment(first)
+        if not is_view:
+            members += [Member(name, type_, comment, initial, position) for name, position, _ in names]
+
+    def _name(self) -> tuple[str, Position, bool]:
+        """Read a name; return it, its place, and whether it was in quotes."""
+        position, token = self.at.position, self.at.token
+        if token.kind is Kind.QUOTED:
+            return self.at.advance().text, position, True
+        if token.kind is not Kind.WORD:
+            raise self.at.expected("a member's name")
+        return self.at.advance().text if self.interface else self.at.words(), position, False
+
+    def body_type(self) -> Type:
+        """Read what stands for the body of a data block: the name of a type."""
+        return self._type(0)
+
+    def _type(self, depth: int) -> Type:
+        position = self.at.position
+        if not self.at.accept_word("ARRAY"):
+            return self._element(depth)
+        dims = bounds(self.at)
+        self.at.expect_word("OF")
+        if self.at.token.is_word("ARRAY"):
+            raise self.at.expected("the type of an element; an array of arrays is one array with more dimensions")
+        return Array(dims, self._element(depth), position)
+
+    def _element(self, depth: int) -> Named | Struct:
+        position, token = self.at.position, self.at.token
+        if depth + 1 >= MAX_DEPTH and token.is_word("STRUCT"):
+            raise self.at.fault(token, f"structures are nested more than {MAX_DEPTH} deep")
+        if self.at.accept_word("STRUCT"):
+            errors = len(self.at.report.errors)
+            members = self.members("END_STRUCT", depth + 1)
+            if not members and len(self.at.report.errors) == errors:
+                raise self.at.fault(token, "expected at least one member in the structure")
+            return Struct(members, position)
+        if token.kind is Kind.QUOTED:
+            self.at.advance()
+            return Named(token.text, True, position)
+        if token.kind is not Kind.WORD or token.is_word(*STOPS, *SECTIONS):
+            raise self.at.expected("a type")
+        self.at.advance()
+        if token.is_word("STRING", "WSTRING"):
+            return Named(token.text.upper(), False, position, string_length(self.at, token.text.upper()))
+        if token.is_word(*_NUMBERED_TYPES) and self.at.token.kind is Kind.NUMBER:
+            return Named(token.text + self.at.advance().text, False, position)  # UDT 10 is UDT10
+        return Named(token.text, False, position)
+
+
+_HEADER = (
+    *("AUTHOR", "FAMILY", "NAME", "VERSION", "CODE_VERSION1", "STANDARD"),
+    *("KNOW_HOW_PROTECT", "UNLINKED", "READ_ONLY", "NON_RETAIN", "RETAIN"),
+)
+_NUMBERED = ("DB", "UDT", "FB", "FC", "OB", "SFB")
+_DB_NUMBER = re.compile(r"DB([1-9][0-9]{0,4})", re.IGNORECASE)
+_PROTECTED = (
+    "the block {!r} is know-how protected and its declaration is not in the source: remove the protection in its "
+    "properties and export it again, or write its members here"
+)
+
+
+def parse(file: str, text: str, tokens: list[Token], report: Report) -> Unit:
+    """Parse one file; what could not be understood is in the report and left out of the result."""
+    return _Parser(Cursor(file, text, tokens, report)).unit()
+
+
+@dataclass(slots=True)
+class _Header:
+    """What stands between a block's name and its body."""
+
+    optimized: bool = False
+    protected: bool = False
+
+
+class _Parser:
+    def __init__(self, cursor: Cursor) -> None:
+        self.at = cursor
+        self.declare = Declarations(cursor)
+
+    def unit(self) -> Unit:
+        unit = Unit()
+        while not self.at.at_end():
+            try:
+                if self.at.accept_word("DATA_BLOCK"):
+                    unit.blocks.append(self.block())
+                elif self.at.accept_word("TYPE"):
+                    unit.types.append(self.type_declaration())
+                elif self.at.accept_word("FUNCTION_BLOCK"):
+                    unit.types.append(self.function_block())
+                elif self.at.token.is_word("FUNCTION", "ORGANIZATION_BLOCK"):
+                    self.code_block()
+                elif self.at.accept_word("VAR"):
+                    self.at.expect_word("CONSTANT")
+                    unit.constants += self.declare.constants("END_VAR")
+                elif not self.at.accept(";"):
+                    raise self.at.expected("DATA_BLOCK, TYPE or FUNCTION_BLOCK")
+            except SyntaxFault as fault:
+                self.at.report.add(fault.diagnostic)
+                self.resume()
+        return unit
+
+    def resume(self) -> None:
+        """Go to where the next declaration begins."""
+        while not self.at.at_end() and not self.at.token.is_word(*TOP):
+            self.at.advance()
+
+    @contextmanager
+    def collecting(self, *, resume: bool = True) -> Iterator[Report]:
+        """Collect what is wrong with one declaration: not every one is used. ``resume`` after it, if it is broken."""
+        outer, inner = self.at.report, Report([self.at.file])
+        self.at.report = inner
+        with suppress(TooManyErrors):
+            try:
+                yield inner
+            except SyntaxFault as fault:
+                inner.add(fault.diagnostic)
+                if resume:
+                    self.resume()
+        if resume and len(inner.errors) >= MAX_ERRORS:
+            self.at.skip_to_any(*TOP)
+        self.at.report = outer
+
+    def block(self) -> BlockDeclaration:
+        position = self.at.position
+        name, quoted = self.block_name("the block's name")
+        match = None if quoted else _DB_NUMBER.fullmatch(name)
+        number = int(match[1]) if match and int(match[1]) <= 65_535 else None
+        header = _Header()
+        body: Type = Struct((), position)
+        constants: tuple[ConstantDeclaration, ...] = ()
+        assignments: list[Assignment] = []
+        with self.collecting() as found:
+            header = self.header()
+            if header.protected and self.at.token.is_word("BEGIN", "END_DATA_BLOCK"):
+                raise SyntaxFault(position.error(_PROTECTED.format(name)))
+            if self.at.token.is_word("STRUCT", *BLOCK_SECTIONS):
+                body, constants = self.declare.sections()
+            else:
+                body = self.declare.body_type()
+                header = self.header(header)  # STEP 7 takes it on either side of the type's name
+            self.at.accept(";")
+            if self.at.accept_word("BEGIN"):
+                while not self.at.token.is_word("END_DATA_BLOCK", *TOP) and self.at.token.kind is not Kind.END:
+                    self.declare.recovering(lambda: self.assignment(assignments))
+            self.at.expect_word("END_DATA_BLOCK")
+        faults = (*found.errors, *found.warnings)
+        return BlockDeclaration(name, number, header.optimized, body, constants, tuple(assignments), position, faults)
+
+    def type_declaration(self) -> TypeDeclaration:
+        position = self.at.position
+        name, _ = self.block_name("the type's name")
+        body = Struct((), position)
+        with self.collecting() as found:
+            header = self.header()
+            if header.protected and self.at.token.is_word("END_TYPE"):
+                raise SyntaxFault(position.error(_PROTECTED.format(name)))
+            if not self.at.token.is_word("STRUCT"):
+                raise self.at.expected("STRUCT")
+            body, _ = self.declare.sections()
+            if not body.members and not found.errors:
+                found.add(position.error(f"expected at least one member in the type {name!r}"))
+            self.at.accept(";")
+            self.at.expect_word("END_TYPE")
+        return TypeDeclaration(name, body, position, faults=(*found.errors, *found.warnings))
+
+    def function_block(self) -> TypeDeclaration:
+        """Read the interface; the code is passed over."""
+        position = self.at.position
+        name, _ = self.block_name("the function block's name")
+        body, header = Struct((), position), _Header()
+        constants: tuple[ConstantDeclaration, ...] = ()
+        self.declare.interface = True
+        with self.collecting(resume=False) as found:
+            header = self.header()
+            if header.protected and self.at.token.is_word("BEGIN", "END_FUNCTION_BLOCK"):
+                raise SyntaxFault(position.error(_PROTECTED.format(name)))
+            body, constants = self.declare.sections()
+            if self.at.token.kind is Kind.PUNCT and self.at.token.text not in "#;":  # no statement begins so
+                raise self.at.expected("a section of variables or BEGIN")
+        self.declare.interface = False
+        if not self.at.skip_to("END_FUNCTION_BLOCK"):
+            raise SyntaxFault(position.error(f"the function block {name!r} has no END_FUNCTION_BLOCK"))
+        self.at.advance()
+        return TypeDeclaration(name, body, position, constants, True, header.optimized, tuple(found.errors))
+
+    def code_block(self) -> None:
+        start = self.at.advance()
+        end, name = f"END_{start.text.upper()}", self.at.token.text
+        if not self.at.skip_to(end):
+            raise self.at.fault(start, f"{start.text} has no {end}")
+        self.at.advance()
+        self.at.report.add(self.at.at(start).warning(f"{start.text} {name!r} declares no data block and is skipped"))
+
+    def block_name(self, what: str) -> tuple[str, bool]:
+        token = self.at.token
+        if token.kind not in (Kind.WORD, Kind.QUOTED):
+            raise self.at.expected(what)
+        self.at.advance()
+        name = token.text
+        if token.is_word(*_NUMBERED) and self.at.token.kind is Kind.NUMBER:
+            name += self.at.advance().text  # DB 10 is DB10
+        return name, token.kind is Kind.QUOTED
+
+    def header(self, header: _Header | None = None) -> _Header:
+        """Skip what stands between a block's name and its body; add to what was found before."""
+        header = header or _Header()
+        while True:
+            if self.at.token.is_punct("{"):
+                header.optimized |= self.declare.attributes().get("S7_OPTIMIZED_ACCESS", "").upper() == "TRUE"
+            elif self.at.token.is_word(*_HEADER):
+                word = self.at.advance()
+                header.protected |= word.is_word("KNOW_HOW_PROTECT")
+                if self.at.accept(":") or self.at.accept("="):
+                    while self.at.token.line == word.line and not self.at.token.is_word("STRUCT", "BEGIN", *SECTIONS):
+                        if self.at.advance().kind is Kind.END:
+                            break
+            else:
+                return header
+
+    def assignment(self, assignments: list[Assignment]) -> None:
+        if self.at.accept(";"):
+            return
+        position = self.at.position
+        target: list[str | tuple[int, ...]] = []
+        while True:
+            token = self.at.token
+            if token.kind is Kind.QUOTED:
+                target.append(self.at.advance().text)
+            elif token.kind is Kind.WORD:
+                target.append(self.at.words())
+            else:
+                raise self.at.expected("a member's name")
+            if self.at.accept("["):
+                index = [integer(self.at, "an index")]
+                while self.at.accept(","):
+                    index.append(integer(self.at, "an index"))
+                self.at.expect("]", "']' after the index")
+                target.append(tuple(index))
+            if not self.at.accept("."):
+                break
+        self.at.expect(":=", "':=' and a value")
+        value = self.at.value()
+        self.at.expect(";", "';' after the value")
+        assignments.append(Assignment(tuple(target), value, position))

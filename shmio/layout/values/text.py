@@ -1,0 +1,167 @@
+"""Values as text, as wire version 1 carries them.
+
+The text of a number is the shortest that reads back to the same value in the register's own type: ``0.1`` for
+a REAL. Reading also takes numbers as Java prints them.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from decimal import Decimal
+from functools import partial
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from shmio.errors import ValueRangeError
+from shmio.layout.model import Register
+from shmio.layout.types import ElementType
+from shmio.layout.values.checks import brief, out_of_range, to_bool
+from shmio.layout.values.codec import Value, flatten
+from shmio.layout.values.scalar import Scalar, bounds, scalar_codec
+
+WireType = Literal["double", "int", "bool", "string"]
+
+MAX_NUMBER = 100  # characters
+MAX_TEXT = 1 << 20
+
+_FLOATS = frozenset({"REAL", "LREAL"})
+_STRINGS = frozenset(["CHAR", "WCHAR", "STRING", "WSTRING", "DATE", "DATE_AND_TIME", "LDT", "DTL", "POINTER", "ANY"])
+_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?")
+_NON_FINITE = {"NaN": math.nan, "Infinity": math.inf, "+Infinity": math.inf, "-Infinity": -math.inf}
+
+
+def wire_type(register: Register) -> WireType:
+    """Return version 1's word for the type of the register, or of its elements."""
+    base = register.element.base
+    if base == "BOOL":
+        return "bool"
+    if base in _FLOATS:
+        return "double"
+    return "string" if base in _STRINGS else "int"
+
+
+def to_text(value: Value, register: Register) -> str:
+    """Return a register's decoded value as text: ``true``, ``-3``, ``0.1``, ``NaN``, text as it is, arrays as JSON.
+
+    A scalar of None (bytes that are no value of the type) is the empty text; in an array it is ``null``.
+    """
+    return _text(register.element, value)
+
+
+def texts(register: Register) -> Callable[[Value], str]:
+    """Return ``to_text`` of one register, for who needs it often."""
+    element = register.element
+    return _real_text if element.base == "REAL" and not register.dims else partial(_text, element)
+
+
+def _text(element: ElementType, value: Value) -> str:
+    if isinstance(value, list):
+        return msgspec.json.encode(json_value(value, element) if element.base in _FLOATS else value).decode()
+    return _scalar_text(value, element)
+
+
+def _real_text(value: Any) -> str:
+    return repr(_shortest_real(value)) if math.isfinite(value) else _non_finite_text(value)
+
+
+def shortest(value: float, element: ElementType) -> float:
+    """Return the float of fewest digits that is the same value in a REAL; of an LREAL, the value itself."""
+    return _shortest_real(value) if element.base == "REAL" and math.isfinite(value) else value
+
+
+def _shortest_real(value: float) -> float:
+    return float(str(np.float32(value)))
+
+
+def from_text(text: str, register: Register) -> Value:
+    """Return the value of a text: the reverse of ``to_text``, and numbers as Java prints them.
+
+    Raises ValueRangeError: no value of the register's type, or out of its range.
+    """
+    if len(text) > MAX_TEXT:
+        raise ValueRangeError(f"{register.path}: the text is longer than {MAX_TEXT} characters")
+    element = register.element
+    if not register.dims:
+        return _read(text, element)
+    try:
+        value = json.loads(text)
+    except (ValueError, RecursionError):
+        raise ValueRangeError(f"{register.path}: expected a JSON array, found {brief(text)}") from None
+    if element.base in _FLOATS:
+        value = _finite_or_not(value)
+    for item in flatten(value, register.shape, register.path):
+        _check(item, element)
+    return value  # type: ignore[no-any-return]  # flatten has seen to its shape, _check to its elements
+
+
+def json_value(value: Value, element: ElementType) -> Value:
+    """Return a value fit for JSON: a REAL's shortest digits; NaN and infinities, which JSON does not know, as texts."""
+    if isinstance(value, list):
+        return [json_value(item, element) for item in value]
+    if isinstance(value, float):
+        return shortest(value, element) if math.isfinite(value) else _scalar_text(value, element)
+    return value
+
+
+def _finite_or_not(value: object) -> object:
+    """Read the texts of ``json_value`` back."""
+    if isinstance(value, list):
+        return [_finite_or_not(item) for item in value]
+    return _NON_FINITE.get(value, value) if isinstance(value, str) else value
+
+
+def _scalar_text(value: Scalar, element: ElementType) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, float):
+        if math.isfinite(value):
+            return repr(shortest(value, element))
+        return _non_finite_text(value)
+    return str(value)
+
+
+def _non_finite_text(value: float) -> str:
+    return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+
+
+def _read(text: str, element: ElementType) -> Scalar:
+    base = element.base
+    if base in _STRINGS:
+        _check(text, element)
+        return text
+    text = text.strip()
+    if base == "BOOL":
+        value: bool | None = {"true": True, "1": True, "false": False, "0": False}.get(text.lower())
+        if value is None:
+            raise ValueRangeError(f"BOOL: expected true or false, found {brief(text)}")
+        return value
+    if base in _FLOATS and text in _NON_FINITE:
+        return _NON_FINITE[text]
+    if len(text) > MAX_NUMBER or not _NUMBER.fullmatch(text):
+        raise ValueRangeError(f"{element.name}: expected a number, found {brief(text)}")
+    if base in _FLOATS:
+        number = float(text)
+        if math.isinf(number):
+            raise out_of_range(text, element.name, *bounds("f" if base == "REAL" else "d"))
+        _check(number, element)
+        return number
+    exact = Decimal(text)  # "5.0" and "1.0E2" are whole numbers, and 2^63-1 keeps all its digits
+    if exact != exact.to_integral_value():
+        raise ValueRangeError(f"{element.name}: expected a whole number, found {brief(text)}")
+    _check(int(exact), element)
+    return int(exact)
+
+
+def _check(value: object, element: ElementType) -> None:
+    """Raise ValueRangeError unless the type can hold the value."""
+    if element.base == "BOOL":
+        to_bool(value, "BOOL")
+    else:
+        scalar_codec(element).encode(value)

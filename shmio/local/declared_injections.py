@@ -1,0 +1,71 @@
+"""Declared injections as a program lays them: checked as a whole, then sent to their sources one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+from shmio.config import Declaration
+from shmio.config.declaration import check_declarations
+from shmio.errors import CommandError, ConfigError
+from shmio.injection import Program, compile_program
+from shmio.local.writer import Commander
+from shmio.segment.block import Block
+
+
+class Laid(NamedTuple):
+    """A declared injection as the program that laid it holds it."""
+
+    commander: Commander
+    number: int
+    """By which anybody may lift it."""
+    program: Program
+
+    def lift(self) -> None:
+        """Lift it. CommandError: it is over, was lifted already, or no answer came."""
+        self.commander.lift(self.number)
+
+
+def check(
+    declarations: Sequence[Declaration], blocks: Mapping[str, Block], wanted: Callable[[], bool] = lambda: True
+) -> list[Program]:
+    """What declarations mean in this instance; ConfigError: the first fault, as ``injection[0].target: …``.
+
+    ``wanted``: asked before each, for many of a large layout take seconds. CommandError: it is not any more.
+    """
+    check_declarations(declarations)
+    layouts = {source: block.layout for source, block in blocks.items()}
+    periods_ns = {source: block.period_ns for source, block in blocks.items()}
+    programs = []
+    for index, declaration in enumerate(declarations):
+        if not wanted():
+            raise CommandError("whoever declared it does not wait for it any more")
+        try:
+            programs.append(compile_program(declaration, layouts, periods_ns))
+        except ConfigError as error:
+            raise ConfigError(f'injection[{index}].{error} (injection "{declaration.name}")') from None
+    return programs
+
+
+def declare(
+    declarations: Sequence[Declaration],
+    blocks: Mapping[str, Block],
+    commander: Callable[[Block], Commander],
+    *,
+    keep: bool = False,
+) -> list[Laid]:
+    """Lay all or none; ``commander``: who sends commands to a block. ConfigError; CommandError: a source refuses."""
+    laid: list[Laid] = []
+    try:
+        for program in check(declarations, blocks):
+            sender = commander(blocks[program.source])
+            try:
+                number = sender.declare(program.declaration, keep=keep)
+            except CommandError as error:
+                raise CommandError(f'{error} (injection "{program.declaration.name}")') from None
+            laid.append(Laid(sender, number, program))
+    except BaseException:
+        for one in laid:
+            one.lift()
+        raise
+    return laid

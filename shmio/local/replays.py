@@ -1,0 +1,285 @@
+"""How a local program moves what plays recordings: all sources of one recording together, so that they stay in step."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from typing import Final
+
+import msgspec
+
+from shmio.errors import CommandError, PathError, ValueRangeError
+from shmio.layout.topic import look_up, parse_topic
+from shmio.local.recording_times import moment_ns
+from shmio.model.replay_status import Playing
+from shmio.segment.block import Block
+from shmio.segment.playhead import MAX_SPEED, MIN_SPEED, Ask, Find, Found, Move, Play, Playhead
+from shmio.segment.segment import Segment
+
+ANSWER_S: Final = 5.0
+"""So long an answer is waited for that needs no search."""
+SEARCH_S: Final = 600.0
+TURN_NS: Final = 500_000_000
+"""How often it is looked whether who asks still wants to know."""
+
+
+class Wanted(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What is to change; None and empty: nothing. It pauses at ``until``, once.
+
+    ``seek``, ``until``: seconds from the begin, or a date and time, local unless it says. ``change``: play to the next
+    change of a register, ``event``: to the next event of a kind, and pause there; with ``jump`` be there at once.
+    ``sources``: only these, and what else plays the same recording.
+    """
+
+    paused: bool | None = None
+    speed: float | None = None
+    seek: str = ""
+    until: str = ""
+    loop: bool | None = None
+    change: str = ""
+    event: str = ""
+    jump: bool = False
+    sources: tuple[str, ...] = ()
+
+    @property
+    def nothing(self) -> bool:
+        """Whether nothing is to change."""
+        return self == Wanted(sources=self.sources)
+
+
+class Replays:
+    """The replays of an instance. Several threads may use it; of programs one at a time."""
+
+    def __init__(self, segment: Segment) -> None:
+        """``segment``: writable, to do more than look."""
+        self._segment = segment
+
+    def status(self, sources: Collection[str] = ()) -> list[Playing]:
+        """How each plays; with ``sources`` only these, and what else plays the same recording.
+
+        CommandError: none does; PathError: one of them does not.
+        """
+        now_ns = self._segment.clock.present_ns()
+        plays = self._chosen(Wanted(sources=tuple(sources)))
+        return [_told(source, play, now_ns) for source, play in plays.items()]
+
+    def pause(self) -> list[Playing]:
+        """Have all stand where they are."""
+        return self.change(Wanted(paused=True))
+
+    def play(self, speed: float | None = None) -> list[Playing]:
+        """Have all go on; what is over begins anew. ValueRangeError: no such speed."""
+        return self.change(Wanted(paused=False, speed=speed))
+
+    def speed(self, speed: float) -> list[Playing]:
+        """Play ``speed`` times as fast as the instance's clock, 0.01 to 1000. ValueRangeError."""
+        return self.change(Wanted(speed=speed))
+
+    def seek(self, to: float | str) -> list[Playing]:
+        """Be at a time: seconds from the begin, or a date and time. ValueRangeError: it is not in the recording."""
+        return self.change(Wanted(seek=str(to)))
+
+    def loop(self, on: bool = True) -> list[Playing]:
+        """Begin anew at the end, or do not."""
+        return self.change(Wanted(loop=on))
+
+    def play_until(self, to: float | str) -> list[Playing]:
+        """Play to a time, and pause there."""
+        return self.change(Wanted(paused=False, until=str(to)))
+
+    def to_change(self, path: str, *, jump: bool = False) -> list[Playing]:
+        """Play to the next change of a register, and pause there. PathError; CommandError: there is none."""
+        return self.change(Wanted(change=path, jump=jump))
+
+    def to_event(self, kind: str, *, jump: bool = False) -> list[Playing]:
+        """The same with the next event of a kind, such as ``accepted`` or ``noted``, or ``any``, of any source."""
+        return self.change(Wanted(event=kind, jump=jump))
+
+    def change(self, wanted: Wanted, given_up: Callable[[], bool] = lambda: False) -> list[Playing]:
+        """Do what is wanted; how all play then. ``given_up`` is asked now and then while a recording is searched.
+
+        ValueRangeError: a speed or a time; PathError: a source or a register; CommandError: there is no replay, or it
+        refuses, or does not answer, or it was given up.
+        """
+        if not self._segment.shared.writable:
+            raise CommandError("this attachment only reads: attach with writable=True")
+        if wanted.speed is not None and not (math.isfinite(wanted.speed) and MIN_SPEED <= wanted.speed <= MAX_SPEED):
+            raise ValueRangeError(f"a speed is from {MIN_SPEED:g} to {MAX_SPEED:g}, not {wanted.speed:g}")
+        plays = self._chosen(wanted)
+        with self._held(plays) as heads:
+            if wanted.change or wanted.event:
+                self._go_to(wanted, heads, given_up)
+            else:
+                self._move(heads, lambda play, clock_ns: _moved(play, wanted, clock_ns))
+        return self.status(wanted.sources)
+
+    # ---- which -----------------------------------------------------------------------------------------------------
+
+    def _blocks(self) -> dict[str, Block]:
+        self._segment.refresh()
+        return {name: block for name, block in self._segment.blocks.items() if block.playhead is not None}
+
+    def _plays(self) -> dict[str, Play]:
+        found: dict[str, Play] = {}
+        for source, block in self._blocks().items():
+            play = block.playhead.read() if block.playhead else None
+            if play is not None:
+                found[source] = play
+        if not found:
+            raise CommandError(f"instance {self._segment.instance!r} plays no recording")
+        return found
+
+    def _chosen(self, wanted: Wanted) -> dict[str, Play]:
+        """The sources that are meant, and what plays the same recordings."""
+        plays = self._plays()
+        for source in wanted.sources:
+            if source not in plays:
+                raise PathError(f"source {source!r} plays no recording; these do: {', '.join(plays)}")
+        names = list(wanted.sources)
+        if wanted.change:
+            names = [self._register(wanted.change)[0]]
+        meant = {_recording(plays[source]) for source in names or plays}
+        if wanted.event and len(meant) > 1:  # whose positions have nothing to do with each other
+            raise CommandError(
+                f"several recordings are played: name one of the sources of the one that is meant ({', '.join(plays)})"
+            )
+        return {source: play for source, play in plays.items() if _recording(play) in meant}
+
+    def _register(self, path: str) -> tuple[str, str]:
+        """Source and path of a register that is played; PathError."""
+        blocks = self._blocks()
+        topic = parse_topic(path, self._segment.blocks, next(iter(blocks)) if len(blocks) == 1 else None)
+        if topic.source not in blocks:
+            raise PathError(f"{path}: source {topic.source!r} plays no recording; these do: {', '.join(blocks)}")
+        look_up(blocks[topic.source].layout, topic)
+        return topic.source, topic.path
+
+    @contextmanager
+    def _held(self, sources: Collection[str]) -> Iterator[dict[str, Playhead]]:
+        """The playheads of sources, for this program alone."""
+        blocks = self._blocks()
+        heads = {source: head for source in blocks if source in sources and (head := blocks[source].playhead)}
+        with ExitStack() as stack:
+            for head in heads.values():  # each program in the same order
+                stack.enter_context(head.held())
+            yield heads
+
+    # ---- what ------------------------------------------------------------------------------------------------------
+
+    def _go_to(self, wanted: Wanted, heads: Mapping[str, Playhead], given_up: Callable[[], bool]) -> None:
+        """Have them stand, look ahead, and go on to what was found."""
+        self._move(heads, lambda _, clock_ns: Move(clock_ns, paused=True))
+        searched = dict(heads)
+        path = ""
+        if wanted.change:
+            source, path = self._register(wanted.change)
+            searched = {source: heads[source]}
+        now_ns = self._segment.clock.read().time_ns
+        after_ns = {source: play.at_ns(now_ns) for source, play in self._plays().items()}
+        answers = self._ask(
+            searched, {source: Find(after_ns[source], path, wanted.event) for source in searched}, SEARCH_S, given_up
+        )
+        positions_ns = [found.position_ns for found in answers.values() if found.position_ns is not None]
+        if not positions_ns:
+            raise CommandError(next(iter(answers.values())).error)
+        at_ns = min(positions_ns)
+        if wanted.jump:
+            self._move(heads, lambda _, clock_ns: Move(clock_ns, paused=True, position_ns=at_ns))
+        else:
+            self._move(heads, lambda _, now: Move(now, paused=False, until_ns=at_ns, speed=wanted.speed))
+
+    def _move(self, heads: Mapping[str, Playhead], move: Callable[[Play, int], Move]) -> None:
+        """Move all from one moment on."""
+        clock_ns = self._segment.clock.read().time_ns  # behind a step that is under way: until then nobody answers
+        asks: dict[str, Ask] = {}
+        for source, head in heads.items():
+            play = head.read()
+            if play is not None:
+                asks[source] = move(play, clock_ns)
+        for source, found in self._ask(heads, asks, ANSWER_S).items():
+            if found.error:
+                raise CommandError(f"{source}: {found.error}")
+
+    def _ask(
+        self,
+        heads: Mapping[str, Playhead],
+        asks: Mapping[str, Ask],
+        patience_s: float,
+        given_up: Callable[[], bool] = lambda: False,
+    ) -> dict[str, Found]:
+        """Ask all at once; their answers."""
+        numbers = {source: heads[source].ask(ask) for source, ask in asks.items()}
+        for slot in self._segment.processes:
+            if slot.name in asks:
+                self._segment.clock.slot_bell(slot.index).ring()
+        until_ns = time.monotonic_ns() + round(patience_s * 1e9)
+        return {
+            source: self._answer(source, heads[source], number, until_ns, given_up)
+            for source, number in numbers.items()
+        }
+
+    def _answer(self, source: str, head: Playhead, number: int, until_ns: int, given_up: Callable[[], bool]) -> Found:
+        ring = self._segment.blocks[source].ring
+        while True:
+            seen = ring.doorbell()
+            found = head.found(number)
+            if found is not None:
+                return found
+            rest_ns = until_ns - time.monotonic_ns()
+            if rest_ns <= 0:
+                raise CommandError(f"source {source} does not answer: {self._state(source)}")
+            if given_up():
+                raise CommandError(f"source {source} has not answered: it was given up")
+            ring.wait(seen, min(rest_ns, TURN_NS))
+
+    def _state(self, source: str) -> str:
+        for slot in self._segment.processes:
+            if slot.name == source and slot.alive():
+                return f"pid {slot.report.pid} is busy, or a step of time is under way"
+        return "its process does not run"
+
+
+def _recording(play: Play) -> tuple[int, int, int]:
+    return play.begin_ns, play.end_ns, play.utc_ns
+
+
+def _moved(play: Play, wanted: Wanted, clock_ns: int) -> Move:
+    """The same request for one source. ValueRangeError: a time that it does not have."""
+    return Move(
+        clock_ns,
+        paused=wanted.paused,
+        speed=wanted.speed,
+        position_ns=_position(play, wanted.seek) if wanted.seek else None,
+        loop=wanted.loop,
+        until_ns=_position(play, wanted.until) if wanted.until else None,
+    )
+
+
+def _position(play: Play, text: str) -> int:
+    try:
+        position_ns = moment_ns(text, play.utc_ns + play.begin_ns) - play.utc_ns
+    except ValueError:
+        raise ValueRangeError(
+            f"{text!r} is neither a time such as 2026-11-21T08:30:00 nor seconds from the begin of what is played"
+        ) from None
+    if not play.begin_ns <= position_ns <= play.end_ns:
+        length_s = (play.end_ns - play.begin_ns) / 1e9
+        raise ValueRangeError(f"{text} is not within what is played, which is {length_s:.3f} s long")
+    return position_ns
+
+
+def _told(source: str, play: Play, clock_ns: int) -> Playing:
+    position_ns = play.at_ns(clock_ns)
+    return Playing(
+        source,
+        (play.utc_ns + position_ns) / 1e9,
+        (position_ns - play.begin_ns) / 1e9,
+        (play.end_ns - play.begin_ns) / 1e9,
+        play.speed,
+        play.paused,
+        play.loop,
+        play.over,
+        (play.until_ns - play.begin_ns) / 1e9 if play.until_ns < play.end_ns else None,
+    )

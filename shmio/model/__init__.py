@@ -1,0 +1,1 @@
+"""Types that local programs, clients and endpoints share."""

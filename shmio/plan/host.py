@@ -1,0 +1,95 @@
+"""What a configuration demands of the host, looked at before anything starts."""
+
+from __future__ import annotations
+
+import grp
+import os
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+
+from shmio import realtime
+from shmio.config import Config, Mqtt
+from shmio.config.mqtt.accounts import read_accounts, read_password
+from shmio.config.mqtt.tls import client_context, server_context
+from shmio.config.tls import read_tls
+from shmio.config.tokens import read_tokens
+from shmio.errors import ConfigError
+
+
+def check_host(config: Config, catching: Callable[[], AbstractContextManager[None]]) -> None:
+    """Group, priorities, folders of log files and recordings, TLS files, tokens. Nothing is made.
+
+    ``catching``: what makes a context that keeps a ConfigError for later.
+    """
+    with catching():
+        _check_group(config.instance.group)
+    for index, source in enumerate(config.source):
+        with catching():
+            _check_priority(f"source[{index}]", source.realtime_priority)
+    for index, emulator in enumerate(config.emulator):
+        with catching():
+            _check_priority(f"emulator[{index}]", emulator.realtime_priority)
+    with catching():
+        _check_folder("instance.log_dir", config.log_dir)
+    if config.recorder:
+        with catching():
+            _check_folder("recorder.directory", config.path(config.recorder.directory))
+    if config.grpc:
+        with catching():
+            if config.grpc.tls:
+                read_tls(config.grpc.tls)
+        with catching():
+            read_tokens(config.grpc.token)
+    if config.mqtt:
+        with catching():
+            _check_mqtt(config.mqtt)
+
+
+def _check_mqtt(mqtt: Mqtt) -> None:
+    """What its processes will read, and start."""
+    external = mqtt.broker == "external"
+    if mqtt.tls:
+        (client_context if external else server_context)(mqtt.tls)
+    if mqtt.password_file:
+        if external:
+            read_password(mqtt.password_file)
+        else:
+            read_accounts(mqtt.password_file, mqtt.account)
+    if mqtt.broker == "mosquitto":
+        from shmio.endpoints.mqtt.broker import mosquitto  # noqa: PLC0415
+
+        if mosquitto.find() is None:
+            raise ConfigError(mosquitto.NONE)
+
+
+def _check_group(name: str | None) -> None:
+    if name is None:
+        return
+    try:
+        gid = grp.getgrnam(name).gr_gid
+    except KeyError:
+        raise ConfigError(f"instance.group: this host has no group {name!r}") from None
+    if os.geteuid() != 0 and gid not in (os.getegid(), *os.getgroups()):
+        raise ConfigError(f"instance.group: this user is not in group {name!r}, and so cannot give it the segment")
+
+
+def _check_priority(key: str, priority: int | None) -> None:
+    try:
+        if priority is not None:
+            realtime.check(priority)
+    except ConfigError as error:
+        raise ConfigError(f"{key}.{error}") from None
+
+
+def _check_folder(key: str, folder: Path) -> None:
+    """Whether it is there, or can be made, and can be written."""
+    try:
+        place = next(path for path in (folder, *folder.parents) if path.exists())
+    except OSError as error:  # a name too long, a folder above that cannot be searched
+        raise ConfigError(f"{key}: {folder}: {error.strerror}") from None
+    if not place.is_dir():
+        raise ConfigError(f"{key}: {place} is no folder")
+    if not os.access(place, os.W_OK | os.X_OK):
+        why = "cannot be written" if place == folder else f"cannot be made: no permission in {place}"
+        raise ConfigError(f"{key}: {folder} {why}")

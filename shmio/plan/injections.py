@@ -1,0 +1,79 @@
+"""Declared injections against what they name: registers, types, conditions, and what their source allows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import msgspec
+import numpy as np
+
+from shmio.config import Config, Declaration, Source
+from shmio.errors import ConfigError
+from shmio.injection import Program, compile_program
+from shmio.layout.model import Layout
+from shmio.layout.values.write import cover
+from shmio.segment import NO_WRITER
+from shmio.segment.standing_injections import Running, Standing, declared_document, encode, ranges_of
+
+
+def check_injections(config: Config, layouts: Mapping[str, Layout]) -> tuple[dict[str, bytes], tuple[str, ...]]:
+    """What each source's process is given of them, by its name, and what they are, a line each.
+
+    ConfigError with the full key.
+    """
+    periods_ns = {source.name: source.period_ns for source in config.source}
+    found: dict[str, list[Program]] = {}
+    described = []
+    for index, declaration in enumerate(config.injection):
+        try:
+            if not config.source:
+                raise ConfigError("target: there is no [[source]]")
+            program = compile_program(declaration, layouts, periods_ns)
+            source = next(source for source in config.source if source.name == program.source)
+            if program.direction == "in":
+                _check_in(program, source, layouts[source.name])
+        except ConfigError as error:
+            raise ConfigError(f"injection[{index}].{error}") from None
+        found.setdefault(program.source, []).append(program)
+        over = f"{declaration.operation} over source {program.source} /{program.direction}"
+        described.append(f"injection {declaration.name}: {over}")
+    return {source: _document(source, programs) for source, programs in found.items()}, tuple(described)
+
+
+def _check_in(program: Program, source: Source, layout: Layout) -> None:
+    from shmio.connectors import registry  # noqa: PLC0415  as in prepare
+    from shmio.connectors.base import Connector  # noqa: PLC0415
+    from shmio.segment import Provenance  # noqa: PLC0415
+
+    connector = registry.load(source.connector)
+    device = issubclass(connector, Connector) and connector.provenance is Provenance.LIVE
+    if issubclass(connector, Connector) and not connector.can_write:
+        raise ConfigError(f"target: {source.name}/…/in: its connector cannot write")
+    if device and not source.armed:
+        raise ConfigError(f"target: an injection toward a device needs `armed = true` in source {source.name!r}")
+    writable = np.frombuffer(cover(layout, source.writable), np.uint8)
+    if (program.cover & ~writable).any():
+        raise ConfigError(f"target: it covers what is not writable; name that in `writable` of source {source.name!r}")
+
+
+def _document(source: str, programs: list[Program]) -> bytes:
+    from shmio.connectors.injection.layers import MAX_INJECTIONS  # noqa: PLC0415
+    from shmio.connectors.injection.published import GROWTH  # noqa: PLC0415
+
+    declarations: Iterable[Declaration] = [program.declaration for program in programs]
+    try:
+        if len(programs) > MAX_INJECTIONS:
+            raise ValueError(f"a source has at most {MAX_INJECTIONS}")
+        encode([msgspec.json.encode(_standing(program)) for program in programs], GROWTH * len(programs))
+        return declared_document(declarations)
+    except ValueError as error:
+        raise ConfigError(f"injection: {len(programs)} over source {source!r}: {error}") from None
+
+
+def _standing(program: Program) -> Standing:
+    """As its source's process will show it."""
+    declaration = program.declaration
+    return Standing(
+        2**64 - 1, program.direction, declaration.priority, True, declaration.name, NO_WRITER, 0,
+        ranges_of(program.cover.tobytes()), Running(declaration, "waiting", 2**63 - 1),
+    )  # fmt: skip

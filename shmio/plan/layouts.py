@@ -1,0 +1,129 @@
+"""The data-block sources that a configuration names: compiled once, one block chosen from each."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from shmio.config import Config, Emulator, Source
+from shmio.errors import ConfigError, LayoutError
+from shmio.layout import compiler
+from shmio.layout.model import Diagnostic, Layout
+from shmio.layout.source.lexer import MAX_SOURCE_BYTES
+
+_QUOTED = re.compile(r"'[^']*'")
+
+
+class LayoutFiles:
+    """Reads each set of files once, and compiles each data block of them once."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._programs: dict[tuple[Path, ...], compiler.Program] = {}
+        self._compiled: dict[object, compiler.Compiled | LayoutError] = {}
+        self.warnings: list[str] = []
+        self.odd: list[str] = []
+        """What is odd about the sections' keys, each beginning with the key."""
+
+    def get(self, key: str, section: Source | Emulator, number: int | None) -> Layout:
+        """The data block of a section; if its files hold several, the one of its ``block`` or of this number.
+
+        What is wrong with other blocks does not count then. ConfigError: no such file or block, or none is chosen;
+        LayoutError.
+        """
+        paths, program = self._program(key, section)
+        if section.block is None and len(program.blocks) <= 1:
+            return self._compile(key, section, paths, program, None)[0]
+        try:
+            block = _choose(key, section, program.blocks, number)
+        except ConfigError:
+            program.compile(())  # which says so if the sources are damaged: that comes first
+            raise
+        return self._compile(key, section, paths, program, block.name)[0]
+
+    def all(self, key: str, section: Source | Emulator) -> tuple[Layout, ...]:
+        """Every data block of a section's files; ConfigError: no such file; LayoutError."""
+        return self._compile(key, section, *self._program(key, section), None)
+
+    def _program(self, key: str, section: Source | Emulator) -> tuple[tuple[Path, ...], compiler.Program]:
+        if section.layout is None:
+            raise ConfigError(f"{key}.layout: this key is needed: the data block's source (.db), and its UDTs")
+        names = [section.layout] if isinstance(section.layout, str) else section.layout
+        paths = tuple(self._config.path(name) for name in names)
+        if paths not in self._programs:
+            self._programs[paths] = read_program(paths, f"{key}.layout: ")
+        return paths, self._programs[paths]
+
+    def _compile(
+        self, key: str, section: Source | Emulator, paths: object, program: compiler.Program, block: str | None
+    ) -> tuple[Layout, ...]:
+        """Compile one block, or all."""
+        sizes = section.type_bytes
+        which = paths, block and block.lower(), tuple(sorted(sizes.items()))
+        if which not in self._compiled:
+            try:
+                compiled = self._compiled[which] = program.compile(None if block is None else (block,), sizes)
+                self.warnings += [line for line in summarize(compiled.warnings) if line not in self.warnings]
+            except LayoutError as error:
+                self._compiled[which] = error
+        found = self._compiled[which]
+        if isinstance(found, LayoutError):
+            raise found
+        compiled = found
+        held = ", ".join(layout.name for layout in compiled.layouts)
+        self.odd += [f"{key}.type_bytes: nothing in {held} is of the type {name!r}" for name in compiled.unused]
+        return compiled.layouts
+
+
+def _choose(key: str, section: Source | Emulator, blocks: Sequence[compiler.Held], number: int | None) -> compiler.Held:
+    held = ", ".join(block.name for block in blocks)
+    if section.block is not None:
+        for block in blocks:
+            if block.name.lower() == section.block.lower():
+                return block
+        raise ConfigError(f"{key}.block: no data block {section.block!r}; there are: {held}")
+    found = [block for block in blocks if block.number is not None and block.number == number]
+    if len(found) != 1:
+        if number is not None:
+            raise ConfigError(f"{key}.dbNumber: no data block has the number {number} ({held}); choose one by block")
+        raise ConfigError(f"{key}.layout: it holds several data blocks ({held}); choose one by block or dbNumber")
+    return found[0]
+
+
+def read_program(paths: Iterable[Path], key: str = "") -> compiler.Program:
+    """Read files that may use each other's types; ConfigError beginning with ``key``, LayoutError."""
+    return compiler.Program([_read(path, key) for path in paths])
+
+
+def _read(path: Path, key: str) -> compiler.Source:
+    """Read a source; a little more than allowed is enough for the compiler to refuse it."""
+    try:
+        with open(path, "rb", opener=_open_at_once) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise ConfigError(f"{key}{path}: no regular file; name the file of a data block")
+            return compiler.Source(str(path), file.read(MAX_SOURCE_BYTES + 4))
+    except OSError as error:
+        raise ConfigError(f"{key}{path}: {error.strerror}") from None
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    """Open without waiting for a writer, as a FIFO would have it."""
+    return os.open(path, flags | os.O_NONBLOCK)
+
+
+def summarize(warnings: Iterable[Diagnostic]) -> list[str]:
+    """A line each; those of one file that differ in the quoted name only are one, with all the names."""
+    lines: list[str] = []
+    alike: dict[tuple[str, str], int] = {}
+    for warning in warnings:
+        name = _QUOTED.search(warning.message)
+        kind = warning.file, _QUOTED.sub("", warning.message, count=1)
+        if name is None or kind not in alike:
+            alike[kind] = len(lines)
+            lines.append(str(warning))
+        elif name[0] not in lines[at := alike[kind]]:
+            lines[at] += f"{',' if '; likewise ' in lines[at] else '; likewise'} {name[0]}"
+    return lines

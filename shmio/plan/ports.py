@@ -1,0 +1,176 @@
+"""Addresses to listen on: whether they are of this host, and who listens there already; before anything starts."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, Final
+
+from shmio.config import Address, Config, UnixAddress, parse_address
+from shmio.config.unix_socket import obstacle
+from shmio.errors import ConfigError, EndpointError, ShmioError
+from shmio.local.status import read_status
+from shmio.plan.processes import Plan
+from shmio.segment import instances
+
+# proc(5), /proc/net/tcp: addresses are 32-bit words in hexadecimal, each in the host's byte order.
+_MAPPED: Final = "0000000000000000FFFF0000"
+_ANY_IPV4: Final = "0" * 8
+_ANY: Final = "0" * 32
+_LISTEN: Final = "0A"
+
+
+def check_listening(config: Config) -> None:
+    """ConfigError when the name of a host to listen on is none, or two addresses are one port; 0 is any free one."""
+    listening = [(f"emulator[{i}].listen", emulator.listen) for i, emulator in enumerate(config.emulator)]
+    if config.grpc:
+        listening += [(key, address.listen) for key, address in config.grpc.listening.items()]
+    if config.mqtt and config.mqtt.listen:
+        listening.append(("mqtt.listen", config.mqtt.listen))
+    seen: list[tuple[str, str, int, set[str]]] = []
+    sockets: dict[UnixAddress, str] = {}
+    for key, text in listening:
+        address = parse_address(text)
+        if isinstance(address, UnixAddress):
+            if address in sockets:
+                raise ConfigError(f"{key}: {text} is the socket of {sockets[address]} already; choose another")
+            sockets[address] = key
+            continue
+        try:
+            hosts = _hosts(address)
+        except ConfigError as error:
+            raise ConfigError(f"{key}: {error}") from None
+        for other, told, port, others in seen:
+            if port == address.port != 0 and _share(hosts, others):
+                raise ConfigError(f"{key}: {text} is the port of {other} ({told}) already; choose another")
+        seen.append((key, text, address.port, hosts))
+
+
+def check_ports(plan: Plan) -> None:
+    """EndpointError when an address of the plan is taken."""
+    for problem in taken(plan):
+        raise EndpointError(problem)
+
+
+def taken(plan: Plan) -> Iterator[str]:
+    """Each address of the plan that is taken, and by whom, as far as this user may know it.
+
+    Whatever else may be wrong with an address is for its process to find.
+    """
+    for job in plan.jobs:
+        for text in job.listening:
+            address = parse_address(text)
+            if isinstance(address, UnixAddress):
+                if reason := obstacle(address.path):
+                    yield f"{job.name}: cannot listen on {address}: {reason}"
+            elif in_use(address):
+                yield f"{job.name}: cannot listen on {address}: {_holder(address)}"
+
+
+def in_use(address: Address) -> bool:
+    """Whether somebody listens there; of a name with several addresses, on all of them. ConfigError."""
+    with suppress(OSError):
+        return address.port != 0 and all(_taken(family, place) for family, place in _places(address))
+    return False
+
+
+def _places(address: Address) -> list[tuple[int, tuple[Any, ...]]]:
+    """(family, socket address) of each address that the host has; ConfigError if it has none."""
+    try:
+        found = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)
+    except (OSError, UnicodeError) as error:  # UnicodeError: a part of the name is empty, or too long
+        why = error.strerror if isinstance(error, OSError) else "it is no name of a host"
+        raise ConfigError(
+            f"{address}: {address.host!r} cannot be resolved ({why}); write an address or a name of this host"
+        ) from None
+    return [(family, place) for family, _, _, _, place in found]
+
+
+def _hosts(address: Address) -> set[str]:
+    """All that a host's name stands for, as /proc/net/tcp writes it."""
+    return {
+        _words(socket.inet_pton(family, str(place[0]).partition("%")[0])).removeprefix(_MAPPED)
+        for family, place in _places(address)
+    }
+
+
+def _share(hosts: set[str], others: set[str]) -> bool:
+    """Whether who listens on these keeps who listens on those from the same port: [::] takes IPv4, too."""
+    if hosts & others or _ANY in hosts | others:
+        return True
+    ours, theirs = ({host for host in all_ if len(host) == len(_ANY_IPV4)} for all_ in (hosts, others))
+    return bool(ours and theirs and _ANY_IPV4 in ours | theirs)
+
+
+def _taken(family: int, place: tuple[Any, ...]) -> bool:
+    with socket.socket(family) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # connections that are over do not count
+        try:
+            probe.bind(place)
+        except OSError as error:
+            return error.errno == errno.EADDRINUSE
+    return False
+
+
+def _holder(address: Address) -> str:
+    """Who listens there, and what to do about it."""
+    links = {f"socket:[{inode}]" for inode in _listening(address)}
+    for instance in instances():
+        with suppress(ShmioError):
+            for process in read_status(instance).processes:
+                if process.pid and any(links.intersection(_open_files(pid)) for pid in _with_children(process.pid)):
+                    return (
+                        f"process {process.name} of instance {instance}, pid {process.pid}, listens there; choose "
+                        f"another port, or stop that instance: shmio-supervisor down --instance {instance}"
+                    )
+    for pid in _pids():
+        if links.intersection(_open_files(pid)):
+            return f"{_command(pid)}, pid {pid}, listens there; choose another port, or end that program"
+    return f"another program listens there; choose another port, or see which: ss -ltnp sport = :{address.port}"
+
+
+def _listening(address: Address) -> Iterator[str]:
+    """The inodes of the sockets that listen there."""
+    wanted = _hosts(address)
+    for table in ("tcp", "tcp6"):
+        with suppress(OSError):
+            for line in Path("/proc/net", table).read_text().splitlines()[1:]:
+                fields = line.split()
+                host, _, port = fields[1].partition(":")
+                there = fields[3] == _LISTEN and int(port, 16) == address.port
+                if there and _share({host.removeprefix(_MAPPED)}, wanted):
+                    yield fields[9]
+
+
+def _words(packed: bytes) -> str:
+    return "".join(packed[at : at + 4][::-1].hex() for at in range(0, len(packed), 4)).upper()
+
+
+def _with_children(pid: int) -> Iterator[int]:
+    """It, and the programs that it runs: a broker's process has mosquitto."""
+    yield pid
+    with suppress(OSError):
+        for task in Path(f"/proc/{pid}/task").iterdir():
+            yield from map(int, (task / "children").read_text().split())
+
+
+def _pids() -> list[int]:
+    return sorted(int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdecimal())
+
+
+def _command(pid: int) -> str:
+    with suppress(OSError):
+        return Path(f"/proc/{pid}/comm").read_text(errors="replace").strip()
+    return "a program"
+
+
+def _open_files(pid: int) -> Iterator[str]:
+    """What a process's descriptors lead to, as far as this user may know it."""
+    with suppress(OSError):
+        for entry in Path(f"/proc/{pid}/fd").iterdir():
+            with suppress(OSError):
+                yield os.readlink(entry)  # noqa: PTH115 - no path: socket:[4711]

@@ -1,0 +1,354 @@
+"""From the configuration file to a plan: layouts compiled, connectors and emulators asked whether they agree."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from msgspec.structs import replace
+
+from shmio.config import Address, Config, Emulator, Mqtt, Source
+from shmio.config.faults import Faults
+from shmio.config.mqtt.accounts import read_accounts
+from shmio.config.read import examine
+from shmio.config.wording import meant
+from shmio.errors import ConfigError, PathError
+from shmio.layout.glob import Glob
+from shmio.layout.image import complaints
+from shmio.layout.model import Layout
+from shmio.layout.spelling import block_path, topic_path
+from shmio.layout.topic import find, look_up, names_part, near, parse_topic
+from shmio.layout.values.write import chosen
+from shmio.plan.exposure import exposure
+from shmio.plan.host import check_host
+from shmio.plan.layouts import LayoutFiles
+from shmio.plan.ports import check_listening
+from shmio.plan.processes import Plan, make_plan
+from shmio.plan.recordings import Recordings
+from shmio.plan.replay import replayed
+from shmio.plan.sources import check_sources, note_options
+from shmio.recorder.selection import Selection
+
+EMULATOR_KINDS = ("s7",)
+NONFINITE = ("REAL", "LREAL")
+"""The types whose values may be NaN or infinite."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A configuration that can be started."""
+
+    config: Config
+    plan: Plan
+    layouts: dict[str, Layout]
+    """Of each source, by its name."""
+    emulated: dict[str, tuple[Layout, ...]]
+    """All blocks of each emulator, by its name."""
+    injections: tuple[str, ...]
+    """What is declared, in words."""
+    notes: tuple[str, ...] = ()
+    """What to know of it that is no fault."""
+
+
+def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = None) -> Prepared:
+    """Read and check everything that can be checked without starting anything; ConfigError, LayoutError.
+
+    ``keys``: of ``[replay]``, in place of those of the file.
+    """
+    config, faults, broken = examine(file)
+    origin, notices = None, list[str]()
+    if mode == "log" and config.recorder is None and not faults:
+        raise ConfigError(
+            f"{file}: --mode log reads the sources and records them, and there is no [recorder] section: "
+            'add one, such as [recorder] with directory = "dumps", or leave out --mode log'
+        )
+    with Recordings() as recordings:
+        if mode == "replay":
+            faults.raise_any()
+            with faults.catching():
+                config, origin, notices = replayed(config, keys or {}, recordings)
+            faults.raise_any()
+            faults = Faults(file, msgspec.to_builtins(config))  # its sources are not those of the file
+        files = LayoutFiles(config)
+        check_host(config, faults.catching)
+        if not faults:
+            with faults.catching():
+                check_listening(config)
+        sources = check_sources(config, files, recordings, faults)
+    places, faults.places = faults.places, {}
+    for index, own in broken.items():
+        note_options(index, *own, faults)
+    faults.places = places
+    emulated: dict[str, tuple[Layout, ...]] = {}
+    for index, emulator in enumerate(config.emulator):
+        with faults.catching():
+            emulated[emulator.name] = _check_emulator(index, emulator, files)
+    faults.raise_any()
+    layouts = sources.layouts
+    with faults.catching():
+        config = _spelled(config, layouts)
+    declared, described = dict[str, bytes](), tuple[str, ...]()
+    with faults.catching():
+        declared, described = _check_injections(config, layouts)
+    if config.recorder and config.recorder.trigger:
+        with faults.catching():
+            _check_trigger(config.recorder.trigger.when, layouts)
+    odd = [*notices, *files.odd]
+    for found in (
+        lambda: _odd(config, layouts),
+        lambda: _odd_topics(config, layouts),
+        lambda: _odd_recorder(config, layouts),
+        lambda: _not_served(config, layouts, emulated),
+        lambda: _not_emulated(config),
+        lambda: _unread(emulated),
+    ):
+        with faults.catching():
+            odd += found()
+    faults.raise_any()
+    warnings = [*files.warnings, *(f"{file}: warning: {text}" for text in odd)]
+    plan = make_plan(
+        config,
+        layouts,
+        emulated,
+        config_file=file,
+        mode=mode,
+        declared=declared,
+        warnings=warnings,
+        computed=sources.computed,
+        replayed=sources.replayed,
+        remote=sources.remote,
+        origin=origin,
+    )
+    open_to = None if mode == "log" else exposure(config)  # a log serves nobody
+    return Prepared(config, plan, layouts, emulated, described, (open_to,) if open_to else ())
+
+
+def _spelled(config: Config, layouts: dict[str, Layout]) -> Config:
+    """The configuration, with what is written as in TIA Portal in our own spelling."""
+    default = next(iter(layouts)) if len(layouts) == 1 else None
+
+    def topics(patterns: str | list[str]) -> str | list[str]:
+        if isinstance(patterns, str):
+            return topic_path(patterns, layouts, default)
+        return [topic_path(pattern, layouts, default) for pattern in patterns]
+
+    sources = [
+        replace(
+            source,
+            writable=[block_path(pattern, layouts[source.name]) for pattern in source.writable],
+            allow_nonfinite=tuple(block_path(pattern, layouts[source.name]) for pattern in source.allow_nonfinite),
+        )
+        for source in config.source
+    ]
+    mqtt, recorder = config.mqtt, config.recorder
+    if mqtt is not None:
+        rules = [replace(rule, match=topics(rule.match)) for rule in mqtt.topic]
+        sparkplug = mqtt.sparkplug and replace(mqtt.sparkplug, match=topics(mqtt.sparkplug.match))
+        mqtt = replace(mqtt, topic=rules, sparkplug=sparkplug)
+    if recorder is not None:
+        recorder = replace(recorder, registers=topics(recorder.registers))
+    injections = [replace(one, target=topics(one.target)) for one in config.injection]
+    return replace(config, source=sources, mqtt=mqtt, recorder=recorder, injection=injections)
+
+
+def peer(source: Source) -> str:
+    """The device of a checked source, as host:port where it has such; empty if not."""
+    host, port = source.options.get("host"), source.options.get("port")
+    return str(Address(host, port)) if host and port else str(host or "")
+
+
+def _check_injections(config: Config, layouts: dict[str, Layout]) -> tuple[dict[str, bytes], tuple[str, ...]]:
+    if not config.injection:
+        return {}, ()
+    from shmio.plan.injections import check_injections  # noqa: PLC0415
+
+    return check_injections(config, layouts)
+
+
+def _check_trigger(when: str, layouts: dict[str, Layout]) -> None:
+    from shmio.injection.program import compile_condition  # noqa: PLC0415
+
+    try:
+        compile_condition(when, layouts)
+    except ConfigError as error:
+        raise ConfigError(f"recorder.trigger.{error}") from None
+
+
+def _check_emulator(index: int, emulator: Emulator, files: LayoutFiles) -> tuple[Layout, ...]:
+    """The blocks it serves: the one its program runs on, or all of its files if that runs on none."""
+    from shmio.emulators.programs import IDLE, program  # noqa: PLC0415
+
+    key = f"emulator[{index}]"
+    if emulator.kind not in EMULATOR_KINDS:
+        raise ConfigError(
+            f"{key}.kind: {emulator.kind!r} is none; there are: {', '.join(EMULATOR_KINDS)}"
+            + meant(emulator.kind, EMULATOR_KINDS)
+        )
+    if emulator.program == IDLE and emulator.block is None and emulator.dbNumber is None:
+        layouts = files.all(key, emulator)
+        _check_numbers(key, layouts)
+        return layouts
+    layout = files.get(key, emulator, emulator.dbNumber)
+    if emulator.dbNumber is None:
+        _check_numbers(key, (layout,))
+    try:
+        program(emulator.program, layout)
+    except ConfigError as error:
+        raise ConfigError(f"{key}.{error}") from None
+    return (layout,)
+
+
+def _check_numbers(key: str, layouts: Sequence[Layout]) -> None:
+    """Each block must have a number; the compiler gives none twice."""
+    for layout in layouts:
+        if layout.number is None:
+            alone = f'; block = "{layout.name}" beside it, to serve that block alone' if len(layouts) > 1 else ""
+            why = f"the data block {layout.name!r} has no number in its name"
+            raise ConfigError(f"{key}.dbNumber: this key is needed, for {why}{alone}")
+
+
+def _odd(config: Config, layouts: dict[str, Layout]) -> list[str]:
+    """What is allowed and yet hardly meant."""
+    odd = []
+    for index, source in enumerate(config.source):
+        key, layout = f"source[{index}]", layouts[source.name]
+        if source.connector == "remote" and config.grpc is None:
+            odd.append(f"{key}.connector: no model can connect to {source.name}, for there is no [grpc] section")
+        for name, patterns in (("writable", source.writable), ("allow_nonfinite", source.allow_nonfinite)):
+            for pattern in patterns:
+                try:
+                    if not _covers(pattern, layout):
+                        odd.append(f"{key}.{name}: {pattern!r} names nothing in {layout.name}{_near(pattern, layout)}")
+                    elif name == "allow_nonfinite" and not _covers(pattern, layout, NONFINITE):
+                        odd.append(f"{key}.{name}: {pattern!r} names no REAL or LREAL in {layout.name}")
+                except PathError as error:
+                    raise ConfigError(f"{key}.{name}: {error}") from None
+        number = source.options.get("dbNumber")
+        if number is not None and layout.number is not None and number != layout.number:
+            odd.append(f"{key}.dbNumber: {number}, but the layout is that of DB{layout.number}")
+    if not config.source:
+        odd.append("there is no [[source]]: the instance will hold no registers")
+    return odd
+
+
+def _odd_topics(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
+    """Patterns of ``[mqtt]`` that name nothing, and a broker open to all. ConfigError: a pattern that is none."""
+    mqtt = config.mqtt
+    if mqtt and mqtt.listen:
+        yield from _odd_accounts(mqtt, Address.parse(mqtt.listen))
+    for key, pattern, frames in _topics(config):
+        if frames:
+            if pattern not in layouts:
+                raise ConfigError(f"{key}: {pattern!r}: frames are those of a whole source, so name one")
+            continue
+        try:
+            if names_part(pattern) and key.startswith("mqtt.topic"):
+                _check_part(pattern, layouts)
+                continue
+            glob = Glob(pattern)
+        except PathError as error:
+            raise ConfigError(f"{key}: {error}") from None
+        paths = (f"{source}/{register.path}" for source, layout in layouts.items() for register in layout.registers)
+        if not any(map(glob.matches, paths)):
+            yield f"{key}: {pattern!r} names no register; the path of one begins with its source"
+
+
+def _check_part(path: str, layouts: dict[str, Layout]) -> None:
+    """PathError: no such bit, slice or other part."""
+    topic = parse_topic(path, layouts, None)
+    look_up(layouts[topic.source], topic)
+
+
+def _odd_accounts(mqtt: Mqtt, address: Address) -> Iterator[str]:
+    """Who may do more, or less, at our own broker than may be meant."""
+    free = any(account.name is None and "write" in account.roles for account in mqtt.account)
+    shown = mqtt.tls is not None and mqtt.tls.ca is not None
+    if free and (mqtt.password_file or not (address.loopback or shown)):
+        yield (
+            f"mqtt.listen: whoever reaches {mqtt.listen} may publish commands, also without an account: have a "
+            "password_file, and a name in each [[mqtt.account]] with the role write"
+        )
+    if mqtt.password_file:
+        named = {account.name for account in mqtt.account}
+        if others := ", ".join(name for name in read_accounts(mqtt.password_file) if name not in named):
+            yield f"mqtt.password_file: {others} may read alone: [[mqtt.account]] gives it the role write"
+
+
+def _odd_recorder(config: Config, layouts: dict[str, Layout]) -> Iterator[str]:
+    """Patterns of ``recorder.registers`` that name nothing."""
+    if config.recorder is not None:
+        for text in Selection(registers=config.recorder.registers).nothing(layouts):
+            yield f"recorder.registers: {text}"
+
+
+def _topics(config: Config) -> Iterator[tuple[str, str, bool]]:
+    """Each pattern with its key, and whether it is of frames."""
+    if config.mqtt is None:
+        return
+    for index, rule in enumerate(config.mqtt.topic):
+        for pattern in rule.patterns:
+            yield f"mqtt.topic[{index}].match", pattern, rule.payload == "frames"
+    if config.mqtt.sparkplug is not None:
+        for pattern in config.mqtt.sparkplug.patterns:
+            yield "mqtt.sparkplug.match", pattern, False
+
+
+def _near(pattern: str, layout: Layout) -> str:
+    names = [] if "*" in pattern else near(layout, pattern)
+    return f"; did you mean {' or '.join(names)}?" if names else ""
+
+
+def _not_served(config: Config, layouts: dict[str, Layout], emulated: dict[str, tuple[Layout, ...]]) -> Iterator[str]:
+    """Sources of which an emulator of the same file is the device, and does not serve their block."""
+    for index, source in enumerate(config.source):
+        wanted = source.options.get("dbNumber") or layouts[source.name].number
+        for emulator in config.emulator:
+            if wanted is None or peer(source) != str(Address.parse(emulator.listen)):
+                continue
+            served = [emulator.dbNumber or layout.number for layout in emulated[emulator.name]]
+            if wanted not in served:
+                held = ", ".join(f"DB{number}" for number in served)
+                yield f"source[{index}]: it reads DB{wanted} of emulator {emulator.name!r}, which serves {held} alone"
+
+
+def _not_emulated(config: Config) -> Iterator[str]:
+    """Sources that read a controller of this host where no emulator of this file listens, though it has some."""
+    listening = {emulator.name: str(Address.parse(emulator.listen)) for emulator in config.emulator}
+    for index, source in enumerate(config.source):
+        device = peer(source)
+        if source.connector != "s7" or not listening or device in listening.values() or ":" not in device:
+            continue
+        if Address.parse(device).loopback:
+            places = ", ".join(f"{name} listens on {address}" for name, address in listening.items())
+            yield f"source[{index}]: it reads {device}, where no [[emulator]] of this file listens: {places}"
+
+
+def _unread(emulated: dict[str, tuple[Layout, ...]]) -> Iterator[str]:
+    """Initial values that mean nothing to an emulator."""
+    for name, layouts in emulated.items():
+        for text in (text for layout in layouts for text in complaints(layout)):
+            yield f"emulator {name!r}: {text}"
+
+
+def _covers(pattern: str, layout: Layout, types: Sequence[str] = ()) -> bool:
+    """Whether a pattern names a register, what is above one, or a part; of one of these types, if any; PathError."""
+    if names_part(pattern):
+        return any(not types or register.type in types for register in chosen(layout, pattern))
+    glob = Glob(pattern)
+    for register in layout.registers:
+        if types and register.type not in types:
+            continue
+        if glob.matches(register.path):
+            return True
+        if register.dims and glob.matches(layout.element(register, tuple(low for low, _ in register.dims)).path):
+            return True
+    if "*" in pattern:
+        return False
+    try:
+        found = find(layout, pattern)
+    except PathError:
+        return False
+    return not types or found.type in types

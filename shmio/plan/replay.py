@@ -1,0 +1,188 @@
+"""``--mode replay``: the sources of a recording in the place of those of the configuration."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import msgspec
+
+from shmio.config import Config, Mqtt, MqttTopic, Source
+from shmio.config.model import NAME_RULE, Replay
+from shmio.config.read import RESERVED_SOURCES, SECTION_PROCESSES, convert
+from shmio.errors import ConfigError, RecordingError
+from shmio.plan.recordings import Recordings
+from shmio.segment import Origin
+
+LEAD_NS: Final = 2_000_000_000
+"""So long before the recording begins, if it can, the clock does: until then its processes start."""
+_OPTIONS: Final = ("from", "start", "end", "speed", "injections")
+_FLAGS: Final = ("loop", "paused", "record")
+
+
+class Replayed(NamedTuple):
+    """A configuration for a replay."""
+
+    config: Config
+    origin: Origin
+    notices: list[str]
+    """What of the configuration is left out, or has been added."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``up`` that go before the keys of ``[replay]``."""
+    group = parser.add_argument_group("with --mode replay, in place of the keys of [replay]")
+    group.add_argument("--from", nargs="+", metavar="FILE", help="the recording: one .mem, or several of one run")
+    group.add_argument("--start", metavar="TIME", help="seconds from its begin, or a date and time")
+    group.add_argument("--end", metavar="TIME", help="the same")
+    group.add_argument("--speed", type=float, metavar="X", help="times real time, 0.01 to 1000 (default: 1)")
+    group.add_argument("--injections", choices=("keep", "leave out"), help="those of the recording (default: keep)")
+    group.add_argument("--loop", action="store_true", default=None, help="again and again")
+    group.add_argument("--paused", action="store_true", default=None, help="begin when told to: shmio replay play")
+    group.add_argument("--record", action="store_true", default=None, help="start the recorder of the configuration")
+
+
+def given(arguments: argparse.Namespace) -> dict[str, Any]:
+    """What the command line says, as keys of ``[replay]``. ConfigError: it is not for another mode."""
+    found = {name: getattr(arguments, name) for name in (*_OPTIONS, *_FLAGS) if getattr(arguments, name) is not None}
+    if found and arguments.mode != "replay":
+        raise ConfigError(f"--{next(iter(found))} goes with --mode replay only")
+    if "from" in found:
+        found["file"] = [str(Path(file).absolute()) for file in found.pop("from")]
+    return {name: _moment(value) if name in ("start", "end") else value for name, value in found.items()}
+
+
+def options(keys: Mapping[str, Any]) -> list[str]:
+    """The same as options again, for the command line of a detached supervisor."""
+    words: list[str] = []
+    for name, value in keys.items():
+        if name == "file":
+            words += ["--from", *value]
+        else:
+            words += [f"--{name}"] if value is True else [f"--{name}={value}"]
+    return words
+
+
+def replayed(config: Config, keys: Mapping[str, Any], recordings: Recordings) -> Replayed:
+    """The configuration with the recording's sources alone. ConfigError, beginning with the key."""
+    section = _section(config, keys)
+    files = [str(config.path(file)) for file in _listed(section.file)]
+    if not files:
+        raise ConfigError('replay.file: what is to be played: --from FILE.mem, or [replay] with file = "FILE.mem"')
+    try:
+        recording = recordings.get(files)
+    except RecordingError as error:
+        raise ConfigError(f"replay.file: {error}") from None
+    try:
+        span = recording.span(section.start, section.end)
+    except RecordingError as error:
+        raise ConfigError(f"replay.{error}") from None
+    names = recording.sources
+    _check_names(names, files[0])
+    notices = list(_notices(config, section, names))
+    there = {source.name: source for source in config.source}
+    order = [*(name for name in there if name in names), *(name for name in names if name not in there)]
+    sources = [_source(name, there.get(name), section, files) for name in order]
+    grpc = config.grpc
+    if grpc is not None and grpc.default_source not in (None, *names):
+        grpc = msgspec.structs.replace(grpc, default_source=None)
+    changed = msgspec.structs.replace(
+        config,
+        source=sources,
+        emulator=[],
+        injection=[] if section.injections == "keep" else config.injection,
+        recorder=config.recorder if section.record else None,
+        grpc=grpc,
+        mqtt=_mqtt(config, names),
+    )
+    lead_ns = 0 if config.instance.clock == "stepped" else LEAD_NS
+    return Replayed(changed, Origin(max(0, span.begin_ns - lead_ns), recording.utc_ns), notices)
+
+
+def _section(config: Config, keys: Mapping[str, Any]) -> Replay:
+    section = msgspec.to_builtins(config.replay or Replay())
+    whole = convert(msgspec.to_builtins(config) | {"replay": section | dict(keys)}, Config)
+    return whole.replay or Replay()
+
+
+def _notices(config: Config, section: Replay, names: list[str]) -> Iterator[str]:
+    own = [source.name for source in config.source]
+    for name in own:
+        if name not in names:
+            yield f"source {name} is left out: the recording has none of it; it has {', '.join(names)}"
+    for emulator in config.emulator:
+        yield f"emulator {emulator.name} is left out: a recording is played, not a device read"
+    if config.injection and section.injections == "keep":
+        yield (
+            "the configuration's injections are left out: those of the recording are kept; "
+            'replay.injections = "leave out" has it the other way round'
+        )
+    if config.grpc and config.grpc.default_source not in (None, *names):
+        yield f"grpc.default_source is left out: the recording has no source {config.grpc.default_source}"
+    for index, rule in enumerate(config.mqtt.topic if config.mqtt else ()):
+        for name in _gone(config, rule, names):
+            yield f"mqtt.topic[{index}].match: {name} is left out: the recording has no such source"
+    if section.record and config.recorder is None:
+        raise ConfigError("replay.record: there is no [recorder] section that says where to")
+    wanted = config.recorder.sources if section.record and config.recorder else []
+    if wanted and not set(wanted) & set(names):
+        raise ConfigError(
+            f"replay.record: nothing would be recorded: the recording has {', '.join(names)}, and recorder.sources "
+            f"{', '.join(wanted)} alone"
+        )
+
+
+def _mqtt(config: Config, names: list[str]) -> Mqtt | None:
+    """Without rules for frames of sources that are left out."""
+    if config.mqtt is None:
+        return None
+    rules = []
+    for rule in config.mqtt.topic:
+        gone = _gone(config, rule, names)
+        match = [pattern for pattern in rule.patterns if pattern not in gone]
+        if match:
+            rules.append(msgspec.structs.replace(rule, match=match) if gone else rule)
+    return msgspec.structs.replace(config.mqtt, topic=rules)
+
+
+def _gone(config: Config, rule: MqttTopic, names: list[str]) -> list[str]:
+    """The sources of the configuration whose frames a rule means, and that the recording has not."""
+    own = {source.name for source in config.source} - set(names)
+    return [pattern for pattern in rule.patterns if rule.payload == "frames" and pattern in own]
+
+
+def _source(name: str, own: Source | None, section: Replay, files: list[str]) -> Source:
+    keys = ("start", "end", "speed", "loop", "paused", "injections")
+    options = {key: getattr(section, key) for key in keys}
+    return Source(
+        name=name,
+        connector="replay",
+        writable=own.writable if own else [],
+        allow_nonfinite=own.allow_nonfinite if own else (),
+        realtime_priority=own.realtime_priority if own else None,
+        options={"file": files, "source": name, "own_clock": True, **options},
+    )
+
+
+def _check_names(names: list[str], file: str) -> None:
+    """A file may say anything."""
+    for name in names:
+        try:
+            msgspec.convert({"name": name, "connector": "replay"}, Source)
+        except msgspec.ValidationError:
+            raise ConfigError(f"replay.file: {file} has a source {name!r}, which is no name: {NAME_RULE}") from None
+        if name.lower() in RESERVED_SOURCES | SECTION_PROCESSES:
+            raise ConfigError(f"replay.file: {file} has a source {name!r}, and that name is reserved")
+
+
+def _listed(value: str | list[str] | None) -> list[str]:
+    return [value] if isinstance(value, str) else value or []
+
+
+def _moment(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text

@@ -1,0 +1,181 @@
+"""The sources of a configuration: their connectors asked whether all goes together, their layouts found.
+
+Connectors are imported here, and only when they are asked: status and its like do without them.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final, NamedTuple
+
+import msgspec
+
+from shmio.config import Config, Source
+from shmio.config.faults import Faults
+from shmio.config.read import unknown_option
+from shmio.config.wording import near
+from shmio.errors import ConfigError, RecordingError
+from shmio.layout.model import Layout
+from shmio.plan.layouts import LayoutFiles
+from shmio.plan.recordings import Recordings
+
+NEEDED: Final = "this key is needed"
+
+
+class Sources(NamedTuple):
+    """What was found out about the sources, by their names."""
+
+    layouts: dict[str, Layout]
+    computed: list[str]
+    """Those that live on the instance's clock."""
+    replayed: list[str]
+    """Those that play a recording."""
+    remote: dict[str, tuple[list[str], list[str]]]
+    """Patterns of what a program elsewhere computes, of sources that have such: outputs, in-outs."""
+
+
+def check_sources(config: Config, files: LayoutFiles, recordings: Recordings, faults: Faults) -> Sources:
+    """Ask the connectors of all sources whether they can be as configured, and note what is wrong.
+
+    Their ``options`` are complete and of their types from here on.
+    """
+    found = Sources({}, [], [], {})
+    inputs: dict[int, tuple[str, ...]] = {}
+    for index, source in enumerate(config.source):
+        with faults.catching():
+            _check_source(index, source, found, inputs, config, files, recordings, faults)
+    if not faults:
+        for index, paths in inputs.items():
+            from shmio.plan.models import check_connections  # noqa: PLC0415
+
+            source, key = config.source[index], f"source[{index}]"
+            with faults.catching():
+                check_connections(key, source.name, source.options.get("connections", {}), paths, found.layouts)
+    return found
+
+
+def _check_source(
+    index: int,
+    source: Source,
+    found: Sources,
+    inputs: dict[int, tuple[str, ...]],
+    config: Config,
+    files: LayoutFiles,
+    recordings: Recordings,
+    faults: Faults,
+) -> None:
+    from shmio.connectors import registry  # noqa: PLC0415
+    from shmio.connectors.models.computed import Computed  # noqa: PLC0415
+    from shmio.connectors.replay.replayed import Replayed  # noqa: PLC0415
+
+    key = f"source[{index}]"
+    options = _options(key, source, faults)
+    try:
+        connector = registry.load(source.connector)
+    except ConfigError:  # which is told with the options
+        return
+    if issubclass(connector, Computed | Replayed):
+        found.computed.append(source.name)
+    if issubclass(connector, Replayed):
+        found.replayed.append(source.name)
+        if options is not None:
+            found.layouts[source.name] = _recorded(key, source, config, recordings)
+        return
+    if source.connector == "simulation":
+        if options is not None:
+            found.layouts[source.name], inputs[index] = _model(key, source, config, files)
+        return
+    layout = found.layouts[source.name] = files.get(key, source, source.options.get("dbNumber"))
+    if options is None:  # its faults are told; what else the connector would say is told with them
+        options = _filled(connector.Options, source)
+        if options is None:
+            return
+    try:
+        made = connector(options, layout)
+    except ConfigError as error:
+        raise ConfigError(f"{key}.{error}") from None
+    if isinstance(made, Computed):
+        inputs[index] = made.inputs
+    elif not isinstance(made, Replayed):
+        made.close()
+    if source.connector == "remote" and "outputs" in source.options:
+        found.remote[source.name] = source.options["outputs"], source.options["inouts"]
+
+
+def note_options(index: int, connector: str, options: dict[str, Any], texts: dict[str, str], faults: Faults) -> None:
+    """Note what is wrong with the connector's own keys of a source, by its place in the file."""
+    from shmio.connectors import registry  # noqa: PLC0415
+
+    key = f"source[{index}]"
+    try:
+        known = [field.encode_name for field in msgspec.structs.fields(registry.options_type(connector))]
+    except ConfigError as error:
+        faults.add(f"{key}.connector: {error}")
+        return
+    near_to = {name for option in (*options, *texts) if option not in known for name in near(option, known)}
+    for option in (*options, *texts):
+        if option not in known:
+            faults.add(unknown_option(index, option, known))
+    for fault in registry.option_faults(connector, options, texts):
+        missing, _, what = fault.partition(": ")
+        if missing not in near_to or what != NEEDED:
+            faults.add(f"{key}.{fault}")
+
+
+def _options(key: str, source: Source, faults: Faults) -> msgspec.Struct | None:
+    """The connector's own keys, checked; None if there are faults, which are noted."""
+    from shmio.connectors import registry  # noqa: PLC0415
+
+    before = faults.count
+    note_options(int(key[7:-1]), source.connector, source.options, source.texts, faults)
+    if faults.count > before:
+        return None
+    try:
+        options = registry.convert_options(source.connector, source.options, source.texts)
+    except ConfigError as error:
+        faults.add(f"{key}.{error}")
+        return None
+    source.options, source.texts = msgspec.to_builtins(options), {}
+    return options
+
+
+def _filled(kind: type[msgspec.Struct], source: Source) -> msgspec.Struct | None:
+    """The options with something in place of texts that are missing; None if more than that is wrong."""
+    fields = msgspec.structs.fields(kind)
+    known = {field.encode_name for field in fields}
+    given = {key: value for key, value in (source.texts | source.options).items() if key in known}
+    missing = {field.encode_name: "missing" for field in fields if field.required}
+    try:
+        return msgspec.convert(missing | given, kind, strict=False)
+    except (msgspec.ValidationError, ConfigError):
+        return None
+
+
+def _recorded(key: str, source: Source, config: Config, recordings: Recordings) -> Layout:
+    """The layout of a replay: that of the recording, which has its period and its age, too."""
+    from shmio.connectors.replay.source import Replay, chosen, files  # noqa: PLC0415
+
+    for name in ("layout", "block", "type_bytes", "properties"):
+        if getattr(source, name):
+            raise ConfigError(f"{key}.{name}: a replay has none: its registers are those of the recording")
+    options = msgspec.convert(source.options, Replay.Options)
+    source.options["file"] = [str(config.path(file)) for file in files(options)]
+    try:
+        recording = recordings.get(source.options["file"])
+    except RecordingError as error:
+        raise ConfigError(f"{key}.file: {error}") from None
+    try:
+        block = chosen(recording, options, source.name)[1].block
+    except ConfigError as error:
+        raise ConfigError(f"{key}.{error}") from None
+    source.period_ms, source.stale_ms = block.period_ns / 1e6, block.stale_ns / 1e6
+    return block.layout
+
+
+def _model(key: str, source: Source, config: Config, files: LayoutFiles) -> tuple[Layout, tuple[str, ...]]:
+    """The layout and the inputs of a simulation: those of its files, if it has any, else what its model declares."""
+    from shmio.connectors.models.simulation import Simulation  # noqa: PLC0415
+    from shmio.plan.models import describe  # noqa: PLC0415
+
+    source.options["folder"] = str(config.path(source.options["folder"]))
+    layout = None if source.layout is None else files.get(key, source, None)
+    return describe(key, msgspec.convert(source.options, Simulation.Options), layout)

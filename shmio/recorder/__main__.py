@@ -1,0 +1,103 @@
+"""The process of the recorder."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import msgspec
+
+from shmio import worker
+from shmio.config import Recorder as Settings
+from shmio.recorder.attach import ConfigFiles
+from shmio.recorder.keeper import Keeper
+from shmio.recorder.predecessor import interrupted, places
+from shmio.recorder.selection import Selection
+from shmio.recorder.series import Series
+from shmio.recorder.tap import Start, Tap
+from shmio.recorder.triggered import Triggered
+from shmio.recording.format.encoding import SUPERVISED, Reason
+from shmio.segment import Report
+from shmio.worker import BEAT_S, Worker
+
+NOTE = "to "
+"""How a recorder that is well begins its note; the name of its file follows."""
+WAITS = f"{NOTE}a file as soon as its trigger comes"
+
+
+def run(worker: Worker) -> None:
+    """Record until told to stop."""
+    settings = msgspec.convert({k: v for k, v in worker.config.items() if k != "config_file"}, Settings)
+    directory, segment = Path(settings.directory), worker.segment
+    worker.running()  # its search for what its predecessor has may take a while
+    segment.clock.abstain(worker.slot.index)  # for which no step waits: the rings have what comes meanwhile
+    known = places(directory, segment, SUPERVISED, worker.slot.beat)
+    elsewhere = _elsewhere(worker.before, directory)
+    start = Start(known, reason=Reason.ELSEWHERE if elsewhere else Reason.NOT_RUNNING)
+    selection = Selection(settings.sources or None, settings.registers)
+    for missing in selection.nothing({name: block.layout for name, block in segment.blocks.items()}):
+        worker.log.warning("recorder.registers: %s", missing)
+    tap, attachments = Tap(segment, start, selection), ConfigFiles(Path(worker.config["config_file"]))
+    series: Series | Triggered
+    if settings.trigger:
+        going = interrupted(directory, segment, SUPERVISED, worker.slot.beat)
+        series = Triggered(tap, settings, settings.trigger, SUPERVISED, attachments, going=going)
+    else:
+        series = Series(tap, settings, SUPERVISED, attachments)
+    goes_on = ", going on where its predecessor ended" if known else ""
+    worker.log.info("recording %s%s%s", _note(series), goes_on, elsewhere)
+    keeper = Keeper(segment.instance, settings, SUPERVISED, series.present)
+    keeper.start()
+    _record(worker, series)
+    keeper.stop()
+    for unclosed in series.close():
+        worker.log.error("%s", unclosed)
+    _report(worker, series, "")
+    counters = series.counters
+    worker.log.info("%d frames, %d events, %d missed", counters.frames, counters.events, counters.missed)
+
+
+def _elsewhere(before: Report, directory: Path) -> str:
+    """What to say of a predecessor whose file is not in this folder; empty if there was none, or it is here."""
+    name = before.note.removeprefix(NOTE)
+    if before.note in (name, WAITS) or (directory / name).exists():
+        return ""
+    return f"; {name} of the recorder before is not in this folder: what the rings no longer hold is there alone"
+
+
+def _record(worker: Worker, series: Series | Triggered) -> None:
+    """Turn after turn; in virtual time a step is over only when there was one for it, so that none of it is missed."""
+    clock, slot = worker.segment.clock, worker.slot.index
+    bell = clock.slot_bell(slot)
+    seen, more, problem, told_s = bell.value(), False, "", 0.0
+    clock.deliver(slot, 0)  # from now on each step waits for it
+    while not worker.stopping.is_set():
+        if not more:
+            seen = bell.wait(seen, round(series.tap.pause_s * 1e9))
+        more = series.turn()
+        if (done := series.tap.done) != clock.delivered(slot):
+            clock.deliver(slot, done)
+        if time.monotonic() - told_s < BEAT_S:
+            continue
+        told_s = time.monotonic()
+        renewed = series.tend()
+        before, problem = "" if renewed else problem, series.problem
+        if problem and not before:
+            worker.log.error("%s", problem)
+        elif before and not problem:
+            worker.log.info("%s is being written again", series.file)
+        _report(worker, series, problem)
+
+
+def _report(worker: Worker, series: Series | Triggered, problem: str) -> None:
+    counters = series.counters
+    numbers = (counters.frames, counters.events, counters.missed, series.written)
+    worker.report(numbers, note=problem or _note(series))
+
+
+def _note(series: Series | Triggered) -> str:
+    return f"{NOTE}{series.file.name}" if series.file else WAITS
+
+
+if __name__ == "__main__":
+    raise SystemExit(worker.main(run))

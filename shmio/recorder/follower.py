@@ -1,0 +1,126 @@
+"""One block's frames and events, each once, in the order in which they happened; what was overwritten is a gap."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Generic, NamedTuple, TypeVar
+
+from shmio.recorder.selection import Part
+from shmio.recording.format.encoding import Gap, Place, ProcessChange, Reason, StepMark
+from shmio.segment import Block, Cursor, Event, Frame
+
+Item = TypeVar("Item", bound=Frame | Event)
+
+
+class Entry(NamedTuple):
+    """Something of a block that is to be recorded, with the time it has there."""
+
+    log_ns: int
+    follower: Follower
+    item: Frame | Event | Gap
+
+
+class Aside(NamedTuple):
+    """Something of the instance that is to be recorded, with the time it has there."""
+
+    log_ns: int
+    item: StepMark | ProcessChange
+
+
+class _Side(Generic[Item]):
+    """The frames, or the events."""
+
+    def __init__(self, what: str, cursor: Cursor[Item], log_ns: int, reason: Reason) -> None:
+        self.what = what
+        self.cursor = cursor
+        self.last = cursor.last
+        self.reason = reason
+        self.log_ns = log_ns
+        self.held: Item | None = None
+
+    def peek(self) -> Item | None:
+        if self.held is None:
+            self.held = self.cursor.poll()
+        return self.held
+
+
+class Follower:
+    """Follows one block. ``done`` when a reload has ended the block and all of it was taken."""
+
+    def __init__(
+        self,
+        block: Block,
+        number: int,
+        place: Place,
+        reason: Reason,
+        log_time: Callable[[int], int],
+        *,
+        over: bool = False,
+        part: Part | None = None,
+    ) -> None:
+        """``number``: of the block in the recording. ``reason``: why something may be missing at the beginning.
+
+        ``log_time`` turns CLOCK_MONOTONIC into the time in the recording. ``over``: a reload had ended it before.
+        ``part``: what is recorded of it; default: all.
+        """
+        self.block = block
+        self.number = number
+        self.begin = place
+        self.over = over
+        self.part = part or Part(block.layout)
+        self.done = False
+        self._log_time = log_time
+        self._log_ns = place.log_ns
+        self._frames = _Side("frames", block.cursor(after=place.frame), place.log_ns, reason)
+        self._events = _Side("events", block.events.cursor(after=place.event), place.log_ns, reason)
+
+    def take(self, limit: int) -> Iterator[Entry]:
+        """At most about so many entries that are there by now."""
+        retired = self.block.retired  # before looking: what was published before the end is still read
+        for _ in range(limit):
+            side = self._next()
+            if side is None:
+                self.done = retired
+                self._frames.reason = self._events.reason = Reason.OVERTAKEN  # what comes now was not there before
+                return
+            yield from self._entries(side)
+
+    def rest(self) -> Iterator[Entry]:
+        """Gaps at the end, which no later entry has shown."""
+        for side in (self._frames, self._events):
+            if side.cursor.last > side.last and side.held is None:
+                yield Entry(self._log_ns, self, self._gap(side, side.cursor.last, 0))
+
+    def _next(self) -> _Side[Frame] | _Side[Event] | None:
+        """The side whose entry comes first."""
+        frame = self._frames.peek()
+        event = self._events.peek()
+        if event is None:
+            return None if frame is None else self._frames
+        if frame is None and event.frame > self._frames.cursor.last:
+            frame = self._frames.peek()  # it was published between the two looks
+        return self._events if frame is None or event.frame < frame.number else self._frames
+
+    def _entries(self, side: _Side[Frame] | _Side[Event]) -> Iterator[Entry]:
+        item = side.held
+        assert item is not None  # noqa: S101  _next has looked
+        # Never back: the order of one block is that of its numbers, whatever its clock does.
+        self._log_ns = log_ns = max(self._log_ns, self._log_time(self.block.clock.monotonic_ns(item.clock_ns)))
+        if item.number > side.last + 1:
+            yield Entry(log_ns, self, self._gap(side, item.number - 1, log_ns))
+        side.held, side.last, side.log_ns, side.reason = None, item.number, log_ns, Reason.OVERTAKEN
+        yield Entry(log_ns, self, item)
+
+    def _gap(self, side: _Side[Frame] | _Side[Event], last: int, before_ns: int) -> Gap:
+        first = side.last + 1
+        return Gap(
+            self.block.source,
+            self.number,
+            side.what,
+            first,
+            last,
+            last - first + 1,
+            side.reason,
+            side.log_ns,
+            before_ns,
+        )

@@ -1,0 +1,156 @@
+"""Looks after the files of recorders before: closes what was not closed, deletes what is old or too much.
+
+In a thread of its own, so that neither many files nor a slow disk hold up the recording.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from shmio.config import Recorder as Settings
+from shmio.errors import RecordingError
+from shmio.recorder.closing import finalise
+from shmio.recorder.folder import about_of, is_own, own_files
+from shmio.recording.reading.reader import Reader
+
+LOOK_S: Final = 60.0
+DAY_S: Final = 86_400
+
+log = logging.getLogger("shmio.recorder")
+
+
+class _File(NamedTuple):
+    """A file as it was when it was looked at; it is looked into only once while it stays as it is."""
+
+    path: Path
+    inode: int
+    size: int
+    changed_ns: int
+
+
+class Keeper:
+    """The thread. It touches only recordings of this instance by this kind of recorder (``by``), of this user.
+
+    Never those that are being written, by whomever.
+    """
+
+    def __init__(self, instance: str, settings: Settings, by: str, present: Callable[[], set[Path]]) -> None:
+        """``present``: the files that this recorder is writing."""
+        self._instance = instance
+        self._settings = settings
+        self._by = by
+        self._present = present
+        self._own: dict[_File, bool] = {}
+        """Those that are this recorder's kind's: whether they are closed; others are looked into again."""
+        self._strange: set[_File] = set()
+        self._undeletable: set[_File] = set()
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="keeper", daemon=True)
+
+    def start(self) -> None:
+        """Begin, with a first look."""
+        self._thread.start()
+
+    def stop(self, patience_s: float = 0.5) -> None:
+        """End, at the next file."""
+        self._stop.set()
+        self._thread.join(patience_s)
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            try:
+                self.look()
+            except Exception:  # a recording must not end with what is beside it
+                log.exception("looking after the recordings before failed")
+            self._stop.wait(LOOK_S)
+
+    def look(self) -> None:
+        """Close and delete what is to be."""
+        present = self._present()
+        files = [_file(path) for path in own_files(Path(self._settings.directory), self._instance)]
+        found = [file for file in files if file is not None]
+        self._own = {file: closed for file, closed in self._own.items() if file in found}
+        self._strange &= set(found)
+        self._undeletable &= set(found)
+        for file in found:
+            if self._stop.is_set():
+                return
+            known = file.path in present or self._own.get(file) or file in self._strange
+            if file.size and not known:  # an empty one has just been made, or nothing ever came of it
+                self._take_in(file)
+        self._delete([file for file in found if file.path in present])
+
+    def _take_in(self, file: _File) -> None:
+        try:
+            if not about_of(file.path, self._instance, self._by):
+                self._strange.add(file)
+                return
+            with Reader(file.path, own=True) as reader:
+                closed = reader.records.footer() is not None
+            if not closed and finalise(file.path):
+                log.info("%s is closed: its recorder did not come to that", file.path)
+                file, closed = _file(file.path) or file, True
+            self._own[file] = closed
+        except (OSError, RecordingError) as error:
+            self._strange.add(file)
+            log.warning("%s stays as it is: %s", file.path, error)
+
+    def _delete(self, present: list[_File]) -> None:
+        """What is too old, then the oldest while there is too much; closed ones only."""
+        settings = self._settings
+        left = sum(file.size for file in (*present, *self._own))
+        oldest = sorted((file for file, closed in self._own.items() if closed), key=lambda file: file.changed_ns)
+        for file in oldest:
+            age_days = (time.time() - file.changed_ns / 1e9) / DAY_S
+            if settings.keep_days and age_days > settings.keep_days:
+                why = f"it is {age_days:.1f} days old, recorder.keep_days is {settings.keep_days:g}"
+            elif settings.keep_mb and left > settings.keep_mb * 1e6:
+                why = f"there are {left / 1e6:.1f} MB of recordings, recorder.keep_mb is {settings.keep_mb:g}"
+            else:
+                continue
+            if self._remove(file, why):
+                left -= file.size
+
+    def _remove(self, file: _File, why: str) -> bool:
+        try:
+            if _file(file.path) != file or _is_held(file.path):
+                return False
+            file.path.unlink()
+        except OSError as error:
+            if file not in self._undeletable:
+                self._undeletable.add(file)
+                log.warning("%s cannot be deleted: %s; %s", file.path, error.strerror, why)
+            return False
+        del self._own[file]
+        log.info("%s is deleted: %s", file.path, why)
+        return True
+
+
+def _is_held(path: Path) -> bool:
+    """Whether somebody plays it: its processes, started anew, would find nothing."""
+    fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:  # a file system without locks
+        return False
+    finally:
+        os.close(fd)
+    return False
+
+
+def _file(path: Path) -> _File | None:
+    """The file as it is now; None if it is no regular one of this user, or gone."""
+    try:
+        found = path.lstat()
+    except OSError:
+        return None
+    return _File(path, found.st_ino, found.st_size, found.st_mtime_ns) if is_own(found) else None

@@ -1,0 +1,95 @@
+"""Where the recorder before this one came to: so much of it as is still in the rings need not be missed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+from shmio.errors import RecordingError
+from shmio.recorder.folder import about_of, own_files
+from shmio.recording.format.encoding import EVENT, FRAME, Place
+from shmio.recording.reading.reader import Reader
+from shmio.recording.reading.survey import survey
+from shmio.segment import Block, Segment
+
+MAX_FILES: Final = 256
+"""How many recordings, the newest by their names first, are looked at."""
+
+log = logging.getLogger("shmio.recorder")
+
+
+def places(directory: Path, segment: Segment, by: str, beat: Callable[[], object] = lambda: None) -> dict[int, Place]:
+    """By section the last frame and event of each block that recorders of this kind (``by``) have of this run.
+
+    Blocks that were not recorded are left out. ``beat`` is called now and then.
+    """
+    found: dict[int, Place] = {}
+    blocks = {block.section: block for block in (*segment.ended, *segment.blocks.values())}
+    for file in _of_this_run(directory, segment, by, beat):
+        beat()
+        try:
+            with Reader(file, own=True, beat=beat) as reader:
+                found = _places(reader, blocks) | found
+        except (OSError, RecordingError) as error:
+            log.warning("it is not known where the recording before ended: %s", error)
+            continue
+        if found.keys() >= blocks.keys():
+            break
+    return found
+
+
+def interrupted(directory: Path, segment: Segment, by: str, beat: Callable[[], object] = lambda: None) -> bool:
+    """Whether the recorder before died within what a trigger had begun."""
+    for file in _of_this_run(directory, segment, by, beat)[:1]:
+        with suppress(OSError, RecordingError), Reader(file, own=True, beat=beat) as reader:
+            return reader.records.footer() is None and "trigger" in about_of(file, segment.instance, by)
+    return False
+
+
+def _of_this_run(directory: Path, segment: Segment, by: str, beat: Callable[[], object]) -> list[Path]:
+    """The recordings of this run, the newest first; not by name, for the host's clock may go back."""
+    epoch = f"{segment.header.epoch:016x}"
+    found: list[tuple[int, Path]] = []
+    for file in sorted(own_files(directory, segment.instance), reverse=True)[:MAX_FILES]:
+        beat()
+        try:
+            about = about_of(file, segment.instance, by, beat)
+            if about.get("epoch") == epoch:
+                found.append((int(about["recording_ns"]), file))
+        except (OSError, RecordingError, KeyError, ValueError) as error:
+            log.warning("%s is passed over: %s", file, error)
+    return [file for _, file in sorted(found, reverse=True)]
+
+
+def _places(reader: Reader, blocks: dict[int, Block]) -> dict[int, Place]:
+    """Where a file ends: where it began, if nothing came of a block, or its last chunk is damaged."""
+    found = survey(reader)
+    places = {section: place for section, place in reader.places.items() if section in blocks}
+    for channel in reader.channels.values():
+        block = blocks.get(channel.section)
+        if block is None or channel.source != block.source or channel.encoding not in (FRAME, EVENT):
+            continue
+        what = "frames" if channel.encoding == FRAME else "events"
+        track = found.tracks.get(channel.number)
+        number = channel.after
+        if track:
+            try:
+                number = track.last(reader)
+            except RecordingError as error:
+                log.warning("where the recording before ended is known from its beginning only: %s", error)
+                track = None
+        number = max(number, found.missed_to.get((channel.source, channel.block, what), 0))
+        frame, event, log_ns = places.get(channel.section, Place())
+        log_ns = max(log_ns, track.last_ns if track else 0)
+        if channel.encoding == FRAME:
+            places[channel.section] = Place(number, event, log_ns)
+        else:
+            places[channel.section] = Place(frame, number, log_ns)
+    return {
+        section: place
+        for section, place in places.items()
+        if place.frame <= blocks[section].ring.head() and place.event <= blocks[section].events.head()
+    }

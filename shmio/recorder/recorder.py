@@ -1,0 +1,325 @@
+"""One file of a recording, filled from a tap."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+from shmio import __version__
+from shmio.recorder.attach import Attachment, Attachments, no_attachments
+from shmio.recorder.follower import Aside, Entry, Follower
+from shmio.recorder.output import Output
+from shmio.recorder.tap import TURN_S, Tap
+from shmio.recorder.writer import JSON, Channels, Writer
+from shmio.recording.format.encoding import Gap, Place, ProcessChange, Reason
+from shmio.segment import Event, Frame
+
+
+@dataclass(slots=True)
+class _Lost:
+    """What could not be taken because there was no room: numbers from, to."""
+
+    first: int
+    last: int
+    after_ns: int
+
+    @property
+    def count(self) -> int:
+        return self.last - self.first + 1
+
+
+@dataclass(slots=True)
+class Followed:
+    """A block in one file. ``begin``: where that begins; then the last frame and event that are in it, or in a gap."""
+
+    follower: Follower
+    begin: Place
+    frame: int
+    event: int
+    log_ns: int
+    channels: Channels | None = None
+    lost: dict[str, _Lost] = field(default_factory=dict)
+    """By what it is."""
+
+    @property
+    def place(self) -> Place:
+        """Behind what was written last."""
+        return Place(self.frame, self.event, self.log_ns)
+
+    @property
+    def losses(self) -> int:
+        """How many are lost, and not told yet."""
+        return sum(lost.count for lost in self.lost.values())
+
+    def come_to(self, what: str, number: int, log_ns: int) -> None:
+        """Up to this frame or event it was written, or is in a gap that was."""
+        self.log_ns = log_ns
+        if what == "frames":
+            self.frame = number
+        else:
+            self.event = number
+
+    def lose(self, item: Frame | Event | Gap) -> int:
+        """There is no room for it; how many frames or events that costs."""
+        if isinstance(item, Gap):
+            what, first, last = item.what, item.first, item.last
+        else:
+            what, first, last = "frames" if isinstance(item, Frame) else "events", item.number, item.number
+        lost = self.lost.setdefault(what, _Lost(first, last, self.log_ns))
+        lost.last = last
+        return last - first + 1
+
+    def found(self, before_ns: int) -> list[Gap]:
+        """What was lost, now that there is room again; it is not kept any longer."""
+        block = self.follower.block
+        lost, self.lost = self.lost, {}
+        return [
+            Gap(
+                block.source, self.follower.number, what, one.first, one.last, one.count, Reason.NO_ROOM,
+                one.after_ns, before_ns,
+            )
+            for what, one in lost.items()
+        ]  # fmt: skip
+
+
+CHUNK_S: Final = 0.8
+"""A chunk is no longer than this: with a turn, and the time to write it, less than the second that a kill may cost."""
+CLOSE_S: Final = 3.0
+CHECK_S: Final = 1.0
+CONFIG_S: Final = 5.0
+"""How often it is looked whether the configuration has changed."""
+
+
+@dataclass(slots=True)
+class Counters:
+    """What came of it so far. ``missed``: frames and events."""
+
+    frames: int = 0
+    events: int = 0
+    missed: int = 0
+
+
+class Recorder:
+    """One file. Use from one thread: :meth:`turn` again and again, then :meth:`close`."""
+
+    def __init__(
+        self,
+        tap: Tap,
+        output: Output,
+        *,
+        by: str,
+        places: Mapping[int, Place] | None = None,
+        about: Mapping[str, str] | None = None,
+        counters: Counters | None = None,
+        attachments: Attachments = no_attachments,
+    ) -> None:
+        """``by``: who records. ``about``: what else is to be told of this recording.
+
+        ``places``: where the recording before ended, by section; default: where the tap began.
+        ``counters``: what came of the recordings before, if it goes on from there.
+        """
+        self.tap = tap
+        self.output = output
+        self.counters = counters or Counters()
+        self.places = dict(tap.start.places if places is None else places)
+        """Where the recording had come to, by section, when :meth:`settle` was called last."""
+        self.confirmed: Mapping[int, Place] = dict(self.places)
+        """Where it had come to when what was written last that is on the disk for certain."""
+        self._ended = False
+        self.empty = True
+        """Whether nothing has happened yet."""
+        self._attachments = attachments
+        self._writer = Writer(output, {**self._about(by), **(about or {})})
+        self._followed: dict[int, Followed] = {}
+        self._attached: set[bytes] = set()
+        self._config = attachments(None, 0)
+        self._attach(self._config)
+        self._unaware = True
+        """Whether the file does not say how the processes are."""
+        self._to_confirm: tuple[int, dict[int, Place]] | None = None
+        self._writer.places(self.places)
+        for follower in tap.followers:
+            self._known(follower)
+        self._flushed_s = self._checked_s = self._looked_s = time.monotonic()
+
+    def _about(self, by: str) -> dict[str, str]:
+        segment = self.tap.segment
+        head = segment.header
+        return {
+            "instance": segment.instance,
+            "epoch": f"{head.epoch:016x}",
+            "mode": head.mode,
+            "started_utc_ns": str(head.started_utc_ns),
+            "started_ns": str(head.started_ns),
+            "instance_version": head.version,
+            "version": __version__,
+            "host": socket.gethostname(),
+            "recorder": by,
+            "recorder_pid": str(os.getpid()),
+            "recording_utc_ns": str(time.time_ns()),
+            "recording_ns": str(self.tap.log_time(time.monotonic_ns())),
+        }
+
+    def turn(self) -> bool:
+        """Take what has been published; whether there is more at once. RecordingError: the file was removed."""
+        entries, more = self.tap.take()
+        self.put(entries)
+        return more
+
+    def put(self, entries: Iterable[Entry | Aside]) -> None:
+        """Add what the tap gave; end the chunk if it is time. RecordingError: the file was removed."""
+        for follower in self.tap.followers:
+            self._known(follower)
+        full = self.output.full
+        if self._unaware and not full:
+            self._unaware = False
+            entries = [*(entry for entry in entries if not of_a_process(entry)), *self.tap.standing()]
+        for entry in entries:
+            if full:
+                self._lose(entry)
+            else:
+                self._write(entry)
+        if not full:
+            for followed in self._followed.values():
+                if followed.lost and followed.follower.done:  # nothing comes before which it could be told
+                    self._tell_lost(followed, 0)
+        now_s = time.monotonic()
+        if now_s - self._flushed_s >= CHUNK_S - TURN_S / 2:
+            self._flushed_s = now_s
+            self._writer.flush()
+            self._confirm()
+        if now_s - self._checked_s >= CHECK_S:
+            self._checked_s = now_s
+            self.output.check()
+        if now_s - self._looked_s >= CONFIG_S:
+            self._looked_s = now_s
+            self._look()
+
+    def _confirm(self) -> None:
+        """See what the disk has for certain; what was written by now is the next that it is to have."""
+        if self._to_confirm and self.output.synced >= self._to_confirm[0]:
+            self.confirmed, self._to_confirm = self._to_confirm[1], None
+        if not self._to_confirm and not self.losing:
+            self.settle()
+            self._to_confirm = self.output.tell(), dict(self.places)
+
+    def settle(self) -> None:
+        """Bring :attr:`places` up to date."""
+        self.places |= {section: followed.place for section, followed in self._followed.items()}
+
+    @property
+    def losing(self) -> bool:
+        """Whether something could not be taken for want of room, which is not told in the file yet."""
+        return any(followed.lost for followed in self._followed.values())
+
+    @property
+    def problem(self) -> str:
+        """What is wrong at present, in words; empty: nothing."""
+        problem = self.output.problem
+        lost = sum(followed.losses for followed in self._followed.values())
+        return f"{problem}; {lost} frames and events lost so far" if problem and lost else problem
+
+    def end(self) -> None:
+        """Have index and footer written behind what was put in; the disk may take its time. Once is enough."""
+        if self._ended:
+            return
+        self._ended = True
+        for followed in self._followed.values():
+            self._tell_lost(followed, 0)
+        self.settle()
+        self._writer.finish()
+        self.output.end()
+
+    def close(self, patience_s: float = CLOSE_S) -> bool:
+        """Take what is there, write it, close the file; False if the disk did not take all of it in this time."""
+        while self.turn():
+            pass
+        self.put(self.tap.rest())
+        self.end()
+        return self.output.close(patience_s)
+
+    # ---- blocks ------------------------------------------------------------------------------------------------------
+
+    def _known(self, follower: Follower) -> Followed:
+        return self._followed.get(follower.block.section) or self._follow(follower)
+
+    def _follow(self, follower: Follower) -> Followed:
+        """Begin with a block: attach what is needed to read it."""
+        block = follower.block
+        place = self.places.get(block.section, follower.begin)
+        followed = self._followed[block.section] = Followed(follower, place, *place)
+        layout = follower.part.layout
+        if layout.hash not in self._attached:
+            self._attached.add(layout.hash)
+            self._attach([Attachment(f"layouts/{layout.hash.hex()}.json", JSON, layout.to_json())])
+        if not follower.over:  # the files on the disk are of its successor
+            self._attach(self._attachments(block.source, follower.number))
+        return followed
+
+    def _look(self) -> None:
+        """Attach the configuration again if it is not what it was."""
+        now = self._attachments(None, 0)
+        if now and [(one.name, one.data) for one in now] != [(one.name, one.data) for one in self._config]:
+            self._config = now
+            self._attach(now)
+
+    def _attach(self, attachments: list[Attachment]) -> None:
+        for name, media_type, data, changed_ns in attachments:
+            self._writer.attach(name, media_type, data, self.tap.now(), changed_ns)
+
+    # ---- entries -----------------------------------------------------------------------------------------------------
+
+    def _write(self, entry: Entry | Aside) -> None:
+        self.empty = self.empty and of_a_process(entry)
+        if isinstance(entry, Aside):
+            self._aside(entry)
+            return
+        log_ns, follower, item = entry
+        followed = self._known(follower)
+        self._tell_lost(followed, log_ns)
+        if isinstance(item, Gap):
+            self.counters.missed += item.count
+            self._writer.gap(item, log_ns)
+            followed.come_to(item.what, item.last, log_ns)
+            return
+        if followed.channels is None:
+            after = followed.begin
+            followed.channels = self._writer.open_block(
+                follower.block, follower.number, after.frame, after.event, follower.part.layout
+            )
+        if isinstance(item, Frame):
+            self.counters.frames += 1
+            self._writer.frame(followed.channels, follower.part.keep(item), log_ns)
+            followed.come_to("frames", item.number, log_ns)
+        else:
+            self.counters.events += 1
+            self._writer.event(followed.channels, item, log_ns)
+            followed.come_to("events", item.number, log_ns)
+
+    def _aside(self, aside: Aside) -> None:
+        if isinstance(aside.item, ProcessChange):
+            self._writer.process(aside.item, aside.log_ns)
+        else:
+            self._writer.step(aside.item, aside.log_ns)
+
+    def _lose(self, entry: Entry | Aside) -> None:
+        if isinstance(entry, Aside):
+            self._unaware |= of_a_process(entry)
+        else:
+            self.counters.missed += self._known(entry.follower).lose(entry.item)
+
+    def _tell_lost(self, followed: Followed, before_ns: int) -> None:
+        """Put down what there was no room for, before what follows it."""
+        for gap in followed.found(before_ns):
+            log_ns = before_ns or self.tap.now()
+            self._writer.gap(gap, log_ns)
+            followed.come_to(gap.what, gap.last, log_ns)
+
+
+def of_a_process(entry: Entry | Aside) -> bool:
+    """Whether it is what has happened to a process."""
+    return isinstance(entry.item, ProcessChange)

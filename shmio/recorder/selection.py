@@ -1,0 +1,91 @@
+"""Which sources, and of their blocks which registers, are recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from shmio.errors import PathError
+from shmio.layout.model import Layout
+from shmio.layout.topic import holder, near, parse_topic
+from shmio.layout.values.write import chosen, covering
+from shmio.segment import Block, Frame
+
+
+class Part:
+    """Registers of a block. ``layout`` has only these, each at its place."""
+
+    def __init__(self, layout: Layout, mask: npt.NDArray[np.uint8] | None = None) -> None:
+        """``mask``: the bits that are theirs; None: all of the block."""
+        self.layout = layout
+        self._mask = mask
+
+    def keep(self, frame: Frame) -> Frame:
+        """The frame with zeros where none of the registers is."""
+        if self._mask is None:
+            return frame
+        effective = None if frame.effective is None else _kept(frame.effective, self._mask)
+        return frame._replace(raw=_kept(frame.raw, self._mask), effective=effective)
+
+
+def _kept(image: bytes, mask: npt.NDArray[np.uint8]) -> bytes:
+    return (np.frombuffer(image, np.uint8) & mask).tobytes()
+
+
+class Selection:
+    """Without ``sources`` all; ``registers`` are patterns as for ``shmio get``, none: all. An element is its array."""
+
+    def __init__(self, sources: Collection[str] | None = None, registers: Sequence[str] = ()) -> None:
+        self._sources = sources
+        self._registers = registers
+
+    def part(self, block: Block, sources: Collection[str]) -> Part | None:
+        """What is recorded of a block; None: nothing. ``sources``: all there are."""
+        if self._sources is not None and block.source not in self._sources:
+            return None
+        if not self._registers:
+            return Part(block.layout)
+        paths = {path for pattern in self._registers for path in _paths(pattern, block.source, block.layout, sources)}
+        registers = tuple(register for register in block.layout.registers if register.path in paths)
+        if len(registers) == len(block.layout.registers):
+            return Part(block.layout)
+        mask = np.frombuffer(covering(registers, block.layout.size), np.uint8)
+        return Part(replace(block.layout, registers=registers), mask) if registers else None
+
+    def nothing(self, layouts: Mapping[str, Layout]) -> list[str]:
+        """What of it names nothing: sources that are not there, patterns without registers. ``layouts``: by source."""
+        missing = [
+            f"no source {source!r}; there are: {', '.join(layouts)}"
+            for source in self._sources or ()
+            if source not in layouts
+        ]
+        missing += [
+            f"{pattern}: no register has such a path{_near(pattern, layouts)}"
+            for pattern in self._registers
+            if not any(_paths(pattern, source, layout, layouts) for source, layout in layouts.items())
+        ]
+        return missing
+
+
+def _near(pattern: str, layouts: Mapping[str, Layout]) -> str:
+    """What may have been meant, to go on with after a message."""
+    try:
+        topic = parse_topic(pattern, layouts, next(iter(layouts)) if len(layouts) == 1 else None)
+    except PathError:
+        return ""
+    alike = [] if "*" in pattern or topic.source not in layouts else near(layouts[topic.source], topic.path)
+    return f"; near: {', '.join(f'{topic.source}/{path}' for path in alike)}" if alike else ""
+
+
+def _paths(pattern: str, source: str, layout: Layout, sources: Collection[str]) -> set[str]:
+    """The registers of a source that a pattern names; none if it is no pattern for it."""
+    try:
+        topic = parse_topic(pattern, sources, next(iter(sources)) if len(sources) == 1 else None)
+        if topic.source != source or topic.direction == "in":
+            return set()
+        return {holder(layout, register) for register in chosen(layout, topic.path or "**")}
+    except PathError:
+        return set()

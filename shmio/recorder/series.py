@@ -1,0 +1,208 @@
+"""Recordings of one recorder, one file after the other."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Final
+
+from shmio.config import Recorder as Settings
+from shmio.errors import RecordingError
+from shmio.recorder.attach import Attachments
+from shmio.recorder.follower import Aside, Entry
+from shmio.recorder.output import Output, create
+from shmio.recorder.recorder import CLOSE_S, Counters, Recorder
+from shmio.recorder.tap import Start, Tap
+from shmio.recording.format.encoding import Place, Reason
+
+FIRST_WAIT_S: Final = 1.0
+MAX_WAIT_S: Final = 600.0
+"""A disk whose fsync fails for good gets a new file so often at last, and twice as often each time before."""
+
+log = logging.getLogger("shmio.recorder")
+
+
+class Series:
+    """Takes a new file when the present one is large or old enough, from the entry on with which that ends.
+
+    Also when an fsync of a file has failed: of that nobody can say any more what the disk has. Then the new file begins
+    where the disk had the old one for certain: what the rings still hold of it is recorded again, the rest is a gap
+    there.
+    """
+
+    def __init__(
+        self,
+        tap: Tap,
+        settings: Settings,
+        by: str,
+        attachments: Attachments,
+        *,
+        places: Mapping[int, Place] | None = None,
+        about: Mapping[str, str] | None = None,
+        counters: Counters | None = None,
+    ) -> None:
+        """``places``: where it begins, by section, if the caller takes from the tap: then it must :meth:`put`.
+
+        ``about``: what else is to be told of this recording. RecordingError: no file can be made.
+        """
+        self._settings = settings
+        self._by = by
+        self._attachments = attachments
+        self._wait_s = FIRST_WAIT_S
+        self._again_s = 0.0
+        self._ending: list[Recorder] = []
+        """Files that are complete but for what the disk has not taken yet."""
+        self.counters = counters or Counters()
+        self._takes = places is None
+        self._why = dict(about or {})
+        self.recorder = self._begin(tap, places, {})
+
+    def _begin(
+        self,
+        tap: Tap,
+        places: Mapping[int, Place] | None,
+        about: Mapping[str, str],
+        after: Output | None = None,
+    ) -> Recorder:
+        settings = self._settings
+        path, fd = create(Path(settings.directory), tap.segment.instance)
+        output = Output(
+            path,
+            fd,
+            limit_bytes=settings.buffer_bytes,
+            fsync_s=settings.fsync_s,
+            after=after,
+        )
+        self._begun_s = time.monotonic()
+        return Recorder(
+            tap, output, by=self._by, places=places, about={**self._why, **about}, counters=self.counters,
+            attachments=self._attachments,
+        )  # fmt: skip
+
+    def turn(self) -> bool:
+        """Record what has been published; whether there is more at once. RecordingError: the file was removed."""
+        return self.recorder.turn()
+
+    def put(self, entries: Iterable[Entry | Aside]) -> None:
+        """Record what the tap gave. RecordingError: the file was removed."""
+        self.recorder.put(entries)
+
+    def end(self) -> Mapping[int, Place]:
+        """Nothing more comes: have all files closed, however long the disk takes; where it ended, by section."""
+        self.recorder.end()
+        return self.recorder.places
+
+    @property
+    def ended(self) -> bool:
+        """Whether the disk has all, after :meth:`end`."""
+        return all(recorder.output.ended for recorder in (*self._ending, self.recorder))
+
+    @property
+    def tap(self) -> Tap:
+        """What is recorded from: another one after a file that was given up."""
+        return self.recorder.tap
+
+    @property
+    def file(self) -> Path:
+        """What is being written."""
+        return self.recorder.output.path
+
+    @property
+    def written(self) -> int:
+        """Bytes in the present file."""
+        return self.recorder.output.written
+
+    @property
+    def waiting(self) -> int:
+        """Bytes that wait for the disk."""
+        return sum(recorder.output.waiting for recorder in (*self._ending, self.recorder))
+
+    @property
+    def problem(self) -> str:
+        """What is wrong at present, in words; empty: nothing."""
+        return next(filter(None, (recorder.problem for recorder in (*self._ending, self.recorder))), "")
+
+    def tend(self) -> bool:
+        """Begin a new file if that is called for; whether a doubtful one was given up."""
+        for old in [old for old in self._ending if old.output.ended and not old.output.doubt]:
+            old.output.close(0)
+            self._ending.remove(old)
+        doubtful = next((old for old in (*self._ending, self.recorder) if old.output.doubt), None)
+        if doubtful is not None:
+            return self._renew(doubtful)
+        if self.recorder.output.synced:
+            self._wait_s = FIRST_WAIT_S
+        if self._due and time.monotonic() >= self._again_s:
+            self._rotate()
+        return False
+
+    def present(self) -> set[Path]:
+        """What is being written; asked from another thread."""
+        return {recorder.output.path for recorder in (*self._ending, self.recorder)}
+
+    @property
+    def _due(self) -> bool:
+        """Whether the present file is to end: never while the disk has trouble, which a new file would not help."""
+        settings, recorder = self._settings, self.recorder
+        old = bool(settings.rotate_min) and time.monotonic() - self._begun_s >= settings.rotate_min * 60
+        large = bool(settings.rotate_mb) and recorder.output.tell() >= settings.rotate_mb * 1e6
+        return (old or large) and not (recorder.empty or self._ending or recorder.problem or recorder.losing)
+
+    def _rotate(self) -> None:
+        old = self.recorder
+        old.settle()
+        try:
+            self.recorder = self._begin(self.tap, old.places, {}, after=old.output)
+        except RecordingError as error:
+            log.error("%s; going on in %s", error, old.output.path)
+            self._again_s = time.monotonic() + MAX_WAIT_S
+            return
+        old.end()
+        self._ending.append(old)
+        log.info("recording to %s, going on where %s ends", self.recorder.output.path, old.output.path.name)
+
+    def _renew(self, doubtful: Recorder) -> bool:
+        if time.monotonic() < self._again_s:
+            return False
+        self._again_s = time.monotonic() + self._wait_s
+        self._wait_s = min(2 * self._wait_s, MAX_WAIT_S)
+        output = doubtful.output
+        about = {"doubtful": output.path.name, "doubtful_from": str(output.synced)}
+        tap, places = self.tap, None
+        if self._takes:
+            tap = tap.again(Start(doubtful.confirmed, True, Reason.UNSURE))
+        else:  # somebody else's, who has no more of what is in doubt
+            self.recorder.settle()
+            places = self.recorder.places
+        try:
+            recorder = self._begin(tap, places, about)
+        except RecordingError as error:
+            log.error("%s; %s", output.problem, error)
+            return False
+        log.error("%s; going on in %s", output.problem, recorder.output.path)
+        if self.recorder is not doubtful:
+            self._ending.remove(doubtful)
+            output.close(0)
+        self._finish(CLOSE_S)
+        self.recorder = recorder
+        return True
+
+    def _finish(self, patience_s: float) -> bool:
+        if self._takes:
+            return self.recorder.close(patience_s)
+        self.recorder.end()
+        return self.recorder.output.close(patience_s)
+
+    def close(self, patience_s: float = CLOSE_S) -> list[str]:
+        """Take what is there, write it, close all files; what is wrong with those that are not whole."""
+        until_s = time.monotonic() + patience_s
+        files = [*self._ending, self.recorder]
+        closed = [old.output.close(max(0.0, until_s - time.monotonic())) for old in self._ending]
+        closed.append(self._finish(max(0.1, until_s - time.monotonic())))
+        return [_unclosed(recorder.output) for recorder, whole in zip(files, closed, strict=True) if not whole]
+
+
+def _unclosed(output: Output) -> str:
+    return f"{output.problem or output.path}{'' if output.doubt else '; it was not closed'}"

@@ -1,0 +1,269 @@
+"""Recordings of what a trigger is about: a file a trigger, with the seconds before."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from shmio.config import Recorder as Settings
+from shmio.config import Trigger as TriggerSettings
+from shmio.errors import ConfigError, RecordingError
+from shmio.injection.expression import Memory, Number
+from shmio.injection.program import NEVER, compile_condition
+from shmio.layout.values.codec import RegisterCodec
+from shmio.recorder.attach import Attachments
+from shmio.recorder.follower import Aside, Entry
+from shmio.recorder.recorder import CLOSE_S, Counters, of_a_process
+from shmio.recorder.series import Series
+from shmio.recorder.tap import TURN_S, Tap
+from shmio.recording.format.encoding import Gap, Place, Reason
+from shmio.segment import Block, Frame, Quality
+
+ENTRY_BYTES: Final = 800
+"""About as much an entry takes in memory beside its images."""
+
+log = logging.getLogger("shmio.recorder")
+
+
+class Trigger:
+    """The condition, looked at with each frame of a source that it reads: of what consumers saw of good frames."""
+
+    def __init__(self, when: str, blocks: Mapping[str, Block]) -> None:
+        """ConfigError: it is no condition, or reads what is not there."""
+        self.when = when
+        self._blocks = blocks
+        self._bind(blocks)
+
+    def follow(self, blocks: Mapping[str, Block]) -> None:
+        """Find the registers anew if a reload has changed the blocks; as long as one is not there it is not true."""
+        if blocks is not self._blocks:
+            try:
+                self._bind(blocks)
+            except ConfigError as error:
+                log.warning("the trigger waits for what it reads: %s", error)
+                self._blocks, self._condition = blocks, NEVER
+
+    def _bind(self, blocks: Mapping[str, Block]) -> None:
+        self._condition = compile_condition(self.when, {name: block.layout for name, block in blocks.items()})
+        self._blocks = blocks
+        self._sections = {block.section: name for name, block in blocks.items()}
+        self.sources = {source for source, _ in self._condition.reads}
+        """Which it reads."""
+        self._images: dict[str, bytes | None] = {}
+        self._memory = Memory()
+
+    def sees(self, entry: Entry | Aside) -> bool:
+        """Whether it is true with this entry."""
+        if isinstance(entry, Aside) or not isinstance(entry.item, Frame):
+            return False
+        source = self._sections.get(entry.follower.block.section, "")
+        if source not in self.sources:
+            return False
+        frame = entry.item
+        known = frame.quality is not Quality.BAD and frame.source_ns != 0
+        self._images[source] = frame.image if known else None
+        return self._condition.expression.holds([self._value(*read) for read in self._condition.reads], self._memory)
+
+    def _value(self, source: str, codec: RegisterCodec) -> Number | None:
+        image = self._images.get(source)
+        value = None if image is None else codec.decode(image)
+        return value if isinstance(value, bool | int | float) else None
+
+
+class Backlog:
+    """What was published in the last seconds, as far as a bound of memory lasts; older entries are let go."""
+
+    def __init__(self, before_s: float, limit_bytes: int, places: Mapping[int, Place]) -> None:
+        """``places``: behind which it begins, by section."""
+        self._before_ns = round(before_s * 1e9)
+        self._limit = limit_bytes
+        self._entries: deque[Entry | Aside] = deque()
+        self._size = 0
+        self._told = False
+        self.places = dict(places)
+        """Behind which it begins now, by section."""
+
+    def add(self, entry: Entry | Aside) -> None:
+        """The next one. What was lost before this recorder ran is not missed."""
+        item = entry.item
+        if isinstance(item, Gap) and item.reason is not Reason.OVERTAKEN:
+            self._pass(entry)
+            return
+        self._entries.append(entry)
+        self._size += _size(entry)
+        self._trim(entry.log_ns)
+        if self._size > self._limit and not self._told:
+            self._told = True
+            kept_s = (entry.log_ns - self._entries[0].log_ns) / 1e9
+            log.warning(
+                "only %.1f s before a trigger are kept: recorder.trigger.before_mb has no room for more", kept_s
+            )
+        while self._size > self._limit:
+            self._drop()
+
+    def before(self, log_ns: int) -> list[Entry | Aside]:
+        """What was published in the seconds before this time, the oldest first; :attr:`places` is where it begins."""
+        self._trim(log_ns)
+        return list(self._entries)
+
+    def _trim(self, now_ns: int) -> None:
+        while self._entries and self._entries[0].log_ns < now_ns - self._before_ns:
+            self._drop()
+
+    def _drop(self) -> None:
+        entry = self._entries.popleft()
+        self._size -= _size(entry)
+        self._pass(entry)
+
+    def _pass(self, entry: Entry | Aside) -> None:
+        if isinstance(entry, Aside):
+            return
+        section, item = entry.follower.block.section, entry.item
+        frame, event, _ = self.places.get(section, entry.follower.begin)
+        if isinstance(item, Gap):
+            frame, event = (item.last, event) if item.what == "frames" else (frame, item.last)
+        elif isinstance(item, Frame):
+            frame = item.number
+        else:
+            event = item.number
+        self.places[section] = Place(frame, event, entry.log_ns)
+
+
+def _size(entry: Entry | Aside) -> int:
+    item = entry.item
+    return ENTRY_BYTES + (len(item.raw) + len(item.effective or b"") if isinstance(item, Frame) else 0)
+
+
+class Triggered:
+    """As :class:`~shmio.recorder.series.Series`, but for the time between triggers. One that comes prolongs a file."""
+
+    def __init__(
+        self, tap: Tap, settings: Settings, trigger: TriggerSettings, by: str, attachments: Attachments,
+        *, going: bool = False,
+    ) -> None:  # fmt: skip
+        """``going``: a recorder that died was within such a recording. ConfigError: the condition cannot be."""
+        self.counters = Counters()
+        self.tap = tap
+        self._settings = settings
+        self._trigger = Trigger(trigger.when, tap.segment.blocks)
+        self._times = trigger
+        tap.watch(self._trigger.sources)
+        self._by = by
+        self._attachments = attachments
+        self._series: Series | None = None
+        self._ending: list[Series] = []
+        self._backlog = self._anew(tap.start.places)
+        self._until_ns = 0
+        self._came_s = time.monotonic()
+        self._problem = ""
+        self._held = False  # whether no file could be begun for what of others waits
+        if going:
+            self._begin(tap.now())
+
+    def turn(self) -> bool:
+        """Look what has been published, and record what is to be; whether there is more at once. RecordingError."""
+        self._trigger.follow(self.tap.segment.blocks)
+        entries, more = self.tap.take()
+        if entries:
+            self._came_s = time.monotonic()
+        batch: list[Entry | Aside] = []
+        for entry in entries:
+            if self._series and entry.log_ns > self._until_ns and not of_a_process(entry):
+                self._end(batch)
+                batch = []
+            if self._trigger.sees(entry):
+                self._begin(entry.log_ns)
+            if isinstance(entry, Entry) and not entry.follower.number:
+                continue  # it is only watched
+            if self._series:
+                batch.append(entry)
+            else:
+                self._backlog.add(entry)
+        if self._series:
+            self._series.put(batch)
+            silent_s = time.monotonic() - self._came_s
+            if not self.tap.segment.clock.read().virtual and silent_s > self._times.after_s + TURN_S:
+                self._end([])  # nothing comes any more that would tell; a replay's times are not the host's
+        return more
+
+    def _begin(self, log_ns: int) -> None:
+        """Begin a file with what was before, or have the present one go on."""
+        self._until_ns = log_ns + round(self._times.after_s * 1e9)
+        if self._series is not None:
+            return
+        if sum(series.waiting for series in self._ending) > self._settings.buffer_bytes:
+            if not self._held:
+                log.error("%s: no file is begun while those before wait for the disk", self._trigger.when)
+            self._held = True
+            return
+        self._held = False
+        before = self._backlog.before(log_ns)
+        about = {"trigger": self._trigger.when, "triggered_ns": str(log_ns)}
+        try:
+            series = Series(
+                self.tap, self._settings, self._by, self._attachments,
+                places=self._backlog.places, about=about, counters=self.counters,
+            )  # fmt: skip
+        except RecordingError as error:  # the seconds before are kept; with the next frame that fires it is tried again
+            if not self._problem:
+                log.error("%s: %s", self._trigger.when, error)
+            self._problem = str(error)
+            return
+        self._problem = ""
+        self._series = series
+        series.put(before)
+        log.info("%s: recording to %s", self._trigger.when, series.file)
+
+    def _end(self, last: Sequence[Entry | Aside]) -> None:
+        if series := self._series:
+            series.put(last)
+            self._backlog = self._anew(series.end())
+            self._ending.append(series)  # before it is the present one no longer: another thread may look
+            self._series = None
+
+    def _anew(self, places: Mapping[int, Place]) -> Backlog:
+        return Backlog(self._times.before_s, round(self._times.before_mb * 1e6), places)
+
+    @property
+    def _all(self) -> list[Series]:
+        present = self._series
+        return [*self._ending, *([present] if present else [])]
+
+    def tend(self) -> bool:
+        """Look after the files; whether a doubtful one was given up."""
+        for series in [series for series in self._ending if series.ended]:
+            for unclosed in series.close(0):
+                log.error("%s", unclosed)
+            self._ending.remove(series)
+        return bool(self._series and self._series.tend())
+
+    @property
+    def problem(self) -> str:
+        """What is wrong at present, in words; empty: nothing."""
+        return next(filter(None, (series.problem for series in self._all)), self._problem)
+
+    @property
+    def file(self) -> Path | None:
+        """What is being written; None: it waits for its trigger."""
+        return self._series.file if self._series else None
+
+    @property
+    def written(self) -> int:
+        """Bytes in the present file."""
+        return self._series.written if self._series else 0
+
+    def present(self) -> set[Path]:
+        """What is being written; asked from another thread."""
+        return {path for series in self._all for path in series.present()}
+
+    def close(self, patience_s: float = CLOSE_S) -> list[str]:
+        """Take what is there, close all files; what is wrong with those that are not whole."""
+        while self.turn():
+            pass
+        self._end(self.tap.rest())
+        until_s = time.monotonic() + patience_s
+        return [text for series in self._ending for text in series.close(max(0.1, until_s - time.monotonic()))]

@@ -1,0 +1,158 @@
+"""A recording as MCAP: channels for the frames and events of each block, for gaps, steps and processes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import IO, Final, cast
+
+import mcap.writer
+
+from shmio import __version__
+from shmio.layout.model import Layout
+from shmio.recorder.output import Output
+from shmio.recording.format.blocks import DumpBlock
+from shmio.recording.format.encoding import (
+    ABOUT,
+    EVENT,
+    EVENT_SCHEMA,
+    FRAME_V2,
+    FRAME_V2_SCHEMA,
+    GAP_SCHEMA,
+    GAPS_TOPIC,
+    PLACES,
+    PLAIN,
+    PROCESS_SCHEMA,
+    PROCESSES_TOPIC,
+    PROFILE,
+    STEP_SCHEMA,
+    STEPS_TOPIC,
+    Gap,
+    Place,
+    ProcessChange,
+    StepMark,
+    differ,
+    encode_event,
+    encode_frame,
+    encode_json,
+    encode_place,
+)
+from shmio.segment import Block, Event, Frame
+
+CHUNK_BYTES: Final = 1 << 20
+
+JSON: Final = "application/json"
+TOML: Final = "application/toml"
+TEXT: Final = "text/plain"
+
+
+@dataclass(frozen=True, slots=True)
+class Channels:
+    """Where the messages of one block go."""
+
+    frames: int
+    events: int
+
+
+class Writer:
+    """Writes one recording; one thread. With an :class:`Output` nothing here waits for the disk."""
+
+    def __init__(self, output: Output | IO[bytes], about: Mapping[str, str]) -> None:
+        """``output``: or any other file. ``about``: what the reader is told of the instance."""
+        self._output = output
+        self._mcap = mcap.writer.Writer(cast("IO[bytes]", output), chunk_size=CHUNK_BYTES, enable_data_crcs=True)
+        self._mcap.start(PROFILE, f"shmio {__version__}")
+        self._mcap.add_metadata(ABOUT, dict(about))
+        self._schemas: dict[str, int] = {}
+        self._own: dict[str, int] = {}
+        self.flush()
+
+    def places(self, places: Mapping[int, Place]) -> None:
+        """Tell where the recorder before had come to, by section: it may be all that there is of a block."""
+        if places:
+            self._mcap.add_metadata(PLACES, {str(section): encode_place(place) for section, place in places.items()})
+
+    def attach(self, name: str, media_type: str, data: bytes, now_ns: int, changed_ns: int = 0) -> None:
+        """Attach a file."""
+        self._mcap.add_attachment(changed_ns, now_ns, name, media_type, data)
+
+    def open_block(
+        self,
+        block: Block | DumpBlock,
+        number: int,
+        after_frame: int,
+        after_event: int,
+        layout: Layout | None = None,
+        of: str = "",
+    ) -> Channels:
+        """Begin a block: the ``number``-th in this recording, behind these numbers. Its layout was attached before.
+
+        ``layout``: what is recorded of it, if that is not all; ``of``: the hash of the whole, if that is another's.
+        """
+        layout = layout or block.layout
+        self.flush()  # a channel's record is in the chunk of its block's first message, for readers without an index
+        about = {
+            "source": block.source,
+            "block": str(number),
+            "section": str(block.section),
+            "layout": layout.hash.hex(),
+            "period_ns": str(block.period_ns),
+            "stale_ns": str(block.stale_ns),
+        }
+        if of or layout.hash != block.layout.hash:
+            about["of"] = of or block.layout.hash.hex()
+        frames, events = about | {"after": str(after_frame)}, about | {"after": str(after_event)}
+        return Channels(
+            self._mcap.register_channel(
+                f"{block.source}/frames", FRAME_V2, self._schema(FRAME_V2, FRAME_V2_SCHEMA), frames
+            ),
+            self._mcap.register_channel(f"{block.source}/events", EVENT, self._schema(EVENT, EVENT_SCHEMA), events),
+        )
+
+    def _schema(self, name: str, text: bytes) -> int:
+        if name not in self._schemas:
+            self._schemas[name] = self._mcap.register_schema(name, "text/plain", text)
+        return self._schemas[name]
+
+    def frame(self, channels: Channels, frame: Frame, log_ns: int) -> None:
+        """Add a frame."""
+        told_ns = frame.source_ns if frame.source_ns > 0 else log_ns
+        sequence = frame.number & 0xFFFFFFFF
+        data = differ(encode_frame(frame), sequence, log_ns, told_ns)
+        self._mcap.add_message(channels.frames, log_ns, data, told_ns, sequence)
+
+    def event(self, channels: Channels, event: Event, log_ns: int) -> None:
+        """Add an event."""
+        told_ns = event.utc_ns if event.utc_ns > 0 else log_ns
+        self._mcap.add_message(channels.events, log_ns, encode_event(event), told_ns, event.number & 0xFFFFFFFF)
+
+    def gap(self, gap: Gap, log_ns: int) -> None:
+        """Tell what was missed; it comes before what follows it."""
+        self._mcap.add_message(self._channel(GAPS_TOPIC, "shmio.gap.v1", GAP_SCHEMA), log_ns, encode_json(gap), log_ns)
+
+    def step(self, mark: StepMark, log_ns: int) -> None:
+        """Tell that a step is done; it comes after all its frames."""
+        channel = self._channel(STEPS_TOPIC, "shmio.step.v1", STEP_SCHEMA)
+        self._mcap.add_message(channel, log_ns, encode_json(mark), log_ns, mark.step & 0xFFFFFFFF)
+
+    def process(self, change: ProcessChange, log_ns: int) -> None:
+        """Tell what has happened to a process."""
+        channel = self._channel(PROCESSES_TOPIC, "shmio.process.v1", PROCESS_SCHEMA)
+        self._mcap.add_message(channel, log_ns, encode_json(change), log_ns)
+
+    def _channel(self, topic: str, schema: str, text: bytes) -> int:
+        """A channel of the instance's own, described in the chunk of its first message."""
+        if topic not in self._own:
+            self.flush()
+            number = self._mcap.register_schema(schema, "jsonschema", text)
+            self._own[topic] = self._mcap.register_channel(topic, PLAIN, number)
+        return self._own[topic]
+
+    def flush(self) -> None:
+        """End the chunk; what was added is on its way to the file."""
+        self._mcap.flush()
+
+    def finish(self) -> None:
+        """Write index and footer: the recording is closed."""
+        self._mcap.finish()
+        self._output.flush()

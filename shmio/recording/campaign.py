@@ -1,0 +1,198 @@
+"""What was injected in a recording, as declared injections that do the same again."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import msgspec
+
+from shmio.config import Declaration
+from shmio.recording.dump import Dump
+from shmio.recording.explain import Explained, Explainer, Place
+from shmio.segment.events import NO_WRITER, Event, EventKind
+
+NS = 1e9
+
+
+@dataclass(slots=True)
+class _Held:
+    """A value that a client gave, since when."""
+
+    place: Place
+    since_ns: int
+
+
+@dataclass(slots=True)
+class _Laid:
+    """An injection from the time when it was laid, the ``place``-th."""
+
+    place: int
+    name: str
+    since_ns: int
+    declaration: Declaration | None
+    """None: a client gave it values."""
+    priority: int = 0
+    held: dict[str, _Held] = field(default_factory=dict)
+    """By path, what it gave last."""
+
+
+@dataclass(slots=True)
+class Derived:
+    """Declarations, source by source, as they were laid (of several over one register the newest is outermost).
+
+    ``left_out``: what of the recording's injections is not in them.
+    """
+
+    declarations: list[Declaration] = field(default_factory=list)
+    left_out: list[str] = field(default_factory=list)
+
+    @property
+    def begin_s(self) -> float:
+        """When the first of them begins; 0: there is none, or it is there from the start."""
+        return min((one.start_s or 0.0 for one in self.declarations), default=0.0)
+
+    def shifted(self, by_s: float) -> list[Declaration]:
+        """The declarations, by so much earlier."""
+        return [
+            msgspec.structs.replace(
+                one,
+                start_s=None if not (start_s := _round((one.start_s or 0.0) - by_s)) else start_s,
+                end_s=None if one.end_s is None else _round(one.end_s - by_s),
+            )
+            for one in self.declarations
+        ]
+
+
+def derive(dump: Dump) -> Derived:
+    """Declarations that do what was injected while it was recorded, by the times of the instance's clock.
+
+    A declared injection is there as it was declared, with its seed; from when it was laid, and until it was lifted.
+    What a client's injection gave to consumers is a ``set`` from each value to the next. A client's injection over
+    ``/in``, whose values depend on what is written, cannot be declared.
+    """
+    found = Derived()
+    for source in dump.sources:
+        work = _Source(found)
+        explainers: dict[int, Explainer] = {}
+        for _, block, event in dump.events(source):
+            if block is not None:
+                explainer = explainers.setdefault(block.section, Explainer(source, block.layout))
+                work.follow(event, explainer.explain(event))
+        work.end()
+    found.declarations = list(_named(found))
+    return found
+
+
+class _Source:
+    def __init__(self, found: Derived) -> None:
+        self._found = found
+        self._laid: dict[int, _Laid] = {}
+        self._declared: list[tuple[int, Declaration]] = []
+        self._count = 0
+        self._unknown: set[int] = set()
+
+    def follow(self, event: Event, explained: Explained) -> None:
+        if event.kind == EventKind.INJECTED and explained.laid is not None:
+            self._lay(event, explained)
+        elif event.kind == EventKind.SHADOWED:
+            self._shadow(event, explained)
+        elif event.kind == EventKind.LIFTED and event.injection in self._laid:
+            self._lift(self._laid.pop(event.injection), event)
+
+    def _lay(self, event: Event, explained: Explained) -> None:
+        how = dict(explained.laid or {})
+        declaration = None
+        if event.writer == NO_WRITER:
+            self._found.left_out.append(
+                f"{event.text}: no command has laid it: the configuration, or a replayed recording, does"
+            )
+            return
+        if "operation" in how:
+            try:
+                declaration = msgspec.convert(how, Declaration)
+            except msgspec.ValidationError as error:
+                self._found.left_out.append(f"{event.text}: {error}")
+                return
+        elif explained.direction == "in":
+            self._found.left_out.append(
+                f"{event.text or event.injection}: a client gave it values over /in, which depended on what was written"
+            )
+            return
+        priority = how.get("priority", 0)
+        self._count += 1
+        self._laid[event.injection] = _Laid(
+            self._count, event.text, event.clock_ns, declaration, priority if isinstance(priority, int) else 0
+        )
+
+    def _shadow(self, event: Event, explained: Explained) -> None:
+        laid = self._laid.get(event.injection)
+        if laid is None:
+            if event.injection not in self._unknown:
+                self._unknown.add(event.injection)
+                self._found.left_out.append(f"{event.text or event.injection}: it was laid before the recording began")
+            return
+        for place in explained.places:
+            before = laid.held.get(place.path)
+            if not place.valued:
+                continue
+            if before is not None and before.place.value == place.value:
+                continue
+            if before is not None:
+                self._set(laid, before, event.clock_ns)
+            laid.held[place.path] = _Held(place, event.clock_ns)
+
+    def _lift(self, laid: _Laid, event: Event) -> None:
+        for held in laid.held.values():
+            self._set(laid, held, event.clock_ns)
+        if laid.declaration is not None:
+            self._declare(laid, laid.declaration, None if event.text == "over" else event.clock_ns)
+
+    def end(self) -> None:
+        """What stands at the recording's end stands for ever."""
+        for laid in self._laid.values():
+            for held in laid.held.values():
+                self._set(laid, held, None)
+            if laid.declaration is not None:
+                self._declare(laid, laid.declaration, None)
+        self._declared.sort(key=lambda pair: pair[0])
+        self._found.declarations += [one for _, one in self._declared]
+
+    def _set(self, laid: _Laid, held: _Held, until_ns: int | None) -> None:
+        place = held.place
+        value = place.plain
+        if value is None or (isinstance(value, float) and not math.isfinite(value)):
+            value = place.text
+        name = laid.name or place.path.replace("/", "-")
+        one = Declaration(name=name, target=place.path, operation="set", value=value, priority=laid.priority)
+        self._declare(laid, one, until_ns, held.since_ns)
+
+    def _declare(self, laid: _Laid, one: Declaration, until_ns: int | None, since_ns: int | None = None) -> None:
+        """Within these times, too. A change is seen from the next cycle on: in virtual time that is a later moment."""
+        since_s = (max(0, laid.since_ns if since_ns is None else since_ns) + 1) / NS
+        if since_s > max(one.start_s or 0.0, 1 / NS):
+            one = msgspec.structs.replace(one, start_s=_round(since_s))
+        if until_ns is not None and (one.end_s is None or one.end_s > (until_ns + 1) / NS):
+            one = msgspec.structs.replace(one, end_s=_round((until_ns + 1) / NS))
+        if one.end_s is None or one.end_s > (one.start_s or 0.0):
+            self._declared.append((laid.place, one))
+
+
+def _named(found: Derived) -> Iterator[Declaration]:
+    """Each with a name of its own; what is random in one that gets another name is not what it was."""
+    seen: dict[str, int] = {}
+    for one in found.declarations:
+        count = seen[one.name] = seen.get(one.name, 0) + 1
+        if count == 1:
+            yield one
+            continue
+        name = f"{one.name}-{count}"
+        if one.seed is not None and one.operation != "set":
+            found.left_out.append(f"{name}: a second one named {one.name}; what is random in it follows from its name")
+        yield msgspec.structs.replace(one, name=name)
+
+
+def _round(seconds: float) -> float:
+    """To the ns, as times are kept."""
+    return round(seconds, 9)

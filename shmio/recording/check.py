@@ -1,0 +1,197 @@
+"""Reads all of a recording and holds it to what its format promises (docs/reference/dump-format.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from mcap.opcode import Opcode
+
+from shmio.errors import RecordingError
+from shmio.recording.format.channels import Channel
+from shmio.recording.format.damage import Damage, DamageLog
+from shmio.recording.format.encoding import EVENT, FRAME, Gap
+from shmio.recording.format.framing import U32, U64
+from shmio.recording.format.records import BROKEN, Record
+from shmio.recording.reading.reader import Reader
+from shmio.recording.reading.survey import MAX_BLOCKS, Count, read_index
+
+MAX_TOLD: Final = 1000
+"""Damaged places, and contradictions, that are kept one by one; all are counted."""
+
+
+@dataclass(slots=True)
+class Findings:
+    """What a check has found."""
+
+    chunks: int = 0
+    """That are whole."""
+    messages: int = 0
+    damage: list[Damage] = field(default_factory=list)
+    """The first places that cannot be read."""
+    problems: list[str] = field(default_factory=list)
+    """What can be read and contradicts itself: the first ones."""
+    count: int = 0
+    """Of both."""
+
+    @property
+    def whole(self) -> bool:
+        """Whether all that the recorder wrote is there, unchanged."""
+        return self.count == 0
+
+
+def check(reader: Reader, at: Callable[[int], object] = lambda _: None) -> Findings:
+    """Read the whole file: every CRC, every message, and that the numbers of each block go on without a hole but gaps.
+
+    ``at`` is told which byte it has come to.
+    A file that was not closed is held to what is there of it. RecordingError: it is no recording of ours.
+    """
+    work = _Check(reader)
+    for record in reader.records.walk():
+        at(record.start)
+        work.take(record)
+    return work.end()
+
+
+class _Check:
+    def __init__(self, reader: Reader) -> None:
+        self._reader = reader
+        self._records = reader.records
+        self._found = Findings()
+        self._log = DamageLog(self._damaged)
+        self._numbers = _Numbers(self._problem)
+        self._chunk: Record | None = None
+        """The last one, and the messages in it, which its indexes are to agree with."""
+        self._counts: dict[int, Count] = {}
+        self._indexes: dict[int, Count] = {}
+
+    def take(self, record: Record) -> None:
+        """The next record."""
+        try:
+            if record.opcode == Opcode.MESSAGE_INDEX:
+                self._index(record)
+                return
+            if record.opcode != BROKEN:  # which may be the rest of the indexes
+                self._compare_indexes()
+            self._chunk, self._counts, self._indexes = None, {}, {}
+            if record.opcode == Opcode.CHUNK:
+                self._read_chunk(record)
+                return
+            self._reader.note(record)
+            if record.opcode == Opcode.ATTACHMENT:
+                self._records.check_crc(record)
+            elif record.opcode == Opcode.DATA_END:
+                self._check_data(record)
+            elif record.opcode == Opcode.FOOTER and (damage := self._records.summary_damage()):
+                self._problem(damage)
+        except RecordingError as error:
+            self._log.add(record, error)
+
+    def end(self) -> Findings:
+        """What was found; RecordingError."""
+        self._log.end()
+        self._reader.require_ours()
+        return self._found
+
+    def _damaged(self, damage: Damage) -> None:
+        self._found.count += 1
+        if len(self._found.damage) < MAX_TOLD:
+            self._found.damage.append(damage)
+
+    def _problem(self, text: str) -> None:
+        self._found.count += 1
+        if len(self._found.problems) < MAX_TOLD:
+            self._found.problems.append(text)
+
+    # ---- chunks ------------------------------------------------------------------------------------------------------
+
+    def _read_chunk(self, record: Record) -> None:
+        first_ns, last_ns = self._records.chunk_times(record)
+        messages = self._reader.raw(record)
+        self._log.end(first_ns)
+        times: list[int] = []
+        problem: RecordingError | None = None
+        for channel, log_ns, data in messages:
+            times.append(log_ns)
+            old = self._counts.get(channel.number, Count(channel.number, 0, log_ns, log_ns))
+            self._counts[channel.number] = old._replace(messages=old.messages + 1, last_ns=log_ns)
+            try:
+                self._message(channel, data)
+            except RecordingError as error:
+                problem = error
+        if problem:
+            raise problem
+        self._log.after(last_ns)
+        self._found.chunks += 1
+        self._found.messages += len(times)
+        self._chunk = record
+        if times and (min(times), max(times)) != (first_ns, last_ns):
+            self._problem(f"the chunk at byte {record.at}: its times are not those of its messages")
+
+    def _message(self, channel: Channel, data: memoryview) -> None:
+        if channel.encoding in (EVENT, FRAME) and len(data) >= U64.size:  # even if the rest is not to be decoded
+            self._numbers.take(channel, *U64.unpack_from(data))
+        item = self._reader.decode(channel, data)
+        if isinstance(item, Gap):
+            self._numbers.gap(item)
+
+    def _index(self, record: Record) -> None:
+        count = read_index(self._reader, record)
+        if count is None:
+            raise RecordingError(f"{self._reader.file}: the index at byte {record.at} is damaged")
+        channel = self._reader.channel(count.channel)
+        if channel is None or channel.encoding:  # or another program's
+            self._indexes[count.channel] = count
+
+    def _compare_indexes(self) -> None:
+        if self._chunk is not None and self._indexes != self._counts:
+            self._problem(f"the chunk at byte {self._chunk.at}: its indexes are not of what is in it")
+
+    # ---- the rest ----------------------------------------------------------------------------------------------------
+
+    def _check_data(self, record: Record) -> None:
+        """The CRC of everything, for what has none of its own: metadata, times, indexes."""
+        self._log.end()
+        (crc,) = U32.unpack(self._records.read(record.at, U32.size))
+        if crc and self._found.whole and self._records.crc(0, record.start) != crc:
+            self._problem("bytes between the chunks were changed: the checksum of all data is wrong")
+
+
+class _Numbers:
+    """Holds the numbers of each block's frames and events to going on by one, messages and gaps taken together."""
+
+    def __init__(self, problem: Callable[[str], None]) -> None:
+        self._problem = problem
+        self._last: dict[tuple[str, int, str], int] = {}
+        self._first: dict[tuple[str, int, str], int] = {}
+        self._known: set[int] = set()
+
+    def take(self, channel: Channel, number: int) -> None:
+        """A frame's or an event's number."""
+        key = channel.source, channel.block, "frames" if channel.encoding == FRAME else "events"
+        if channel.number not in self._known:
+            self._known.add(channel.number)
+            begin = self._first.get(key, number)
+            if begin != channel.after + 1:
+                self._broken(key, channel.after, begin)
+        self._go_on(key, number, number)
+
+    def gap(self, gap: Gap) -> None:
+        """What was missed."""
+        self._go_on((gap.source, gap.block, gap.what), gap.first, gap.last)
+
+    def _go_on(self, key: tuple[str, int, str], first: int, last: int) -> None:
+        if key not in self._last:
+            if len(self._last) >= MAX_BLOCKS:
+                raise RecordingError(f"messages and gaps of more than {MAX_BLOCKS} blocks")
+            self._first[key] = first
+        elif first != self._last[key] + 1:
+            self._broken(key, self._last[key], first)
+        self._last[key] = max(last, self._last.get(key, 0))
+
+    def _broken(self, key: tuple[str, int, str], last: int, number: int) -> None:
+        source, block, what = key
+        missing = f"{what} {last + 1} to {number - 1} are neither there nor in a gap"
+        again = f"{what}: {number} comes after {last}"
+        self._problem(f"{source}, block {block}: {missing if number > last else again}")

@@ -1,0 +1,183 @@
+"""Registers of a recording as numpy arrays, and as tables of other libraries."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import product
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+from shmio.errors import RecordingError
+from shmio.layout.model import ByteOrder, Layout, Register
+from shmio.layout.values.frame_codec import FrameCodec
+from shmio.recording.format.blocks import DumpBlock
+from shmio.recording.libraries import ANALYSIS, library
+from shmio.recording.reading.batch import HEAD, Batch
+
+if TYPE_CHECKING:
+    import pandas
+    import polars
+    import pyarrow
+
+Array = npt.NDArray[Any]
+
+FIELDS: Final = ("number", "cycle", "source_ns", "quality", "provenance")
+"""What a frame's header gives a column of."""
+OF_FRAMES: Final = frozenset({"time", "source_time", "number", "cycle", "quality", "provenance"})
+"""What tables call that, and the times."""
+DECODED_BYTES: Final = 1 << 20
+"""So many bytes of frames are decoded at once."""
+
+
+@dataclass(frozen=True)
+class Columns(Mapping[str, Array]):
+    """Registers of one source over n frames: a mapping of paths to arrays (n, …), of the types of ``framecodec.py``.
+
+    ``time_ns``: (n,) int64, log times in UTC; ``source_ns``: the source's own time stamps, 0 while it never had an
+    image, whose values are zeros then. ``quality``: 0 bad, 1 uncertain, 2 good; ``provenance``: 0 live, 1 simulated,
+    2 replayed, 3 injected.
+    """
+
+    source: str
+    registers: tuple[Register, ...]
+    time_ns: npt.NDArray[np.int64]
+    number: npt.NDArray[np.uint64]
+    cycle: npt.NDArray[np.uint64]
+    source_ns: npt.NDArray[np.int64]
+    quality: npt.NDArray[np.uint8]
+    provenance: npt.NDArray[np.uint8]
+    values_by_path: Mapping[str, Array]
+
+    def __getitem__(self, path: str) -> Array:
+        """A register's values, by its path without the source."""
+        return self.values_by_path[path]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values_by_path)
+
+    def __len__(self) -> int:
+        return len(self.values_by_path)
+
+    def to_arrow(self) -> pyarrow.Table:
+        """A table: time, number, cycle, quality, and each register, arrays as lists. MissingLibraryError."""
+        from shmio.recording.arrow import table  # noqa: PLC0415  pyarrow only for those who ask for it
+
+        return table(self)
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """A frame indexed by time, a column for each register and each element of an array. MissingLibraryError."""
+        pandas = library("pandas", ANALYSIS)
+        data = {"number": self.number, "cycle": self.cycle, "quality": self.quality, **self._flat()}
+        return pandas.DataFrame(data, index=pandas.to_datetime(self.time_ns, utc=True).rename("time"))
+
+    def to_polars(self) -> polars.DataFrame:
+        """The same, with ``time`` as its first column. MissingLibraryError."""
+        polars = library("polars", ANALYSIS)
+        time = polars.Series("time", self.time_ns).cast(polars.Datetime("ns", "UTC"))
+        data = {"number": self.number, "cycle": self.cycle, "quality": self.quality, **self._flat()}
+        return polars.DataFrame([time, *(polars.Series(name, values) for name, values in data.items())])
+
+    def _flat(self) -> dict[str, Array]:
+        return {
+            heading(self.source, name): values
+            for register in self.registers
+            for name, values in flat(register, self[register.path])
+        }
+
+
+def heading(source: str, path: str, taken: Collection[str] = OF_FRAMES) -> str:
+    """What a table calls the column of a register: its path, with its source if the frame's own columns have that."""
+    return f"{source}/{path}" if path in taken else path
+
+
+def flat(register: Register, values: Array) -> Iterator[tuple[str, Array]]:
+    """(path, (n,) values) of a register, or of each element of an array; POINTER and ANY in hexadecimal digits."""
+    if values.dtype.kind == "V":
+        texts = [bytes(value).hex() for value in values.reshape(-1)]
+        values = np.array(texts, f"U{2 * values.dtype.itemsize}").reshape(values.shape)
+    if not register.dims:
+        yield register.path, values
+        return
+    rows = values.reshape(len(values), register.count)
+    for flat_index, place in enumerate(product(*(range(length) for length in register.shape))):
+        index = "/".join(str(low + at) for at, (low, _) in zip(place, register.dims, strict=True))
+        yield f"{register.path}/{index}", rows[:, flat_index]
+
+
+class Collector:
+    """Puts batches together to columns."""
+
+    def __init__(self, source: str) -> None:
+        self._source = source
+        self._registers: tuple[Register, ...] = ()
+        self._codec: FrameCodec | None = None
+        self._waiting: list[Batch] = []
+        self._waiting_bytes = 0
+        self._times: list[npt.NDArray[np.int64]] = []
+        self._heads: list[Array] = []
+        self._decoded: list[Array] = []
+
+    @property
+    def begun(self) -> bool:
+        """Whether it is known which registers there are."""
+        return self._codec is not None
+
+    def begin(self, block: DumpBlock, registers: Sequence[Register]) -> None:
+        """Of this block, these registers. RecordingError: they were others until now."""
+        codec = record_codec(tuple(registers), block.layout.size, block.layout.byte_order)
+        if self._codec is codec:
+            return
+        if self._codec is not None and self._codec.dtype != codec.dtype:
+            raise RecordingError(
+                f"{self._source}: a reload changed the registers that were asked for: ask for a time before or after it"
+            )
+        self._flush()
+        self._codec, self._registers = codec, tuple(registers)
+
+    def add(self, block: DumpBlock, registers: Sequence[Register], batch: Batch) -> None:
+        """The next frames; RecordingError as :meth:`begin`."""
+        self.begin(block, registers)
+        self._waiting.append(batch)
+        self._waiting_bytes += batch.records.nbytes
+        if self._waiting_bytes >= DECODED_BYTES:
+            self._flush()
+
+    def _flush(self) -> None:
+        if self._waiting and self._codec is not None:
+            records = np.concatenate([batch.records for batch in self._waiting])
+            self._times += [batch.time_ns for batch in self._waiting]
+            head = records[:, : HEAD.itemsize].view(HEAD)[:, 0]
+            kept = np.empty(len(head), [(name, HEAD[name]) for name in FIELDS])
+            for name in FIELDS:
+                kept[name] = head[name]
+            self._heads.append(kept)
+            self._decoded.append(self._codec.decode(records))
+        self._waiting, self._waiting_bytes = [], 0
+
+    @property
+    def bytes(self) -> int:
+        """About how much is held."""
+        return self._waiting_bytes + sum(some.nbytes for some in self._decoded)
+
+    def columns(self) -> Columns:
+        """What was added since the last call."""
+        self._flush()
+        assert self._codec is not None  # noqa: S101  begin() came first
+        decoded = np.concatenate([np.empty(0, self._codec.dtype), *self._decoded])
+        heads = np.concatenate([np.empty(0, [(name, HEAD[name]) for name in FIELDS]), *self._heads])
+        header = {name: np.ascontiguousarray(heads[name]) for name in FIELDS}
+        values = {register.path: np.ascontiguousarray(decoded[register.path]) for register in self._registers}
+        time_ns = np.concatenate([np.empty(0, np.int64), *self._times])
+        self._times, self._heads, self._decoded = [], [], []
+        return Columns(self._source, self._registers, time_ns, **header, values_by_path=values)
+
+
+@lru_cache(maxsize=64)
+def record_codec(registers: tuple[Register, ...], size: int, byte_order: ByteOrder) -> FrameCodec:
+    """What decodes registers out of a batch's records: of images of this size behind a header."""
+    shifted = tuple(replace(register, offset=register.offset + HEAD.itemsize) for register in registers)
+    return FrameCodec(Layout("", None, HEAD.itemsize + size, False, shifted, byte_order))

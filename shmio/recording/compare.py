@@ -1,0 +1,431 @@
+"""What two recordings have in common, and where they differ: frame by frame, event by event."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, TypeVar
+
+from shmio.errors import PathError
+from shmio.layout.model import Layout, Register
+from shmio.layout.values.codec import Value, codec
+from shmio.layout.values.write import elements
+from shmio.recording.dump import Dump
+from shmio.recording.format.blocks import DumpBlock
+from shmio.recording.format.entries import Entry
+from shmio.recording.joining import EVENT_FIELDS, Pair, aligned, at_once, joined, one_by_one
+from shmio.segment import Event, EventKind, Frame, Provenance
+from shmio.segment.changed_registers import ChangeScan
+from shmio.segment.playhead import OWN_WORDS
+
+
+@dataclass(slots=True)
+class RegisterDifference:
+    """A register that differs in ``count`` frames, first in those at these times; ``largest``: of numbers."""
+
+    count: int
+    first: tuple[int, int]
+    values: tuple[Value, Value]
+    largest: float = 0.0
+
+
+@dataclass(slots=True)
+class Difference:
+    """Something that differs first: at these log times, numbers of frames or events; None: one has none."""
+
+    times_ns: tuple[int | None, int | None]
+    numbers: tuple[int | None, int | None]
+    what: list[str]
+
+
+@dataclass(slots=True)
+class Side:
+    """Frames or events of one source in both."""
+
+    compared: int = 0
+    differing: int = 0
+    only_first: int = 0
+    only_second: int = 0
+    first: Difference | None = None
+
+    @property
+    def same(self) -> bool:
+        """Whether both have the same."""
+        return not (self.differing or self.only_first or self.only_second)
+
+
+class Timing:
+    """How far the distances of frames to the first one differ; percentiles to 5 %, in little memory."""
+
+    def __init__(self) -> None:
+        self._bins: dict[int, int] = {}
+        self._count = 0
+        self._first: tuple[int, int] | None = None
+        self.max_ns = 0
+
+    def add(self, first_ns: int, second_ns: int) -> None:
+        """Log times of two frames that belong together."""
+        if self._first is None:
+            self._first = first_ns, second_ns
+        error_ns = abs((first_ns - self._first[0]) - (second_ns - self._first[1]))
+        self.max_ns = max(self.max_ns, error_ns)
+        place = round(math.log(error_ns + 1) * 20)
+        self._bins[place] = self._bins.get(place, 0) + 1
+        self._count += 1
+
+    def percentile_ns(self, percent: float) -> int:
+        """So many of the errors are at most this; 0 without any."""
+        rest = self._count * percent / 100
+        for place in sorted(self._bins):
+            rest -= self._bins[place]
+            if rest <= 0:
+                return min(round(math.exp(place / 20) - 1), self.max_ns)
+        return self.max_ns
+
+
+@dataclass(slots=True)
+class SourceDifference:
+    """One source in both recordings."""
+
+    source: str
+    frames: Side = field(default_factory=Side)
+    events: Side = field(default_factory=Side)
+    registers: dict[str, RegisterDifference] = field(default_factory=dict)
+    fields: dict[str, int] = field(default_factory=dict)
+    """In how many frames something else differs."""
+    missing: list[str] = field(default_factory=list)
+    """Registers that only one has."""
+    timing: Timing = field(default_factory=Timing)
+
+    @property
+    def same(self) -> bool:
+        """Whether nothing differs that was asked for."""
+        return self.frames.same and self.events.same and not self.missing
+
+
+IGNORABLE: Final = ("times", "cycle", "reason", "events", "ends")
+"""``ends``: what one of the two has before the first frame or event of both, or after the last."""
+_OF_PROCESSES: Final = frozenset({EventKind.STARTED, EventKind.STOPPED})
+
+T = TypeVar("T", Frame, Event)
+_Chosen = tuple[Mapping[DumpBlock, Sequence[Register]], Mapping[DumpBlock, Sequence[Register]]]
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """What is compared: ``ignore`` of :data:`IGNORABLE`; ``only`` as of :meth:`Dump.select`, none for all.
+
+    REAL and LREAL are the same within ``tolerance`` or, relative to the larger one, ``relative``.
+    """
+
+    ignore: Collection[str] = ()
+    only: Collection[str] = ()
+    tolerance: float = 0.0
+    relative: float = 0.0
+
+
+def compare(
+    first: Dump,
+    second: Dump,
+    how: Comparison,
+    sources: Collection[str] | None = None,
+    progress: Callable[[int], object] = lambda _: None,
+) -> Iterator[SourceDifference]:
+    """Source by source. ``progress`` is told log times of the first. PathError: no such source, or register, in either.
+
+    Frames belong together that have the same cycle; where that is ignored, the same source time; else in their order.
+    """
+    names = list(dict.fromkeys((*first.sources, *second.sources)))
+    chosen = _chosen(first, how), _chosen(second, how)
+    if how.only:
+        names = [name for name in names if any(block.source == name for some in chosen for block in some)]
+    if sources is not None:
+        unknown = [source for source in sources if source not in names]
+        if unknown:
+            raise PathError(f"no source {unknown[0]!r} in them; there are: {', '.join(names)}")
+        names = list(sources)
+    for name in names:
+        yield _Source(first, second, name, how, chosen, progress).compare()
+
+
+def _chosen(dump: Dump, how: Comparison) -> Mapping[DumpBlock, Sequence[Register]]:
+    return dump.select(how.only) if how.only else {block: block.layout.registers for block in dump.blocks}
+
+
+class _Source:
+    def __init__(
+        self, first: Dump, second: Dump, name: str, how: Comparison, chosen: _Chosen, progress: Callable[[int], object]
+    ) -> None:
+        self._dumps = first, second
+        self._chosen = chosen
+        self._name = name
+        self._how = how
+        self._progress = progress
+        self._found = SourceDifference(name)
+        self._pairs: dict[tuple[DumpBlock, DumpBlock], _Registers] = {}
+        self._common = _Common()
+
+    def compare(self) -> SourceDifference:
+        found = self._found
+        frames = [one_by_one(_frames(dump, self._name), self._frame_key) for dump in self._dumps]
+        self._compare(found.frames, joined(frames[0], frames[1], zip), self._frames)
+        if "events" not in self._how.ignore:
+            events = [at_once(_events(dump, self._name), self._event_key) for dump in self._dumps]
+            self._compare(found.events, joined(events[0], events[1], aligned), self._events)
+        found.missing = sorted({path for pair in self._pairs.values() for path in pair.missing})
+        return found
+
+    def _frame_key(self, entry: Entry[Frame]) -> int:
+        if "cycle" not in self._how.ignore:
+            return entry.item.cycle
+        return 0 if "times" in self._how.ignore else entry.item.source_ns
+
+    def _event_key(self, entry: Entry[Event]) -> int:
+        if "cycle" not in self._how.ignore:
+            return entry.item.cycle
+        if "times" not in self._how.ignore:
+            return entry.item.utc_ns
+        return entry.item.frame - (entry.block.after.get("frames", 0) if entry.block else 0)
+
+    def _compare(
+        self, side: Side, pairs: Iterator[Pair[T]], differs: Callable[[Entry[T], Entry[T]], list[str]]
+    ) -> None:
+        since, inside = _Alone(), _Alone()
+        begun = False
+        for one, other in pairs:
+            if one is None or other is None:
+                since.add(one, other)
+                if self._common.has(one, other):
+                    inside.add(one, other)
+                continue
+            self._alone(side, since if begun else self._of_end(since, inside))
+            since, inside, begun = _Alone(), _Alone(), True
+            side.compared += 1
+            if what := differs(one, other):
+                side.differing += 1
+                self._first(side, one, other, what)
+            self._common.add(one, other)
+            self._progress(one.time_ns)
+        self._alone(side, self._of_end(since, inside))
+
+    def _of_end(self, since: _Alone, inside: _Alone) -> _Alone:
+        """What counts of that which stands before or behind all that both have: events are inside if frames are."""
+        return inside if "ends" in self._how.ignore else since
+
+    def _alone(self, side: Side, alone: _Alone) -> None:
+        if alone.first is not None:
+            side.only_first += alone.counts[0]
+            side.only_second += alone.counts[1]
+            one, other = alone.first
+            self._first(side, one, other, ["only in the first" if other is None else "only in the second"])
+
+    def _first(self, side: Side, one: Entry[Any] | None, other: Entry[Any] | None, what: list[str]) -> None:
+        if side.first is None:
+            side.first = Difference(
+                (one and one.time_ns, other and other.time_ns),
+                (one and one.item.number, other and other.item.number),
+                what,
+            )
+
+    # ---- frames ------------------------------------------------------------------------------------------------------
+
+    def _frames(self, one: Entry[Frame], other: Entry[Frame]) -> list[str]:
+        a, b, ignore = one.item, other.item, self._how.ignore
+        self._found.timing.add(one.time_ns, other.time_ns)
+        what = []
+        if a.quality is not b.quality:
+            what.append(self._field("quality", a.quality, b.quality))
+        if a.reason != b.reason and "reason" not in ignore:
+            what.append(self._field("reason", a.reason, b.reason))
+        if a.source_ns != b.source_ns and "times" not in ignore:
+            what.append(self._field("source time", a.source_ns, b.source_ns))
+        registers = self._registers(one.block, other.block)
+        if registers is not None:
+            for path, values in registers.differing(a, b):
+                what.append(f"{path}: {values[0]} -> {values[1]}")
+                self._register(path, (one.time_ns, other.time_ns), values)
+        return what
+
+    def _registers(self, one: DumpBlock | None, other: DumpBlock | None) -> _Registers | None:
+        """What to compare of two blocks; None: nothing of one of them was asked for."""
+        if one is None or other is None or one not in self._chosen[0] or other not in self._chosen[1]:
+            return None
+        if (one, other) not in self._pairs:
+            self._pairs[one, other] = _Registers((one, other), self._how, self._chosen)
+        return self._pairs[one, other]
+
+    def _field(self, name: str, one: object, other: object) -> str:
+        self._found.fields[name] = self._found.fields.get(name, 0) + 1
+        return f"{name}: {one!s} -> {other!s}"
+
+    def _register(self, path: str, times_ns: tuple[int, int], values: tuple[Value, Value]) -> None:
+        found = self._found.registers.get(path)
+        if found is None:
+            found = self._found.registers[path] = RegisterDifference(0, times_ns, values)
+        found.count += 1
+        if all(isinstance(value, int | float) for value in values):
+            found.largest = max(found.largest, abs(float(values[0]) - float(values[1])))  # type: ignore[arg-type]
+
+    # ---- events ------------------------------------------------------------------------------------------------------
+
+    def _events(self, one: Entry[Event], other: Entry[Event]) -> list[str]:
+        return [
+            f"{name}: {getattr(one.item, name)!s} -> {getattr(other.item, name)!s}"
+            for name in EVENT_FIELDS
+            if getattr(one.item, name) != getattr(other.item, name)
+        ]
+
+
+class _Alone:
+    """What one of the two alone has, since both had the same."""
+
+    def __init__(self) -> None:
+        self.counts = [0, 0]
+        self.first: tuple[Entry[Any] | None, Entry[Any] | None] | None = None
+
+    def add(self, one: Entry[Any] | None, other: Entry[Any] | None) -> None:
+        self.counts[one is None] += 1
+        self.first = self.first or (one, other)
+
+
+class _Common:
+    """The time, in each of the two, from the first to the last that both have."""
+
+    def __init__(self) -> None:
+        self._times: tuple[tuple[int, int], tuple[int, int]] | None = None
+
+    def add(self, one: Entry[Any], other: Entry[Any]) -> None:
+        first, last = self._times or (((one.time_ns, other.time_ns),) * 2)
+        self._times = (
+            (min(first[0], one.time_ns), min(first[1], other.time_ns)),
+            (max(last[0], one.time_ns), max(last[1], other.time_ns)),
+        )
+
+    def has(self, one: Entry[Any] | None, other: Entry[Any] | None) -> bool:
+        """Whether what only one of them has lies within."""
+        if self._times is None:
+            return False
+        first, last = self._times
+        return all(
+            entry is None or first[place] <= entry.time_ns <= last[place] for place, entry in enumerate((one, other))
+        )
+
+
+class _Registers:
+    """The registers that two blocks have in common."""
+
+    def __init__(self, blocks: tuple[DumpBlock, DumpBlock], how: Comparison, chosen: _Chosen) -> None:
+        first, second = blocks
+        ones, others = (
+            {register.path: register for register in some[block]} for block, some in zip(blocks, chosen, strict=True)
+        )
+        both = [path for path in ones if path in others and _kind(ones[path]) == _kind(others[path])]
+        self.missing = sorted((ones.keys() | others.keys()) - set(both))
+        self._layouts = first.layout, second.layout
+        alike = first.layout.size == second.layout.size and first.layout.byte_order == second.layout.byte_order
+        alike = alike and all(ones[path].offset == others[path].offset for path in both)
+        self._all = _Places([(ones[path], others[path]) for path in both], self._layouts, how, alike=alike)
+        self._of_array: dict[str, _Places] = {}
+
+    def differing(self, one: Frame, other: Frame) -> Iterator[tuple[str, tuple[Value, Value]]]:
+        """Paths and values, of an array its elements; of what was delivered, if that alone differs."""
+        seen = set()
+        for path, values in self._images(one.image, other.image):
+            seen.add(path)
+            yield path, values
+        if one.effective is not None or other.effective is not None:
+            for path, values in self._images(one.raw, other.raw):
+                if path not in seen:
+                    yield path, values
+
+    def _images(self, one: bytes, other: bytes) -> Iterator[tuple[str, tuple[Value, Value]]]:
+        for pair, values in self._all.differing(one, other):
+            if not pair[0].dims:
+                yield pair[0].path, values
+                continue
+            for element, (a, b) in self._elements(pair).differing(one, other):
+                yield element[0].path, (a, b)
+
+    def _elements(self, pair: tuple[Register, Register]) -> _Places:
+        path = pair[0].path
+        if path not in self._of_array:
+            both = (elements(layout, register) for layout, register in zip(self._layouts, pair, strict=True))
+            self._of_array[path] = self._all.like(list(zip(*both, strict=True)))
+        return self._of_array[path]
+
+
+class _Places:
+    """Registers, or elements of one, where each of two layouts has them."""
+
+    def __init__(
+        self,
+        pairs: Sequence[tuple[Register, Register]],
+        layouts: tuple[Layout, Layout],
+        how: Comparison,
+        *,
+        alike: bool,
+    ) -> None:
+        """``alike``: both layouts have them at the same places, so that bytes can be compared."""
+        self._pairs = pairs
+        self._how = how
+        self._layouts = layouts
+        self._tolerant = how.tolerance > 0 or how.relative > 0
+        self._codecs = [
+            (codec(one, layouts[0].byte_order), codec(other, layouts[1].byte_order)) for one, other in pairs
+        ]
+        self._scan = ChangeScan([one for one, _ in pairs]) if alike else None
+
+    def like(self, pairs: Sequence[tuple[Register, Register]]) -> _Places:
+        """Others of the same layouts."""
+        return _Places(pairs, self._layouts, self._how, alike=self._scan is not None)
+
+    def differing(self, one: bytes, other: bytes) -> Iterator[tuple[tuple[Register, Register], tuple[Value, Value]]]:
+        """Those whose values in two images are not the same."""
+        if self._scan is not None and one == other:
+            return
+        places = range(len(self._pairs)) if self._scan is None else self._scan.changed(one, other)
+        for place in places:
+            codec_of_one, codec_of_other = self._codecs[place]
+            values = codec_of_one.decode(one), codec_of_other.decode(other)
+            if self._scan is None and values[0] == values[1]:
+                continue
+            real = self._pairs[place][0].element.base in ("REAL", "LREAL")
+            if real and (self._scan is None or self._tolerant) and _alike(*values, self._how):
+                continue
+            yield self._pairs[place], values
+
+
+def _alike(one: Value, other: Value, how: Comparison) -> bool:
+    """Whether two values are the same within the tolerance for REAL and LREAL."""
+    if isinstance(one, list) and isinstance(other, list):
+        return all(_alike(a, b, how) for a, b in zip(one, other, strict=True))
+    if not isinstance(one, float) or not isinstance(other, float):
+        return False
+    if math.isnan(one) or math.isnan(other):
+        return math.isnan(one) and math.isnan(other)
+    return math.isclose(one, other, rel_tol=how.relative, abs_tol=how.tolerance)
+
+
+def _kind(register: Register) -> tuple[str, object]:
+    return register.type, register.dims
+
+
+def _frames(dump: Dump, source: str) -> Iterator[Entry[Frame]]:
+    """Those of the source itself: what a replay says of its own is not."""
+    if source in dump.sources:
+        for entry in dump.frames(source):
+            if entry.item.provenance is not Provenance.REPLAYED or not entry.item.reason.startswith(OWN_WORDS):
+                yield entry
+
+
+def _events(dump: Dump, source: str) -> Iterator[Entry[Event]]:
+    """Those that are of the source itself: starts and ends of its process, and what a replay tells, are not."""
+    if source in dump.sources:
+        for entry in dump.events(source):
+            if entry.item.kind not in _OF_PROCESSES and not _is_replays(entry.item):
+                yield entry
+
+
+def _is_replays(event: Event) -> bool:
+    return event.kind == EventKind.QUALITY and event.text.startswith(OWN_WORDS)

@@ -1,0 +1,202 @@
+"""What recorded events are about, in the words of their block's layout: registers, values, direction, and who."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Final, NamedTuple
+
+import msgspec
+
+from shmio.layout.model import Layout, Register
+from shmio.layout.naming import paths_of
+from shmio.layout.topic import find
+from shmio.layout.values.codec import Value, codec
+from shmio.layout.values.text import json_value, to_text
+from shmio.layout.values.write import Write, bits_of
+from shmio.layout.values.write import apply as write_to
+from shmio.segment.events import NO_WRITER, Event, EventKind
+from shmio.segment.processes import GUESTS, WRITERS
+
+MAX_REMEMBERED: Final = 4096
+"""Commands under way, and injections, whose beginning is kept in mind."""
+MAX_LAID_BYTES: Final = 1 << 16
+
+_INWARD: Final = frozenset(
+    {
+        EventKind.ACCEPTED,
+        EventKind.WRITTEN,
+        EventKind.REFUSED,
+        EventKind.EXPIRED,
+        EventKind.UNKNOWN,
+        EventKind.TAKEN,
+        EventKind.REJECTED,
+    }
+)
+"""What happens to writes, which may be the values that an injection over ``/in`` gives."""
+_WITH_VALUES: Final = frozenset({EventKind.ACCEPTED, EventKind.DIVERTED, EventKind.SHADOWED})
+_OF_WRITES: Final = frozenset({*_INWARD, EventKind.DIVERTED, EventKind.SHADOWED})
+_OF_INJECTIONS: Final = frozenset(
+    {EventKind.INJECTED, EventKind.LIFTED, EventKind.ACTIVATED, EventKind.DEACTIVATED, EventKind.DIVERTED}
+)
+_ROLES: Final = {writer: name for name, writer in WRITERS.items()}
+
+
+class Place(NamedTuple):
+    """A register, an element, a range or a part: its whole path, and its value if the event has one."""
+
+    path: str
+    register: Register
+    value: Value = None
+    valued: bool = False
+
+    @property
+    def text(self) -> str:
+        """The value as text."""
+        return to_text(self.value, self.register)
+
+    @property
+    def plain(self) -> Any:
+        """The value as JSON has it."""
+        return json_value(self.value, self.register.element)
+
+
+class Explained(NamedTuple):
+    """What an event is about. ``by``: grpc, mqtt, a program; empty: nobody, or it is not known.
+
+    ``laid``: of an injection that is laid how it is, as declared or as its client has laid it; with its last event.
+    """
+
+    places: tuple[Place, ...]
+    direction: str
+    by: str
+    laid: dict[str, Any] | None
+
+
+class _Injection(NamedTuple):
+    direction: str
+    places: tuple[Place, ...]
+
+
+class Explainer:
+    """Explains the events of one block, which it is given in their order."""
+
+    def __init__(self, source: str, layout: Layout | None) -> None:
+        """``layout``: None if it cannot be read: then nothing has a name."""
+        self._source = source
+        self._layout = layout
+        self._injections: dict[int, _Injection] = {}
+        self._documents: dict[int, bytes] = {}
+        self._under_way: dict[tuple[int, int, int], dict[int, tuple[Place, ...]]] = {}
+
+    def explain(self, event: Event) -> Explained:
+        """What the next event is about."""
+        laid = self._laid(event) if event.kind == EventKind.INJECTED else None
+        known = self._injections.get(event.injection)
+        direction, places = "", tuple[Place, ...]()
+        if event.kind in _OF_INJECTIONS:
+            direction = known.direction if known else ""
+        elif event.kind in _INWARD and event.size:  # else it is none of a write
+            direction = "in"
+        elif event.kind == EventKind.SHADOWED:  # over /in an injection's values are accepted, and written
+            direction = "out"
+        if event.kind in _OF_WRITES:
+            places = self._of_command(event)
+        elif known is not None and event.kind in _OF_INJECTIONS:
+            places = known.places
+        if event.kind == EventKind.LIFTED:
+            self._injections.pop(event.injection, None)
+        return Explained(places, direction, by(event.writer), laid)
+
+    def _of_command(self, event: Event) -> tuple[Place, ...]:
+        """Where it writes: of an end that is told for several items at once, as they were accepted."""
+        if event.kind in _WITH_VALUES:
+            places = self._places(event.offset, len(event.data), event.mask, event.data)
+            if event.kind == EventKind.ACCEPTED:
+                self._remember(event, places)
+            return places
+        key = event.incarnation, event.writer, event.command
+        accepted = self._under_way.get(key, {})
+        found: tuple[Place, ...] = ()
+        for item in range(event.item, event.item + min(event.items, MAX_REMEMBERED)):
+            found += tuple(place._replace(value=None, valued=False) for place in accepted.pop(item, ()))
+        if not accepted:
+            self._under_way.pop(key, None)
+        return found or self._places(event.offset, event.size, event.mask)
+
+    def _remember(self, event: Event, places: tuple[Place, ...]) -> None:
+        if len(self._under_way) >= MAX_REMEMBERED:
+            self._under_way.pop(next(iter(self._under_way)))
+        items = self._under_way.setdefault((event.incarnation, event.writer, event.command), {})
+        if len(items) < MAX_REMEMBERED:
+            items[event.item] = items.get(event.item, ()) + places
+
+    def _places(self, offset: int, size: int, mask: int, data: bytes = b"") -> tuple[Place, ...]:
+        if self._layout is None or offset + size > self._layout.size:
+            return ()
+        found = self._named([Write(offset, mask, b"\xff" * size)])
+        if not data:
+            return found
+        image, bits = bytearray(self._layout.size), bytearray(self._layout.size)
+        write_to(Write(offset, mask, data), image)
+        write_to(Write(offset, mask, b"\xff" * size), bits)
+        order = self._layout.byte_order
+        return tuple(
+            place._replace(value=codec(place.register, order).decode(image), valued=True)
+            if _is_whole(place.register, bits)
+            else place
+            for place in found
+        )
+
+    def _named(self, writes: Iterable[Write]) -> tuple[Place, ...]:
+        if self._layout is None:
+            return ()
+        paths = paths_of(self._layout, writes)
+        return tuple(Place(f"{self._source}/{path}", find(self._layout, path)) for path in paths)
+
+    # ---- injections --------------------------------------------------------------------------------------------------
+
+    def _laid(self, event: Event) -> dict[str, Any] | None:
+        """How an injection is laid, when all parts of that have come; it is kept in mind."""
+        document = (self._documents.pop(event.injection, b"") if event.offset else b"") + event.data
+        try:
+            laid = msgspec.json.decode(document, type=dict[str, Any])
+        except (msgspec.MsgspecError, RecursionError):
+            if document and len(document) < MAX_LAID_BYTES and len(self._documents) < MAX_REMEMBERED:
+                self._documents[event.injection] = document
+            return None
+        if len(self._injections) >= MAX_REMEMBERED:
+            self._injections.pop(next(iter(self._injections)))
+        if "ranges" in laid:
+            self._injections[event.injection] = _Injection(
+                str(laid.get("direction", "")), self._over(laid.pop("ranges"))
+            )
+        else:
+            target = laid.get("target", "")
+            targets = [str(one) for one in target] if isinstance(target, list) else [str(target)]
+            inward = any(one.endswith("/in") for one in targets)
+            self._injections[event.injection] = _Injection("in" if inward else "out", ())
+        return laid
+
+    def _over(self, ranges: object) -> tuple[Place, ...]:
+        """What these ranges are over: (offset, size, bits of each byte)."""
+        try:
+            parts = msgspec.convert(ranges, list[tuple[int, int, int]])
+        except msgspec.ValidationError:
+            return ()
+        most = self._layout.size if self._layout else 0
+        return self._named(
+            Write(offset, bits, b"\xff" * min(size, most)) for offset, size, bits in parts if 0 <= offset < most
+        )
+
+
+def _is_whole(register: Register, bits: bytearray) -> bool:
+    """Whether all bits of a register are among these."""
+    there = bits[register.offset : register.offset + register.size]
+    return all(own & bit == own for own, bit in zip(bits_of(register), there, strict=True))
+
+
+def by(writer: int) -> str:
+    """Whose a command queue is."""
+    if writer == NO_WRITER:
+        return ""
+    return _ROLES.get(writer, f"program {writer + 1}" if writer < GUESTS else f"writer {writer}")

@@ -1,0 +1,1 @@
+"""The messages and records of a recording (docs/reference/dump-format.md)."""

@@ -1,0 +1,37 @@
+"""All frames of a recording as columns, piece by piece, so that any length of it fits into memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
+
+from shmio.layout.model import Register
+from shmio.recording.columns import Collector, Columns
+from shmio.recording.dump import Dump
+from shmio.recording.format.blocks import DumpBlock
+from shmio.recording.reading.part import MAX_NS
+
+PIECE_BYTES: Final = 8 << 20
+
+
+def pieces(
+    dump: Dump,
+    source: str,
+    chosen: Mapping[DumpBlock, Sequence[Register]],
+    from_ns: int = 0,
+    to_ns: int = MAX_NS,
+    *,
+    raw: bool = False,
+) -> Iterator[tuple[DumpBlock, Columns]]:
+    """The chosen registers of one source, in order; each piece is of one block. PathError, RecordingError."""
+    collector, of = Collector(source), None
+    for block, batch in dump.batches(source, from_ns, to_ns, raw=raw):
+        if block not in chosen:
+            continue
+        if of is not None and (block is not of or collector.bytes >= PIECE_BYTES):
+            yield of, collector.columns()
+        if block is not of:
+            collector, of = Collector(source), block
+        collector.add(block, chosen[block], batch)
+    if of is not None:
+        yield of, collector.columns()

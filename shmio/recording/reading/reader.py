@@ -1,0 +1,309 @@
+"""Reads recordings: whole ones, those of a killed recorder, and those being written."""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.records import Header, Metadata
+
+from shmio.errors import LayoutError, RecordingError
+from shmio.layout.model import Layout
+from shmio.recording.format.channels import MAX_CHANNEL_BYTES, MAX_CHANNELS, Channel, describe
+from shmio.recording.format.damage import Damage, DamageLog
+from shmio.recording.format.encoding import (
+    ABOUT,
+    EVENT,
+    FRAME,
+    GAP,
+    PLACES,
+    PROCESS,
+    PROFILE,
+    STEP,
+    Gap,
+    Place,
+    ProcessChange,
+    StepMark,
+    decode_event,
+    decode_frame,
+    decode_gap,
+    decode_place,
+    decode_process,
+    decode_step,
+    restore,
+)
+from shmio.recording.format.records import BROKEN, LOOK_BYTES, MAGIC, ONLY_BEGUN, Record, Records, stream
+from shmio.segment import Event, Frame
+
+MAX_LAYOUT_BYTES: Final = 64 << 20
+"""All layouts of one file together."""
+MAX_ATTACHMENTS: Final = 10_000
+
+_MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
+_ATTACHMENT_HEAD: Final = 4096  # times, name, media type and size of any attachment fit in
+_LAYOUTS: Final = "layouts/"
+
+
+Item = Frame | Event | Gap | StepMark | ProcessChange
+
+_DECODERS: Final[dict[str, Callable[[bytes], Item]]] = {
+    EVENT: decode_event,
+    GAP: decode_gap,
+    STEP: decode_step,
+    PROCESS: decode_process,
+}
+
+
+class Message(NamedTuple):
+    """One message: a frame, an event, a gap or the end of a step."""
+
+    channel: Channel
+    log_ns: int
+    item: Item
+
+
+class AttachmentEntry(NamedTuple):
+    """An attachment: where its data are, and the record that holds them."""
+
+    at: int
+    size: int
+    record: Record
+
+
+class Reader:
+    """One recording. A context manager; what is read of it is known from where :meth:`messages` has come to.
+
+    OSError, RecordingError: it cannot be opened, or is no recording.
+    """
+
+    def __init__(self, file: Path, *, own: bool = False, beat: Callable[[], object] = lambda: None) -> None:
+        """``own``: refuse what is no regular file of this user. ``beat`` is called now and then while it is read."""
+        self.file = file
+        self.records = Records(file, own=own, beat=beat)
+        self.about: dict[str, str] = {}
+        """What the recorder said of the instance."""
+        self.places: dict[int, Place] = {}
+        """By section where the recorder before had come to, as far as it was known."""
+        self.complete = False
+        """Whether all channels are known, from a walk through the whole file."""
+        self.channels: dict[int, Channel] = {}
+        self.summary_damage = ""
+        """The first record of the summary that was needed and could not be read."""
+        self.attachments: dict[str, AttachmentEntry] = {}
+        self._layouts: dict[str, Layout] = {}
+        self._layout_bytes = 0
+        self._summarized = False
+        self._ours = False  # by what the file's header says
+
+    def messages(
+        self,
+        wanted: Callable[[Channel], bool] = lambda _: True,
+        from_ns: int = 0,
+        to_ns: int = (1 << 64) - 1,
+        damaged: Callable[[Damage], object] | None = None,
+        records: Iterable[Record] | None = None,
+    ) -> Iterator[Message]:
+        """Messages of the wanted channels whose log times are in this range, as the file has them.
+
+        ``records``: only of these; None: of the whole file. Ends where the file does; then :attr:`Records.closed` and
+        :attr:`Records.damage` say how. What is damaged before that, in this range, ``damaged`` is told of where it is,
+        and the next whole chunk follows; without it RecordingError is raised. Chunks outside of the range are not
+        looked into.
+        """
+
+        def tell(damage: Damage) -> None:
+            if damaged and damage.after_ns <= to_ns and not 0 < damage.before_ns < from_ns:
+                damaged(damage)
+
+        log = DamageLog(tell)
+        for record in self.records.walk() if records is None else records:
+            try:
+                if record.opcode == Opcode.CHUNK:
+                    first_ns, last_ns = self.records.chunk_times(record)
+                    if (first_ns <= to_ns and last_ns >= from_ns) or not self.complete:
+                        contents = self.raw(record)
+                        log.end(first_ns)
+                        yield from self._decoded(contents, wanted, from_ns, to_ns)
+                    log.after(last_ns)
+                else:
+                    self.note(record)
+            except RecordingError as error:
+                if damaged is None:
+                    raise
+                log.add(record, error)
+        log.end()
+
+    def _decoded(
+        self,
+        contents: Iterator[tuple[Channel, int, memoryview]],
+        wanted: Callable[[Channel], bool],
+        from_ns: int,
+        to_ns: int,
+    ) -> Iterator[Message]:
+        """A chunk's messages; what cannot be decoded is passed over, and RecordingError raised at the end."""
+        problem: RecordingError | None = None
+        for channel, log_ns, data in contents:
+            if from_ns <= log_ns <= to_ns and wanted(channel):
+                try:
+                    item = self.decode(channel, data)
+                except RecordingError as error:
+                    problem = error
+                else:
+                    yield Message(channel, log_ns, item)
+        if problem:
+            raise problem
+
+    def raw(self, record: Record) -> Iterator[tuple[Channel, int, memoryview]]:
+        """(channel, log time, data) of a chunk's messages, those of others passed over; its channels are noted.
+
+        Frames are as FRAME has them, of whichever version they are.
+        RecordingError: at once if the chunk as a whole is damaged; at its end if messages had to be left out.
+        """
+        return self._raw(self.records.chunk(record))
+
+    def _raw(self, contents: Iterator[tuple[int, memoryview]]) -> Iterator[tuple[Channel, int, memoryview]]:
+        unknown: int | None = None
+        for opcode, content in contents:
+            if opcode == Opcode.CHANNEL:
+                self._channel(content)
+            elif opcode == Opcode.MESSAGE:
+                if len(content) < _MESSAGE.size:
+                    raise RecordingError(f"{self.file}: a message is shorter than its header")
+                number, sequence, log_ns, publish_ns = _MESSAGE.unpack_from(content)
+                channel = self.channel(number)
+                if channel is None:
+                    unknown = number
+                    continue
+                data = content[_MESSAGE.size :]
+                if channel.differences:
+                    data = memoryview(restore(bytes(data), sequence, log_ns, publish_ns))
+                if channel.encoding:
+                    yield channel, log_ns, data
+        if unknown is not None:
+            raise RecordingError(f"{self.file}: messages of channel {unknown}, which is not described")
+
+    def channel(self, number: int) -> Channel | None:
+        """A channel by its number; if the chunk that describes it is damaged, from the summary of a closed file.
+
+        What is damaged there costs no other channel: :attr:`summary_damage`.
+        """
+        if number not in self.channels and not self._summarized:
+            self._summarized = True
+            for record in self.records.summary():
+                if record.opcode == Opcode.CHANNEL:
+                    try:
+                        self._channel(memoryview(self.records.read(record.at, record.size)))
+                    except RecordingError as error:
+                        self.summary_damage = self.summary_damage or f"{error} (byte {record.at}, in the index)"
+        return self.channels.get(number)
+
+    def decode(self, channel: Channel, data: memoryview) -> Item:
+        """What a message holds; RecordingError."""
+        try:
+            if channel.encoding == FRAME:
+                frame = decode_frame(bytes(data))
+                if len(frame.raw) != self.layout(channel).size:
+                    raise ValueError("a frame is not of its layout's size")
+                return frame
+            return _DECODERS[channel.encoding](bytes(data))
+        except ValueError as error:
+            raise RecordingError(f"{self.file}: {channel.topic}: {error}") from None
+
+    def layout(self, channel: Channel) -> Layout:
+        """The layout of a channel's block, from its attachment; RecordingError."""
+        digest = channel.layout
+        if digest not in self._layouts:
+            entry = self.attachments.get(f"{_LAYOUTS}{digest}.json")
+            if entry is None:
+                raise RecordingError(f"{self.file}: the layout of {channel.topic} is not in the file")
+            self._layout_bytes += entry.size
+            data = self.records.read(entry.at, entry.size, MAX_LAYOUT_BYTES - self._layout_bytes + entry.size)
+            if hashlib.sha256(data).hexdigest() != digest:
+                raise RecordingError(f"{self.file}: the layout of {channel.topic} is damaged")
+            try:
+                self._layouts[digest] = Layout.from_json(data)
+            except LayoutError as error:
+                raise RecordingError(f"{self.file}: the layout of {channel.topic}: {error}") from None
+        return self._layouts[digest]
+
+    def attachment(self, name: str, limit: int = MAX_LAYOUT_BYTES) -> bytes:
+        """The bytes of an attachment, whole by their CRC; RecordingError: damaged, or more than the limit."""
+        entry = self.attachments[name]
+        self.records.check_crc(entry.record)
+        return self.records.read(entry.at, entry.size, limit)
+
+    def note(self, record: Record) -> None:
+        """Take in a record that is not of a chunk: what it tells of the instance, or an attachment. RecordingError."""
+        if record.opcode == BROKEN:
+            raise RecordingError(
+                f"{self.file}: bytes {record.at} to {record.at + record.size - 1} make no sense: they were changed"
+            )
+        try:
+            if record.opcode == Opcode.METADATA:
+                metadata = Metadata.read(stream(self.records.read(record.at, record.size)))
+                if metadata.name == ABOUT:
+                    self.about = metadata.metadata
+                elif metadata.name == PLACES:
+                    self.places = {int(section): decode_place(place) for section, place in metadata.metadata.items()}
+            elif record.opcode == Opcode.HEADER:
+                self._ours = self._profile(record) == PROFILE
+            elif record.opcode == Opcode.ATTACHMENT and len(self.attachments) < MAX_ATTACHMENTS:
+                self._attachment(record)
+        except (ValueError, struct.error, McapError):
+            raise RecordingError(f"{self.file}: the record at byte {record.at} is damaged") from None
+
+    def _is_cut_short(self) -> bool:
+        """Whether it ends within its header."""
+        start = self.records.read(len(MAGIC), min(1, self.records.size - len(MAGIC)))
+        return start in (b"", bytes([Opcode.HEADER])) and self.records.record(len(MAGIC)) is None
+
+    def _profile(self, record: Record) -> str:
+        """What a header says that the file is; nothing depends on it but what is said of one without content."""
+        with suppress(ValueError, struct.error, McapError):
+            return str(Header.read(stream(self.records.read(record.at, min(record.size, LOOK_BYTES)))).profile)
+        return ""
+
+    def _attachment(self, record: Record) -> None:
+        data = stream(self.records.read(record.at, min(record.size, _ATTACHMENT_HEAD)))
+        data.read(16)
+        name = data.read_prefixed_string()
+        data.read_prefixed_string()
+        size = data.read8()
+        if data.count + size + 4 != record.size:
+            raise ValueError("its sizes contradict each other")
+        self.attachments[name] = AttachmentEntry(record.at + data.count, size, record)
+
+    def _channel(self, content: memoryview) -> None:
+        if len(content) > MAX_CHANNEL_BYTES or len(self.channels) >= MAX_CHANNELS:
+            raise RecordingError(
+                f"{self.file}: it describes more channels, or one at more length, than a recorder does"
+            )
+        try:
+            channel = describe(content)
+        except (ValueError, KeyError, struct.error, McapError):
+            raise RecordingError(f"{self.file}: the description of a channel is damaged") from None
+        if self.channels.setdefault(channel.number, channel) != channel:  # whose messages could be read in two ways
+            raise RecordingError(f"{self.file}: channel {channel.number} is described twice, and differently")
+
+    def require_ours(self) -> None:
+        """RecordingError if nothing in what was read is of a recorder of shmio."""
+        if not self.about and not any(channel.encoding for channel in self.channels.values()):
+            if not self.records.closed and (self._ours or self._is_cut_short()):
+                raise RecordingError(f"{self.file} {ONLY_BEGUN}")
+            raise RecordingError(f"{self.file} is an MCAP file, but no recording of shmio")
+
+    def close(self) -> None:
+        """Close the file."""
+        self.records.close()
+
+    def __enter__(self) -> Reader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

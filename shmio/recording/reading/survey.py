@@ -1,0 +1,279 @@
+"""What is in a recording, found out without reading all of it: chunks are passed over where their indexes suffice."""
+
+from __future__ import annotations
+
+import struct
+from array import array
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from mcap.opcode import Opcode
+
+from shmio.errors import RecordingError
+from shmio.recording.format.channels import Channel
+from shmio.recording.format.encoding import GAP, Gap
+from shmio.recording.format.framing import INDEX, U64
+from shmio.recording.format.records import BROKEN, MAX_RECORD_BYTES, Record
+from shmio.recording.reading.reader import Reader
+
+MAX_CHUNKS: Final = 1 << 22
+MAX_SETS: Final = 1 << 16
+"""Different sets of channels that chunks hold."""
+
+_Times = npt.NDArray[np.uint64]
+
+
+class Chunks:
+    """A table of chunks, and of places that cannot be read, as the file has them; 40 bytes for each."""
+
+    def __init__(self) -> None:
+        self._at = array("Q")
+        self._size = array("Q")
+        self._first_ns = array("Q")
+        self._last_ns = array("Q")
+        self._opcode = array("B")
+        self._held = array("I")
+        self._sets: dict[frozenset[int], int] = {}
+
+    def __len__(self) -> int:
+        return len(self._at)
+
+    def add(self, chunk: Record, first_ns: int, last_ns: int, channels: Collection[int]) -> None:
+        """The next chunk; RecordingError: more than any recorder makes."""
+        held = frozenset(channels)
+        if len(self._at) >= MAX_CHUNKS or (held not in self._sets and len(self._sets) >= MAX_SETS):
+            raise RecordingError(f"more than {MAX_CHUNKS} chunks, or channels in more than {MAX_SETS} combinations")
+        self._opcode.append(chunk.opcode)
+        self._held.append(self._sets.setdefault(held, len(self._sets)))
+        self._at.append(chunk.at)
+        self._size.append(chunk.size)
+        self._first_ns.append(first_ns)
+        self._last_ns.append(last_ns)
+
+    def add_broken(self, record: Record) -> None:
+        """Bytes that make no sense, behind the last chunk; RecordingError."""
+        at_ns = self._last_ns[-1] if self._last_ns else 0
+        self.add(record, at_ns, at_ns, ())
+
+    def between(
+        self, from_ns: int, to_ns: int, channels: Collection[int] | None = None
+    ) -> Iterator[tuple[Record, int, int]]:
+        """(chunk, log time of its first message, of its last) of those that may hold something of this range.
+
+        ``channels``: only those with messages of some of these.
+        """
+        begin, end = self._bounds(from_ns, to_ns)
+        yield from self._rows(range(begin, end), from_ns, to_ns, channels)
+
+    def before(self, time_ns: int, channels: Collection[int] | None = None) -> Iterator[tuple[Record, int, int]]:
+        """The same of those that begin not after a time, the last one first."""
+        _, end = self._bounds(0, time_ns)
+        yield from self._rows(range(end - 1, -1, -1), 0, time_ns, channels)
+
+    def _rows(
+        self, indices: range, from_ns: int, to_ns: int, channels: Collection[int] | None
+    ) -> Iterator[tuple[Record, int, int]]:
+        wanted = {number for held, number in self._sets.items() if channels is None or not held.isdisjoint(channels)}
+        for index in indices:
+            first_ns, last_ns = self._first_ns[index], self._last_ns[index]
+            if self._held[index] in wanted and first_ns <= to_ns and last_ns >= from_ns:
+                yield Record(self._opcode[index], self._at[index], self._size[index]), first_ns, last_ns
+
+    def _bounds(self, from_ns: int, to_ns: int) -> tuple[int, int]:
+        """Indices between which all are that may hold something of this range: their times may overlap a little."""
+        latest_ns, earliest_ns = self._sorted
+        begin = int(np.searchsorted(latest_ns, np.uint64(min(max(from_ns, 0), _MAX_U64)), "left"))
+        end = int(np.searchsorted(earliest_ns, np.uint64(min(max(to_ns, 0), _MAX_U64)), "right"))
+        return begin, end
+
+    @cached_property
+    def _sorted(self) -> tuple[_Times, _Times]:
+        """The latest time up to each chunk, and the earliest from each on: both go up. The table is complete then."""
+        first_ns: npt.NDArray[Any] = np.array(self._first_ns, np.uint64)
+        last_ns: npt.NDArray[Any] = np.array(self._last_ns, np.uint64)
+        return np.maximum.accumulate(last_ns), np.minimum.accumulate(first_ns[::-1])[::-1]
+
+
+_MAX_U64: Final = (1 << 64) - 1
+
+
+MAX_GAPS: Final = 1000
+"""Gaps that are kept one by one; all are counted."""
+MAX_DAMAGE: Final = 20
+"""Damaged places that are told."""
+MAX_BLOCKS: Final = 10_000
+
+_ENTRY: Final = struct.Struct("<QQ")  # log time, offset
+
+
+class Count(NamedTuple):
+    """Messages of one channel in one chunk: how many, log times of the first and the last."""
+
+    channel: int
+    messages: int
+    first_ns: int
+    last_ns: int
+
+
+@dataclass(slots=True)
+class Track:
+    """The messages of one channel: how many, from when to when, in which chunks the first and the last are."""
+
+    channel: Channel
+    count: int
+    first_ns: int
+    last_ns: int
+    first_in: Record
+    last_in: Record
+
+    def numbers(self, reader: Reader) -> tuple[int, int]:
+        """Numbers of its first and its last frame or event; RecordingError."""
+        return self._in(reader, self.first_in)[0], self.last(reader)
+
+    def last(self, reader: Reader) -> int:
+        """Number of its last frame or event; RecordingError."""
+        return self._in(reader, self.last_in)[-1]
+
+    def _in(self, reader: Reader, chunk: Record) -> list[int]:
+        """Its numbers in a chunk: one at least."""
+        found: list[int] = []
+        try:
+            for channel, _, data in reader.raw(chunk):
+                if channel.number == self.channel.number and len(data) >= U64.size:
+                    found.append(U64.unpack_from(data)[0])  # how frames and events begin
+        except RecordingError:
+            if not found:  # otherwise it is messages of other channels that are lost
+                raise
+        if not found:
+            raise RecordingError(f"{reader.file}: {self.channel.topic}: an index names messages that are not there")
+        return found
+
+
+@dataclass(slots=True)
+class Survey:
+    """A recording as a whole."""
+
+    tracks: dict[int, Track] = field(default_factory=dict)
+    """By the channel's number."""
+    gaps: list[Gap] = field(default_factory=list)
+    """The first ones."""
+    missed: dict[tuple[str, int, str], int] = field(default_factory=dict)
+    """How many by source, block, and what it is."""
+    missed_to: dict[tuple[str, int, str], int] = field(default_factory=dict)
+    """Highest number missed."""
+    gap_count: int = 0
+    damage: list[str] = field(default_factory=list)
+    """What could not be read."""
+    chunks: Chunks = field(default_factory=Chunks)
+    """All that can be told of, by their indexes or by themselves."""
+
+    @property
+    def begin_ns(self) -> int:
+        """Log time of the first frame or event; 0: there is none."""
+        return min((track.first_ns for track in self.tracks.values() if track.channel.source), default=0)
+
+    @property
+    def end_ns(self) -> int:
+        """Log time of the last one."""
+        return max((track.last_ns for track in self.tracks.values() if track.channel.source), default=0)
+
+    def add_gap(self, gap: Gap) -> None:
+        """Something was missed. RecordingError: it is of more blocks than a recorder tells of."""
+        key = (gap.source, gap.block, gap.what)
+        if key not in self.missed and len(self.missed) >= MAX_BLOCKS:
+            raise RecordingError(f"gaps of more than {MAX_BLOCKS} blocks")
+        self.gap_count += 1
+        self.missed[key] = self.missed.get(key, 0) + gap.count
+        self.missed_to[key] = max(self.missed_to.get(key, 0), gap.last)
+        if len(self.gaps) < MAX_GAPS:
+            self.gaps.append(gap)
+
+
+def survey(reader: Reader) -> Survey:
+    """Walk through the file. RecordingError: it is no recording of ours; damage within it is noted only."""
+    found = Survey()
+    chunk: Record | None = None
+    counts: list[Count] | None = []
+    for record in reader.records.walk():
+        if record.opcode == Opcode.MESSAGE_INDEX:
+            count = read_index(reader, record) if counts is not None else None
+            counts = None if counts is None or count is None else [*counts, count]
+            continue
+        if chunk is not None:
+            if record.opcode == BROKEN:  # which may be the rest of its indexes
+                counts = None
+            _settle(reader, found, chunk, counts)
+            chunk = None
+        if record.opcode == Opcode.CHUNK:
+            chunk, counts = record, []
+        else:
+            if record.opcode == BROKEN:
+                found.chunks.add_broken(record)
+            try:
+                reader.note(record)
+            except RecordingError as error:
+                _damaged(found, str(error))
+    if chunk is not None:  # the last of a file that ends here: its indexes may be missing
+        _settle(reader, found, chunk, None)
+    if reader.summary_damage:
+        _damaged(found, reader.summary_damage)
+    reader.require_ours()
+    reader.complete = True
+    return found
+
+
+def read_index(reader: Reader, record: Record) -> Count | None:
+    """What a message index says; None if it is of no use."""
+    if not INDEX.size < record.size <= MAX_RECORD_BYTES or (record.size - INDEX.size) % _ENTRY.size:
+        return None
+    data = reader.records.read(record.at, record.size)
+    channel, _ = INDEX.unpack_from(data)
+    first_ns, _ = _ENTRY.unpack_from(data, INDEX.size)
+    last_ns, _ = _ENTRY.unpack_from(data, record.size - _ENTRY.size)
+    return Count(channel, (record.size - INDEX.size) // _ENTRY.size, first_ns, last_ns)
+
+
+def _settle(reader: Reader, found: Survey, chunk: Record, counts: list[Count] | None) -> None:
+    """Count a chunk's messages: by its indexes, unless something in it must be read."""
+    if not counts or any(_must_read(reader, count.channel) for count in counts):
+        counts = _read(reader, found, chunk)
+    first_ns, last_ns = reader.records.chunk_times(chunk)
+    found.chunks.add(chunk, first_ns, last_ns, [count.channel for count in counts])
+    for count in counts:
+        channel = reader.channels[count.channel]
+        track = found.tracks.get(count.channel)
+        if track is None:
+            found.tracks[count.channel] = Track(channel, count.messages, count.first_ns, count.last_ns, chunk, chunk)
+        else:
+            track.count += count.messages
+            track.last_ns, track.last_in = count.last_ns, chunk
+
+
+def _damaged(found: Survey, why: str) -> None:
+    if len(found.damage) < MAX_DAMAGE:
+        found.damage.append(why)
+
+
+def _must_read(reader: Reader, number: int) -> bool:
+    channel = reader.channels.get(number)  # which a chunk describes, with a CRC; the summary is only for want of that
+    return channel is None or channel.encoding == GAP
+
+
+def _read(reader: Reader, found: Survey, chunk: Record) -> list[Count]:
+    """Count what can be read of a chunk."""
+    counts: dict[int, Count] = {}
+    try:
+        for channel, log_ns, data in reader.raw(chunk):
+            old = counts.get(channel.number, Count(channel.number, 0, log_ns, log_ns))
+            counts[channel.number] = old._replace(messages=old.messages + 1, last_ns=log_ns)
+            if channel.encoding == GAP:
+                item = reader.decode(channel, data)
+                if isinstance(item, Gap):
+                    found.add_gap(item)
+    except RecordingError as error:
+        _damaged(found, str(error))
+    return list(counts.values())

@@ -1,0 +1,70 @@
+"""Which registers differ between two images of a block.
+
+Bytes are compared, never values: a NaN that stays the same has not changed, and 0.0 that became -0.0 has. A BOOL is its
+bit alone; padding belongs to nobody.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Iterator, Sequence
+
+from shmio.layout.model import Register
+from shmio.layout.values.write import bits_of
+from shmio.segment import _atomics
+
+_ENTRY = struct.Struct("=IIII")  # offset, size, mask, index: scan_entry in _atomics.c
+
+
+class ChangeScan:
+    """Compares two images over the given registers, in C; immutable."""
+
+    def __init__(self, registers: Sequence[Register]) -> None:
+        self._table = b"".join(entries([register], index) for index, register in enumerate(registers))
+
+    @classmethod
+    def joined(cls, parts: Iterable[bytes]) -> ChangeScan:
+        """One over what :func:`entries` made; their indices in this order."""
+        scan = cls(())
+        scan._table = b"".join(parts)
+        return scan
+
+    def changed(self, old: bytes, new: bytes) -> list[int]:
+        """Indices, ascending, of the registers whose bytes differ.
+
+        Both images have one size and hold all registers; ValueError otherwise.
+        """
+        return _atomics.changed(old, new, self._table)
+
+
+def entries(registers: Iterable[Register], index: int) -> bytes:
+    """The part of a scan that reports a change of any of the registers as ``index``."""
+    return b"".join(_ENTRY.pack(*run, index) for register in registers for run in runs(register))
+
+
+def runs(register: Register) -> Iterator[tuple[int, int, int]]:
+    """(offset, size, mask) of the bytes that hold the register's data; mask 0: whole bytes."""
+    offset, element = register.offset, register.element
+    if register.partial:
+        masks = bits_of(register)
+        yield offset, 1, masks[0]
+        if len(masks) > 2:
+            yield offset + 1, len(masks) - 2, 0
+        if len(masks) > 1:
+            yield offset + len(masks) - 1, 1, masks[-1]
+    elif register.bit is not None:
+        # A row of bits begins at a byte; its last byte may be padded.
+        bits = register.shape[-1] if register.dims else 1
+        first = 0 if register.dims else register.bit
+        for row in range(register.count // bits):
+            start = offset + row * -(-bits // 8)
+            whole, rest = divmod(bits, 8) if register.dims else (0, 1)
+            if whole:
+                yield start, whole, 0
+            if rest:
+                yield start + whole, 1, ((1 << rest) - 1) << first
+    elif element.stride == element.size:
+        yield offset, register.size, 0
+    else:  # strings of odd length have a byte of padding between them
+        for start in range(offset, offset + register.size, element.stride):
+            yield start, element.size, 0

@@ -1,0 +1,256 @@
+"""Reloads: planned in a thread, so that the supervisor goes on looking after what runs, and carried out by its loop."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+
+from shmio.errors import ShmioError
+from shmio.logs import fields
+from shmio.plan.processes import Job, Plan
+from shmio.segment import Block, Segment
+from shmio.supervisor import policy
+from shmio.supervisor.control import Answer
+from shmio.supervisor.fleet import Fleet
+from shmio.supervisor.managed import brief, log
+from shmio.supervisor.notify import Notifier
+from shmio.supervisor.policy import Limits
+from shmio.supervisor.reconcile import reconcile, refusal
+from shmio.supervisor.states import Event, State
+
+SETTLED = (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED)
+
+
+class Change:
+    """Brings an instance to a plan, a step at each call of :meth:`step`; what is as planned already is not touched."""
+
+    def __init__(self, fleet: Fleet, segment: Segment, plan: Plan) -> None:
+        """Begin. SegmentError: no room for what is new; then nothing has changed."""
+        self.plan = plan
+        present = fleet.present()
+        self.changes = reconcile(plan, segment.header.epoch, present, segment.blocks.values())
+        self._unwell = {name for name, found in present.items() if not found.well}
+        self._fleet = fleet
+        self._segment = segment
+        self._jobs = {job.name: job for job in plan.jobs}
+        self._stopped = False
+        self._injections: list[str] = []
+        segment.processes.require(len(self.changes.started) - len(self.changes.stopped))
+        segment.reserve(self.changes.add)  # the last to fail: what it takes is not given back
+        self._told = [name for name in self.changes.kept if self._fleet.named(name).keep(self._jobs[name])]
+
+    @property
+    def _leaving(self) -> tuple[str, ...]:
+        return (*self.changes.stopped, *self.changes.replaced)
+
+    @property
+    def _coming(self) -> list[Job]:
+        names = {*self.changes.started, *self.changes.replaced}
+        return [job for job in self.plan.jobs if job.name in names]
+
+    def step(self) -> bool:
+        """Do what can be done now; whether the change is over: each new process runs, or has failed once."""
+        if not self._stopped:
+            self._stopped = self._stop()
+            if self._stopped:
+                self._turn()
+        if self._stopped:
+            self._fleet.start_due()
+        return self._stopped and all(self._has_come(job.name) for job in self._coming)
+
+    def _has_come(self, name: str) -> bool:
+        life = self._fleet.named(name).life
+        return life.starts > 0 and life.state in SETTLED
+
+    @property
+    def stuck(self) -> str:
+        """Which processes must end and do not, if that is what is waited for."""
+        leaving = [] if self._stopped else [self._fleet.named(name) for name in self._leaving]
+        return "; ".join(f"{managed.name}: {managed.life.note}" for managed in leaving if managed.life.stuck)
+
+    def _stop(self) -> bool:
+        """Have all end that must, rank by rank, so that a recorder has the last of a source; whether they have."""
+        leaving = [self._fleet.named(name) for name in self._leaving]
+        for index in policy.to_stop([(managed.rank, managed.life) for managed in leaving]):
+            self._fleet.apply(leaving[index], Event.STOP)
+        return policy.all_gone([(managed.rank, managed.life) for managed in leaving])
+
+    def _turn(self) -> None:
+        """Between the old and the new."""
+        if self.changes.add or self.changes.retire:
+            self._segment.change(self.changes.add, self.changes.retire)
+        for spec in self.plan.blocks:  # new ones have theirs; the others' processes follow without a restart
+            self._declare(self._segment.blocks[spec.source], spec.declared)
+        for name in self.changes.stopped:
+            self._fleet.drop(name)
+        for job in self._coming:
+            self._fleet.assign(job)
+
+    def _declare(self, block: Block, declared: bytes) -> None:
+        before = {declaration.name: declaration for declaration in block.declared.read()}
+        block.declared.write(declared)
+        block.commands.wake()
+        after = {declaration.name: declaration for declaration in block.declared.read()}
+        for name in {**before, **after}:
+            if before.get(name) != after.get(name):
+                what = "laid" if name not in before else "changed" if name in after else "lifted"
+                self._injections.append(f"injection {name}: {what} at {block.source}")
+
+    def outcome(self) -> tuple[list[str], list[str]]:
+        """What was done, and what came out badly, a line each."""
+        done = [*(f"{name}: stopped" for name in self.changes.stopped), *self._injections]
+        done += [f"{name}: told to take its tokens and roles anew" for name in self._told]
+        problems = []
+        for job in self._coming:
+            managed = self._fleet.named(job.name)
+            how = "restarted, as its configuration has changed" if job.name in self.changes.replaced else "started"
+            if job.name in self.changes.replaced and job.name in self._unwell:
+                how = "started again, as it was not running"
+            if managed.life.state is State.RUNNING:
+                done.append(f"{job.name}: {how}")
+            else:
+                why = managed.life.note or managed.life.state.value
+                problems.append(f"{job.name}: {how}, but it does not run: {why}")
+        return done, problems
+
+
+class _Planning:
+    """A plan in the making: to compile a big layout takes seconds, and a file system may hang."""
+
+    def __init__(self, replan: Callable[[], Plan], limit_s: float) -> None:
+        self.read_ns = time.time_ns()
+        self.limit_s = limit_s
+        self._deadline = time.monotonic() + limit_s
+        self._plan: Plan | None = None
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, args=(replan,), name="plan", daemon=True)
+        self._thread.start()
+
+    def _run(self, replan: Callable[[], Plan]) -> None:
+        try:
+            self._plan = replan()
+        except BaseException as error:  # noqa: BLE001 - raised by ``result``
+            self._error = error
+
+    @property
+    def over(self) -> bool:
+        return not self._thread.is_alive()
+
+    @property
+    def late(self) -> bool:
+        """Whether it has had its time. A thread cannot be ended: its result, if there ever is one, is lost."""
+        return not self.over and time.monotonic() >= self._deadline
+
+    def result(self) -> Plan:
+        """The plan, or what went wrong."""
+        if not self.over:
+            raise ShmioError(
+                f"what the configuration names could not be read within {self.limit_s:g} s, and nothing is changed: "
+                "see whether a file system hangs, and reload again"
+            )
+        if self._plan is None:
+            raise self._error or RuntimeError("there is no plan")
+        return self._plan
+
+
+class Changer:
+    """The change of an instance that is under way, if any, and the plan that it follows by now."""
+
+    def __init__(
+        self,
+        fleet: Fleet,
+        segment: Segment,
+        notifier: Notifier,
+        plan: Plan,
+        replan: Callable[[], Plan],
+        limits: Limits,
+    ) -> None:
+        self.plan = plan
+        self.read_ns = time.time_ns()
+        """When the configuration was read, ns since 1970."""
+        self._fleet = fleet
+        self._segment = segment
+        self._notifier = notifier
+        self._replan = replan
+        self._limits = limits
+        self._planning: _Planning | None = None
+        self._change: Change | None = None
+        self._answer: Answer | None = None
+
+    @property
+    def under_way(self) -> bool:
+        """Whether processes and blocks are being changed."""
+        return self._change is not None
+
+    def busy(self) -> str | None:
+        """Why nothing else can be changed at present."""
+        if self._change is None:
+            return None
+        if stuck := self._change.stuck:
+            return f"the instance is just being changed, which waits for what does not end: {stuck}"
+        return "the instance is just being changed: ask again when that is over"
+
+    def follow(self) -> None:
+        """Bring what was taken over to the plan. SegmentError: no room."""
+        self._change = Change(self._fleet, self._segment, self.plan)
+
+    def reload(self, answer: Answer) -> None:
+        """Plan anew, then follow that; refused while another reload is under way."""
+        reason = self.busy() or (self._planning and "another reload is just being planned: ask again when it is over")
+        if reason:
+            answer.error(reason)
+            return
+        self._notifier.reloading()
+        self._planning, self._answer = _Planning(self._replan, self._limits.plan_s), answer
+
+    def drop(self) -> None:
+        """Give up what is under way, for all is to stop."""
+        if self._answer is not None:
+            self._answer.error("the instance is stopping")
+        self._planning = self._change = self._answer = None
+
+    def step(self) -> None:
+        """Do what can be done now."""
+        if self._planning is not None and (self._planning.over or self._planning.late):
+            planning, self._planning = self._planning, None
+            self._begin(planning)
+        if self._change is not None:
+            self._follow(self._change)
+
+    def _begin(self, planning: _Planning) -> None:
+        try:
+            plan = planning.result()
+            if reason := refusal(plan, self.plan):
+                raise ShmioError(f"{plan.config_file}: {reason}")
+            self._change = Change(self._fleet, self._segment, plan)
+        except Exception as error:  # noqa: BLE001 - whatever a connector's own check raises, what runs goes on
+            expected = isinstance(error, ShmioError)
+            reason = str(error) if expected else f"the reload failed: {brief(error)}"
+            log.error("nothing is changed: %s", reason, exc_info=None if expected else error)
+            self._tell(lambda answer: answer.error(reason))
+            return
+        self.plan, self.read_ns = plan, planning.read_ns
+
+    def _follow(self, change: Change) -> None:
+        if not change.step():
+            if stuck := change.stuck:
+                self._tell(lambda answer: answer.error(f"{stuck}; the reload goes on as soon as it has ended"))
+            return
+        done, problems = change.outcome()
+        for line in done:
+            log.info("%s", line)
+        for line in problems:
+            log.error("%s", line)
+        kept = list(change.changes.kept)
+        log.info("the change is over", extra=fields(kept=len(kept)))
+        self._change = None
+        told = {"warnings": list(change.plan.warnings), "done": done, "problems": problems, "kept": kept}
+        self._tell(lambda answer: answer.ok(**told))
+
+    def _tell(self, how: Callable[[Answer], None]) -> None:
+        """Answer who has asked, if nobody has yet."""
+        if self._answer is not None:
+            self._notifier.ready()
+            how(self._answer)
+            self._answer = None

@@ -1,0 +1,180 @@
+"""``[mqtt]``: what is accepted, where the broker is, how what is not accepted is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from shmio.config import Mqtt, MqttAccount, load
+from shmio.config.mqtt.accounts import hashed, matches, read_accounts, read_password
+from shmio.config.mqtt.rules import brokers
+from shmio.errors import ConfigError
+
+OWN = '[mqtt]\nlisten = "127.0.0.1:1883"\n'
+EXTERNAL = '[mqtt]\nbroker = "external"\n'
+ACCOUNT = "[[mqtt.account]]\nroles = "
+TLS = '[mqtt.tls]\nca = "ca.pem"\n'
+
+
+def read(folder: Path, text: str) -> Mqtt:
+    file = folder / "supervisor.toml"
+    file.write_text(f'[instance]\nname = "a"\n{text}')
+    mqtt = load(file).mqtt
+    assert mqtt is not None
+    return mqtt
+
+
+def test_what_is_not_written_has_its_default(tmp_path: Path) -> None:
+    mqtt = read(tmp_path, OWN)
+    assert (mqtt.broker, mqtt.prefix, mqtt.keep_alive_s, mqtt.session_expiry_s) == ("embedded", "shmio/a", 30, 0)
+    assert mqtt.password_file is None
+
+
+def test_paths_are_those_of_the_file(tmp_path: Path) -> None:
+    mqtt = read(tmp_path, f'{EXTERNAL}host = "b"\nusername = "u"\npassword_file = "p"\n{TLS}')
+    assert mqtt.password_file == str(tmp_path / "p")
+    assert mqtt.tls is not None
+    assert mqtt.tls.ca == str(tmp_path / "ca.pem")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('host = "127.0.0.1"', ["127.0.0.1:1883"]),
+        ('host = "127.0.0.1:99"', ["127.0.0.1:99"]),
+        ('host = ["b1", "b2:9"]\nport = 7\ninsecure = true', ["b1:7", "b2:9"]),
+        (f'host = "b1"\n{TLS}', ["b1:8883"]),
+        ('host = "[::1]"', ["[::1]:1883"]),
+        ('host = "[::1]:9"', ["[::1]:9"]),
+    ],
+)
+def test_where_an_external_broker_is(tmp_path: Path, text: str, expected: list[str]) -> None:
+    assert [str(address) for address in brokers(read(tmp_path, f"{EXTERNAL}{text}\n"))] == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("[mqtt]\n", "mqtt.listen: this key is needed"),
+        ('[mqtt]\nlisten = "1883"\n', "mqtt.listen: '1883' is not an address"),
+        ('[mqtt]\nlisten = "127.0.0.1:0"\n', "mqtt.listen: 127.0.0.1:0 has no port"),
+        ('[mqtt]\nlisten = "0.0.0.0:1883"\n', "can be reached from other hosts in plain text"),
+        ('[mqtt]\nlisten = "0.0.0.0:1883"\n[mqtt.tls]\nca = "x"\n', "mqtt.tls.certificate: this key is needed"),
+        (f'{OWN}host = "b"\n', 'mqtt.host: is for broker = "external"'),
+        (f'{OWN}username = "b"\n', "mqtt.username: is for"),
+        (f'{OWN}prefix = "a/#"\n', "mqtt.prefix: 'a/#' cannot begin a topic"),
+        (f'{OWN}prefix = "$SYS"\n', "mqtt.prefix"),
+        (f'{OWN}prefix = "a/"\n', "mqtt.prefix"),
+        (f'{OWN}prefix = "a//b"\n', "mqtt.prefix: 'a//b' cannot begin a topic"),
+        (f'{OWN}prefix = "a\\u0000"\n', "mqtt.prefix: must not hold control characters"),
+        (f'{OWN}prefix = "a\\u009f"\n', r"mqtt.prefix: 'a\x9f' cannot begin a topic"),
+        (f'{OWN}prefix = "a\\uffff"\n', r"mqtt.prefix: 'a\uffff' cannot begin a topic"),
+        (f'{OWN}prefix = "{"a" * 257}"\n', "cannot begin a topic: at most 256 characters"),
+        (f'{OWN}client_id = "a\\u0000"\n', "mqtt.client_id: must not hold control characters"),
+        (f'{OWN}[mqtt.sparkplug]\ngroup = "a/b"\n', "mqtt.sparkplug.group: 'a/b' is a part of a topic"),
+        (f'{OWN}[mqtt.sparkplug]\ngroup = "a"\nnode = "+"\n', "mqtt.sparkplug.node: '+' is a part of a topic"),
+        (f'{OWN}[mqtt.sparkplug]\ngroup = "a\\n"\n', "mqtt.sparkplug.group: must not hold control characters"),
+        (f'{OWN}[mqtt.sparkplug]\ngroup = "\\ufdd0"\n', r"mqtt.sparkplug.group: '\ufdd0' is a part of a topic"),
+        (f'{OWN}[mqtt.sparkplug]\ngroup = "a"\nnode = "{"n" * 257}"\n', "is a part of a topic: at most 256 characters"),
+        (f'{OWN}[mqtt.sparkplug]\ngroup = "a"\nprimary_host = "a/b"\n', "mqtt.sparkplug.primary_host: 'a/b' is a part"),
+        (f'{OWN}[mqtt.sparkplug]\ngroup = "a"\nnode = ""\n', "mqtt.sparkplug.node: must not be empty"),
+        (f"{OWN}[mqtt.sparkplug]\n", "mqtt.sparkplug.group"),
+        (f'{OWN}broker = "hive"\n', "mqtt.broker: 'hive' is none; there are: embedded, mosquitto, external"),
+        (f"{OWN}backlog = 1\n", "mqtt.backlog: unknown key; did you mean backlog_mb?"),
+        (f'{OWN}[mqtt.topic]\nmatch = "a"\n', "mqtt.topic: write [[mqtt.topic]]"),
+        (f"{OWN}[[mqtt.topic]]\n", "mqtt.topic[0].match: this key is needed"),
+        (f'{OWN}[[mqtt.topic]]\nmatch = "a"\nqos = 2\n', "mqtt.topic[0].qos"),
+        (f'{OWN}[[mqtt.topic]]\nmatch = "a"\nretained = true\n', "unknown key; did you mean retain?"),
+        (f'{OWN}[[mqtt.topic]]\nmatch = "a"\npayload = "xml"\n', "there are: text, json, structure, frames"),
+        (
+            f'{OWN}[[mqtt.topic]]\nmatch = "a"\npayload = "structure"\ndeadband = 1\n',
+            "mqtt.topic[0].deadband: is for single",
+        ),
+        (f'{OWN}[[mqtt.topic]]\nmatch = "a"\npayload = "frames"\nelements = true\n', "mqtt.topic[0].elements: is for"),
+        (f'{OWN}[mqtt.account]\nroles = ["read"]\n', "mqtt.account: write [[mqtt.account]]"),
+        (f"{OWN}[[mqtt.account]]\n", "mqtt.account[0].roles: this key is needed"),
+        (f'{OWN}{ACCOUNT}["see"]\n', "mqtt.account[0].roles[0]: no role 'see'; there are: read, write"),
+        (f'{OWN}{ACCOUNT}["read"]\n{ACCOUNT}["write"]\n', "mqtt.account[1].name: one without a name"),
+        (f'{OWN}{ACCOUNT}["read"]\nname = "a"\n', "mqtt.account[0].name: 'a' needs a password"),
+        (f'{OWN}{ACCOUNT}["read"]\npublish = ["a"]\n', "mqtt.account[0].publish: needs the role write"),
+        (f'{OWN}{ACCOUNT}["write"]\npublish = ["a/#/b"]\n', "mqtt.account[0].publish[0]: 'a/#/b' is no filter"),
+        (f'{OWN}{ACCOUNT}["write"]\npublish = ["$SYS/#"]\n', "publish[0]: '$SYS/#' is no filter of topics"),
+        (f'{OWN}{ACCOUNT}["write"]\npublish = ["b", "+/#"]\n', "publish[1]: '+/#' would have others publish on"),
+        (f'{OWN}{ACCOUNT}["write"]\npublish = ["shmio/a"]\n', "the instance's own topics, shmio/a/#"),
+        (f'{OWN}{ACCOUNT}["write"]\npublish = ["shmio/+/x"]\n', "the instance's own topics, shmio/a/#"),
+        (
+            f'{OWN}{ACCOUNT}["write"]\npublish = ["spBv1.0/g/DDATA/#"]\n[mqtt.sparkplug]\ngroup = "g"\n',
+            "the instance's own topics, spBv1.0/g/+/a/#",
+        ),
+        (f'{EXTERNAL}host = "127.0.0.1"\n{ACCOUNT}["read"]\n', "an external broker has accounts of its own"),
+        (EXTERNAL, 'mqtt.host: broker = "external" needs it'),
+        (f'{EXTERNAL}host = "b"\n', "b:1883 would be spoken to in plain text over the network"),
+        (f'{EXTERNAL}host = ["b", "c:x"]\n{TLS}', "mqtt.host[1]"),
+        (f'{EXTERNAL}host = "mqtts://b:8883"\n{TLS}', "mqtt.host: 'mqtts://b:8883': write the host's name or address"),
+        (f'{EXTERNAL}host = "b"\nlisten = "127.0.0.1:1"\n{TLS}', "mqtt.listen: an external broker listens by itself"),
+        (f'{EXTERNAL}host = "b"\npassword_file = "p"\n{TLS}', "mqtt.username: a password_file needs it"),
+        (f'{EXTERNAL}host = "b"\n{TLS}key = "k"\n', "mqtt.tls: certificate and key go together"),
+        (f'{OWN}[[source]]\nname = "broker"\nconnector = "memory"\n', "is the name of a process of ours"),
+    ],
+)
+def test_what_will_not_do_is_named(tmp_path: Path, text: str, told: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        read(tmp_path, text)
+    assert told in str(caught.value)
+
+
+def test_topics_beside_the_instances_own_may_be_anybodys(tmp_path: Path) -> None:
+    topics = ["shmio/b/#", "shmio", "homeassistant/+/x", "spBv1.0/g/+/b/#"]
+    mqtt = read(tmp_path, f'{OWN}{ACCOUNT}["write"]\npublish = {topics}\n[mqtt.sparkplug]\ngroup = "g"\n')
+    assert mqtt.account[0].publish == topics
+
+
+def test_an_account_with_roles_has_a_password(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"mqtt\.account\[1\]\.name: 'bert' has no line"):
+        read_accounts(secret(tmp_path, "anna:x\n"), [MqttAccount(roles=["read"], name=one) for one in ("anna", "bert")])
+
+
+def secret(folder: Path, text: str, mode: int = 0o600) -> str:
+    file = folder / "secret"
+    file.write_text(text)
+    file.chmod(mode)
+    return str(file)
+
+
+def test_accounts_are_hashed_as_mosquitto_does(tmp_path: Path) -> None:
+    known = hashed("it is:me")
+    accounts = read_accounts(secret(tmp_path, f"# of the line\nanna:se:cret\n\nbert:{known}\n"))
+    assert accounts["bert"] == known
+    assert matches("se:cret", accounts["anna"])
+    assert matches("it is:me", accounts["bert"])
+    assert not matches("it is:you", accounts["bert"])
+    assert not matches("", "plain")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("anna\n", "line 1: expected name:password"),
+        ("a:x\na:y\n", "line 2: this name has a line already"),
+        ("# none\n", "it has no account"),
+        (":x\n", "line 1: expected name:password"),
+        ("anna: secret\n", "line 1: a blank beside the colon"),
+        ("a:x\nanna :secret\n", "line 2: a blank beside the colon"),
+        ("anna:$argon2id$v=19$m=65536,t=3,p=1$c2FsdA$aGFzaA\n", "line 1: a hash of a kind that is not known here"),
+        ("anna:$7$101$c2Fs*A==$aGFzaA==\n", "or a damaged one: use mosquitto_passwd -H sha512-pbkdf2"),
+    ],
+)
+def test_accounts_that_will_not_do_are_named_and_not_shown(tmp_path: Path, text: str, told: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        read_accounts(secret(tmp_path, text))
+    assert told in str(caught.value)
+
+
+def test_a_password_is_the_first_line_of_a_file_that_nobody_else_reads(tmp_path: Path) -> None:
+    assert read_password(secret(tmp_path, "se cret\r\nand more\n")) == "se cret"
+    for text, mode, told in (("x\n", 0o644, "chmod 600"), ("\n", 0o600, "is empty")):
+        with pytest.raises(ConfigError, match=told):
+            read_password(secret(tmp_path, text, mode))
+    with pytest.raises(ConfigError, match=r"mqtt\.password_file: .*No such file"):
+        read_password(str(tmp_path / "none"))

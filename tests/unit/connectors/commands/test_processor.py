@@ -1,0 +1,481 @@
+"""What becomes of commands: judged at once, carried out once a cycle, each with an end that is true."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Sequence
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shmio.connectors.base import Lost, WriteLostError
+from shmio.connectors.commands.batch import Item, coalesce
+from shmio.connectors.commands.processor import MAX_WAITING, CommandDesk
+from shmio.connectors.output import Output
+from shmio.errors import ConnectorError
+from shmio.layout.model import Layout, Register
+from shmio.segment import (
+    BlockSpec,
+    BlockWriter,
+    Command,
+    CommandKind,
+    CommandSender,
+    Cursor,
+    Event,
+    EventKind,
+    ProcessSpec,
+    Record,
+    Segment,
+    Write,
+)
+
+LAYOUT = Layout(
+    "DB1",
+    1,
+    400,
+    False,
+    (
+        Register("count", "INT", (), 0, None, 2, 1),
+        Register("a", "BOOL", (), 2, 0, 1, 1),
+        Register("b", "BOOL", (), 2, 1, 1, 1),
+        Register("secret", "INT", (), 4, None, 2, 1),
+        Register("long", "BYTE", ((1, 300),), 6, None, 300, 300),
+    ),
+)
+WRITABLE = ("count", "a", "b", "long")
+FAR = 10**18
+
+
+class Bench:
+    """A desk with its thread, a sender, and the events."""
+
+    def __init__(self, writer: BlockWriter, writable: Sequence[str] | None = WRITABLE) -> None:
+        self.now_ns = 0
+        self.desk = CommandDesk(Output(writer), writable, lambda: self.now_ns)
+        self.sender = CommandSender(writer.block, 4)
+        self._events: Cursor[Event] = writer.block.events.cursor()
+        self._thread = threading.Thread(target=self.desk.run)
+        self._thread.start()
+
+    def send(self, *writes: Write, deadline_ns: int = FAR) -> int:
+        return self.sender.submit(writes, deadline_ns)
+
+    def event(self) -> Event:
+        event = self._events.next(20)
+        assert event is not None, "no event came"
+        return event
+
+    def accepted(self, *writes: Write, deadline_ns: int = FAR) -> int:
+        """Send, and wait until it is among what waits for the cycle."""
+        number = self.send(*writes, deadline_ns=deadline_ns)
+        for place in range(len(writes)):
+            event = self.event()
+            assert (event.kind, event.command, event.item) == (EventKind.ACCEPTED, number, place)
+        # Accepted is told before it waits; the next command is judged after both.
+        self.send(Write(4, 0, b"\0\0"))
+        assert self.event().kind == EventKind.REJECTED
+        return number
+
+    def stop(self) -> None:
+        self.desk.stop()
+        self._thread.join(20)
+        assert not self._thread.is_alive()
+
+
+@pytest.fixture
+def writer(instance: str) -> Iterator[BlockWriter]:
+    block = BlockSpec("cell", LAYOUT, 20_000_000, 10**9, 1 << 16)
+    with Segment.create(instance, [block], [ProcessSpec("cell", "source")]) as segment:
+        yield segment.writer("cell")
+        segment.unlink()
+
+
+@pytest.fixture
+def bench(writer: BlockWriter) -> Iterator[Bench]:
+    bench = Bench(writer)
+    bench.desk.open()
+    yield bench
+    bench.stop()
+
+
+def confirm(device: list[Write]) -> Callable[[Sequence[Write]], list[str]]:
+    def write(writes: Sequence[Write]) -> list[str]:
+        device.extend(writes)
+        return [""] * len(writes)
+
+    return write
+
+
+def test_a_command_is_accepted_carried_out_and_confirmed(bench: Bench) -> None:
+    number = bench.accepted(Write(0, 0, b"\1\2"), Write(2, 2, b"\2"))
+    assert bench.desk.waiting
+    device: list[Write] = []
+    bench.desk.carry_out(confirm(device))
+    assert device == [Write(0, 0, b"\1\2"), Write(2, 2, b"\2")]
+    done = bench.event()
+    assert (done.kind, done.command, done.writer, done.item, done.items) == (EventKind.WRITTEN, number, 4, 0, 2)
+    assert not bench.desk.waiting
+
+
+def test_a_note_is_an_event_whatever_the_device_does(bench: Bench) -> None:
+    bench.desk.close("cable out")
+    number = bench.sender.submit([], FAR, CommandKind.NOTE, name="Greifer getauscht")
+    event = bench.event()
+    assert (event.kind, event.text, event.writer, event.command) == (EventKind.NOTED, "Greifer getauscht", 4, number)
+    assert (event.data, event.size, event.items) == (b"", 0, 1)
+
+
+def test_a_note_that_comes_too_late_is_not_taken(bench: Bench) -> None:
+    bench.now_ns = FAR
+    bench.sender.submit([], FAR - 1, CommandKind.NOTE, name="late")
+    assert bench.event().kind == EventKind.REJECTED
+
+
+def test_of_one_cycle_the_last_value_wins_and_is_written_once(bench: Bench) -> None:
+    first = bench.accepted(Write(0, 0, b"\0\1"), Write(2, 1, b"\1"))
+    second = bench.accepted(Write(0, 0, b"\0\2"))
+    device: list[Write] = []
+    bench.desk.carry_out(confirm(device))
+    assert device == [Write(2, 1, b"\1"), Write(0, 0, b"\0\2")], "in the order of what counts"
+    ends = [bench.event() for _ in range(3)]
+    assert [(end.command, end.item, end.kind, end.text) for end in ends] == [
+        (first, 0, EventKind.WRITTEN, "superseded by a later write of the same cycle"),
+        (first, 1, EventKind.WRITTEN, ""),
+        (second, 0, EventKind.WRITTEN, ""),
+    ]
+
+
+def test_neighbouring_bits_of_two_writers_both_arrive(bench: Bench, writer: BlockWriter) -> None:
+    bench.accepted(Write(2, 1, b"\1"))
+    CommandSender(writer.block, 1).submit([Write(2, 2, b"\0")], FAR)
+    assert bench.event().writer == 1
+    bench.send(Write(4, 0, b"\0\0"))
+    bench.event()
+    device: list[Write] = []
+    bench.desk.carry_out(confirm(device))
+    assert [(write.offset, write.mask, write.data[0] & write.mask) for write in device] == [(2, 1, 1), (2, 2, 0)]
+
+
+@pytest.mark.parametrize(
+    ("write", "reason"),
+    [
+        (Write(4, 0, b"\0\0"), "bytes 4 to 5 are not writable; name them in the source's `writable`"),
+        (Write(2, 4, b"\4"), "bytes 2 to 2 are not writable"),
+        (Write(2, 0, b"\3"), "bytes 2 to 2 are not writable"),
+        (Write(399, 0, b"\0\0"), "byte 400 lies outside the block"),
+        (Write(2**32 - 1, 0, b"\0\0"), "lies outside the block"),
+    ],
+)
+def test_what_must_not_be_written_is_rejected_as_a_whole(bench: Bench, write: Write, reason: str) -> None:
+    number = bench.send(Write(0, 0, b"\0\0"), write)
+    event = bench.event()
+    assert (event.kind, event.command, event.items) == (EventKind.REJECTED, number, 2)
+    assert reason in event.text
+    assert not bench.desk.waiting
+
+
+def test_a_command_for_the_process_before_is_rejected(writer: BlockWriter, instance: str) -> None:
+    sender = CommandSender(writer.block, 4)
+    sender.submit([Write(0, 0, b"\0\0")], FAR)
+    with Segment.open(instance, writable=True) as segment:
+        successor = segment.writer("cell")
+        bench = Bench(successor)
+        bench.desk.open()
+        try:
+            assert bench.event().kind == EventKind.REJECTED
+        finally:
+            bench.stop()
+        last = successor.block.events.read(successor.block.events.head())
+        assert last is not None
+        assert "meant for the source's process before this one" in last.text
+
+
+def test_a_command_that_comes_too_late_is_rejected(bench: Bench) -> None:
+    bench.now_ns = 5_000_000
+    bench.send(Write(0, 0, b"\0\0"), deadline_ns=2_000_000)
+    event = bench.event()
+    assert (event.kind, event.text) == (EventKind.REJECTED, "it came 3 ms after its deadline")
+
+
+def test_what_no_cycle_carried_out_in_time_expires(bench: Bench) -> None:
+    number = bench.accepted(Write(0, 0, b"\0\0"), deadline_ns=1_000)
+    bench.now_ns = 2_000
+    device: list[Write] = []
+    bench.desk.carry_out(confirm(device))
+    event = bench.event()
+    assert (event.kind, event.command) == (EventKind.EXPIRED, number)
+    assert device == []
+
+
+def test_nothing_is_accepted_while_the_device_is_away_and_nothing_done_when_it_is_back(bench: Bench) -> None:
+    number = bench.accepted(Write(0, 0, b"\0\0"))
+    bench.desk.close("cable out")
+    event = bench.event()
+    assert (event.kind, event.command, event.text) == (EventKind.EXPIRED, number, "cable out")
+    bench.send(Write(0, 0, b"\0\0"))
+    event = bench.event()
+    assert (event.kind, event.text) == (EventKind.REJECTED, "the source is not connected: cable out")
+    bench.desk.open()
+    assert not bench.desk.waiting
+    bench.accepted(Write(0, 0, b"\0\0"))
+
+
+def test_a_lost_connection_leaves_the_end_unknown(bench: Bench) -> None:
+    bench.accepted(Write(0, 0, b"\0\0"))
+
+    def lost(_: Sequence[Write]) -> list[str]:
+        raise ConnectorError("cut")
+
+    with pytest.raises(ConnectorError):
+        bench.desk.carry_out(lost)
+    event = bench.event()
+    assert (event.kind, event.text) == (EventKind.UNKNOWN, "sent, but not confirmed: cut")
+
+
+def test_of_a_lost_batch_each_item_has_the_end_that_is_known(bench: Bench) -> None:
+    """Confirmed and refused before the loss, under way at that moment, never sent; one is superseded."""
+    first = bench.accepted(Write(0, 0, b"\0\0"), Write(6, 0, b"a"), Write(8, 0, b"b"), Write(10, 0, b"c"))
+    second = bench.accepted(Write(10, 0, b"d"), Write(2, 1, b"\1"), Write(2, 2, b"\2"))
+
+    def lost(writes: Sequence[Write]) -> list[str]:
+        assert len(writes) == 6
+        raise WriteLostError("cut", ["", "no", Lost.UNKNOWN, Lost.UNSENT, Lost.UNSENT, Lost.UNSENT])
+
+    with pytest.raises(ConnectorError):
+        bench.desk.carry_out(lost)
+    ends = [bench.event() for _ in range(5)]
+    assert [(end.command, end.item, end.items, end.kind, end.text) for end in ends] == [
+        (first, 0, 1, EventKind.WRITTEN, ""),
+        (first, 1, 1, EventKind.REFUSED, "no"),
+        (first, 2, 1, EventKind.UNKNOWN, "sent, but not confirmed: cut"),
+        (first, 3, 1, EventKind.EXPIRED, "not sent: cut"),
+        (second, 0, 3, EventKind.EXPIRED, "not sent: cut"),
+    ]
+
+
+def test_an_item_of_which_a_part_was_done_is_not_expired(bench: Bench) -> None:
+    """The bytes that a later item did not take were written, the others were not."""
+    bench.accepted(Write(6, 0, b"abcd"))
+    bench.accepted(Write(8, 0, b"xy"))
+
+    def lost(writes: Sequence[Write]) -> list[str]:
+        assert writes == [Write(6, 0, b"ab"), Write(8, 0, b"xy")]
+        raise WriteLostError("", ["", Lost.UNSENT])
+
+    with pytest.raises(ConnectorError):
+        bench.desk.carry_out(lost)
+    assert [bench.event().kind for _ in range(2)] == [EventKind.UNKNOWN, EventKind.EXPIRED]
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_of_a_connector_that_tells_too_little_nothing_is_known(bench: Bench, lost: bool) -> None:
+    number = bench.send(Write(0, 0, b"\0\1"), Write(6, 0, b"\1"))
+    for _ in range(2):
+        assert bench.event().kind == EventKind.ACCEPTED
+
+    def write(_: Sequence[Write]) -> list[str]:
+        if lost:
+            raise WriteLostError("cut", [""])
+        return [""]
+
+    with pytest.raises(ConnectorError, match="1 outcomes of 2 writes"):
+        bench.desk.carry_out(write)
+    end = bench.event()
+    assert (end.command, end.item, end.items, end.kind) == (number, 0, 2, EventKind.UNKNOWN)
+
+
+def test_the_refusal_of_one_item_is_told_of_that_item(bench: Bench) -> None:
+    bench.accepted(Write(0, 0, b"\0\0"), Write(2, 1, b"\1"), Write(2, 2, b"\2"), Write(6, 0, b"\0"))
+    bench.desk.carry_out(lambda writes: ["access denied" if write.mask == 2 else "" for write in writes])
+    ends = [bench.event() for _ in range(3)]
+    assert [(end.kind, end.item, end.items, end.text) for end in ends] == [
+        (EventKind.WRITTEN, 0, 2, ""),
+        (EventKind.REFUSED, 2, 1, "access denied"),
+        (EventKind.WRITTEN, 3, 1, ""),
+    ]
+
+
+def test_a_long_write_is_told_in_parts(bench: Bench) -> None:
+    data = bytes(range(256)) + bytes(44)
+    bench.send(Write(6, 0, data))
+    first, second = bench.event(), bench.event()
+    assert first.data + second.data == data
+    assert [(part.item, part.offset, part.size) for part in (first, second)] == [(0, 6, 256), (0, 262, 44)]
+
+
+def test_what_waits_has_a_bound_and_the_rest_its_turn(bench: Bench) -> None:
+    numbers = [bench.send(*[Write(0, 0, b"\0\0")] * 100) for _ in range(5)]
+    device: list[Write] = []
+    seen: list[tuple[int, EventKind]] = []
+
+    def until(commands: int) -> None:
+        while sum(kind is EventKind.ACCEPTED for _, kind in seen) < 100 * commands:
+            event = bench.event()
+            seen.append((event.command, EventKind(event.kind)))
+
+    until(2)
+    assert len(bench.desk._items) <= MAX_WAITING
+    for commands in (2, 4, 5):
+        until(commands)
+        while not bench.desk.waiting:  # accepted is told before it waits
+            pass
+        bench.desk.carry_out(confirm(device))
+    accepted = [command for command, kind in seen if kind is EventKind.ACCEPTED]
+    assert accepted == [number for number in numbers for _ in range(100)]
+
+
+def test_what_waits_has_a_bound_in_bytes(bench: Bench, writer: BlockWriter, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four times what the block has: five of 300 of its 400 bytes."""
+    commands, looked = writer.block.commands, threading.Semaphore(0)
+    wait = commands.wait
+
+    def rest(seen: int, timeout_ns: int) -> None:
+        looked.release()
+        wait(seen, timeout_ns)
+
+    monkeypatch.setattr(commands, "wait", rest)
+    numbers = [bench.send(Write(6, 0, bytes(300))) for _ in range(6)]
+    accepted = [bench.event().command for _ in range(10)]  # two parts each
+    assert accepted == [number for number in numbers[:5] for _ in range(2)]
+    while looked.acquire(blocking=False):
+        pass
+    for _ in range(2):  # one may have been under way
+        commands.wake()
+        assert looked.acquire(timeout=20)
+    assert bench._events.next(0) is None
+    bench.desk.carry_out(confirm([]))
+    after = [bench.event() for _ in range(7)]
+    assert [event.command for event in after if event.kind == EventKind.WRITTEN] == numbers[:5]
+    assert [event.command for event in after if event.kind == EventKind.ACCEPTED] == numbers[5:] * 2
+
+
+def test_a_connection_lost_while_a_command_is_being_accepted(
+    bench: Bench, writer: BlockWriter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was judged before, and would wait after: it is neither done later nor left without an end."""
+    tell = writer.event
+
+    def told(record: Record) -> int:
+        number = tell(record)
+        if record.kind is EventKind.ACCEPTED:
+            bench.desk.close("cable out")
+        return number
+
+    monkeypatch.setattr(writer, "event", told)
+    number = bench.send(Write(0, 0, b"\0\1"))
+    ends = [bench.event() for _ in range(2)]
+    assert [(end.command, end.kind, end.text) for end in ends] == [
+        (number, EventKind.ACCEPTED, ""),
+        (number, EventKind.EXPIRED, "the source is not connected: cable out"),
+    ]
+    bench.desk.open()
+    bench.desk.settle()
+    assert not bench.desk.waiting
+
+
+def test_a_superseded_value_is_not_written_when_what_took_its_place_was_refused(bench: Bench) -> None:
+    first, second = bench.accepted(Write(0, 0, b"\0\1")), bench.accepted(Write(0, 0, b"\0\2"))
+    bench.desk.carry_out(lambda writes: ["no"] * len(writes))
+    ends = [bench.event() for _ in range(2)]
+    assert [(end.command, end.kind, end.text) for end in ends] == [
+        (first, EventKind.REFUSED, "no"),
+        (second, EventKind.REFUSED, "no"),
+    ]
+
+
+def test_commands_go_in_the_order_in_which_they_were_accepted(bench: Bench) -> None:
+    """First the data, then the strobe that tells of them, though it lies before them."""
+    bench.accepted(Write(100, 0, b"DATA"))
+    bench.accepted(Write(2, 1, b"\1"))
+    bench.accepted(Write(104, 0, b"MORE"))
+    device: list[Write] = []
+    bench.desk.carry_out(confirm(device))
+    assert device == [Write(100, 0, b"DATA"), Write(2, 1, b"\1"), Write(104, 0, b"MORE")]
+
+
+def test_what_waits_expires_at_its_deadline_though_no_cycle_comes(bench: Bench) -> None:
+    number = bench.accepted(Write(0, 0, b"\0\0"), deadline_ns=1_000)
+    bench.now_ns = 2_000
+    bench.desk._writer.block.commands.wake()
+    event = bench.event()
+    assert (event.kind, event.command) == (EventKind.EXPIRED, number)
+    assert not bench.desk.waiting
+
+
+def test_whatever_a_write_raises_the_end_is_told(bench: Bench) -> None:
+    bench.accepted(Write(0, 0, b"\0\0"))
+
+    def defect(_: Sequence[Write]) -> list[str]:
+        raise ZeroDivisionError("a defect")
+
+    with pytest.raises(ZeroDivisionError):
+        bench.desk.carry_out(defect)
+    assert bench.event().kind == EventKind.UNKNOWN
+
+
+def test_a_writer_of_garbage_is_told_once_a_second(bench: Bench, writer: BlockWriter) -> None:
+    for _ in range(50):
+        while not writer.block.commands.push(2, b"garbage"):
+            pass
+    assert bench.event().kind == EventKind.REJECTED
+    bench.accepted(Write(0, 0, b"\0\0"))  # the next event is about this one
+
+
+def test_what_is_no_command_is_told_and_passed_over(bench: Bench, writer: BlockWriter) -> None:
+    writer.block.commands.push(2, b"garbage")
+    event = bench.event()
+    assert (event.kind, event.writer) == (EventKind.REJECTED, 2)
+    assert "not a command" in event.text
+    bench.accepted(Write(0, 0, b"\0\0"))
+
+
+def test_a_source_that_cannot_write_says_so(writer: BlockWriter) -> None:
+    bench = Bench(writer, None)
+    bench.desk.open()
+    try:
+        bench.send(Write(0, 0, b"\0\0"))
+        assert "connector cannot write" in bench.event().text
+    finally:
+        bench.stop()
+
+
+single = st.tuples(
+    st.integers(0, 9), st.sampled_from([1 << bit for bit in range(8)]), st.binary(min_size=1, max_size=1)
+)
+whole = st.tuples(st.integers(0, 5), st.just(0), st.binary(min_size=1, max_size=5))
+
+
+@given(st.lists(st.one_of(single, whole), max_size=12), st.binary(min_size=10, max_size=10))
+@settings(max_examples=300)
+def test_coalesced_writes_leave_what_the_single_ones_would(items: list[tuple[int, int, bytes]], before: bytes) -> None:
+    def apply(image: bytes, writes: Sequence[Write]) -> bytes:
+        changed = bytearray(image)
+        for offset, mask, data in writes:
+            for at, byte in enumerate(data, offset):
+                bits = mask or 0xFF
+                changed[at] = changed[at] & ~bits | byte & bits
+        return bytes(changed)
+
+    writes = [Write(*item) for item in items]
+    commands = [
+        Command(0, place // 3, 1, FAR, tuple(writes[place - place % 3 : place - place % 3 + 3]))
+        for place in range(len(writes))
+    ]
+    first = {command.id: command for command in commands}
+    merged, superseded = coalesce([Item(first[place // 3], place % 3) for place in range(len(writes))], 10)
+    assert apply(before, merged) == apply(before, writes)
+    assert apply(before, [w for place, w in enumerate(writes) if place not in superseded]) == apply(before, writes)
+
+
+def test_a_command_keeps_its_place_in_its_queue(writer: BlockWriter) -> None:
+    """Commands of one writer are judged in the order in which they were sent."""
+    sender = CommandSender(writer.block, 0)
+    numbers = [sender.submit([Write(0, 0, bytes([0, n]))], FAR) for n in range(50)]
+    bench = Bench(writer)
+    bench.desk.open()
+    try:
+        seen = [bench.event().command for _ in range(50)]
+    finally:
+        bench.stop()
+    assert seen == numbers

@@ -1,0 +1,553 @@
+"""Declared injections in a source's process: what consumers see, what reaches the device, what is told."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from typing import Any
+
+import msgspec
+import pytest
+
+from shmio.config import Declaration
+from shmio.connectors.commands.processor import CommandDesk
+from shmio.connectors.injection.declared import MAX_HELD
+from shmio.connectors.injection.layers import Owner
+from shmio.connectors.output import Image, Output
+from shmio.errors import CommandError
+from shmio.injection.draw import Draw
+from shmio.layout.compiler import Source, compile_sources
+from shmio.layout.values.codec import Value, codec
+from shmio.local.reading import reading
+from shmio.local.writer import Commander
+from shmio.segment import (  # fmt: skip
+    Attributes,
+    BlockSpec,
+    CommandKind,
+    CommandSender,
+    Event,
+    EventKind,
+    Frame,
+    ProcessSpec,
+    Provenance,
+    Quality,
+    Segment,
+    Write,
+)
+from shmio.segment.standing_injections import declared_document
+from shmio.testing.cell import until
+
+TABLE = b"""
+[registers]
+position = "LREAL"
+speed = "INT"
+lamps = "ARRAY[0..9] OF BOOL"
+flags = "WORD"
+"axis/1" = "REAL"
+"axis/2" = "REAL"
+"""
+LAYOUT = compile_sources([Source("cell.toml", TABLE)]).layouts[0]
+PERIOD_NS = 10_000_000
+FIRST: list[Value] = [True, *[False] * 9]
+"""Of the lamps the first is on."""
+
+
+def declaration(name: str, target: str | list[str], operation: str, **keys: Any) -> Declaration:
+    return msgspec.convert({"name": name, "target": target, "operation": operation, **keys}, Declaration)
+
+
+class Rig:
+    """A source's process without its loop: the test is the device, one cycle after another."""
+
+    def __init__(self, segment: Segment, source: str = "cell", **options: Any) -> None:
+        self.segment = segment
+        self.block = segment.blocks[source]
+        self.owners = {4: Owner(4, 100), 5: Owner(5, 200)}
+        self.client, self.other = Commander(self.block, 4), Commander(self.block, 5)
+        self.events = self.block.events.cursor()
+        self.writer = segment.writer(source)
+        self.output = Output(self.writer)
+        self.desk = CommandDesk(
+            self.output, ["**"], lambda: 0, armed=True, owner_of=self.owners.get, blocks=lambda: segment.blocks,
+            **options,
+        )  # fmt: skip
+        self.desk.open()
+        self.cycle = 0
+        self.image = bytearray(LAYOUT.size)
+        self.written: list[Write] = []
+        self._thread = threading.Thread(target=self.desk.run)
+        self._thread.start()
+
+    def close(self) -> None:
+        self.desk.stop()
+        self._thread.join(20)
+        assert not self._thread.is_alive()
+
+    def give(self, values: Mapping[str, Value]) -> None:
+        """What the device has from now on."""
+        for path, value in values.items():
+            codec(LAYOUT.registers[LAYOUT.by_path[path]], LAYOUT.byte_order).encode_into(value, self.image)
+
+    def poll(self, values: Mapping[str, Value] | None = None, quality: Quality = Quality.GOOD) -> Frame:
+        """One cycle, as the loop does it; the frame that consumers see."""
+        self.give(values or {})
+        self.cycle += 1
+        self.writer.cycle = self.cycle
+        self.desk.release(self.cycle)
+        if self.desk.waiting:
+            self.desk.carry_out(self._write)
+        self.output.publish(Image(bytes(self.image), self.cycle, 1, quality, Provenance.LIVE, ""))
+        frame = self.block.latest()
+        assert frame is not None
+        return frame
+
+    def _write(self, writes: Any) -> list[str]:
+        self.written += writes
+        return [""] * len(writes)
+
+    def sees(self, path: str) -> Value:
+        return reading(self.block, LAYOUT.registers[LAYOUT.by_path[path]], self.block.latest()).value
+
+    def follow(self, path: str, values: Sequence[Value], give: str | None = None) -> list[Value]:
+        """What consumers see of a register while the device has one value after another, there or elsewhere."""
+        seen = []
+        for value in values:
+            self.poll({give or path: value})
+            seen.append(self.sees(path))
+        return seen
+
+    def told(self, *kinds: EventKind) -> list[Event]:
+        """The events of these kinds since the last look."""
+        found = []
+        while (event := self.events.next(0)) is not None:
+            if event.kind in kinds:
+                found.append(event)
+        return found
+
+    def write(self, values: Mapping[str, Value]) -> int:
+        """Send, and wait until it is judged; the command's number."""
+        judged = self.block.events.cursor()
+        ticket = self.other.submit(values)
+        while (event := judged.next(20)) is not None and event.command != ticket.number:
+            pass
+        # Accepted is told before it waits; the next command is judged after both.
+        with pytest.raises(CommandError, match="no injection"):
+            self.client.lift(1)
+        return ticket.number
+
+    def settle(self) -> None:
+        """Wait until the commands' thread has done what there was to do."""
+        with pytest.raises(CommandError, match="no injection"):
+            self.client.lift(1)
+
+
+def spec(source: str = "cell", *declared: Declaration) -> BlockSpec:
+    attributes = Attributes("device", ("**",), True)
+    return BlockSpec(source, LAYOUT, PERIOD_NS, 10**9, 1 << 20, attributes, declared_document(declared))
+
+
+@pytest.fixture
+def make(instance: str) -> Iterator[Callable[..., Rig]]:
+    """A rig whose configuration declares these."""
+    with ExitStack() as stack:
+
+        def make(*declared: Declaration) -> Rig:
+            specs = [spec("cell", *declared), spec("other")]
+            segment = stack.enter_context(Segment.create(instance, specs, [ProcessSpec("cell", "source")]))
+            stack.callback(segment.unlink)
+            rig = Rig(segment)
+            stack.callback(rig.close)
+            return rig
+
+        yield make
+
+
+RAMP = [10, 20, 30, 40, 50, 60, 70, 80]
+
+
+def test_between_two_times_consumers_see_what_the_operation_makes(make: Callable[..., Rig]) -> None:
+    rig = make(declaration("drift", "cell/speed", "offset", value=100, start_s=0.03, end_s=0.05))
+    rig.events = rig.block.events.cursor(after=0)
+    assert rig.follow("speed", RAMP[:6]) == [10, 20, 130, 140, 50, 60]
+    laid, on, off = rig.told(EventKind.INJECTED, EventKind.ACTIVATED, EventKind.DEACTIVATED)
+    assert (on.cycle, on.injection, on.text, on.item) == (3, laid.injection, "drift", 1)
+    assert (off.cycle, off.injection) == (5, laid.injection)
+    (standing,) = rig.block.standing.read()
+    assert standing.running is not None
+    assert (standing.running.state, standing.configured, standing.active) == ("over", True, False)
+    told = {**msgspec.to_builtins(standing.running.declaration), "seed": standing.running.seed}
+    assert json.loads(laid.data) == told, "what was declared is in the record, with the seed that was drawn"
+
+
+def test_frames_are_as_ever_while_nothing_is_active(make: Callable[..., Rig]) -> None:
+    rig = make(declaration("drift", "cell/speed", "offset", value=100, start_s=0.03, end_s=0.04))
+    assert [rig.poll().effective is None for _ in range(5)] == [True, True, False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("operation", "keys", "seen"),
+    [
+        ("set", {"value": -5}, [-5] * 4),
+        ("set", {"value": "16#FF"}, [255] * 4),
+        ("scale", {"value": 0.25}, [2, 5, 8, 10]),
+        ("scale", {"value": 1e6}, [32767] * 4),
+        ("clamp", {"min": 15, "max": 35}, [15, 20, 30, 35]),
+        ("freeze", {}, [10] * 4),
+        ("delay", {"delay_cycles": 2}, [10, 10, 10, 20]),
+        ("delay", {"delay_ms": 10}, [10, 10, 20, 30]),
+        ("drop", {}, [10] * 4),
+        ("flip", {"bits": [0, 15]}, [value ^ 1 | -32768 for value in RAMP[:4]]),
+    ],
+)
+def test_operations(make: Callable[..., Rig], operation: str, keys: dict[str, Any], seen: list[Value]) -> None:
+    rig = make(declaration("one", "cell/speed", operation, **keys))
+    assert rig.follow("speed", RAMP[:4]) == seen
+    frame = rig.poll({"speed": 5})
+    assert frame.effective is not None
+    assert frame.raw[:8] == frame.effective[:8], "the neighbours stay as they are"
+
+
+def test_the_same_seed_gives_the_same_values_and_another_does_not(make: Callable[..., Rig]) -> None:
+    noise = {"amplitude": 5, "distribution": "gaussian"}
+    rig = make(
+        declaration("noise", "cell/axis/1", "noise", seed=7, **noise, when="cell/lamps/0"),
+        declaration("other", "cell/axis/2", "noise", seed=8, **noise, when="cell/lamps/0"),
+    )
+
+    def run() -> list[tuple[Value, Value]]:
+        rig.poll({"lamps": FIRST})
+        seen = [(rig.sees("axis/1"), rig.sees("axis/2"))]
+        for _ in range(5):
+            rig.poll()
+            seen.append((rig.sees("axis/1"), rig.sees("axis/2")))
+        rig.poll({"lamps": [False] * 10})
+        return seen
+
+    first, second = run(), run()
+    assert len(set(first)) == 6
+    assert first != second, "each activation has its own"
+    assert all(one != other for one, other in first)
+
+
+def test_a_frame_between_two_cycles_draws_nothing_new(make: Callable[..., Rig]) -> None:
+    rig = make(
+        declaration("noise", "cell/axis/1", "noise", amplitude=5, seed=1),
+        declaration("loss", "cell/speed", "drop", probability=0.5, seed=1),
+        declaration("late", "cell/flags", "delay", delay_cycles=1),
+    )
+    for cycle in range(20):
+        before = rig.poll({"speed": cycle, "flags": cycle})
+        number = rig.client.inject(["position"])
+        between = rig.block.latest()
+        assert between is not None
+        rig.client.lift(number)
+        assert before.effective is not None
+        assert between.effective is not None
+        assert between.number > before.number
+        assert between.effective[8:] == before.effective[8:]
+
+
+def test_some_cycles_are_lost(make: Callable[..., Rig]) -> None:
+    rig = make(declaration("loss", "cell/speed", "drop", probability=0.5, seed=3))
+    given = list(range(1, 41))
+    seen = rig.follow("speed", given)
+    kept = [number for number, shown in zip(given, seen, strict=True) if number == shown]
+    assert 10 < len(kept) < 30
+    for place, shown in enumerate(seen):
+        assert shown == max((number for number in kept if number <= given[place]), default=given[0])
+
+
+def test_conditions_over_this_source_and_others(make: Callable[..., Rig]) -> None:
+    rig = make(declaration("stuck", "cell/speed", "set", value=0, when="cell/flags.%X3 and other/speed > 5"))
+    other = rig.segment.writer("other")
+    speed = LAYOUT.registers[LAYOUT.by_path["speed"]]
+
+    def publish(value: int, quality: Quality = Quality.GOOD) -> None:
+        image = bytearray(LAYOUT.size)
+        codec(speed, LAYOUT.byte_order).encode_into(value, image)
+        other.publish(image, cycle=1, quality=quality)
+
+    def seen(flags: int) -> Value:
+        rig.poll({"speed": 9, "flags": flags})
+        return rig.sees("speed")
+
+    assert seen(8) == 9, "the other source has no frame yet"
+    publish(6)
+    assert [seen(flags) for flags in (8, 7, 8)] == [0, 9, 0]
+    publish(6, Quality.BAD)
+    assert seen(8) == 9, "a bad value is none"
+    publish(6)
+    assert seen(8) == 0
+    rig.poll(quality=Quality.BAD)
+    assert rig.sees("speed") == 9
+
+
+def test_a_condition_reads_what_the_device_delivers_not_what_injections_make_of_it(make: Callable[..., Rig]) -> None:
+    rig = make(declaration("limit", "cell/speed", "set", value=0, when="cell/speed > 50"))
+    assert rig.follow("speed", RAMP) == [10, 20, 30, 40, 50, 0, 0, 0]
+
+
+def test_on_a_condition_for_a_limited_time(make: Callable[..., Rig]) -> None:
+    rig = make(declaration("pulse", "cell/speed", "set", value=-1, when="rising(cell/flags > 0)", for_s=0.02, times=2))
+    assert rig.follow("speed", [0, 1, 1, 1, 1, 0, 1, 0, 0, 0, 1, 0], give="flags") == [
+        0, -1, -1, 0, 0, 0, -1, -1, 0, 0, 0, 0,
+    ]  # fmt: skip
+    turns = [(event.cycle, event.item) for event in rig.told(EventKind.ACTIVATED, EventKind.DEACTIVATED)]
+    assert turns == [(2, 1), (4, 1), (7, 2), (9, 2)]
+
+
+def test_the_highest_priority_is_outermost_whoever_laid_it(make: Callable[..., Rig]) -> None:
+    rig = make(
+        declaration("outer", "cell/speed", "offset", value=1, priority=5),
+        declaration("inner", "cell/speed", "scale", value=2),
+    )
+    assert rig.follow("speed", [10]) == [21]
+    number = rig.client.inject(["speed"], priority=3)
+    rig.client.shadow(number, {"speed": 100})
+    rig.poll()
+    assert rig.sees("speed") == 101, "between the two"
+    rig.client.lift(number)
+    rig.poll()
+    assert rig.sees("speed") == 21
+    paths = {reg.path: reading(rig.block, reg, rig.block.latest()).provenance for reg in LAYOUT.registers}
+    assert (paths["speed"], paths["flags"]) == ("injected", "live")
+
+
+def test_bits_elements_ranges_structures_and_whole_blocks(make: Callable[..., Rig]) -> None:
+    rig = make(
+        declaration("bit", "cell/flags.%X2", "set", value=True),
+        declaration("byte", "cell/flags.%B1", "set", value=0x55),
+        declaration("lamps", ["cell/lamps/2..4", "cell/lamps/9"], "set", value=True),
+        declaration("axes", "cell/axis", "offset", value=1.5),
+    )
+    rig.poll({"flags": 1, "axis/1": 1, "axis/2": 2})
+    assert rig.sees("flags") == 0x5505
+    assert rig.sees("lamps") == [place in (2, 3, 4, 9) for place in range(10)]
+    assert (rig.sees("axis/1"), rig.sees("axis/2")) == (2.5, 3.5)
+    everything = declaration("all", "cell", "freeze", priority=9)
+    rig.client.declare(everything)
+    held = rig.poll().effective
+    assert rig.poll({"position": 7, "flags": 0, "speed": 3}).effective == held
+
+
+# -- over /in ----------------------------------------------------------------------------------------------------------
+
+
+def test_what_is_written_reaches_the_device_altered(make: Callable[..., Rig]) -> None:
+    rig = make(declaration("gain", "cell/speed/in", "scale", value=2, start_s=0.02, end_s=0.04))
+    rig.poll()
+    rig.poll()
+    number = rig.write({"speed": 21, "flags": 7})
+    rig.poll()
+    assert rig.written == [Write(8, 0, b"\x2a\0"), Write(12, 0, b"\x07\0")]
+    events = rig.told(EventKind.DIVERTED, EventKind.ACCEPTED, EventKind.WRITTEN)
+    injection = events[0].injection
+    assert [(event.kind, event.command, event.data[:1], event.injection) for event in events] == [
+        (EventKind.DIVERTED, number, b"\x15", injection),
+        (EventKind.ACCEPTED, number, b"\x2a", injection),
+        (EventKind.ACCEPTED, number, b"\x07", 0),
+        (EventKind.WRITTEN, number, b"", 0),
+        (EventKind.WRITTEN, number, b"", 0),
+    ]
+    assert [event.text for event in events[-2:]] == ["with what the injection 'gain' made of it", ""]
+    rig.poll()
+    rig.write({"speed": 21})
+    rig.poll()
+    assert rig.written[-1] == Write(8, 0, b"\x15\0"), "it is over"
+
+
+def test_a_black_hole_takes_what_is_written(make: Callable[..., Rig]) -> None:
+    rig = make(declaration("hole", "cell/lamps/3/in", "drop"))
+    rig.poll()
+    assert rig.other.write({"lamps/3": True})[0].kind is EventKind.TAKEN
+    rig.write({"lamps": [True] * 10})
+    rig.poll()
+    bits = {(write.offset, write.mask) for write in rig.written}
+    assert bits == {(10, 1 << bit) for bit in range(8) if bit != 3} | {(11, 0)}
+
+
+def test_a_delayed_write_is_sent_later(make: Callable[..., Rig]) -> None:
+    rig = make(
+        declaration("late", "cell/speed/in", "delay", delay_cycles=2, priority=1),
+        declaration("gain", "cell/speed/in", "scale", value=3),
+    )
+    rig.poll()
+    rig.write({"speed": 5})
+    sent = []
+    for _ in range(4):
+        rig.poll()
+        sent.append(list(rig.written))
+    assert sent == [[], [], [Write(8, 0, b"\x0f\0")], [Write(8, 0, b"\x0f\0")]], "and met what is further in"
+    rig.events = rig.block.events.cursor(after=0)
+    told = (EventKind.DIVERTED, EventKind.TAKEN, EventKind.ACCEPTED, EventKind.WRITTEN)
+    kinds = [event.kind for event in rig.told(*told)]
+    assert kinds == [
+        EventKind.DIVERTED, EventKind.TAKEN, EventKind.DIVERTED, EventKind.ACCEPTED, EventKind.WRITTEN,
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("by", ["lift", "disconnect"])
+def test_what_a_delay_held_is_not_sent_when_it_is_lifted_or_the_device_is_gone(
+    make: Callable[..., Rig], by: str
+) -> None:
+    rig = make()
+    number = rig.client.declare(declaration("late", "cell/speed/in", "delay", delay_ms=20))
+    rig.poll()
+    rig.write({"speed": 5})
+    if by == "lift":
+        rig.other.lift(number)
+    else:
+        rig.desk.close("cable out")
+        rig.desk.open()
+    (lost,) = rig.told(EventKind.EXPIRED)
+    assert lost.injection == number
+    assert lost.text == f"a delay held it: {'lifted' if by == 'lift' else 'cable out'}"
+    for _ in range(4):
+        rig.poll()
+    assert rig.written == []
+
+
+def test_a_delay_that_is_full_rejects_what_comes(make: Callable[..., Rig]) -> None:
+    rig = make(declaration("late", "cell/speed/in", "delay", delay_cycles=2))
+    rig.poll()
+    for value in range(MAX_HELD):
+        assert rig.other.write({"speed": value})[0].kind is EventKind.TAKEN
+    (outcome,) = rig.other.write({"speed": 1})
+    assert (outcome.kind, outcome.text) == (
+        EventKind.REJECTED, f"the delay of injection late holds {MAX_HELD} values already",
+    )  # fmt: skip
+    rig.client.lift(rig.block.standing.read()[0].id)
+    rig.write({"speed": 1})
+
+
+# -- by command, and from process to process ---------------------------------------------------------------------------
+
+
+def test_one_that_a_client_declares_goes_when_it_is_over_or_its_client_is_gone(make: Callable[..., Rig]) -> None:
+    rig = make()
+    over = rig.client.declare(declaration("short", "cell/speed", "set", value=1, end_s=0.02))
+    gone = rig.other.declare(declaration("left", "cell/flags", "set", value=1))
+    kept = rig.other.declare(declaration("kept", "cell/flags", "set", value=2), keep=True)
+    rig.poll()
+    rig.poll()
+    rig.settle()
+    rig.owners[5] = Owner(5, 201)
+    lifted: list[tuple[int, str]] = []
+    while len(lifted) < 2:
+        event = rig.events.next(20)
+        assert event is not None
+        lifted += [(event.injection, event.text)] if event.kind == EventKind.LIFTED else []
+    assert lifted == [(over, "over"), (gone, "its client is gone")]
+    assert [standing.id for standing in rig.block.standing.read()] == [kept]
+
+
+def test_one_of_the_configuration_that_somebody_lifts_stays_lifted(make: Callable[..., Rig]) -> None:
+    rig = make(declaration("stuck", "cell/speed", "set", value=-1))
+    rig.poll({"speed": 5})
+    (standing,) = rig.block.standing.read()
+    rig.client.lift(standing.id)
+    rig.poll()
+    assert rig.sees("speed") == 5
+    assert [one.lifted for one in rig.block.standing.read()] == [True]
+    with pytest.raises(CommandError, match="the injection stuck was lifted already"):
+        rig.client.lift(standing.id)
+    rig.close()
+    again = Rig(rig.segment)
+    try:
+        again.poll({"speed": 6})
+        assert again.sees("speed") == 6
+    finally:
+        again.close()
+
+
+def test_a_process_goes_on_where_the_one_before_it_ended(make: Callable[..., Rig]) -> None:
+    rig = make(
+        declaration("held", "cell/speed", "freeze", when="cell/lamps/0"),
+        declaration("noise", "cell/axis/1", "noise", amplitude=5, when="cell/lamps/0"),
+        declaration("once", "cell/flags", "set", value=77, when="cell/lamps/0", for_s=0.03, times=1),
+    )
+    rig.poll({"lamps": FIRST, "speed": 3})
+    seeds = {one.name: one.running.seed for one in rig.block.standing.read() if one.running}
+    draw = Draw(seeds["noise"], "noise")
+    expected = [float(5 * (2 * draw.uniform(1, place, 1)[0] - 1)) for place in range(4)]
+    rig.close()
+    again = Rig(rig.segment)
+    again.image, again.cycle = rig.image, rig.cycle
+    try:
+        seen = []
+        for _ in range(3):
+            again.poll({"speed": 9})
+            seen.append((again.sees("speed"), again.sees("axis/1"), again.sees("flags")))
+        assert [speed for speed, _, _ in seen] == [3, 3, 3]
+        assert [noise for _, noise, _ in seen] == pytest.approx(expected[1:], rel=1e-6)
+        assert [flags for _, _, flags in seen] == [77, 77, 0]
+        assert again.told(EventKind.INJECTED) == [], "nobody laid it anew"
+    finally:
+        again.close()
+
+
+def test_the_configuration_may_change_while_the_process_runs(make: Callable[..., Rig]) -> None:
+    stay = declaration("stay", "cell/axis/1", "freeze")
+    rig = make(stay, declaration("go", "cell/flags", "set", value=1), declaration("turn", "cell/speed", "set", value=1))
+    rig.poll({"axis/1": 1})
+    before = {standing.name: standing.id for standing in rig.block.standing.read()}
+    changed = [
+        stay,
+        declaration("turn", "cell/speed", "set", value=2),
+        declaration("new", "cell/lamps/1", "set", value=1),
+    ]
+    rig.block.declared.write(declared_document(changed))
+    rig.block.commands.wake()
+    until(lambda: "new" in {standing.name for standing in rig.block.standing.read()}, "laid, the last thing it does")
+    rig.poll({"axis/1": 2})
+    assert (rig.sees("axis/1"), rig.sees("flags"), rig.sees("speed")) == (1, 0, 2)
+    after = {standing.name: standing.id for standing in rig.block.standing.read()}
+    assert set(after) == {"stay", "turn", "new"}
+    assert before["stay"] == after["stay"]
+    assert before["turn"] != after["turn"]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "reason"),
+    [
+        (declaration("x", "cell/speeds", "freeze"), "target: cell/speeds: no such register"),
+        (declaration("x", "other/speed", "freeze"), "target: it is of source other, this is cell"),
+        (declaration("x", "cell/speed", "set"), "value: this key is needed for operation 'set'"),
+        (declaration("x", "cell/speed", "set", value="hot"), "value: speed: INT: expected"),
+        (declaration("x", "cell/speed", "freeze", when="cell/speed >"), "when: at character 13: expected a register"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_the_source(make: Callable[..., Rig], wrong: Declaration, reason: str) -> None:
+    rig = make()
+    with pytest.raises(CommandError) as refused:
+        rig.client.declare(wrong)
+    assert reason in str(refused.value)
+    assert rig.block.standing.read() == ()
+
+
+def test_garbage_in_place_of_a_declaration_is_refused(make: Callable[..., Rig]) -> None:
+    rig = make()
+    sender = CommandSender(rig.block, 4)
+    for garbage in (b"{", b"[]", b'{"name": 1}', b"\xff" * 100, b"[" * 5000):
+        number = sender.submit([Write(0, 0, garbage)], 1 << 60, CommandKind.DECLARE)
+        while (event := rig.events.next(20)) is None or event.command != number:
+            assert event is not None
+        assert event.kind == EventKind.REJECTED
+    rig.client.declare(declaration("x", "cell/speed", "freeze"))
+
+
+@pytest.mark.parametrize(("operation", "keys"), [("set", {"value": "NaN"}), ("flip", {"bits": list(range(23, 31))})])
+def test_what_an_injection_makes_no_number_of_does_not_reach_the_device(
+    make: Callable[..., Rig], operation: str, keys: dict[str, Any]
+) -> None:
+    rig = make(declaration("mad", "cell/axis/1/in", operation, **keys))
+    rig.poll()
+    rig.told()
+    rig.write({"axis/1": 0.0, "axis/2": 2.5})
+    rig.poll()
+    (refused,) = rig.told(EventKind.REFUSED)
+    assert refused.text.startswith("the injection 'mad' changes it: axis/1: NaN and infinities are not written")
+    other = LAYOUT.registers[LAYOUT.by_path["axis/2"]].offset
+    assert [write.offset for write in rig.written] == [other]

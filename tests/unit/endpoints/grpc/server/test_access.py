@@ -1,0 +1,237 @@
+"""Who may call what: tokens, certificates, and the roles of an address, over real sockets."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import logging
+from collections.abc import AsyncIterator, Sequence
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import grpc
+import pytest
+import trustme
+
+from shmio.config import Address, Grpc, Tls, Token
+from shmio.config.model import Client, Listening
+from shmio.endpoints.grpc.server.access import NEEDS, Door, Keys
+from shmio.endpoints.grpc.server.listeners import Doors, Listener
+from shmio.endpoints.grpc.server.server import Server
+from shmio.segment import Segment
+from shmio.wire import simlog_v1_pb2 as wire
+from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, image, refusal, serve
+
+READER, WRITER = "reader-0123456789abcdef", "writer-0123456789abcdef"
+GET = "/simulation.server.SimlogAPI/GetTopic"
+SUBSCRIBE = "/simulation.server.SimlogAPI/Subscribe"
+PUBLISH = "/simulation.server.SimlogAPI/Publish"
+STEP = wire.TopicDescriptor(path="cell/step").SerializeToString()
+DENIED, UNKNOWN = grpc.StatusCode.PERMISSION_DENIED, grpc.StatusCode.UNAUTHENTICATED
+
+
+def token(secret: str, *roles: str) -> Token:
+    return Token(name=secret.partition("-")[0], roles=list(roles), sha256=hashlib.sha256(secret.encode()).hexdigest())
+
+
+def shown(secret: str) -> list[tuple[str, str]]:
+    return [("authorization", f"Bearer {secret}")]
+
+
+BOTH = [token(READER, "read"), token(WRITER, "read", "write")]
+LOCAL = Grpc(listen=["127.0.0.1:0"], token=BOTH)
+
+
+@asynccontextmanager
+async def guarded(
+    served: Endpoint, listeners: Sequence[Listener], tls: Tls | None = None
+) -> AsyncIterator[tuple[Server, list[int]]]:
+    server = Server(served.service)
+    try:
+        yield server, await server.start(listeners, tls)
+    finally:
+        await server.stop()
+
+
+def call(channel: grpc.aio.Channel, method: str, request: bytes = STEP, secret: str = "") -> Any:
+    multi: Any = channel.unary_unary(method)
+    return multi(request, metadata=shown(secret) if secret else None, timeout=TIMEOUT_S)
+
+
+def follow(channel: grpc.aio.Channel, secret: str) -> Any:
+    multi: Any = channel.unary_stream(SUBSCRIBE)
+    return multi(STEP, metadata=shown(secret), timeout=TIMEOUT_S)
+
+
+def test_a_token_may_what_its_roles_say(segment: Segment, caplog: pytest.LogCaptureFixture) -> None:
+    async def test(served: Endpoint) -> None:
+        async with (
+            guarded(served, Doors(LOCAL).listeners) as (server, (port,)),
+            grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel,
+        ):
+            assert await call(channel, GET, secret=READER)
+            assert await call(channel, PUBLISH, b"", WRITER) == b""
+            told, message = await refusal(call(channel, GET))
+            assert told is UNKNOWN
+            assert message == (
+                "GetTopic needs the role read, and this address gives nothing without a token: send "
+                "authorization: Bearer TOKEN with one of [[grpc.token]]"
+            )
+            told, message = await refusal(call(channel, GET, secret="guessed-0123456789abcdef"))
+            assert (told, message.startswith("the token is none of [[grpc.token]]")) == (UNKNOWN, True)
+            told, message = await refusal(call(channel, PUBLISH, b"", READER))
+            assert told is DENIED
+            assert message == (
+                "Publish needs the role write; token 'reader' has read: roles in [[grpc.token]] would have to name it"
+            )
+            get: Any = channel.unary_unary(GET)
+            basic = [("authorization", f"Basic {READER}")]
+            assert (await refusal(get(STEP, metadata=basic, timeout=TIMEOUT_S)))[0] is UNKNOWN
+            assert server.calls.refusals.count == 4
+
+    with caplog.at_level(logging.DEBUG):
+        serve(segment, test)
+    assert "call refused: the token is none" in caplog.text
+    assert not any(secret in caplog.text for secret in (READER, WRITER, "guessed-"))
+
+
+def test_no_call_of_any_service_passes_without_its_role(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        nobody = Listener(Address("127.0.0.1", 0), Door(Keys(), ()))
+        names = ("simulation.", "simlog.", "grpc.health.", "grpc.reflection.")
+        async with (
+            guarded(served, [nobody]) as (server, (port,)),
+            grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel,
+        ):
+            refused = 0
+            for method, role in NEEDS.items():
+                told, message = await refusal(call(channel, method, b""))
+                if told is not grpc.StatusCode.UNIMPLEMENTED:
+                    assert (told, f"needs the role {role}; this address has none" in message) == (DENIED, True), method
+                    refused += method.startswith(tuple(f"/{name}" for name in names))
+            assert refused >= 14
+            assert len(server.calls) == 0
+
+    serve(segment, test)
+
+
+def test_a_call_that_is_not_in_the_table_is_refused(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(NEEDS, GET)
+
+    async def test(served: Endpoint) -> None:
+        assert await refusal(call(served.channel, GET)) == (
+            DENIED,
+            f"{GET}: this call has no role that could allow it; nobody may",
+        )
+        assert (await refusal(call(served.channel, "/no.Service/Call")))[0] is grpc.StatusCode.UNIMPLEMENTED
+
+    serve(segment, test)
+
+
+def test_a_reload_ends_the_streams_of_tokens_that_went_and_no_others(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        served.publish(image(step=1))
+        doors = Doors(LOCAL)
+        async with (
+            guarded(served, doors.listeners) as (server, (port,)),
+            grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel,
+        ):
+            stays, goes = follow(channel, READER), follow(channel, WRITER)
+            for stream in (stays, goes):
+                assert wire.ROSMessage.FromString(await stream.read()).value == "1"
+            new = "newone-0123456789abcdef"
+            doors.take(Grpc(listen=LOCAL.listen, token=[BOTH[0], token(new, "read")]))
+            assert server.calls.review() == 1
+            told, message = await refusal(goes.read())
+            assert (told, message.startswith("the token is none")) == (UNKNOWN, True)
+            assert await call(channel, GET, secret=new)
+            served.publish(image(step=2))
+            assert wire.ROSMessage.FromString(await stays.read()).value == "2"
+            doors.take(Grpc(listen=LOCAL.listen, token=[token(READER, "write")]))
+            assert server.calls.review() == 1
+            assert (await refusal(stays.read()))[0] is DENIED
+            doors.take(Grpc(listen=LOCAL.listen))
+            assert await call(channel, GET), "open, as without tokens"
+            stays.cancel()
+
+    serve(segment, test)
+
+
+def test_an_address_gives_its_roles_to_who_shows_nothing(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        config = Grpc(listen=[], token=BOTH, address=[Listening(listen="127.0.0.1:0", roles=["read"])])
+        exposed = Listener(Address("127.0.0.1", 0), Door(Keys.of(config), ["read"], takes_tokens=False))
+        async with guarded(served, [*Doors(config).listeners, exposed]) as (_, ports):
+            async with grpc.aio.insecure_channel(f"127.0.0.1:{ports[0]}") as channel:
+                assert await call(channel, GET)
+                told, message = await refusal(call(channel, PUBLISH, b""))
+                assert (told, "this address gives read without a token" in message) == (UNKNOWN, True)
+                assert await call(channel, PUBLISH, b"", WRITER) == b""
+            async with grpc.aio.insecure_channel(f"127.0.0.1:{ports[1]}") as channel:
+                assert await call(channel, GET)
+                told, message = await refusal(call(channel, PUBLISH, b""))
+                assert (told, "this address has read: its roles in [[grpc.address]]" in message) == (DENIED, True)
+                told, message = await refusal(call(channel, GET, secret=WRITER))
+                assert (told, "have this token replaced" in message) == (UNKNOWN, True)
+
+    serve(segment, test)
+
+
+def test_certificates_have_roles_by_their_names(segment: Segment, tmp_path: Path) -> None:
+    authority = trustme.CA()
+    server_cert = authority.issue_cert("localhost")
+    server_cert.private_key_pem.write_to_path(tmp_path / "key.pem")
+    server_cert.cert_chain_pems[0].write_to_path(tmp_path / "cert.pem")
+    authority.cert_pem.write_to_path(tmp_path / "ca.pem")
+    tls = Tls(certificate=str(tmp_path / "cert.pem"), key=str(tmp_path / "key.pem"), client_ca=str(tmp_path / "ca.pem"))
+    config = Grpc(
+        listen=["localhost:0"],
+        tls=tls,
+        token=[token(WRITER, "write")],
+        client=[
+            Client(subject="*.lab.example", roles=["read"]),
+            Client(subject=["planner", "other"], roles=["read", "write"]),
+        ],
+    )
+
+    def as_client(*names: str, common_name: str | None = None) -> grpc.aio.Channel:
+        shows = authority.issue_cert(*names, common_name=common_name)
+        known = grpc.ssl_channel_credentials(
+            authority.cert_pem.bytes(), shows.private_key_pem.bytes(), shows.cert_chain_pems[0].bytes()
+        )
+        return grpc.aio.secure_channel(f"localhost:{port}", known, [("grpc.use_local_subchannel_pool", 1)])
+
+    port = 0
+
+    async def test(served: Endpoint) -> None:
+        nonlocal port
+        async with guarded(served, Doors(config).listeners, tls) as (_, (port,)):
+            async with as_client("dash.lab.example") as channel:
+                assert await call(channel, GET)
+                told, message = await refusal(call(channel, PUBLISH, b""))
+                assert (told, "the certificate of 'dash.lab.example' has read" in message) == (DENIED, True)
+                assert await call(channel, PUBLISH, b"", WRITER) == b"", "roles of both add up"
+            async with as_client("x@example.org", common_name="planner") as channel:
+                assert await call(channel, PUBLISH, b"") == b""
+            async with as_client("dash.lab.example.evil.org") as channel:
+                told, message = await refusal(call(channel, GET))
+                assert (told, "send authorization: Bearer" in message) == (UNKNOWN, True)
+
+    serve(segment, test)
+
+
+def test_those_who_call_are_told_at_once_however_little_they_send(segment: Segment) -> None:
+    """Before the message of a call has come, and without reading it."""
+
+    async def test(served: Endpoint) -> None:
+        async with (
+            guarded(served, Doors(LOCAL).listeners) as (server, (port,)),
+            grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel,
+        ):
+            silent: Any = channel.stream_unary(GET)(timeout=TIMEOUT_S)
+            async with asyncio.timeout(TIMEOUT_S):
+                assert await silent.code() is UNKNOWN
+            assert len(server.calls) == 0
+
+    serve(segment, test)

@@ -1,0 +1,212 @@
+"""How many calls there may be, and what becomes of messages that are none."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from contextlib import suppress
+from typing import Any
+
+import grpc
+import pytest
+
+from shmio.endpoints.grpc.server.access import NEEDS, client_of
+from shmio.endpoints.grpc.server.call_guard import Limits
+from shmio.segment import Segment
+from shmio.wire import simlog_v1_pb2 as wire
+from tests.unit.endpoints import http2
+from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, image, refusal, serve, value
+
+GET = "/simulation.server.SimlogAPI/GetTopic"
+STEP = wire.TopicDescriptor(path="cell/step")
+
+
+class Another:
+    """A client with a connection of its own."""
+
+    def __init__(self, served: Endpoint) -> None:
+        self._channel = grpc.aio.insecure_channel(f"127.0.0.1:{served.port}", [("grpc.use_local_subchannel_pool", 1)])
+        self._subscribe = self._channel.unary_stream(
+            "/simulation.server.SimlogAPI/Subscribe", wire.TopicDescriptor.SerializeToString, wire.ROSMessage.FromString
+        )
+        self.streams: list[Any] = []
+
+    async def open(self, count: int) -> None:
+        """So many streams, one behind the other."""
+        for _ in range(count):
+            stream = self._subscribe(STEP, timeout=TIMEOUT_S)
+            self.streams.append(stream)
+            await stream.initial_metadata()
+
+    async def refused(self) -> str:
+        stream = self._subscribe(STEP, timeout=TIMEOUT_S)
+        told, message = await refusal(stream.read())
+        assert told is grpc.StatusCode.RESOURCE_EXHAUSTED
+        return message
+
+    async def close(self) -> None:
+        for stream in self.streams:
+            stream.cancel()
+        await self._channel.close()
+
+
+def test_connections_beyond_the_limit_are_closed_and_the_others_go_on(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        served.publish(image())
+        polite = Another(served)
+        await polite.open(1)
+        assert await value(polite.streams[0])
+        idle = [await http2.Connection.open(served.port) for _ in range(2)]
+        for _ in range(3):
+            reader, writer = await asyncio.open_connection("127.0.0.1", served.port)
+            with suppress(ConnectionResetError):
+                async with asyncio.timeout(TIMEOUT_S):
+                    assert await reader.read() == b"", "it is not even greeted"
+            writer.close()
+            with suppress(ConnectionResetError):
+                await writer.wait_closed()
+        await polite.open(1)
+        assert await value(polite.streams[1]), "who is there goes on"
+        await idle[0].drop(reset=True)
+
+        async def room() -> bool:
+            reader, writer = await asyncio.open_connection("127.0.0.1", served.port)
+            writer.write(http2.PREFACE + http2.frame(http2.SETTINGS, 0, 0, b""))
+            try:
+                async with asyncio.timeout(TIMEOUT_S):
+                    return bool(await reader.read(1))
+            except ConnectionResetError:
+                return False
+            finally:
+                writer.transport.abort()
+
+        await served.until(room)
+        await idle[1].drop(reset=True)
+        await polite.close()
+
+    serve(segment, test, Limits(connections=3))
+
+
+async def until_calls(served: Endpoint, count: int) -> None:
+    async def reached() -> bool:
+        await asyncio.sleep(0)
+        return len(served.server.calls) == count
+
+    await served.until(reached)
+
+
+def test_one_client_cannot_have_all_calls_and_no_more_than_there_are_are_open(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        served.publish(image(step=1))
+        clients = [Another(served) for _ in range(3)]
+        greedy, other, last = clients
+        await greedy.open(8)
+        assert await greedy.refused() == (
+            "this client has 8 calls open, and the last 4 of 12 are for clients with fewer than 2: version 2 has one "
+            "stream for all topics"
+        )
+        await other.open(2)
+        assert "this client has 2 calls open" in await other.refused()
+        await last.open(2)
+        extra = Another(served)
+        assert await extra.refused() == "12 calls are open at once, which is the most: try again when others have ended"
+        assert served.server.calls.refusals.count == 3
+        served.publish(image(step=2))
+        assert [await value(stream) for stream in (*other.streams, *last.streams)] == ["1"] * 4
+        assert [await value(stream) for stream in (*other.streams, *last.streams)] == ["2"] * 4
+        greedy.streams.pop().cancel()
+        await until_calls(served, 11)
+        await extra.open(1)
+        for client in (*clients, extra):
+            await client.close()
+        await until_calls(served, 0)
+
+    serve(segment, test, Limits(calls=12, reserve=4, share=2))
+
+
+def test_the_limits_hold_as_documented(segment: Segment) -> None:
+    """With the numbers of the page on roles and limits: 4,096 in all, of which one client leaves 1,024."""
+
+    async def test(served: Endpoint) -> None:
+        method, request = "/simulation.server.SimlogAPI/Subscribe", STEP.SerializeToString()
+        greedy, *others = [await http2.Connection.open(served.port) for _ in range(17)]
+        reading = asyncio.create_task(greedy.reader.read())
+        calls = [http2.call(method, request, 2 * number + 1) for number in range(3073)]
+        await greedy.send(b"".join(calls[:3072]))  # at once, of which none gets lost
+        await until_calls(served, 3072)
+        await greedy.send(calls[3072])
+        await refused(served, 1)
+        for number, other in enumerate(others, start=1):
+            await other.send(b"".join(calls[:64]))
+            await until_calls(served, 3072 + 64 * number)
+        extra = Another(served)
+        assert (await extra.refused()).startswith("4096 calls are open at once")
+        await extra.close()
+        for connection in (greedy, *others):
+            await connection.drop(reset=True)
+        reading.cancel()
+        await until_calls(served, 0)
+
+    serve(segment, test)
+
+
+async def refused(served: Endpoint, count: int) -> None:
+    async def reached() -> bool:
+        await asyncio.sleep(0)
+        return served.server.calls.refusals.count == count
+
+    await served.until(reached)
+
+
+def test_a_call_without_its_message_ends(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        silent: Any = served.channel.stream_unary(GET)(timeout=TIMEOUT_S)
+        assert await refusal(silent) == (
+            grpc.StatusCode.DEADLINE_EXCEEDED,
+            f"{GET}: no message came within 0.05 s",
+        )
+        closed: Any = served.channel.stream_unary(GET)(timeout=TIMEOUT_S)
+        await closed.done_writing()
+        assert await refusal(closed) == (grpc.StatusCode.INVALID_ARGUMENT, f"{GET}: the call has no message")
+        await until_calls(served, 0)
+
+    serve(segment, test, Limits(message_s=0.05))
+
+
+PUBLISHES = [method for method in NEEDS if method.endswith("/Publish")]
+
+
+@pytest.mark.parametrize("method", [method for method in NEEDS if method not in PUBLISHES])
+def test_bytes_that_are_no_message_are_refused_in_a_word(
+    segment: Segment, method: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of Publish they are passed over, which its own tests show."""
+
+    async def test(served: Endpoint) -> None:
+        call: Any = served.channel.unary_unary(method)
+        told, message = await refusal(call(b"\xff" * 7, timeout=TIMEOUT_S))
+        if told is not grpc.StatusCode.UNIMPLEMENTED:  # it has no message, or is not there yet
+            assert (told, message) == (
+                grpc.StatusCode.INVALID_ARGUMENT,
+                f"{method}: 7 bytes are no message of this call",
+            )
+        await until_calls(served, 0)
+
+    with caplog.at_level(logging.ERROR):
+        serve(segment, test)
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    ("peer", "token", "client"),
+    [
+        ("ipv4:127.0.0.1:5001", None, "ipv4:127.0.0.1:5001"),
+        ("ipv6:%5B::1%5D:5001", None, "ipv6:%5B::1%5D:5001"),
+        ("unix:", None, "unix:"),
+        ("ipv4:10.0.0.5:5001", None, "ipv4:10.0.0.5"),
+        ("ipv6:%5Bfe80::1%5D:5001", None, "ipv6:%5Bfe80::1%5D"),
+        ("ipv4:10.0.0.5:5001", "dash", "token dash"),
+    ],
+)
+def test_a_client_is_a_token_or_a_host_or_here_a_connection(peer: str, token: str | None, client: str) -> None:
+    assert client_of(peer, token) == client

@@ -1,0 +1,514 @@
+"""Version 1's Inject, over real sockets: between who publishes and the device, or the source and who subscribes."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import grpc
+import pytest
+
+from shmio.config import Declaration
+from shmio.local.writer import Commander
+from shmio.segment import Direction, Quality, Segment
+from shmio.wire import simlog_v1_pb2 as wire
+from tests.unit.endpoints.grpc.commands.test_publish import counted, counts, message, with_plant
+from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, code, refusal, serve, value
+from tests.unit.endpoints.plant import GUEST, Plant
+
+Status = grpc.StatusCode
+SHADOW = "axis/position/shadow"
+
+
+def inject(served: Endpoint, target: str, shadow: str, **options: Any) -> Any:
+    request = wire.InjectRequest(injected=wire.TopicDescriptor(path=shadow), target=wire.TopicDescriptor(path=target))
+    return served.stub.Inject(request, **{"timeout": TIMEOUT_S, **options})
+
+
+async def laid(served: Endpoint, target: str, shadow: str) -> Any:
+    stream = inject(served, target, shadow)
+    await stream.initial_metadata()
+    return stream
+
+
+async def publish(served: Endpoint, *values: tuple[str, str]) -> None:
+    await served.stub.Publish(iter([message(path, text) for path, text in values]), timeout=TIMEOUT_S)
+
+
+def standing(served: Endpoint) -> list[tuple[str, str]]:
+    return [(one.direction, one.name) for one in served.segment.blocks["cell"].standing.read()]
+
+
+async def lifted(served: Endpoint) -> None:
+    async def condition() -> bool:
+        return not standing(served)
+
+    await served.until(condition)
+
+
+async def seen(stream: Any, wanted: str) -> None:
+    while await value(stream) != wanted:
+        pass
+
+
+def test_what_is_written_goes_to_the_injector_and_what_it_publishes_to_the_device(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        originals = await laid(served, "cell/step/in", "cell/step/shadow")
+        await publish(served, ("cell/step/in", "7"), ("cell/step", "7"), ("cell/step/in", "9"))
+        assert [await value(originals) for _ in range(3)] == ["7", "7", "9"]
+        assert counted(served) == (3, 0), "who published cannot tell"
+        assert device.written == []
+        await publish(served, ("cell/step/shadow", "8"))
+        assert device.memory[12:14] == b"\0\x08"
+        originals.cancel()
+        await lifted(served)
+        await publish(served, ("cell/step/in", "5"))
+        assert device.memory[12:14] == b"\0\5"
+        await publish(served, ("cell/step/shadow", "6"))
+        assert counted(served) == (5, 1), "the shadow is gone with its injection"
+
+    with_plant(segment, test)
+
+
+def test_consumers_get_what_the_injector_publishes_and_it_what_the_source_delivers(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        await publish(served, ("cell/step", "3"))
+        consumer = served.subscribe("cell/step")
+        await seen(consumer, "3")
+        originals = await laid(served, "cell/step/out", "cell/step/shadow")
+        assert await value(originals) == "3", "the present value first"
+        await publish(served, ("cell/step/shadow", "-1"))
+        assert await value(consumer) == "-1"
+        await publish(served, ("cell/step", "4"))
+        first = await originals.read()
+        assert (first.value, first.type) == ("4", "int")
+        assert first.timeStamp.stamp.nsec > 0
+        late = served.subscribe("cell/step/out")
+        assert await value(late) == "-1"
+        originals.cancel()
+        assert await value(consumer) == "4"
+        assert await value(late) == "4"
+        await lifted(served)
+
+    with_plant(segment, test)
+
+
+def test_until_its_first_value_consumers_hold_the_last_one(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        await publish(served, ("cell/step", "3"))
+        originals = await laid(served, "cell/step", "s")  # without a suffix: over /out
+        await publish(served, ("cell/step", "4"))
+        await seen(originals, "4")
+        assert await value(served.subscribe("cell/step")) == "3"
+        originals.cancel()
+
+    with_plant(segment, test)
+
+
+def test_the_shadow_is_a_topic_of_its_own_while_the_injection_stands(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        shadow = wire.TopicDescriptor(path=f"/{SHADOW}")
+        assert await code(served.stub.GetTopic(shadow)) is Status.NOT_FOUND
+        originals = await laid(served, "CELL://axis/position/in", SHADOW)
+        info = await served.stub.GetTopic(shadow, timeout=TIMEOUT_S)
+        assert (info.path, info.msgType) == (shadow.path, "double")
+        watching = served.subscribe(f"CELL://{SHADOW}")
+        await watching.initial_metadata()
+        await publish(served, (SHADOW, "1.0E-4"), (f"cell/{SHADOW}", "2"))
+        assert [await value(watching) for _ in range(2)] == ["0.0001", "2.0"]
+        originals.cancel()
+        status, text = await refusal(watching.read())
+        assert status is Status.NOT_FOUND
+        assert text == f"CELL://{SHADOW}: nobody holds it any more"
+        assert await code(served.stub.GetTopic(shadow)) is Status.NOT_FOUND
+        await lifted(served)
+
+    with_plant(segment, test)
+
+
+def test_several_streams_join_one_injection_and_the_last_one_lifts_it(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        streams = [await laid(served, path, "s") for path in ("cell/step/in", "CELL://step/in", "/step/in")]
+        assert len(standing(served)) == 1
+        await publish(served, ("cell/step", "7"))
+        assert [await value(stream) for stream in streams] == ["7"] * 3
+        streams.pop().cancel()
+        streams.pop().cancel()
+        await publish(served, ("cell/step", "8"))
+        assert await value(streams[0]) == "8"
+        assert device.written == []
+        streams.pop().cancel()
+        await lifted(served)
+
+    with_plant(segment, test)
+
+
+def test_a_shadow_in_use_for_another_target_is_refused(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        originals = await laid(served, "cell/step/in", "s")
+        for target in ("cell/step/out", "cell/running/in"):
+            status, text = await refusal(inject(served, target, "/s").read())
+            assert (status, text) == (Status.ALREADY_EXISTS, "/s is the shadow of cell/step/in: name another path")
+        assert len(standing(served)) == 1
+        originals.cancel()
+        await lifted(served)
+        (await laid(served, "cell/running/in", "s")).cancel()
+
+    with_plant(segment, test)
+
+
+def test_elements_and_whole_arrays(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        whole = await laid(served, "cell/inputs/in", "a")
+        await publish(served, ("cell/inputs", "[1, 2]"), ("cell/inputs/1", "3"))
+        assert [await value(whole) for _ in range(2)] == ["[1,2]", "[1,3]"], "with what was written before"
+        await publish(served, ("a", "[4, 5]"))
+        assert device.memory[10:12] == b"\4\5"
+        bit = await laid(served, "cell/bits/9/in", "b")
+        await publish(served, ("cell/bits", "[" + "true," * 9 + "true]"), ("b", "0"))
+        assert await value(bit) == "true"
+        assert device.memory[14:16] == b"\xff\1"
+        long = await laid(served, "cell/long/in", "c")
+        await publish(served, ("cell/long", str([7] * 600)))
+        assert await value(long) == str([7] * 600).replace(" ", "")
+        for stream in (whole, bit, long):
+            stream.cancel()
+
+    with_plant(segment, test)
+
+
+def test_injections_over_each_other_are_a_chain(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        inner, outer = await laid(served, "cell/step/in", "i"), await laid(served, "cell/step/in", "o")
+        await publish(served, ("cell/step", "1"))
+        assert await value(outer) == "1"
+        await publish(served, ("o", "2"))
+        assert await value(inner) == "2"
+        await publish(served, ("i", "3"))
+        assert device.memory[12:14] == b"\0\3"
+        outer.cancel()
+        inner.cancel()
+        await lifted(served)
+        consumer = served.subscribe("cell/step")
+        await seen(consumer, "3")
+        inner = await laid(served, "cell/step", "i")
+        assert await value(inner) == "3"
+        await publish(served, ("i", "4"))
+        await seen(consumer, "4")
+        outer = await laid(served, "cell/step", "o")
+        assert await value(outer) == "4", "what the inner one gives"
+        await publish(served, ("o", "5"), ("i", "6"), ("cell/step", "7"))
+        await seen(consumer, "5")
+        assert await value(outer) == "6"
+        assert await value(inner) == "7"
+        inner.cancel()
+        assert await value(outer) == "7", "the source's own again"
+        outer.cancel()
+        await seen(consumer, "7")
+
+    with_plant(segment, test)
+
+
+@pytest.mark.parametrize(
+    ("target", "shadow", "status", "reason"),
+    [
+        ("cell/nothing/in", "s", Status.NOT_FOUND, "no such register"),
+        ("", "s", Status.NOT_FOUND, ""),
+        ("s", "s", Status.NOT_FOUND, ""),
+        ("cell/axis/in", "s", Status.INVALID_ARGUMENT, "a structure"),
+        ("cell/step/in", "", Status.INVALID_ARGUMENT, "printable characters"),
+        ("cell/step/in", "/", Status.INVALID_ARGUMENT, "printable characters"),
+        ("cell/step/in", "a\nb", Status.INVALID_ARGUMENT, "printable characters"),
+        ("cell/step/in", "a" * 1025, Status.INVALID_ARGUMENT, "printable characters"),
+        ("cell/step/in", "CELL://step/in", Status.INVALID_ARGUMENT, "a path of its own"),
+        ("cell/step/in", "SIMLOG://step", Status.ALREADY_EXISTS, "served by shmio"),
+        ("cell/secret/in", "s", Status.FAILED_PRECONDITION, "cell/secret/in: rejected: it covers what is not writable"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(
+    segment: Segment, target: str, shadow: str, status: Status, reason: str
+) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        found, text = await refusal(inject(served, target, shadow).read())
+        assert (found, reason in text) == (status, True), text
+        assert standing(served) == []
+
+        async def closed() -> bool:
+            return served.service.counters[0] == 0
+
+        await served.until(closed)
+
+    with_plant(segment, test)
+
+
+def test_toward_a_device_that_is_not_armed_it_is_refused_and_over_out_is_not(segment: Segment) -> None:
+    async def test(served: Endpoint) -> None:
+        device = Plant(served.writer, armed=False)
+        device.cycle()
+        try:
+            status, text = await refusal(inject(served, "cell/step/in", "s").read())
+            assert status is Status.FAILED_PRECONDITION
+            assert "needs `armed = true`" in text
+            originals = await laid(served, "cell/step/out", "s")
+            originals.cancel()
+            await lifted(served)
+        finally:
+            device.stop()
+
+    serve(segment, test)
+
+
+def test_no_shadow_path_is_too_odd(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        for shadow in (
+            "a//b",
+            "x://y",
+            "100%",
+            "joints/R3200/Link1/R/position/shadow/out",
+            "h\u00e4nde",
+            "cell/running",
+        ):
+            originals = await laid(served, "cell/step/in", shadow)
+            await publish(served, (shadow, "1"), ("cell/step/in", "2"))
+            assert await value(originals) == "2"
+            originals.cancel()
+            await lifted(served)
+        assert counted(served)[1] == 0
+
+    with_plant(segment, test)
+
+
+def test_while_quality_is_bad_no_original_is_sent_and_on_recovery_it_is_again(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        device.cycle()
+        originals = await laid(served, "cell/step", "s")
+        assert await value(originals) == "0"
+        device.memory[13] = 2
+        device.quality = Quality.BAD
+        device.cycle()
+        device.memory[13] = 0
+        device.quality = Quality.GOOD
+        device.cycle()
+        assert await value(originals) == "0"
+        originals.cancel()
+
+    with_plant(segment, test, running=False)
+
+
+def test_somebody_else_may_lift_it_and_the_stream_says_so(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        for target in ("cell/step/in", "cell/step/out"):
+            originals = await laid(served, target, "s")
+            (one,) = segment.blocks["cell"].standing.read()
+            assert one.name.startswith("s of ipv4:127.0.0.1:")
+            await asyncio.to_thread(Commander(segment.blocks["cell"], GUEST).lift, one.id)
+            while (got := await _end(originals)) is None:
+                pass
+            assert got == (Status.ABORTED, f"{target}: somebody has lifted it")
+
+    with_plant(segment, test)
+
+
+async def _end(stream: Any) -> tuple[Status, str] | None:
+    return (await _next(stream))[1]
+
+
+async def _next(stream: Any) -> tuple[Any, tuple[Status, str] | None]:
+    """A message, or how the stream has ended."""
+    try:
+        return await stream.read(), None
+    except grpc.aio.AioRpcError as error:
+        return None, (error.code(), str(error.details()))
+
+
+def test_a_client_that_does_not_read_what_is_written_loses_its_injection_and_no_value_silently(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shmio.endpoints.grpc.streams.outbox.EVENT_BOUND", 20)
+
+    async def test(served: Endpoint, device: Plant) -> None:
+        originals = await laid(served, "cell/long/in", "s")
+        sent: list[str] = []
+        while standing(served):
+            # One by one: on a busy machine more than the bound would come at once, before any of it could be sent.
+            sent.append(str([len(sent) % 256] * 600))
+            await publish(served, ("cell/long", sent[-1]))
+        got, told = [], None
+        while told is None:
+            message, told = await _next(originals)
+            got += [] if message is None else [message.value.replace(" ", "")]
+        assert told[0] is Status.RESOURCE_EXHAUSTED
+        assert "too slow" in told[1]
+        assert len(got) >= 20
+        assert got == [text.replace(" ", "") for text in sent[: len(got)]]
+
+    with_plant(segment, test)
+
+
+Ending = Callable[[Endpoint, Any], Awaitable[None]]
+
+
+async def _deadline(served: Endpoint, stream: Any) -> None:
+    assert await code(everything(stream)) is Status.DEADLINE_EXCEEDED
+
+
+async def everything(stream: Any) -> None:
+    async for _ in stream:
+        pass
+
+
+async def _cancel(served: Endpoint, stream: Any) -> None:
+    stream.cancel()
+
+
+async def _drop(served: Endpoint, stream: Any) -> None:
+    await served.channel.close()
+
+
+@pytest.mark.parametrize("ending", [_deadline, _cancel, _drop])
+@pytest.mark.parametrize("target", ["cell/step/in", "cell/step/out"])
+def test_however_a_stream_ends_its_shadow_goes(segment: Segment, target: str, ending: Ending) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        stream = inject(served, target, "s", timeout=1 if ending is _deadline else TIMEOUT_S)
+        await stream.initial_metadata()
+        assert len(standing(served)) == 1
+        await ending(served, stream)
+        await lifted(served)
+
+        async def closed() -> bool:
+            return served.service.counters[0] == 0
+
+        await served.until(closed)
+
+    with_plant(segment, test)
+
+
+def test_a_call_that_is_gone_before_it_is_answered_leaves_nothing(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        for turn in range(20):
+            stream = inject(served, "cell/step/in", "s")
+            for _ in range(turn):
+                await asyncio.sleep(0)
+            stream.cancel()
+        originals = await laid(served, "cell/step/in", "s")
+        await publish(served, ("cell/step", "7"))
+        assert await value(originals) == "7"
+        originals.cancel()
+        await lifted(served)
+
+    with_plant(segment, test)
+
+
+def test_what_is_published_while_it_is_laid_is_its_own(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        call: Any = served.stub.Publish(timeout=TIMEOUT_S)
+        with device.output.turn:  # the source takes its time
+            stream = inject(served, "cell/step/in", "s")
+
+            async def named() -> bool:
+                return served.service._shadows.find("s") is not None
+
+            await served.until(named)
+            await call.write(message("s", "8"))
+            await call.done_writing()
+
+            async def received() -> bool:
+                return any(
+                    stream.received for streams in served.service._publisher._streams.values() for stream in streams
+                )
+
+            await served.until(received)
+            assert standing(served) == []
+        await call
+        assert device.memory[12:14] == b"\0\x08"
+        assert counted(served) == (1, 0)
+        stream.cancel()
+        await lifted(served)
+
+    with_plant(segment, test)
+
+
+def test_a_source_that_does_not_answer_refuses_it_and_lays_nothing_later(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shmio.local.writer.TIMEOUT_S", 0)
+
+    async def test(served: Endpoint) -> None:
+        status, text = await refusal(inject(served, "cell/step/in", "s").read())
+        assert status is Status.FAILED_PRECONDITION
+        assert "gave no answer in time" in text
+        monkeypatch.setattr("shmio.local.writer.TIMEOUT_S", TIMEOUT_S)
+        device = Plant(served.writer)
+        try:
+            device.cycle()
+            device.run()
+            await publish(served, ("cell/step", "1"))
+            assert standing(served) == []
+            (await laid(served, "cell/step/in", "s")).cancel()
+            await lifted(served)
+        finally:
+            device.stop()
+
+    serve(segment, test)
+
+
+def test_at_most_so_many_at_once(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shmio.endpoints.grpc.injection.injections.MAX_INJECTIONS", 2)
+
+    async def test(served: Endpoint, device: Plant) -> None:
+        streams = [await laid(served, f"cell/inputs/{place}", f"s{place}") for place in range(2)]
+        status, text = await refusal(inject(served, "cell/step", "s").read())
+        assert status is Status.RESOURCE_EXHAUSTED
+        assert "2 injections stand on cell already" in text
+        for stream in streams:
+            stream.cancel()
+        await lifted(served)
+
+    with_plant(segment, test)
+
+
+def test_a_program_lays_one_beneath_or_above_those_of_clients(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        originals = await laid(served, "cell/step", "s")
+        await value(originals)
+        program = Commander(segment.blocks["cell"], GUEST)
+        inner = await asyncio.to_thread(program.inject, ["step"], priority=-1, direction=Direction.OUT)
+        await asyncio.to_thread(program.shadow, inner, {"step": 11})
+        await seen(originals, "11")
+        await asyncio.to_thread(program.lift, inner)
+        assert await value(originals) == "0"
+        originals.cancel()
+
+    with_plant(segment, test)
+
+
+def test_publishing_to_a_shadow_is_counted_and_its_refusals_logged(
+    segment: Segment, caplog: pytest.LogCaptureFixture
+) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        originals = await laid(served, "cell/step", "s")
+        await publish(served, ("s", "1"), ("s", "many"), ("s", "2"))
+        await counts(served, 2, 1)
+        assert "expected a number" in caplog.text
+        originals.cancel()
+
+    with_plant(segment, test)
+
+
+def test_what_declared_injections_further_in_make_of_it_is_in_the_originals(segment: Segment) -> None:
+    async def test(served: Endpoint, device: Plant) -> None:
+        consumer = served.subscribe("cell/step")
+        program = Commander(segment.blocks["cell"], GUEST)
+        declaration = Declaration(name="hundred", target="cell/step", operation="offset", value=100)
+        number = await asyncio.to_thread(program.declare, declaration)
+        await seen(consumer, "100")
+        originals = await laid(served, "cell/step", "s")
+        await seen(originals, "100")
+        await publish(served, ("cell/step", "4"))
+        await seen(originals, "104")
+        await asyncio.to_thread(program.lift, number)
+        await seen(originals, "4")
+        originals.cancel()
+
+    with_plant(segment, test)

@@ -1,0 +1,33 @@
+"""Values that a model gives, put into an image of its block."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from shmio.endpoints.grpc.shmio_v1.simulate import Fill
+from shmio.endpoints.grpc.shmio_v1.values import MAX_VALUES
+from shmio.endpoints.grpc.shmio_v1.views import Selection
+from shmio.errors import ValueRangeError
+from shmio.layout.model import Layout, Register
+from shmio.messages import value_to_wire
+from shmio.segment import BlockSpec, Segment
+from shmio.wire import shmio_v1_pb2 as wire
+
+ROWS = Layout("ROWS", None, 20_000, False, (Register("rows", "DINT", ((0, 4999),), 0, None, 20_000, 5000),))
+
+
+def test_values_by_path_are_few_for_each_takes_its_time(instance: str) -> None:
+    blocks = [BlockSpec("line", ROWS, 20_000_000, 500_000_000, 1 << 20)]
+    with Segment.create(instance, blocks, []) as segment:
+        try:
+            fill = Fill(Selection(1, segment.blocks["line"], ROWS.registers))
+            given = [wire.Assignment(path=f"rows/{at}", value=value_to_wire(at, "rows")) for at in range(MAX_VALUES)]
+            image = bytearray(ROWS.size)
+            asyncio.run(fill.assigned(given, image))
+            assert image[4 * 4095 : 4 * 4096] == (4095).to_bytes(4, "big")
+            with pytest.raises(ValueRangeError, match=r"4097 values, 4096 are the most by path: give them by slots"):
+                asyncio.run(fill.assigned([*given, given[0]], image))
+        finally:
+            segment.unlink()

@@ -1,0 +1,665 @@
+"""Simulate over real sockets: with the generated code alone, as any client has it, and by the clients of Python."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import grpc
+import numpy as np
+import pytest
+
+from shmio.client import Client, Simulation, connect, connect_aio
+from shmio.client.model import Values
+from shmio.endpoints.grpc.time import stepper
+from shmio.errors import CommandError, ConflictError, LostError, PathError, RemoteError, ShmioError, ValueRangeError
+from shmio.messages import value_to_wire
+from shmio.segment import Quality, Segment
+from shmio.wire import shmio_v1_pb2 as wire
+from tests.unit.connectors.models.test_stepped import Running
+from tests.unit.endpoints import http2
+from tests.unit.endpoints.grpc.shmio_v1.harness import stub, values
+from tests.unit.endpoints.grpc.shmio_v1.remote import remote_segment, serve_remote, shown, source, spec
+from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, endpoint, refusal
+
+Status = grpc.StatusCode
+Request = wire.SimulateRequest
+
+
+class Raw:
+    """A model that speaks the wire itself."""
+
+    def __init__(self, served: Endpoint) -> None:
+        self.call = stub(served).Simulate(timeout=TIMEOUT_S)
+
+    async def join(self, source: str = "drive", name: str = "raw") -> Any:
+        await self.call.write(Request(join=wire.Join(source=source, name=name)))
+        self.joined = (await self.read()).joined
+        return self.joined
+
+    async def read(self) -> Any:
+        found = await asyncio.wait_for(self.call.read(), TIMEOUT_S)
+        assert found is not grpc.aio.EOF
+        return found
+
+    async def work(self) -> Any:
+        """The next step."""
+        found = await self.read()
+        assert found.WhichOneof("what") == "work"
+        return found.work
+
+    def inputs(self, work: Any) -> dict[str, Any]:
+        return values(self.joined.inputs.registers, work.values)
+
+    async def done(self, step: int, **given: Any) -> None:
+        await self.call.write(Request(done=wire.Done(step=step, **given)))
+
+
+def assigned(**given: Any) -> list[wire.Assignment]:
+    return [wire.Assignment(path=path, value=value_to_wire(value, path)) for path, value in given.items()]
+
+
+def stepping(served: Endpoint, count: int = 1) -> asyncio.Task[Any]:
+    """Steps, under way."""
+
+    async def steps() -> Any:
+        for _ in range(count):
+            clock = await stub(served).Step(wire.StepRequest(dt_ns=20_000_000), timeout=TIMEOUT_S)
+        return clock
+
+    return asyncio.create_task(steps())
+
+
+async def read(served: Endpoint, pattern: str = "drive") -> dict[str, Any]:
+    found = await stub(served).Read(wire.ReadRequest(patterns=[pattern]), timeout=TIMEOUT_S)
+    return values(found.tables[0].registers, found.updates[0].values)
+
+
+# ---- on the wire -----------------------------------------------------------------------------------------------------
+
+
+def test_a_model_is_told_what_there_is_then_its_steps(instance: str) -> None:
+    async def test(served: Endpoint, drive: Running) -> None:
+        model = Raw(served)
+        joined = await model.join()
+        assert [register.path for register in joined.inputs.registers] == ["target", "speed", "label", "when", "lamps"]
+        assert [register.path for register in joined.outputs.registers] == [
+            "axis/position", "axis/moving", "axis/ready", "axis/count", "axis/name", "row", "lamps",
+        ]  # fmt: skip
+        assert (joined.computed, joined.clock.virtual, joined.period_ns) == (False, True, 20_000_000)
+        present = values(joined.outputs.registers, joined.values)
+        assert (present["axis/position"], present["row"]) == (0.25, [0] * 6)
+        await shown(drive, Quality.GOOD)
+
+        task = stepping(served, 3)
+        work = await model.work()
+        assert (work.step, work.time_ns, work.dt_ns, work.doubt) == (1, 20_000_000, 20_000_000, "")
+        inputs = model.inputs(work)
+        assert (inputs["target"], inputs["speed"], inputs["label"], inputs["lamps"]) == (1.5, 0, "", [False] * 10)
+        bools = wire.Bools(values=[True, False, *[True] * 10])
+        await model.done(1, values=wire.Values(doubles=wire.Doubles(values=[7.5]), bools=bools))
+        work = await model.work()
+        assert (work.step, model.inputs(work)) == (2, {}), "only what has changed"
+        ints = wire.Int32s(slots=[0, 2], values=[5, -3])
+        await model.done(
+            2, values=wire.Values(int32s=ints), assignments=assigned(**{"drive/axis/name": "x1", "row/2/2": 9})
+        )
+        assert (await model.work()).step == 3
+        await model.done(3)
+        assert (await task).step == 3
+        found = await read(served)
+        assert (found["axis/position"], found["axis/moving"], found["axis/ready"]) == (7.5, True, False)
+        assert (found["axis/count"], found["row"], found["axis/name"]) == (5, [0, -3, 0, 0, 0, 9], "x1")
+        assert found["lamps"] == [True] * 10, "what an in-out shows"
+        await model.call.done_writing()
+        await shown(drive, Quality.BAD)
+        assert await model.call.read() is grpc.aio.EOF
+
+    serve_remote(instance, test)
+
+
+def test_what_is_written_reaches_it_and_bytes_that_are_no_value_are_marked(instance: str) -> None:
+    async def test(served: Endpoint, drive: Running) -> None:
+        model = Raw(served)
+        await model.join()
+        task = stepping(served)
+        assert list((await model.work()).invalid.registers) == []
+        await model.done(1)
+        await task
+        async with connect_aio(f"127.0.0.1:{served.port}") as cell:
+            await cell.write({"drive/speed": -3, "drive/lamps/4": True}, until_accepted=True)
+        task = stepping(served)
+        assert model.inputs(await model.work()) == {"speed": -3, "lamps": {4: True}}
+        await model.done(2)
+        await task
+        assert (await read(served))["lamps"] == [False] * 10
+        model.call.cancel()
+
+    serve_remote(instance, test)
+
+
+def test_one_that_joins_again_goes_on_from_what_was_shown(instance: str) -> None:
+    async def test(served: Endpoint, drive: Running) -> None:
+        model = Raw(served)
+        await model.join()
+        task = stepping(served)
+        await model.done((await model.work()).step, assignments=assigned(**{"axis/position": 3.5}))
+        await task
+        model.call.cancel()
+        await shown(drive, Quality.BAD)
+        again = Raw(served)
+        joined = await again.join()
+        assert joined.computed
+        assert values(joined.outputs.registers, joined.values)["axis/position"] == 3.5
+        task = stepping(served)
+        work = await again.work()
+        assert (work.step, again.inputs(work)["target"]) == (2, 1.5), "all inputs at first"
+        await again.done(2)
+        await task
+        assert (await read(served))["axis/position"] == 3.5
+        again.call.cancel()
+
+    serve_remote(instance, test)
+
+
+@pytest.mark.parametrize(
+    ("given", "reason"),
+    [
+        ({"failure": "no\n solution\x1b[2J"}, "model 'raw': no solution\\x1b[2J"),
+        ({"failure": ""}, "model 'raw': it gave no reason"),
+        ({"assignments": assigned(**{"axis/count": 70_000})}, "model 'raw': axis/count: "),
+        ({"assignments": assigned(target=1.0)}, "target: it is none of the outputs of drive"),
+        ({"assignments": assigned(**{"axis/coumt": 1})}, "near: axis/count"),
+        ({"assignments": assigned(**{"lamps/in": [True] * 10})}, "lamps/in: it is none of the outputs"),
+        ({"values": wire.Values(doubles=wire.Doubles(slots=[7], values=[1.0]))}, "doubles: the table has no slot 7"),
+        ({"values": wire.Values(doubles=wire.Doubles(values=[1.0, 2.0]))}, "doubles: 2 values for 1 slots"),
+        (
+            {"values": wire.Values(doubles=wire.Doubles(slots=[0, 0], values=[1, 2]))},
+            "doubles: 2 values, the table has 1",
+        ),
+        ({"assignments": assigned(**{"axis/count": 1}) * 22}, "assignments: 22 values, the table has 21"),
+        ({"values": wire.Values(floats=wire.Floats(slots=[0], values=[1.0]))}, "floats: the table has no slot 0"),
+    ],
+)
+def test_a_step_fails_with_what_is_wrong_and_the_next_goes_on(instance: str, given: Any, reason: str) -> None:
+    async def test(served: Endpoint, drive: Running) -> None:
+        model = Raw(served)
+        await model.join()
+        task = stepping(served)
+        await model.work()
+        await model.done(1, **given)
+        code, text = await refusal(task)
+        assert (code, reason in text) == (Status.FAILED_PRECONDITION, True), text
+        task = stepping(served)
+        refused = (await model.work()).refused
+        assert refused == "" if "failure" in given else refused.startswith("step 1: "), refused
+        await model.done(2, assignments=assigned(**{"axis/count": 2}))
+        await task
+        assert (await read(served))["axis/count"] == 2
+        model.call.cancel()
+
+    serve_remote(instance, test)
+
+
+def test_what_it_has_set_too_late_is_shown_with_the_next_step(instance: str) -> None:
+    async def test(served: Endpoint, drive: Running) -> None:
+        model = Raw(served)
+        await model.join()
+        task = stepping(served)
+        await model.work()
+        code, text = await refusal(task)
+        assert (code, "did not answer within 200 ms" in text) == (Status.FAILED_PRECONDITION, True), text
+        code, text = await refusal(stepping(served))
+        assert "did not answer within 200 ms" in text, "it has the first one in hand still"
+        await model.done(1, assignments=assigned(**{"axis/count": 1}))
+        number = 2
+        link = served.segment.blocks["drive"].link
+        assert link is not None
+        while True:  # a busy machine may need more than one
+            number += 1
+            task = stepping(served)
+            work = await model.work()
+            assert number > 3 or not link.answered.head(), "what counts for nothing is not given to the source at all"
+            assert work.step == number, "no step that nobody waits for"
+            assert number > 3 or "step 1: the answer came " in work.refused
+            await model.done(number)
+            try:
+                await task
+            except grpc.aio.AioRpcError:
+                continue
+            break
+        assert (await read(served))["axis/count"] == 1
+        model.call.cancel()
+
+    serve_remote(instance, test, timeout_ms=200)
+
+
+@pytest.mark.parametrize(
+    ("requests", "code", "text"),
+    [
+        ([Request(done=wire.Done(step=1))], Status.INVALID_ARGUMENT, "the first message of Simulate joins"),
+        ([Request()], Status.INVALID_ARGUMENT, "the first message of Simulate joins"),
+        ([], Status.INVALID_ARGUMENT, "the first message of Simulate joins"),
+        ([Request(join=wire.Join(source="nothing"))], Status.NOT_FOUND, "no source 'nothing'; there are: drive, cell"),
+        ([Request(join=wire.Join(source="cell"))], Status.FAILED_PRECONDITION, "those that one can join: drive"),
+        ([Request(join=wire.Join(source="drive", name="x" * 104))], Status.INVALID_ARGUMENT, "name: at most 103 bytes"),
+        ([Request(join=wire.Join(source="drive"))] * 2, Status.INVALID_ARGUMENT, "a model joins once"),
+        (
+            [Request(join=wire.Join(source="drive")), Request(done=wire.Done(step=4))],
+            Status.INVALID_ARGUMENT,
+            "an answer to step 4, and none is to be done",
+        ),
+    ],
+)
+def test_what_is_no_model_is_told(instance: str, requests: list[Any], code: Status, text: str) -> None:
+    async def test(served: Endpoint, drive: Running) -> None:
+        async def converse() -> None:
+            call = stub(served).Simulate(timeout=TIMEOUT_S)
+            for request in requests:
+                await call.write(request)
+            if not requests:
+                await call.done_writing()
+            while await call.read() is not grpc.aio.EOF:
+                pass
+
+        found, told = await refusal(converse())
+        assert (found, text in told) == (code, True), told
+        await Raw(served).join()  # nothing is left of it
+
+    serve_remote(instance, test)
+
+
+def test_an_answer_to_another_step_ends_the_stream(instance: str) -> None:
+    async def test(served: Endpoint, drive: Running) -> None:
+        model = Raw(served)
+        await model.join()
+        task = stepping(served)
+        await model.work()
+        await model.done(9)
+        code, text = await refusal(model.work())
+        assert (code, text) == (Status.INVALID_ARGUMENT, "an answer to step 9, and step 1 is to be done")
+        _, text = await refusal(task)
+        assert "model 'raw' was gone before it had answered" in text
+
+    serve_remote(instance, test)
+
+
+def test_who_ends_without_reading_leaves_the_source_to_others(instance: str) -> None:
+    async def test(served: Endpoint, drive: Running) -> None:
+        deaf = await http2.Connection.open(served.port, deaf=True)
+        await deaf.send(http2.headers("/shmio.v1.Shmio/Simulate"))
+        joining = http2.message(Request(join=wire.Join(source="drive")).SerializeToString())
+        await deaf.send(http2.frame(http2.DATA, 0, 1, joining))
+        await shown(drive, Quality.GOOD)
+        await deaf.send(http2.frame(http2.DATA, http2.END_STREAM, 1, b""))
+        await asyncio.wait_for(shown(drive, Quality.BAD), TIMEOUT_S)
+        await Raw(served).join()
+        await deaf.drop(reset=True)
+
+    serve_remote(instance, test)
+
+
+def test_a_second_model_is_refused_by_the_name_of_the_first(instance: str) -> None:
+    async def test(served: Endpoint, drive: Running) -> None:
+        await Raw(served).join(name="first")
+        code, text = await refusal(Raw(served).join(name="second"))
+        assert code is Status.ALREADY_EXISTS
+        assert text.startswith("drive: model 'first' (ipv4:127.0.0.1:")
+
+    serve_remote(instance, test)
+
+
+def test_one_that_another_process_has_is_refused_too(instance: str) -> None:
+    async def test(served: Endpoint, drive: Running) -> None:
+        with Segment.open(served.segment.instance, writable=True) as other:
+            link = other.blocks["drive"].link
+            assert link is not None
+            assert link.join("local")
+            code, text = await refusal(Raw(served).join())
+            assert (code, "model 'local' (pid " in text) == (Status.ALREADY_EXISTS, True)
+            link.leave()
+        await Raw(served).join()
+
+    serve_remote(instance, test)
+
+
+def test_a_reload_ends_it_and_it_may_join_the_new_one(instance: str) -> None:
+    async def run(segment: Segment) -> None:
+        async with endpoint(segment) as served:
+            model = Raw(served)
+            await model.join()
+            segment.change(add=[spec("drive", 10_000_000)], retire=["drive"])
+            served.service.move(["drive"])
+            code, text = await refusal(model.read())
+            assert (code, text) == (Status.UNAVAILABLE, "drive was changed or removed by a reload: join again")
+
+    with remote_segment(instance) as segment:
+        asyncio.run(run(segment))
+
+
+def test_an_endpoint_that_ends_within_a_step_gives_time_up_once(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stepper, "REST_S", 0.02)
+
+    async def test(served: Endpoint, drive: Running) -> None:
+        wrong: list[dict[str, Any]] = []
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(lambda _, context: wrong.append(context))
+        model = Raw(served)
+        await model.join()
+        step = asyncio.create_task(served.service.stepper.step(20_000_000))
+        await model.work()
+        await served.service.stepper.stop()
+        with pytest.raises(asyncio.CancelledError):
+            await step
+        rested = asyncio.Event()
+        loop.call_later(5 * stepper.REST_S, rested.set)  # longer than whoever moved time rests
+        await rested.wait()
+        gc.collect()
+        assert wrong == []
+        model.call.cancel()
+
+    serve_remote(instance, test)
+
+
+# ---- the clients -----------------------------------------------------------------------------------------------------
+
+
+def with_client(instance: str, test: Callable[[Client, Running], None], **options: Any) -> None:
+    async def run(served: Endpoint, drive: Running) -> None:
+        def call() -> None:
+            with connect(f"127.0.0.1:{served.port}", timeout_s=TIMEOUT_S) as cell:
+                test(cell, drive)
+
+        await asyncio.to_thread(call)
+
+    serve_remote(instance, run, **options)
+
+
+class Serving:
+    """A model in a thread, by ``simulate``, until it is closed."""
+
+    def __init__(self, address: str, step: Any, **options: Any) -> None:
+        self.joined = threading.Event()
+        self.simulations: list[Simulation] = []
+        self.error: ShmioError | None = None
+        self._cell = connect(address)
+        self._options = {"name": "served", "start": self._start, **options}
+        self._thread = threading.Thread(target=self._run, args=(step,))
+        self._thread.start()
+
+    def _start(self, simulation: Simulation) -> None:
+        self.simulations.append(simulation)
+        self.joined.set()
+
+    def _run(self, step: Any) -> None:
+        try:
+            self._cell.simulate("drive", step, **self._options)
+        except ShmioError as error:
+            self.error = error
+        self.joined.set()
+
+    def __enter__(self) -> Serving:
+        assert self.joined.wait(TIMEOUT_S)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._cell.close()
+        self._thread.join()
+
+
+def seen(cell: Client, quality: str) -> None:
+    """Wait until the source is so."""
+    while str(cell.read("drive").of("drive/speed").quality) != quality:
+        pass
+
+
+def test_a_function_computes_a_source(instance: str) -> None:
+    def test(cell: Client, drive: Running) -> None:
+        calls: list[tuple[float, float, Any, tuple[str, ...]]] = []
+
+        def step(time_s: float, dt_s: float, inputs: Values) -> dict[str, object]:
+            calls.append((time_s, dt_s, inputs["target"], inputs.changed))
+            return {
+                "axis/position": time_s * inputs["target"],
+                "drive/axis/moving": np.bool_(True),
+                "axis/count": 3.0,
+                "axis/name": "abc",
+                "row": np.arange(6).reshape(2, 3),
+                "lamps": [False] * 9 + [True],
+            }
+
+        with Serving(cell.target.address, step) as serving:
+            seen(cell, "good")
+            cell.step(0.5)
+            cell.write({"drive/target": 2.5}, until_accepted=True)
+            cell.step(0.25)
+            found = cell.read("drive")
+            assert [found[f"drive/axis/{name}"] for name in ("position", "moving", "ready", "count", "name")] == [
+                1.875, True, False, 3, "abc",
+            ]  # fmt: skip
+            np.testing.assert_array_equal(found["drive/row"], [[0, 1, 2], [3, 4, 5]])
+            assert found["drive/lamps"].tolist() == [False] * 9 + [True]
+            (simulation,) = serving.simulations
+            assert (simulation.source, simulation.computed, simulation.period_s) == ("drive", False, 0.02)
+            assert set(simulation.inputs) == {"target", "speed", "label", "when", "lamps"}
+            assert (simulation.outputs["axis/position"], simulation.clock.virtual) == (0.25, True)
+        assert calls == [
+            (0.5, 0.5, 1.5, ("target", "speed", "label", "when", "lamps")),
+            (0.75, 0.25, 2.5, ("target",)),
+        ]
+        assert serving.error is None
+        with pytest.raises(CommandError, match="no model is connected"):
+            cell.step()
+
+    with_client(instance, test)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "reason"),
+    [
+        ({"axis/none": 1}, "axis/none: it is no output of drive; there are: axis/position, axis/moving"),
+        ({"target": 1.0}, "target: it is no output of drive"),
+        ({"axis/count": 1.5}, "axis/count: expected INT, found 1.5"),
+        ({"axis/position": "far"}, "axis/position: expected LREAL, found 'far'"),
+        ({"axis/name": 3}, "axis/name: expected STRING"),
+        ({"axis/count": 1 << 40}, "axis/count: expected INT"),
+        ({"axis/count": 70_000}, "axis/count: "),
+        ({"row": [1, 2, 3]}, "row: expected 2 times 3 elements, found 3"),
+        ({"row": [[1], [2, 3]]}, "row: expected 2 times 3 elements"),
+        ({"row": 5}, "row: expected 2 times 3 elements, found no"),
+        (7, "step gave 7, and is to give outputs by their paths"),
+    ],
+)
+def test_outputs_that_cannot_be_fail_the_step(
+    instance: str, outputs: Any, reason: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    def test(cell: Client, drive: Running) -> None:
+        good = threading.Event()
+        with Serving(cell.target.address, lambda *_: {"axis/count": 1} if good.is_set() else outputs):
+            with caplog.at_level(logging.WARNING, "shmio.client"):
+                for _ in range(2):
+                    with pytest.raises(CommandError) as caught:
+                        cell.step()
+            assert reason in str(caught.value)
+            if outputs != {"axis/count": 70_000}:  # which the endpoint finds
+                told = [record.getMessage() for record in caplog.records if record.name == "shmio.client"]
+                assert [text.startswith("drive: step 1 failed: ") for text in told] == [True], "once"
+            good.set()
+            cell.step()
+            assert cell["drive/axis/count"] == 1
+            if outputs == {"axis/count": 70_000}:
+                last = [record.getMessage() for record in caplog.records if record.name == "shmio.client"][-1]
+                assert last.startswith("drive: step 2: axis/count: "), "the next step has told it"
+
+    with_client(instance, test)
+
+
+def test_what_its_code_raises_is_the_reason_with_the_line(instance: str) -> None:
+    def test(cell: Client, drive: Running) -> None:
+        def step(time_s: float, dt_s: float, inputs: Values) -> None:
+            if dt_s > 1:
+                raise ZeroDivisionError("too far\nat once")
+
+        with Serving(cell.target.address, step):
+            cell.step(1.0)
+            with pytest.raises(
+                CommandError,
+                match=r"drive: model 'served': ZeroDivisionError: too far at once \(test_simulate.py, line \d+\)$",
+            ):
+                cell.step(2.0)
+            cell.step(1.0)
+
+    with_client(instance, test)
+
+
+def test_steps_one_by_one(instance: str) -> None:
+    def test(cell: Client, drive: Running) -> None:
+        stepper = connect(cell.target.address)
+        thread = threading.Thread(target=stepper.step, args=(0.5,))
+        with stepper, cell.simulation("drive") as simulation:
+            with pytest.raises(RemoteError, match="no step is to be answered"):
+                simulation.done({})
+            thread.start()
+            work = next(simulation)
+            assert (work.step, work.time_ns, work.dt_ns) == (1, 500_000_000, 500_000_000)
+            assert (work.time_s, work.dt_s, work.doubt) == (0.5, 0.5, "")
+            with pytest.raises(PathError):
+                simulation.done({"nothing": 1})
+            simulation.done({"axis/count": work.step})
+            thread.join()
+            assert cell["drive/axis/count"] == 1
+            errors: list[Exception] = []
+
+            def fails() -> None:
+                try:
+                    stepper.step()
+                except CommandError as error:
+                    errors.append(error)
+
+            thread = threading.Thread(target=fails)
+            thread.start()
+            next(simulation)
+            simulation.fail("no solution")
+            thread.join()
+            assert "no solution" in str(errors[0])
+            simulation.close()
+            assert list(simulation) == []
+
+    with_client(instance, test)
+
+
+def test_joining_what_cannot_be_joined(instance: str) -> None:
+    def test(cell: Client, drive: Running) -> None:
+        with pytest.raises(PathError, match="no source 'x'"):
+            cell.simulate("x", lambda *_: None)
+        with pytest.raises(CommandError, match="no model can join it"):
+            cell.simulate("cell", lambda *_: None)
+        with cell.simulation("drive", "first"), pytest.raises(ConflictError, match="model 'first'"):
+            cell.simulate("drive", lambda *_: None)
+        with pytest.raises(ValueRangeError, match="name: at most 103 bytes"):
+            cell.simulation("drive", "x" * 200)
+
+    with_client(instance, test)
+
+
+def test_an_instance_that_is_not_there_is_waited_for_so_long() -> None:
+    with connect("127.0.0.1:1") as cell, pytest.raises(LostError, match="no instance serves there"):
+        cell.simulate("drive", lambda *_: None, patience_s=0.3)
+
+
+def test_it_joins_again_when_the_endpoint_is_started_anew_and_tells_all_it_knows(instance: str) -> None:
+    """The endpoint goes with its port; another one takes the port."""
+    with remote_segment(instance) as segment, Running(segment, "drive", source()) as drive:
+
+        def step(time_s: float, dt_s: float, inputs: Values) -> dict[str, object]:
+            first = "target" in inputs.changed and time_s < 1
+            return {"axis/count": 7, "axis/name": "kept"} if first else {"axis/count": 8}
+
+        async def first() -> tuple[Serving, int]:
+            async with endpoint(segment) as served:
+                serving = await asyncio.to_thread(Serving, f"127.0.0.1:{served.port}", step, patience_s=TIMEOUT_S)
+                await asyncio.to_thread(serving.joined.wait, TIMEOUT_S)
+                await stepping(served)
+                serving.joined.clear()
+                return serving, served.port
+
+        async def second(port: int, serving: Serving) -> None:
+            async with endpoint(segment, port=port) as served:
+                assert await asyncio.to_thread(serving.joined.wait, TIMEOUT_S)
+                await shown(drive, Quality.GOOD)
+                await stub(served).Step(wire.StepRequest(dt_ns=2_000_000_000), timeout=TIMEOUT_S)
+                found = await read(served)
+                assert (found["axis/count"], found["axis/name"]) == (8, "kept")
+                assert [one.computed for one in serving.simulations] == [False, True]
+
+        serving, port = asyncio.run(first())
+        try:
+            asyncio.run(second(port, serving))
+        finally:
+            serving.close()
+
+
+def test_the_same_with_asyncio(instance: str) -> None:
+    async def test(served: Endpoint, drive: Running) -> None:
+        async def step(time_s: float, dt_s: float, inputs: Values) -> dict[str, object]:
+            await asyncio.sleep(0)
+            if dt_s > 1:
+                raise ValueError("too far")
+            return {"axis/count": round(time_s * 100)}
+
+        async with connect_aio(f"127.0.0.1:{served.port}") as cell:
+            joined = asyncio.Event()
+            task = asyncio.create_task(cell.simulate("drive", step, name="aio", start=lambda _: joined.set()))
+            await asyncio.wait_for(joined.wait(), TIMEOUT_S)
+            await cell.step(0.5)
+            assert (await cell.read("drive"))["drive/axis/count"] == 50
+            with pytest.raises(CommandError, match=r"model 'aio': ValueError: too far \(test_simulate.py, line "):
+                await cell.step(2.0)
+            with pytest.raises(ConflictError, match="model 'aio'"):
+                await cell.simulate("drive", step)
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+            await shown(drive, Quality.BAD)
+
+            async with await cell.simulation("drive") as simulation:
+                assert (simulation.computed, simulation.outputs["axis/count"]) == (True, 50)
+                stepped = asyncio.create_task(cell.step(0.5))
+                work = await anext(simulation)
+                with pytest.raises(ValueRangeError):
+                    await simulation.done({"axis/count": 1.5})
+                await simulation.done({"axis/count": work.step})
+                await stepped
+                stepped = asyncio.create_task(cell.step(0.5))
+                await anext(simulation)
+                await simulation.fail("no solution")
+                with pytest.raises(CommandError, match="no solution"):
+                    await stepped
+                with pytest.raises(RemoteError, match="no step is to be answered"):
+                    await simulation.fail("twice")
+            with pytest.raises(PathError):
+                await cell.simulation("x")
+
+    serve_remote(instance, test)
+
+
+def test_in_real_time_it_is_asked_once_a_period(instance: str) -> None:
+    def test(cell: Client, drive: Running) -> None:
+        with Serving(cell.target.address, lambda time_s, dt_s, _: {"axis/position": time_s}):
+            shown_at = 0.0
+            for update in cell.subscribe("drive/axis/position", every_frame=True):
+                if str(update.quality) == "good" and update.cycle > 0:
+                    now = float(update["axis/position"])
+                    assert now in (pytest.approx(update.cycle * 0.02), 0.25)
+                    if now > shown_at > 0.25:
+                        break
+                    shown_at = max(now, shown_at)
+
+    with_client(instance, test, virtual=False)

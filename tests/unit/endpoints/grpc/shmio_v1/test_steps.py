@@ -1,0 +1,175 @@
+"""Many steps by one call of shmio.v1."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from typing import Any
+
+import grpc
+import pytest
+
+from shmio.client import Stepped, connect, connect_aio
+from shmio.endpoints.grpc.shmio_v1 import clock
+from shmio.errors import CommandError, ValueRangeError
+from shmio.local.time_control import Step
+from shmio.wire import shmio_v1_pb2 as wire
+from tests.unit.endpoints.grpc.shmio_v1.harness import stub, subscribe
+from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint
+from tests.unit.endpoints.stepped import Model, simulate
+
+Models = dict[str, Model]
+MS = 1_000_000
+
+
+def target(served: Endpoint) -> str:
+    return f"127.0.0.1:{served.port}"
+
+
+def done(*numbers: int, dt_ms: int = 50) -> list[Stepped]:
+    return [Stepped(number, number * dt_ms * MS) for number in numbers]
+
+
+def test_so_many_steps_are_done_and_all_streams_have_each_of_them(instance: str) -> None:
+    async def test(served: Endpoint, _: Models) -> None:
+        stream = subscribe(served, "sim/count")
+        assert await stream.values() == {"count": 0}
+        async with connect_aio(target(served)) as cell:
+            seen = []
+            async for step in cell.steps(40, 0.02):
+                seen.append(step)
+                assert served.service.stepper.timeline.hold.moment.number >= step.step
+            assert seen == done(*range(1, 41), dt_ms=20)
+            assert (await cell.clock()).step == 40
+        assert [await stream.values() for _ in range(40)] == [{"count": number} for number in range(1, 41)]
+
+    simulate(instance, test)
+
+
+def test_what_is_written_between_two_steps_is_done_in_the_second(instance: str) -> None:
+    async def test(served: Endpoint, _: Models) -> None:
+        async with connect_aio(target(served)) as cell, cell.steps() as stepping:
+            for goal in (7, 8, 9):
+                await cell.write({"sim/goal": goal}, until_accepted=True)
+                await stepping.step()
+                assert (await cell.read("sim"))["sim/goal"] == goal
+            assert await stepping.step(0.02) == Stepped(4, 170 * MS)
+
+    simulate(instance, test)
+
+
+def test_a_program_with_threads_does_the_same(instance: str) -> None:
+    def work(address: str) -> None:
+        with connect(address) as cell:
+            assert list(cell.steps(3)) == done(1, 2, 3)
+            assert list(cell.steps()) == []
+            with cell.steps(2) as stepping:
+                assert next(stepping) == done(4)[0]
+                assert stepping.step() == done(6)[0], "behind what was asked for before"
+                assert stepping.step() == done(7)[0]
+                assert list(stepping) == []
+            with pytest.raises(ValueRangeError, match=r"from 0\.001 ms to 3600000 ms"):
+                cell.steps(1, 4000)
+            with pytest.raises(ValueRangeError, match="-1 steps: from 0 to 4294967295"):
+                cell.steps(-1)
+
+    async def test(served: Endpoint, _: Models) -> None:
+        await asyncio.to_thread(work, target(served))
+
+    simulate(instance, test)
+
+
+def test_the_first_that_fails_ends_it_and_those_behind_it_are_not_done(instance: str) -> None:
+    async def test(served: Endpoint, models: Models) -> None:
+        async with connect_aio(target(served)) as cell:
+            stepping = cell.steps()
+            for _ in range(3):
+                await stepping.step()
+            models["sim"].failure = "division by zero"
+            call = stub(served).Steps(timeout=TIMEOUT_S)
+            await call.write(wire.StepsRequest(count=5))
+            await call.write(wire.StepsRequest(count=5))
+            assert await call.code() is grpc.StatusCode.FAILED_PRECONDITION
+            assert "division by zero" in await call.details()
+            assert (await cell.clock()).step == 3
+            with pytest.raises(CommandError, match="step 5: sim: division by zero"):
+                await stepping.step()
+            models["sim"].failure = ""
+            assert [step.step async for step in cell.steps(2)] == [6, 7]
+
+    simulate(instance, test)
+
+
+def test_a_failure_is_told_after_the_answers_to_the_steps_before_it(instance: str) -> None:
+    async def test(served: Endpoint, models: Models) -> None:
+        call = stub(served).Steps(timeout=TIMEOUT_S)
+        await call.write(wire.StepsRequest(count=2))
+        await call.write(wire.StepsRequest(dt_ns=1 << 62))
+        seen = [step.number async for message in _until_error(call) for step in message.steps]
+        assert seen == [1, 2]
+        assert await call.code() is grpc.StatusCode.INVALID_ARGUMENT
+
+    simulate(instance, test)
+
+
+async def _until_error(call: Any) -> AsyncIterator[Any]:
+    try:
+        async for message in call:
+            yield message
+    except grpc.RpcError:
+        return
+
+
+def test_who_ends_it_leaves_the_rest_undone_and_time_to_others(instance: str) -> None:
+    async def test(served: Endpoint, _: Models) -> None:
+        async with connect_aio(target(served)) as cell:
+            stepping = cell.steps(1_000_000)
+            assert [await anext(stepping) for _ in range(3)] == done(1, 2, 3)
+            stepping.close()
+            last = (await cell.step()).step
+            async with asyncio.timeout(TIMEOUT_S):
+                while (now := (await cell.step()).step) != last + 1:  # the other takes turns until it is ended
+                    last = now
+
+    simulate(instance, test)
+
+
+def test_time_that_is_played_is_not_stepped(instance: str) -> None:
+    async def test(served: Endpoint, _: Models) -> None:
+        async with connect_aio(target(served)) as cell:
+            await cell.play(dt_s=0.005)
+            with pytest.raises(CommandError, match="played"):
+                await anext(cell.steps(3))
+            await cell.pause()
+
+    simulate(instance, test)
+
+
+def test_of_who_does_not_read_the_next_steps_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clock, "MAX_ANSWERS", 5)
+
+    class Stepper:
+        made = 0
+
+        async def step(self, dt_ns: int | None, peer: str) -> Step:
+            assert (dt_ns, peer) == (None, "peer")
+            await asyncio.sleep(0)
+            self.made += 1
+            return Step(self.made, self.made, 1)
+
+    async def requests() -> AsyncIterator[Any]:
+        yield wire.StepsRequest(count=100)
+
+    async def test() -> None:
+        stepper: Any = Stepper()
+        messages = clock.Steps(stepper, "peer").messages(requests())
+        sizes = []
+        async for message in messages:
+            sizes.append(len(wire.StepsResponse.FromString(message).steps))
+            for _ in range(50):  # turns of the event loop
+                await asyncio.sleep(0)
+            assert stepper.made <= sum(sizes) + 5
+        assert sum(sizes) == stepper.made == 100
+        assert max(sizes) == 5
+
+    asyncio.run(test())

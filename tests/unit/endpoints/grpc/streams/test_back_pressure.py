@@ -1,0 +1,299 @@
+"""A feed reads no more than its streams can take; what those take that are far behind is the newest."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from contextlib import closing
+
+import pytest
+
+from shmio.endpoints.grpc.streams import back_pressure, outbox, wakeups
+from shmio.endpoints.grpc.streams.back_pressure import Pace
+from shmio.endpoints.grpc.streams.feed import Feed
+from shmio.endpoints.grpc.streams.outbox import Outbox, StateLane
+from shmio.endpoints.grpc.streams.wakeups import Bells
+from shmio.segment import Attributes, BlockSpec, ProcessSpec, Quality, Segment
+from shmio.segment.block import Stamp
+from tests.unit.endpoints.grpc.test_grpc import STEP
+from tests.unit.endpoints.harness import LAYOUT, SOON_STALE_NS, STALE_NS, TIMEOUT_S, WRITABLE, WRITER, image
+
+MANY = 300
+
+
+class Known(Pace):
+    """Says what it is told to."""
+
+    def __init__(self, *, behind: bool) -> None:
+        super().__init__()
+        self.behind = behind
+
+    def offer(self, now_s: float) -> None: ...
+
+
+class Followed:
+    """A feed, its source, and streams of one register, of which each has had its first value."""
+
+    def __init__(self, segment: Segment, *behind: bool, source: str = "cell") -> None:
+        self.writer = segment.writer(source)
+        self._bells = Bells()
+        self.told = list[bool]()
+        self.feed = Feed(segment.blocks[source], WRITER, self._bells, lambda _, good: self.told.append(good))
+        self.count = 0
+        self.feed.start()
+        self.streams = [Outbox() for _ in behind]
+        for stream, late in zip(self.streams, behind, strict=True):
+            stream.pace = Known(behind=late)
+            StateLane(stream).join(self.feed, STEP)
+
+    async def begin(self) -> None:
+        asking = [asyncio.ensure_future(self.next(stream)) for stream in self.streams]  # before anything is passed over
+        await self.publish(1)
+        assert [await value for value in asking] == [1] * len(asking)
+
+    async def publish(self, count: int) -> None:
+        """Frames with the next numbers, with time between them to be shown or passed over."""
+        for _ in range(count):
+            self.count += 1
+            self.writer.publish(image(step=self.count), cycle=self.count)
+            await self.pass_by()
+
+    async def fail(self) -> None:
+        """A frame that says that there are no values."""
+        self.count += 1
+        self.writer.publish(image(), cycle=self.count, quality=Quality.BAD, reason="cable out")
+        await self.pass_by()
+
+    async def pass_by(self) -> None:
+        for _ in range(3):
+            await asyncio.sleep(0)
+
+    async def next(self, stream: Outbox) -> int:
+        async with asyncio.timeout(TIMEOUT_S):
+            message = await stream.pop()
+        assert message is not None
+        return int.from_bytes(message, "big")
+
+    def stop(self) -> None:
+        self.feed.stop()
+        self._bells.close()
+
+
+def follow(segment: Segment, test: Callable[[Followed], Awaitable[None]], *behind: bool) -> None:
+    async def run() -> None:
+        followed = Followed(segment, *behind)
+        try:
+            await followed.begin()
+            await test(followed)
+        finally:
+            followed.stop()
+
+    asyncio.run(run())
+
+
+@pytest.fixture(autouse=True)
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is looked at for its age, and nothing is new."""
+    monkeypatch.setattr(back_pressure, "LOOK_S", 1000.0)
+    monkeypatch.setattr(back_pressure, "LATE_S", 0.0)
+    monkeypatch.setattr(wakeups, "REST_S", 1000.0)
+
+
+def test_frames_that_nobody_could_take_are_not_read(segment: Segment) -> None:
+    async def test(followed: Followed) -> None:
+        feed, (first, second) = followed.feed, followed.streams
+        before = feed.messages
+        await followed.publish(MANY)
+        assert feed.messages == before
+        assert await followed.next(first) == MANY + 1, "the newest when it can be taken"
+        assert await followed.next(second) == MANY + 1
+        assert feed.messages == before + 1
+        assert first.dropped == second.dropped == MANY - 1
+        await followed.publish(1)
+        waiting = asyncio.ensure_future(followed.next(first))
+        assert await waiting == MANY + 2
+        waiting = asyncio.ensure_future(followed.next(first))
+        await asyncio.sleep(0)
+        await followed.publish(1)
+        assert await waiting == MANY + 3, "who waits is rung for"
+
+    follow(segment, test, True, True)
+
+
+def test_of_what_is_new_they_take_several(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (back_pressure, outbox):
+        monkeypatch.setattr(module, "LATE_S", 1000.0)
+
+    async def test(followed: Followed) -> None:
+        (stream,) = followed.streams
+        await followed.publish(MANY)
+        last = MANY + 1
+        expected = range(last - back_pressure.FEW_FRAMES + 1, last + 1)
+        assert [await followed.next(stream) for _ in expected] == list(expected)
+
+    follow(segment, test, True)
+
+
+def test_one_that_is_not_far_behind_misses_nothing_for_having_been_busy(segment: Segment) -> None:
+    async def test(followed: Followed) -> None:
+        (stream,) = followed.streams
+        before = followed.feed.messages
+        await followed.publish(back_pressure.CATCH_UP_FRAMES)
+        assert followed.feed.messages == before, "they are where they are until it asks"
+        expected = range(2, back_pressure.CATCH_UP_FRAMES + 2)
+        assert [await followed.next(stream) for _ in expected] == list(expected)
+        assert stream.dropped == 0
+        await followed.publish(back_pressure.CATCH_UP_FRAMES + 1)
+        assert await followed.next(stream) == 2 * (back_pressure.CATCH_UP_FRAMES + 1)
+        assert stream.dropped == back_pressure.CATCH_UP_FRAMES
+
+    follow(segment, test, False)
+
+
+def test_beside_one_that_keeps_up_every_frame_is_read(segment: Segment) -> None:
+    async def test(followed: Followed) -> None:
+        late, good = followed.streams
+        for number in range(2, 40):
+            waiting = asyncio.ensure_future(followed.next(good))
+            await followed.publish(1)
+            assert await waiting == number
+        assert await followed.next(late) <= 39
+
+    follow(segment, test, True, False)
+
+
+def test_what_waits_does_not_get_too_old(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(back_pressure, "LOOK_S", 0.0)
+
+    async def test(followed: Followed) -> None:
+        before = followed.feed.messages
+        async with asyncio.timeout(TIMEOUT_S):
+            while followed.feed.messages < before + 20:
+                await followed.publish(1)
+
+    follow(segment, test, True)
+
+
+def test_a_stream_of_several_sources_is_given_what_is_newest_of_each_when_it_asks(instance: str) -> None:
+    blocks = [BlockSpec(name, LAYOUT, 20_000_000, STALE_NS, 1 << 20, Attributes("test", WRITABLE)) for name in "ab"]
+    processes = [*(ProcessSpec(name, "source") for name in "ab"), ProcessSpec("grpc", "grpc")]
+
+    async def run(segment: Segment) -> None:
+        a = Followed(segment, False, source="a")
+        (stream,) = a.streams
+        b = Followed(segment, source="b")
+        StateLane(stream).join(b.feed, STEP)
+        try:
+            await a.publish(1)
+            await b.publish(1)
+            assert [await a.next(stream) for _ in range(2)] == [1, 1]
+            for number in range(2, 10):
+                await b.publish(1)
+                await a.publish(1)
+                async with asyncio.timeout(TIMEOUT_S):
+                    while len(stream.refills) < 2:  # noqa: ASYNC110  another thread's doing
+                        await asyncio.sleep(0)
+                assert [await a.next(stream) for _ in range(2)] == [number, number], "of both, one after the other"
+        finally:
+            a.stop()
+            b.stop()
+
+    with Segment.create(instance, blocks, processes) as segment:
+        with closing(segment):
+            asyncio.run(run(segment))
+        segment.unlink()
+
+
+def test_who_joins_while_a_feed_rests_asks_for_more_as_the_others_do(segment: Segment) -> None:
+    async def test(followed: Followed) -> None:
+        await followed.publish(1)  # passed over: the one that there is never reads
+        async with asyncio.timeout(TIMEOUT_S):
+            while not followed.streams[0].refills:  # noqa: ASYNC110  another thread's doing
+                await asyncio.sleep(0)
+        late = Outbox()
+        StateLane(late).join(followed.feed, STEP)
+        await followed.publish(2)
+        assert await followed.next(late) == 2, "as it was when it came"
+        assert [await followed.next(late) for _ in range(2)] == [3, 4]
+
+    follow(segment, test, False)
+
+
+def test_who_has_left_asks_for_nothing_more(segment: Segment) -> None:
+    """What others have no time for is not read on its behalf."""
+
+    async def test(followed: Followed) -> None:
+        feed, (stream,) = followed.feed, followed.streams
+        gone = Outbox()
+        leave = StateLane(gone).join(feed, STEP)
+        await followed.publish(1)  # passed over: neither asks
+        async with asyncio.timeout(TIMEOUT_S):
+            while not (gone.refills and stream.refills):  # noqa: ASYNC110  another thread's doing
+                await asyncio.sleep(0)
+        leave()
+        before = feed.messages
+        assert await followed.next(gone) == 1, "what it was given"
+        asking = asyncio.ensure_future(followed.next(gone))
+        await asyncio.sleep(0)
+        assert feed.messages == before
+        asking.cancel()
+        assert await followed.next(stream) == 2
+
+    follow(segment, test, False)
+
+
+def test_bad_news_of_a_source_that_says_nothing_more_wait_for_no_ring(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(wakeups, "TURN_NS", 1_000_000_000_000)
+    monkeypatch.setattr(wakeups, "REST_S", 0.001)
+
+    async def test(followed: Followed) -> None:
+        passes, heard = followed.feed._crowd.passes, asyncio.Event()
+
+        def passed() -> bool:
+            heard.set()
+            return passes()
+
+        monkeypatch.setattr(followed.feed._crowd, "passes", passed)
+        await followed.fail()
+        async with asyncio.timeout(TIMEOUT_S):
+            await heard.wait()
+        assert followed.told == [True], "nobody has looked yet"
+        monkeypatch.setattr(back_pressure, "LOOK_S", 0.0)
+        followed.feed._crowd._until_s = 0.0
+        async with asyncio.timeout(TIMEOUT_S):
+            while followed.told == [True]:  # noqa: ASYNC110  it has no bell of its own
+                await asyncio.sleep(0)
+        assert followed.told == [True, False]
+
+    follow(segment, test, False)
+
+
+def test_what_was_passed_over_was_no_silence(soon_stale: Segment) -> None:
+    async def test(followed: Followed) -> None:
+        (stream,) = followed.streams
+        begun_s = asyncio.get_running_loop().time()
+        while asyncio.get_running_loop().time() < begun_s + 1.5e-9 * SOON_STALE_NS:
+            await followed.publish(1)
+        await followed.publish(MANY)
+        last = followed.count
+        assert await followed.next(stream) == last
+        assert followed.told == [True]
+
+    follow(soon_stale, test, True)
+
+
+def test_whoever_sees_two_frames_at_once_sees_that_nothing_came_between_them_for_too_long(segment: Segment) -> None:
+    """By the time of the next frame, not by that at which somebody was awake to look."""
+
+    async def test(followed: Followed) -> None:
+        (stream,), block = followed.streams, segment.blocks["cell"]
+        asking = asyncio.ensure_future(followed.next(stream))
+        await followed.pass_by()
+        late = Stamp(block.now_ns() + 2 * STALE_NS, 0)
+        followed.writer.publish(image(step=followed.count), cycle=followed.count + 1, at=late)
+        assert await asking == followed.count, "what has not changed, once more"
+        assert followed.told == [True, False, True]
+
+    follow(segment, test, False)

@@ -1,0 +1,157 @@
+"""The feeds of an instance that is reloaded."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import threading
+import weakref
+
+import pytest
+
+from shmio.endpoints.grpc.streams import back_pressure
+from shmio.endpoints.grpc.streams import wakeups as ringing
+from shmio.endpoints.grpc.streams.feeds import Feeds
+from shmio.endpoints.grpc.streams.subject import Subject
+from shmio.endpoints.grpc.streams.wakeups import Bells
+from shmio.endpoints.grpc.time.virtual_time import Hold, Moment
+from shmio.segment import Attributes, BlockSpec, Quality, Segment
+from tests.unit.endpoints.grpc.test_grpc import STEP, Recorder
+from tests.unit.endpoints.harness import LAYOUT, STALE_NS, TIMEOUT_S, WRITABLE, WRITER, image
+from tests.unit.endpoints.stepped import LAYOUT as MODEL_LAYOUT
+from tests.unit.endpoints.stepped import stepped_segment
+
+
+def test_what_a_reload_ended_is_forgotten_when_its_streams_are_gone(segment: Segment, instance: str) -> None:
+    async def run(opened: Segment) -> None:
+        bells = Bells()
+        feeds = Feeds(opened, WRITER, bells, lambda source, good: None)
+        feeds.start()
+        old = feeds["cell"]
+        stream = Recorder()
+        old.listen(STEP, stream)
+        segment.writer("cell").publish(image(step=1), cycle=1)
+        async with asyncio.timeout(TIMEOUT_S):
+            while not feeds.messages:  # noqa: ASYNC110  another thread's doing
+                await asyncio.sleep(0)
+        counted = feeds.messages
+        spec = BlockSpec("cell", LAYOUT, 10_000_000, STALE_NS, 1 << 20, Attributes("test", WRITABLE))
+        segment.change(retire=["cell"], add=[spec])
+        async with asyncio.timeout(TIMEOUT_S):
+            while feeds["cell"] is old:
+                await feeds.follow()
+                await asyncio.sleep(0)
+        await feeds.follow()
+        assert old in feeds._ended  # a stream has not gone over yet
+        old.leave(STEP, stream)
+        gone = weakref.ref(old)
+        del old
+        async with asyncio.timeout(TIMEOUT_S):
+            while gone() is not None:
+                await feeds.follow()
+                await asyncio.sleep(0)
+                gc.collect()
+        assert feeds.messages == counted
+        assert feeds.alive
+        feeds.stop()
+        bells.close()
+
+    with Segment.open(instance, writable=True) as opened:
+        asyncio.run(run(opened))
+
+
+def test_the_loop_goes_on_while_a_new_layout_is_read(segment: Segment, instance: str) -> None:
+    """Whatever is read of the segment is read by another thread than that of the streams."""
+
+    async def run(opened: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+        bells = Bells()
+        feeds = Feeds(opened, WRITER, bells, lambda source, good: None)
+        feeds.start()
+        await feeds.follow()
+        going_on, begun, refresh = threading.Event(), asyncio.Event(), opened.refresh
+        loop = asyncio.get_running_loop()
+
+        def slow() -> bool:
+            loop.call_soon_threadsafe(begun.set)
+            assert going_on.wait(TIMEOUT_S)
+            return refresh()
+
+        monkeypatch.setattr(opened, "refresh", slow)
+        spec = BlockSpec("second", LAYOUT, 10_000_000, STALE_NS, 1 << 20, Attributes("test", WRITABLE))
+        segment.change(add=[spec])
+        following = asyncio.create_task(feeds.follow())
+        async with asyncio.timeout(TIMEOUT_S):
+            await begun.wait()
+            assert list(feeds) == ["cell"]
+            going_on.set()
+            assert await following == ["second"]
+        assert list(feeds) == ["cell", "second"]
+        feeds.stop()
+        bells.close()
+
+    with Segment.open(instance, writable=True) as opened, pytest.MonkeyPatch.context() as monkeypatch:
+        asyncio.run(run(opened, monkeypatch))
+
+
+COUNT = Subject("raw", "count", (MODEL_LAYOUT.registers[0],), lambda picture: bytes((picture.number, picture.image[3])))
+
+
+def test_a_model_that_a_reload_changes_in_virtual_time_is_shown_step_by_step_too(instance: str) -> None:
+    async def run(opened: Segment) -> None:
+        bells, hold = Bells(), Hold()
+        hold.on, hold.moment = True, Moment(6, 0)
+        feeds = Feeds(opened, WRITER, bells, lambda source, good: None, hold)
+        feeds.start()
+        attributes = Attributes("simulation", ("goal",), stepped=True)
+        spec = BlockSpec("sim", MODEL_LAYOUT, 10_000_000, STALE_NS, 1 << 20, attributes)
+        opened.change(retire=["sim"], add=[spec])
+        await feeds.follow()
+        stream = Recorder()
+        feeds["sim"].listen(COUNT, stream)
+        writer = opened.writer("sim")
+        for count in (1, 2, 3):
+            writer.publish(b"\0\0\0" + bytes([count]) + bytes(MODEL_LAYOUT.size - 4), cycle=count)
+            async with asyncio.timeout(TIMEOUT_S):
+                while not stream.got:  # noqa: ASYNC110  another thread's doing
+                    await asyncio.sleep(0)
+        assert stream.got == [bytes((6, 1))], "the first image, and nothing more before a step"
+        for number in (7, 8):
+            hold.moment = Moment(number, 0)
+            feeds["sim"].step()
+        assert stream.got == [bytes((6, 1)), bytes((7, 3))]
+        feeds["sim"].leave(COUNT, stream)
+        feeds.stop()
+        bells.close()
+
+    with stepped_segment(instance, "sim") as segment:
+        asyncio.run(run(segment))
+
+
+def test_a_feed_that_is_held_passes_nothing_over(instance: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it reads is not for its streams: they have nothing to be too slow for."""
+    monkeypatch.setattr(back_pressure, "LOOK_S", 1000.0)
+    monkeypatch.setattr(ringing, "REST_S", 0.001)
+
+    async def run(opened: Segment) -> None:
+        told, bells = list[bool](), Bells()
+        feeds = Feeds(opened, WRITER, bells, lambda _, good: told.append(good))
+        feeds.start()
+        feed, stream, writer = feeds["sim"], Recorder(), opened.writer("sim")
+        feed.listen(COUNT, stream)
+        writer.publish(bytes(MODEL_LAYOUT.size), cycle=1)
+        async with asyncio.timeout(TIMEOUT_S):
+            while told[-1:] != [True]:  # noqa: ASYNC110  another thread's doing
+                await asyncio.sleep(0)
+            feed.hold()
+            for cycle in range(2, 2 * back_pressure.CATCH_UP_FRAMES):
+                writer.publish(bytes(MODEL_LAYOUT.size), cycle=cycle)
+            writer.publish(bytes(MODEL_LAYOUT.size), cycle=2 * back_pressure.CATCH_UP_FRAMES, quality=Quality.BAD)
+            while told[-1]:  # noqa: ASYNC110  another thread's doing
+                await asyncio.sleep(0)
+        assert stream.stream.dropped == 0
+        feed.leave(COUNT, stream)
+        feeds.stop()
+        bells.close()
+
+    with stepped_segment(instance, "sim", virtual=False) as segment:
+        asyncio.run(run(segment))

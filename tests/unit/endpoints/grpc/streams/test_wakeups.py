@@ -1,0 +1,136 @@
+"""Bells that ring in the event loop: for whom, when, and until when."""
+
+from __future__ import annotations
+
+import asyncio
+
+import pytest
+
+from shmio.endpoints.grpc.streams.wakeups import Bell, Bells
+from shmio.segment import Segment
+from tests.unit.endpoints.harness import TIMEOUT_S, image
+
+
+def test_all_who_listen_to_a_block_hear_of_it_in_the_order_in_which_they_came(segment: Segment) -> None:
+    async def test() -> None:
+        block, writer, bells = segment.blocks["cell"], segment.writer("cell"), Bells()
+        heard = list[tuple[str, int]]()
+        reached = asyncio.Event()
+
+        def first() -> None:
+            heard.append(("first", block.ring.head()))
+
+        def second() -> None:
+            heard.append(("second", block.ring.head()))
+            if block.ring.head() == 100:
+                reached.set()
+
+        bells.join(block, first)
+        bells.join(block, second)
+        for number in range(100):
+            writer.publish(image(step=number), cycle=number)
+        async with asyncio.timeout(TIMEOUT_S):
+            await reached.wait()
+        assert heard[-2:] == [("first", 100), ("second", 100)]
+        assert len(heard) < 200, "a loop that has no time is not rung for each frame"
+        bells.leave(block, first)
+        heard.clear()
+        reached.clear()
+        writer.publish(image(), cycle=100)
+        async with asyncio.timeout(TIMEOUT_S):
+            while ("second", 101) not in heard:  # noqa: ASYNC110  another thread's doing
+                await asyncio.sleep(0)
+        assert ("first", 101) not in heard
+        bells.close()
+
+    asyncio.run(test())
+
+
+def test_who_leaves_while_it_rings_takes_nobody_with_him(segment: Segment) -> None:
+    async def test() -> None:
+        block, bells, over = segment.blocks["cell"], Bells(), asyncio.Event()
+
+        def leaving() -> None:
+            bells.leave(block, leaving)
+
+        bells.join(block, leaving)
+        bells.join(block, over.set)
+        async with asyncio.timeout(TIMEOUT_S):
+            await over.wait()
+        bells.leave(block, over.set)
+        bells.close()
+
+    asyncio.run(test())
+
+
+def test_a_bell_rests_while_all_who_listen_have_time(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("shmio.endpoints.grpc.streams.wakeups.REST_S", 1000.0)
+
+    async def test() -> None:
+        block, writer, bells = segment.blocks["cell"], segment.writer("cell"), Bells()
+        heard = list[str]()
+        rung = asyncio.Event()
+
+        def busy() -> None:
+            heard.append("busy")
+
+        def patient() -> None:
+            heard.append("patient")
+
+        def prompt() -> None:
+            heard.append("prompt")
+            rung.set()
+
+        bells.join(block, busy)
+        bells.join(block, patient, patient=True)
+        bells.rest(block, busy)
+        heard.clear()
+        for number in range(100):
+            writer.publish(image(step=number), cycle=number)
+            await asyncio.sleep(0)
+        assert not heard
+        bells.join(block, prompt)  # who has no time ends it for all
+        async with asyncio.timeout(TIMEOUT_S):
+            await rung.wait()
+            assert heard == ["busy", "patient", "prompt"]
+            bells.rest(block, busy)
+            rung.clear()
+            writer.publish(image(), cycle=100)
+            await rung.wait()
+            bells.leave(block, prompt)
+            bells.rest(block, busy)
+            heard.clear()
+            bells.resume(block, busy)
+            while not heard:  # noqa: ASYNC110  another thread's doing
+                await asyncio.sleep(0)
+        bells.close()
+
+    asyncio.run(test())
+
+
+def test_a_bell_that_has_rested_rings_for_what_was_left_and_goes_on(
+    segment: Segment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("shmio.endpoints.grpc.streams.wakeups.REST_S", 0.001)
+
+    async def test() -> None:
+        writer, heard = segment.writer("cell"), asyncio.Event()
+        bell = Bell(segment.blocks["cell"].ring, "bell", turn_ns=10**15)
+        bell.listeners[heard.set] = None
+        bell.patient.add(heard.set)
+
+        async def rings() -> None:
+            async with asyncio.timeout(TIMEOUT_S):
+                await heard.wait()
+            heard.clear()
+
+        await rings()
+        bell.rest()
+        await rings()  # though nothing has come since
+        writer.publish(image(), cycle=1)
+        await rings()
+        bell.stop()
+        writer.publish(image(), cycle=2)  # so that its thread looks
+        bell.join()
+
+    asyncio.run(test())

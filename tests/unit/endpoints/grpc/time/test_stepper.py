@@ -1,0 +1,66 @@
+"""A step's waits in the event loop."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Generator
+from typing import Any
+
+from shmio.endpoints.grpc.time.stepper import Driver
+from shmio.local.step_answers import Wait
+from shmio.local.time_control import Step
+
+MANY = 1_000_000
+DONE = Step(1, 50, 50)
+
+
+class Block:
+    """Its bell has rung again whenever one waits for it in the event loop's thread, and never when one only looks."""
+
+    @property
+    def ring(self) -> Block:
+        return self
+
+    def wait(self, seen: int, timeout_ns: int) -> int:
+        assert timeout_ns > 0
+        return seen + 1
+
+    def doorbell(self) -> int:
+        return 0
+
+
+class Bells:
+    """They ring at the loop's next turn."""
+
+    def join(self, block: Any, ring: Callable[[], object]) -> None:
+        asyncio.get_running_loop().call_soon(ring)
+
+    def leave(self, block: Any, ring: Callable[[], object]) -> None: ...
+
+
+def test_a_source_that_rings_much_before_it_answers_does_not_hold_up_the_loop() -> None:
+    turns: list[int] = []
+    waits: list[int] = []
+
+    class Coordinator:
+        def stepping(self, dt_ns: int | None) -> Generator[Wait, None, Step]:
+            block: Any = Block()
+            while len(waits) < MANY and len(turns) < 3:
+                waits.append(0)
+                yield Wait(block, 0, 1_000_000_000)
+            return DONE
+
+    async def others() -> None:
+        while len(turns) < 3:
+            turns.append(0)
+            await asyncio.sleep(0)
+
+    async def test() -> None:
+        coordinator, clock, bells = Coordinator(), None, Bells()
+        driver = Driver(coordinator, clock, bells)  # type: ignore[arg-type]  # what it needs of them
+        beside = asyncio.create_task(others())
+        assert await driver.step(None) == DONE
+        await beside
+
+    asyncio.run(test())
+    assert len(waits) < MANY

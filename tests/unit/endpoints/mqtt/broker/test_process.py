@@ -1,0 +1,188 @@
+"""Our own broker: mosquitto, and the one in Python; as their process runs them, and as clients see them."""
+
+from __future__ import annotations
+
+import json
+import socket
+from pathlib import Path
+from typing import Any
+
+import pytest
+import trustme
+from paho.mqtt.client import Client, MQTTv5, MQTTv311
+from paho.mqtt.enums import CallbackAPIVersion
+
+from shmio.config import Address, Mqtt, MqttTls
+from shmio.endpoints.mqtt.broker import mosquitto
+from shmio.endpoints.mqtt.broker.directory import folder
+from shmio.errors import ConfigError, EndpointError
+from shmio.segment import Segment
+from tests.unit.endpoints.mqtt.harness import PREFIX, bridge, listening
+from tests.unit.endpoints.mqtt.serving import address as address  # noqa: PLC0414  the fixture
+from tests.unit.endpoints.mqtt.serving import bridged, serving
+from tests.unit.endpoints.mqtt.serving import segment as segment  # noqa: PLC0414  the fixture
+
+
+def test_clients_see_what_the_bridge_publishes(segment: Segment, address: Address, program: str) -> None:
+    with serving(segment, address, program), bridged(segment) as running:
+        assert running.bridge.link.mqtt5 is (program == "mosquitto")
+        with listening(address, protocol=MQTTv311) as listener:
+            assert listener.until("cell/step/out") == b"7"
+            listener.shown("cell/axis/position/out", "0.0")
+    assert not folder(segment).exists()
+
+
+def test_a_client_hears_only_what_it_has_subscribed_to(segment: Segment, address: Address, program: str) -> None:
+    with (
+        serving(segment, address, program),
+        bridged(segment),
+        listening(address, protocol=MQTTv311) as everything,
+    ):
+        assert everything.until("cell/step/out") == b"7"
+        with listening(address, f"{PREFIX}/mine", protocol=MQTTv311) as listener:
+            listener.publish("mine", "last")
+            listener.until("mine")
+            assert listener.heard == [(f"{PREFIX}/mine", b"last")]
+
+
+def test_a_retained_command_is_not_carried_out_by_either_version(
+    segment: Segment, address: Address, program: str
+) -> None:
+    with serving(segment, address, program):
+        with listening(address, "none", protocol=MQTTv311) as before:
+            before.publish("cell/step/in", "5", retain=True)
+            before.publish("cell/step/in/result", "none")
+        with bridged(segment) as running, listening(address, protocol=MQTTv311) as listener:
+            listener.publish("cell/secret/in", "5")
+            told = listener.json("cell/secret/in/result")
+            assert "not writable" in told["reason"]
+            assert running.bridge.counters[2] in (1, 2)  # of the retained one the broker says nothing, or it is refused
+            assert not any(json.loads(one)["done"] for one in listener.values("cell/step/in/result"))
+
+
+def test_what_a_bridge_before_has_left_is_forgotten_by_either_version(
+    segment: Segment, address: Address, program: str
+) -> None:
+    with serving(segment, address, program), listening(address, protocol=MQTTv311) as listener:
+        listener.publish("cell/nowhere/out", "1", retain=True)
+        listener.until("cell/nowhere/out", b"1")
+        with bridged(segment):
+            listener.until("cell/nowhere/out", b"")
+            listener.shown("cell/step/out", "7")
+
+
+def test_only_who_has_an_account_gets_in(segment: Segment, address: Address, program: str, tmp_path: Path) -> None:
+    accounts = tmp_path / "accounts"
+    accounts.write_text("anna:secret\n")
+    accounts.chmod(0o600)
+    with serving(segment, address, program, password_file=str(accounts), account=[]), bridged(segment):
+        with listening(address, protocol=MQTTv311, username="anna", password="secret") as listener:
+            assert listener.until("cell/step/out") == b"7"
+        assert answer(address, MQTTv311) == "Not authorized"
+        assert answer(address, MQTTv311, "anna", "guess") == "Not authorized"
+        assert answer(address, MQTTv311, "bert", "secret") == "Not authorized"
+
+
+def answer(address: Address, protocol: Any, *account: str) -> str:
+    """What the broker says to a client that connects."""
+    told: list[str] = []
+    client = Client(CallbackAPIVersion.VERSION2, protocol=protocol)
+    if account:
+        client.username_pw_set(*account)
+    client.on_connect = lambda _client, _data, _flags, code, _properties: told.append(str(code))
+    client.connect(address.host, address.port)
+    while not told:
+        client.loop(1.0)
+    client.disconnect()
+    client.loop(0.1)
+    return told[0]
+
+
+def test_the_one_in_python_says_what_it_does_not_speak(
+    segment: Segment, address: Address, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SHMIO_MOSQUITTO", "")
+    with serving(segment, address, "embedded"):
+        assert answer(address, MQTTv5) == "Unsupported protocol version"
+        assert answer(address, MQTTv311) == "Success"
+
+
+def test_tls_with_certificates_of_both_sides(segment: Segment, address: Address, program: str, tmp_path: Path) -> None:
+    authority = trustme.CA()
+    authority.cert_pem.write_to_path(tmp_path / "ca.pem")
+    server, client = authority.issue_cert("127.0.0.1"), authority.issue_cert("bridge")
+    for name, issued in (("server", server), ("client", client)):
+        issued.private_key_pem.write_to_path(tmp_path / f"{name}.key")
+        (tmp_path / f"{name}.pem").write_bytes(b"".join(blob.bytes() for blob in issued.cert_chain_pems))
+    tls = {key: str(tmp_path / name) for key, name in (("certificate", "server.pem"), ("key", "server.key"))}
+    own = MqttTls(
+        ca=str(tmp_path / "ca.pem"), certificate=str(tmp_path / "client.pem"), key=str(tmp_path / "client.key")
+    )
+    with serving(segment, address, program, tls={**tls, "ca": str(tmp_path / "ca.pem")}):
+        with bridge(segment, address, tls=own) as running:
+            running.until(lambda: running.bridge.link.up and not running.bridge.outbox.busy)
+        trustme.CA().cert_pem.write_to_path(tmp_path / "other.pem")
+        with bridge(segment, address, tls=MqttTls(ca=str(tmp_path / "other.pem"))) as running:
+            running.until(lambda: "its certificate is not to be trusted" in running.bridge.problem)
+        with bridge(segment, address, tls=MqttTls(ca=str(tmp_path / "ca.pem"))) as running:
+            running.until(lambda: "mqtt.tls.certificate and key" in running.bridge.problem)
+            assert not running.bridge.link.up
+        with bridge(segment, address) as running:
+            running.until(lambda: "expects TLS there" in running.bridge.problem)
+    with bridge(segment, address, tls=MqttTls(ca=str(tmp_path / "none.pem"))) as running:
+        running.until(lambda: "mqtt.tls.ca" in running.bridge.problem)
+
+
+def test_a_port_that_is_taken_ends_it_with_the_reason(segment: Segment, program: str) -> None:
+    with (
+        Listening() as taken,
+        pytest.raises(EndpointError, match=r"(?i)address already in use|address in use"),
+        serving(segment, taken.address, program),
+    ):
+        pass
+    assert not folder(segment).exists()
+
+
+class Listening:
+    """Somebody else's server."""
+
+    def __enter__(self) -> Listening:
+
+        self._socket = socket.create_server(("127.0.0.1", 0))
+        self.address = Address("127.0.0.1", self._socket.getsockname()[1])
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+
+def test_a_mosquitto_that_is_insisted_on_and_not_there_is_told(
+    segment: Segment, address: Address, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SHMIO_MOSQUITTO", "")
+    with pytest.raises(ConfigError, match="is not on this machine"), serving(segment, address, "mosquitto"):
+        pass
+
+
+def test_what_mosquitto_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LOGNAME", "nobody")  # as some ways to become root leave it
+    tls = MqttTls(ca="/c/ca.pem", certificate="/c/c.pem", key="/c/k.pem")
+    text = mosquitto.configuration(Mqtt(listen="[::1]:1883", password_file="/c/a", tls=tls), tmp_path, anonymous=False)
+    lines = text.splitlines()
+    own, others = lines.index(f"listener 0 {tmp_path / 's'}"), lines.index("listener 1883 ::1")
+    assert lines[own + 1 :] == [
+        "allow_anonymous false",
+        f"password_file {tmp_path / 'bridge'}",
+        f"acl_file {tmp_path / 'bridge-rights'}",
+    ]
+    assert lines[others + 1 : own] == [
+        "allow_anonymous false",
+        f"acl_file {tmp_path / 'rights'}",
+        f"password_file {tmp_path / 'accounts'}",
+        "certfile /c/c.pem",
+        "keyfile /c/k.pem",
+        "cafile /c/ca.pem",
+        "require_certificate true",
+    ]
+    assert "persistence false" in lines[:others]
+    assert "user root" in lines[:others]

@@ -1,0 +1,150 @@
+"""Tag tables: where registers are placed, and what is refused, with its line."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmio.errors import LayoutError
+from shmio.layout.compiler import Source, compile_sources
+from shmio.layout.image import initial_frame
+from shmio.layout.model import Layout
+from shmio.layout.values.codec import codec
+
+TABLE = """
+[registers]
+"joints/R3200/Link1/R/position" = "LREAL"
+"flag" = "bool"
+"joints/Kuka.j1/R" = { type = "LREAL", initial = 0.5, comment = "rad" }
+"lamps" = { type = "Array[1..3, 0..8] of Bool", initial = [true, false] }
+name = { type = "STRING[20]", initial = "it's $5" }
+wide = { type = "WSTRING[5]", initial = "h\u00e9" }
+since = { type = "TIME", initial = "T#5s" }
+small = "SINT"
+"""
+
+
+def compiled(text: str | bytes, file: str = "cell.toml") -> Layout:
+    return compile_sources([Source(file, text.encode() if isinstance(text, str) else text)]).layouts[0]
+
+
+def refusal(text: str | bytes) -> str:
+    with pytest.raises(LayoutError) as error:
+        compiled(text)
+    assert "\n" not in str(error.value)
+    return str(error.value)
+
+
+def test_values_lie_in_the_order_of_the_file_at_multiples_of_their_size() -> None:
+    layout = compiled(TABLE)
+    assert (layout.name, layout.number, layout.byte_order, layout.optimized) == ("cell", None, "little", False)
+    assert [(r.path, r.type, r.offset, r.bit) for r in layout.registers] == [
+        ("joints/R3200/Link1/R/position", "LREAL", 0, None),
+        ("flag", "BOOL", 8, 0),
+        ("joints/Kuka.j1/R", "LREAL", 16, None),
+        ("lamps", "BOOL", 24, 0),
+        ("name", "STRING[20]", 30, None),
+        ("wide", "WSTRING[5]", 52, None),
+        ("since", "TIME", 68, None),
+        ("small", "SINT", 72, None),
+    ]
+    assert layout.registers[3].dims == ((1, 3), (0, 8))
+    assert layout.registers[2].comment == "rad"
+    assert layout.size == 73
+    assert Layout.from_json(layout.to_json()) == layout
+
+
+def test_initial_values_are_those_of_the_table() -> None:
+    layout = compiled(TABLE)
+    frame, unread = initial_frame(layout)
+    values = {r.path: codec(r, layout.byte_order).decode(bytes(frame)) for r in layout.registers}
+    assert unread == ()
+    assert values["joints/Kuka.j1/R"] == 0.5
+    assert values["lamps"] == [[True] + [False] * 8, [False] * 9, [False] * 9]
+    assert (values["name"], values["wide"], values["small"]) == ("it's $5", "h\u00e9", 0)
+    assert bytes(frame[16:24]) == bytes.fromhex("000000000000e03f"), "not little-endian"
+
+
+def test_name_and_byte_order_can_be_chosen() -> None:
+    layout = compiled('name = "DB9"\nbyte_order = "big"\n[registers]\na = { type = "INT", initial = 1 }\n')
+    assert (layout.name, layout.byte_order, bytes(initial_frame(layout)[0])) == ("DB9", "big", b"\0\1")
+
+
+WRONG = {
+    'a = "INT"': "cell.toml:1:1: error: it is no tag table: ",
+    "[registers]": "it is no tag table",
+    "[registers]\na = INT": "cell.toml:2:5: error: ",
+    "[registers]\n\na = 'INTEGER'": "cell.toml:3:1: error: a: there is no type 'INTEGER'",
+    "[registers]\na = 'ARRAY[3..1] OF INT'": "2:1: error: a: expected bounds",
+    "[registers]\na = 'ARRAY[0..9,0..9,0..9,0..9,0..9,0..9,0..9] OF INT'": "at most 6 dimensions",
+    "[registers]\na = 'ARRAY[0..99999999] OF BOOL'": "at most 1048576 elements",
+    "[registers]\na = 'ARRAY[0..999999] OF LREAL'": "expected at most 1048576 bytes",
+    "[registers]\nx = 'INT'\n'a//b' = 'INT'": "cell.toml:3:1: error: a//b: ",
+    "[registers]\n'a/b/out' = 'INT'": "it ends in a direction",
+    "[registers]\n'a/b' = 'INT'\na = 'INT'": "a is a value itself",
+    "[registers]\n'a.b' = 'INT'\n'a%2Eb' = 'INT'": "it is there twice",
+    "[registers]\na = { type = 'INT', initial = 40000 }": "cell.toml:2:1: error: a: ",
+    "[registers]\na = { type = 'INT', start = 4 }": "a: there is no 'start' here, only type, initial, comment",
+    "[registers]\nb = 'INT'\na = { initial = 4 }": "cell.toml:3:1: error: a: type: this key is needed",
+    f"[registers]\na = {'9' * 5000}": "cell.toml:2:1: error: a number in it has too many digits",
+    f"[registers]\na = {{ type = 'INT', initial = 0x{'f' * 5000} }}": "2:1: error: a: initial: expected a number of",
+    f"[registers]\n'{'/'.join('a' * 225)}' = 'INT'": "a path has at most 224 segments",
+    "[registers]\nb = 'INT'\na = { type = 'ARRAY[1..3] OF INT', initial = [1, 2, 3, 4] }": "3:1: error: a: initial: "
+    "expected at most 3 values, found more",
+    "[registers]\na = { type = 'ARRAY[1..3] OF INT', initial = '1, 3(2)' }": "expected at most 3 values, found more",
+    "[registers]\na = { type = 'ARRAY[0..1, 0..1] OF INT', initial = [1, 2, 3, 4, 5] }": "expected at most 4 values",
+    "[registers]\nb = 'INT'\na = { type = 'ARRAY[0..1, 0..1] OF INT', initial = [[1, 2], [3]] }": "3:1: error: a: "
+    "initial: expected one list",
+    '[registers]\nb = "INT"\n"a\\u0000b" = "INT"': r"3:1: error: a\x00b: 'a\x00b': a path must not hold control",
+    '[registers]\nb = "INT"\n"a\\nb" = "INT"': r"cell.toml:3:1: error: a\nb: 'a\nb': a path must not hold control",
+    "[registers]\n'a%0Ab' = 'INT'": "cell.toml:2:1: error: a%0Ab: 'a%0Ab': a path must not hold control",
+    "[registers]\na = 'INT'\nb = 'INT'\na = 'INT'": "cell.toml:4:1: error: a: it is there twice",
+    "[registers]\n'b/c' = 'INT'\n'b/c' = { type = 'ARRAY[1..2] OF INT', initial = [\n1,\n2] }\nd = 'INT'": "cell.toml"
+    ":3:1: error: 'b/c': it is there twice",
+    "[registers]\na = 'INT'\na.b = 'INT'\n": "3:1: error: a.b: it is there twice; a path with a dot is written in",
+    "[registers]\nab = 'INT'\na.b = 'INT'": "3:1: error: a: there is no 'b' here, only type, initial, comment; "
+    'a path with a dot is written in quotes, "a.b"',
+    "[registers]\na/b = 'INT'": "a path is written in quotes",
+    "name = 'a'\n[registers]\nb = 'INT'\n[registers.name]\ntype = 'INTEGER'": "4:1: error: name: there is no type",
+}
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_what_is_wrong_is_named(text: str) -> None:
+    assert WRONG[text] in refusal(text)
+
+
+def test_an_array_of_several_dimensions_takes_one_list() -> None:
+    layout = compiled("[registers]\na = { type = 'ARRAY[0..1, 0..2] OF INT', initial = [1, 2, 3, 4, 5, 6] }")
+    frame, _ = initial_frame(layout)
+    assert codec(layout.registers[0], "little").decode(bytes(frame)) == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_paths_that_differ_in_case_only_are_warned_of() -> None:
+    text = "[registers]\n'a/Pos' = 'INT'\nb = 'INT'\n'A/pos' = 'INT'"
+    found = compile_sources([Source("cell.toml", text.encode())])
+    assert [register.path for register in found.layouts[0].registers] == ["a/Pos", "b", "A/pos"]
+    assert [str(warning) for warning in found.warnings] == [
+        "cell.toml:4:1: warning: A/pos: only the case of letters tells it from a/Pos"
+    ]
+
+
+def test_what_is_no_text_is_refused() -> None:
+    assert "cell.toml:2:1: error: it is not in UTF-8" in refusal(b"[registers]\n\xff = 'INT'")
+
+
+def test_a_tag_table_stands_alone() -> None:
+    with pytest.raises(LayoutError, match="stands alone"):
+        compile_sources([Source("a.toml", b"[registers]"), Source("b.udt", b"")])
+
+
+@given(st.text(max_size=200) | st.binary(max_size=200))
+def test_anything_is_compiled_or_refused(data: str | bytes) -> None:
+    body = data.encode("utf-8", "replace") if isinstance(data, str) else data
+    for text in (body, b"[registers]\n" + body, b"[registers]\na = '" + body + b"'"):
+        try:
+            layout = compiled(text)
+        except LayoutError:
+            continue
+        assert Layout.from_json(layout.to_json()) == layout

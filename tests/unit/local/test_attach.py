@@ -1,0 +1,155 @@
+"""A local program's view of an instance."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+
+import pytest
+
+import shmio
+from shmio.errors import NotRunningError, PathError, QualityError, SegmentError
+from shmio.layout.model import Layout, Register
+from shmio.local.attach import Attachment
+from shmio.segment import BlockSpec, BlockWriter, ProcessSpec, Quality, Segment
+
+LAYOUT = Layout(
+    "DB1",
+    1,
+    10,
+    False,
+    (
+        Register("axis/position", "REAL", (), 0, None, 4, 1),
+        Register("counts", "INT", ((1, 2),), 4, None, 4, 2),
+        Register("on", "BOOL", (), 8, 0, 1, 1),
+    ),
+)
+
+
+def image(position: float, first: int = 0, second: int = 0, on: bool = False) -> bytes:
+    return struct.pack(">fhhBx", position, first, second, on)
+
+
+@pytest.fixture
+def writer(instance: str) -> Iterator[BlockWriter]:
+    block = BlockSpec("cell", LAYOUT, 20_000_000, 60_000_000_000, 1 << 20)
+    with Segment.create(instance, [block], [ProcessSpec("cell", "source")]) as segment:
+        yield segment.writer("cell")
+        segment.unlink()
+
+
+@pytest.fixture
+def cell(instance: str, writer: BlockWriter) -> Iterator[Attachment]:
+    with shmio.attach(instance) as cell:
+        yield cell
+
+
+def test_values_by_path(cell: Attachment, writer: BlockWriter) -> None:
+    writer.publish(image(1.5, -3, 4, on=True), cycle=1)
+    assert cell["cell/axis/position"] == 1.5
+    assert cell["axis/position/out"] == 1.5
+    assert cell["cell/counts"] == [-3, 4]
+    assert cell["cell/counts/2"] == 4
+    assert cell["CELL://on"] is True
+
+
+def test_no_value_without_quality(cell: Attachment, writer: BlockWriter) -> None:
+    with pytest.raises(QualityError, match="no data yet"):
+        cell["cell/on"]
+    with pytest.raises(QualityError, match="no data yet"):
+        cell.frame()
+    writer.publish(image(2.5), cycle=1, quality=Quality.BAD, reason="cable out")
+    with pytest.raises(QualityError, match=r"cell/axis/position: cable out"):
+        cell["cell/axis/position"]
+    now = cell.read("cell/axis/position")
+    assert (now.value, now.quality, now.reason, now.provenance) == (2.5, Quality.BAD, "cable out", "live")
+    assert now.age_s is not None
+    assert now.age_s >= 0
+
+
+@pytest.mark.parametrize(
+    "path", ["cell/nothing", "press/on", "cell/counts/3", "cell/axis", "cell/on/in", "model/clock"]
+)
+def test_what_is_not_there_is_said(cell: Attachment, path: str) -> None:
+    with pytest.raises(PathError):
+        cell.read(path)
+
+
+def test_a_frame_is_a_copy_and_a_numpy_record(cell: Attachment, writer: BlockWriter) -> None:
+    writer.publish(image(1.5, 7, 8), cycle=12)
+    view = cell.frame("cell")
+    writer.publish(image(9.0), cycle=13)
+    assert (view.cycle, view["axis/position"], view.quality, view.reason) == (12, 1.5, Quality.GOOD, "")
+    assert view.array["axis/position"][0] == 1.5
+    assert view.array["counts"].tolist() == [[7, 8]]
+    assert cell.frame().cycle == 13
+    with pytest.raises(PathError, match="there are: cell"):
+        cell.frame("press")
+
+
+def test_a_stream_has_every_frame_from_its_start_on(cell: Attachment, writer: BlockWriter) -> None:
+    writer.publish(image(0), cycle=0)
+    stream = cell.stream("cell", timeout_s=0)
+    for cycle in range(1, 20):
+        writer.publish(image(cycle), cycle=cycle)
+    assert [(view.cycle, view["axis/position"], view.missed) for view in stream] == [(n, n, 0) for n in range(1, 20)]
+
+
+def test_a_stream_says_where_frames_were_missed(cell: Attachment, writer: BlockWriter) -> None:
+    slots = cell.block().ring.slot_count
+    stream = cell.stream(timeout_s=0)
+    total = slots + 100
+    for cycle in range(1, total + 1):
+        writer.publish(image(0), cycle=cycle)
+    views = list(stream)
+    assert views[0].missed == views[0].cycle - 1 == total - slots
+    assert [view.missed for view in views[1:]] == [0] * (len(views) - 1)
+    assert views[-1].cycle == total
+
+
+def test_wait_returns_the_next_frame(cell: Attachment, writer: BlockWriter) -> None:
+    assert cell.wait(timeout_s=0) is None
+    writer.publish(image(1), cycle=1)
+    view = cell.frame()
+    assert cell.wait(after=view, timeout_s=0) is None
+    writer.publish(image(2), cycle=2)
+    writer.publish(image(3), cycle=3)
+    newer = cell.wait(after=view, timeout_s=10)
+    assert newer is not None
+    assert newer.cycle == 3
+
+
+def test_the_end_of_the_instance_is_seen(instance: str) -> None:
+    with Segment.create(instance, [], []) as segment, shmio.attach(instance) as cell:
+        assert cell.current
+        segment.unlink()
+        assert not cell.current
+
+
+def test_attaching_to_nothing_names_the_remedy(instance: str) -> None:
+    with pytest.raises(NotRunningError, match="shmio-supervisor up"):
+        shmio.attach(instance)
+
+
+def test_an_unknown_attribute_of_the_package_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="nonsense"):
+        shmio.nonsense  # noqa: B018
+
+
+def test_a_value_that_was_never_read_is_none(cell: Attachment, writer: BlockWriter) -> None:
+    writer.publish(image(0), cycle=1, quality=Quality.BAD, reason="absent", source_ns=0)
+    now = cell.read("cell/axis/position")
+    assert (now.value, now.source_time, now.quality) == (None, None, Quality.BAD)
+
+
+def test_a_view_takes_paths_with_the_source_too(cell: Attachment, writer: BlockWriter) -> None:
+    writer.publish(image(3.5), cycle=1)
+    view = cell.frame()
+    assert view["cell/axis/position"] == view["axis/position"] == 3.5
+
+
+def test_a_detached_program_is_told_so(instance: str, writer: BlockWriter) -> None:
+    cell = shmio.attach(instance)
+    cell.close()
+    with pytest.raises(SegmentError, match="detached"):
+        cell["cell/on"]

@@ -1,0 +1,126 @@
+"""A local program that moves time, at a pace."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from shmio.errors import NotRunningError, TimeError, ValueRangeError
+from shmio.layout.model import Layout, Register
+from shmio.local.attach import Attachment
+from shmio.local.time_control import Coordinator
+from shmio.segment import Attributes, BlockSpec, ProcessSpec, Quality, Segment
+
+LAYOUT = Layout("DB1", 1, 4, False, (Register("count", "UDINT", (), 0, None, 4, 1),))
+MS = 1_000_000
+
+
+@pytest.fixture
+def segment(instance: str) -> Iterator[Segment]:
+    block = BlockSpec("sim", LAYOUT, 20 * MS, 500 * MS, 1 << 20, Attributes("simulation", stepped=True))
+    with Segment.create(instance, [block], [ProcessSpec("sim", "source")], stepped=True) as segment:
+        yield segment
+        segment.unlink()
+
+
+@pytest.fixture
+def source(segment: Segment) -> Iterator[dict[int, str]]:
+    """Answers every step; what stands here at its number makes it fail."""
+    failures: dict[int, str] = {}
+    writer, bell = segment.writer("sim"), segment.clock.slot_bell(0)
+    over = threading.Event()
+
+    def run() -> None:
+        handled = 0
+        while not over.is_set():
+            seen = bell.value()
+            state = segment.clock.read()
+            if state.stepping and state.step != handled:
+                handled = state.step
+                reason = failures.get(handled, "")
+                writer.publish(bytes(4), cycle=handled, quality=Quality.BAD if reason else Quality.GOOD, reason=reason)
+            else:
+                bell.wait(seen)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    yield failures
+    over.set()
+    bell.ring()
+    thread.join()
+
+
+@pytest.fixture
+def cell(instance: str, segment: Segment, source: dict[int, str]) -> Iterator[Attachment]:
+    with Attachment(Segment.open(instance, writable=True)) as cell:
+        yield cell
+
+
+def until_step(cell: Attachment, number: int) -> None:
+    block = cell.block()
+    while cell.clock.done < number and cell.clock.playing:
+        block.ring.wait(block.ring.doorbell(), 10 * MS)
+
+
+def test_it_plays_until_it_is_paused_and_then_time_stands(cell: Attachment) -> None:
+    cell.play(rate=100, dt_s=0.01)
+    until_step(cell, 5)
+    assert (cell.clock.playing, cell.clock.rate) == (True, 100)
+    with pytest.raises(TimeError, match="pause it"):
+        cell.step()
+    cell.pause()
+    stands = cell.clock
+    assert (stands.playing, stands.stepping) == (False, False)
+    assert stands.time_ns == stands.step * 10 * MS
+    made = cell.step()
+    assert (made.number, made.time_ns) == (stands.step + 1, stands.time_ns + 50 * MS)
+
+
+def test_it_keeps_the_pace(cell: Attachment) -> None:
+    """Never faster than asked for; how much slower depends on the machine."""
+    begun_ns = cell.block().clock.read().time_ns
+    watch = threading.Event()
+    cell.play(rate=1, dt_s=3600)
+    watch.wait(0.05)
+    cell.pause()
+    assert cell.clock.time_ns - begun_ns == 3_600_000 * MS, "the second step is an hour away"
+
+
+def test_a_step_that_fails_ends_the_play_and_is_told_by_pause(cell: Attachment, source: dict[int, str]) -> None:
+    source[3] = "on fire"
+    cell.play(rate=1000, dt_s=0.01)
+    until_step(cell, 3)
+    with pytest.raises(TimeError, match="step 3: sim: on fire"):
+        cell.pause()
+    assert (cell.clock.done, cell.clock.playing) == (2, False)
+    assert cell.step().number == 4
+
+
+def test_one_that_detaches_while_it_plays_leaves_time_to_others(
+    instance: str, segment: Segment, source: dict[int, str]
+) -> None:
+    with Attachment(Segment.open(instance, writable=True)) as cell:
+        cell.play(rate=100)
+        until_step(cell, 1)
+    state = segment.clock.read()
+    assert (state.playing, state.owner) == (False, 0)
+    assert Coordinator(segment).step().number == state.step + 1
+
+
+def test_what_cannot_be_a_rate_or_a_step_is_refused(cell: Attachment) -> None:
+    with pytest.raises(ValueRangeError, match="a rate is above 0"):
+        cell.play(0)
+    for wrong in (0, -1, 1e300, float("inf"), float("nan")):
+        with pytest.raises(ValueRangeError, match=r"0\.001 ms to 3600000 ms"):
+            cell.step(dt_s=wrong)
+        with pytest.raises(ValueRangeError, match=r"0\.001 ms to 3600000 ms"):
+            cell.play(1, dt_s=wrong)
+    assert not cell.clock.playing
+
+
+def test_a_stopped_instance_is_told(cell: Attachment, segment: Segment) -> None:
+    segment.unlink()
+    with pytest.raises(NotRunningError, match="has stopped"):
+        cell.step()

@@ -1,0 +1,227 @@
+"""Files that a killed recorder has left: closed by the next, whatever they end with."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+from pathlib import Path
+
+import mcap.reader
+import pytest
+from mcap.opcode import Opcode
+
+from shmio.errors import RecordingError
+from shmio.recorder.attach import Attachment
+from shmio.recorder.closing import finalise
+from shmio.recording.check import check
+from shmio.recording.reading.reader import Reader
+from shmio.segment import EventKind, Record, Segment
+from shmio.testing.cell import kill, until
+from tests.unit.recorder.harness import Process, gaps, numbers, publish, recorder
+
+CHUNKS = 4
+
+
+@pytest.fixture
+def whole(segment: Segment, tmp_path: Path) -> Path:
+    """A closed recording of several chunks."""
+    files = [Attachment("config/supervisor.toml", "application/toml", b"[instance]\n", 5)]
+    work = recorder(segment, tmp_path, attachments=lambda source, _: [] if source else files)
+    for turn in range(CHUNKS):
+        for source in ("cell", "press")[: 1 + turn % 2]:
+            publish(segment.writer(source), 5, first=5 * turn)
+            segment.writer(source).event(Record(EventKind.QUALITY, "so so"))
+        work.turn()
+        work._writer.flush()
+    assert work.close()
+    return work.output.path
+
+
+def records(file: Path, opcode: int) -> list[tuple[int, int]]:
+    """Where records of a kind begin and end."""
+    with Reader(file) as reader:
+        return [(found.start, found.at + found.size) for found in reader.records.walk() if found.opcode == opcode]
+
+
+def messages(file: Path) -> list[tuple[str, int, bytes]]:
+    """By another reader than ours, with the index and every checksum."""
+    with file.open("rb") as stream:
+        reader = mcap.reader.make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        found = [(channel.topic, message.log_time, message.data) for _, channel, message in reader.iter_messages()]
+        assert summary.statistics.message_count == len(found)
+        assert summary.statistics.chunk_count == len(summary.chunk_indexes)
+        if found:
+            times = [log_ns for _, log_ns, _ in found]
+            assert (summary.statistics.message_start_time, summary.statistics.message_end_time) == (
+                min(times),
+                max(times),
+            )
+        assert [item.name for item in reader.iter_attachments()][:1] == ["config/supervisor.toml"]
+        assert [item.name for item in reader.iter_metadata()][:1] == ["shmio"]
+        return found
+
+
+def expected(content: bytes, folder: Path, size: int) -> list[tuple[str, int, bytes]]:
+    """What of a file is whole if it ends there, by a reader from front to back."""
+    part = folder / "part"
+    part.write_bytes(content[:size])
+    with part.open("rb") as stream:
+        found = mcap.reader.NonSeekingReader(stream).iter_messages(log_time_order=False)
+        kept: list[tuple[str, int, bytes]] = []
+        try:
+            for _, channel, message in found:
+                kept.append((channel.topic, message.log_time, message.data))
+        except Exception:  # noqa: BLE001  it ends within a record
+            pass
+    return sorted(kept)
+
+
+def test_what_it_makes_is_what_the_recorder_would_have_written(whole: Path, tmp_path: Path) -> None:
+    content = whole.read_bytes()
+    [(end, _)] = records(whole, Opcode.DATA_END)
+    whole.write_bytes(content[:end])
+    os.utime(whole, (1, 1))
+    assert finalise(whole)
+    assert whole.read_bytes() == content
+    assert whole.stat().st_mtime == 1, "nothing was recorded since"
+    assert len(messages(whole)) > CHUNKS
+
+
+def test_it_may_end_anywhere_within_its_last_chunk_and_what_follows_that(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Or within an end that somebody has begun to make, who was killed too."""
+    monkeypatch.setattr(os, "fsync", lambda _: None)  # of a thousand files
+    content = whole.read_bytes()
+    last, end = records(whole, Opcode.CHUNK)[-1]
+    file = tmp_path / "cut.mem"
+    for size in (*range(last, end + 1), *range(end + 2, len(content), 7)):
+        file.write_bytes(content[:size])
+        before = expected(content, tmp_path, size)
+        assert finalise(file)
+        assert sorted(messages(file)) == before
+        assert file.read_bytes()[:last] == content[:last]
+        with Reader(file) as reader:
+            assert check(reader).whole
+
+
+def test_zeros_at_the_end_as_a_power_cut_leaves_them(whole: Path, tmp_path: Path) -> None:
+    content = whole.read_bytes()
+    begin, end = records(whole, Opcode.CHUNK)[-1]
+    for size, zeros in ((begin, 5000), (begin, 3 << 20), (end, 4096)):
+        whole.write_bytes(content[:size] + bytes(zeros))
+        before = expected(content, tmp_path, size)
+        assert finalise(whole)
+        assert sorted(messages(whole)) == before
+
+
+def test_a_last_chunk_of_zeros_is_not_in_the_index(whole: Path, tmp_path: Path) -> None:
+    content = whole.read_bytes()
+    begin, end = records(whole, Opcode.CHUNK)[-1]
+    whole.write_bytes(content[: begin + 60] + bytes(end - begin - 60))
+    before = expected(content, tmp_path, begin)
+    assert finalise(whole)
+    assert sorted(messages(whole)) == before
+
+
+@pytest.mark.parametrize("what", ["garbage", "more behind the end", "no recording"])
+def test_what_no_recorder_leaves_is_left_as_it_is(whole: Path, what: str) -> None:
+    content = whole.read_bytes()
+    begin, end = records(whole, Opcode.CHUNK)[-1]
+    [(over, _)] = records(whole, Opcode.DATA_END)
+    strange = {
+        "garbage": content[:end] + b"\x55" * 5000,
+        "more behind the end": content[:over] + content[over : over + 13] + content[begin:end],
+        "no recording": b"\x89MCAP0\r\n" + content[over : over + 13],
+    }[what]
+    whole.write_bytes(strange)
+    with pytest.raises(RecordingError):
+        finalise(whole)
+    assert whole.read_bytes() == strange
+
+
+def test_without_room_it_stays_as_it_is(whole: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    content = whole.read_bytes()
+    [(end, _)] = records(whole, Opcode.DATA_END)
+    whole.write_bytes(content[:end])
+    write = os.pwrite
+    room = [10, 0]
+
+    def pwrite(fd: int, data: bytes, at: int) -> int:
+        size = room.pop(0)
+        if not size:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(fd, data[:size], at)
+
+    with monkeypatch.context() as full:
+        full.setattr(os, "pwrite", pwrite)
+        with pytest.raises(OSError, match="No space left"):
+            finalise(whole)
+    assert whole.stat().st_size <= end
+    assert expected(content, whole.parent, end) == expected(whole.read_bytes(), whole.parent, end)
+    assert finalise(whole)
+    assert whole.read_bytes() == content
+
+
+def test_one_that_is_being_written_is_not_touched(whole: Path) -> None:
+    [(end, _)] = records(whole, Opcode.DATA_END)
+    os.truncate(whole, end)
+    with whole.open("rb+") as stream:
+        fcntl.flock(stream, fcntl.LOCK_EX)
+        assert not finalise(whole)
+        assert whole.stat().st_size == end
+    assert finalise(whole)
+
+
+def test_the_successor_closes_what_a_killed_recorder_has_left(segment: Segment, tmp_path: Path) -> None:
+    (tmp_path / "supervisor.toml").write_text(f'[instance]\nname = "{segment.instance}"\n')
+    writer = segment.writer("cell")
+    with Process(segment, tmp_path) as first:
+        publish(writer, 20)
+        until(lambda: first.file.is_file() and len(numbers_of(first)) == 20, "what was published")
+        kill(first.popen.pid)
+        first.popen.wait()
+    old = first.file
+    with old.open("ab") as stream:
+        stream.write(b"\x06\xff\xff")  # a part of the next chunk
+    with Process(segment, tmp_path) as second:
+        until(lambda: closed(old), "the predecessor's file closed")
+        publish(writer, 5, first=20)
+        until(lambda: second.counts("frames") == 5, "its own")
+        assert second.stop() == 0
+    assert [topic for topic, _, _ in messages(old)].count("cell/frames") == 20
+    assert f"{old} is closed: its recorder did not come to that" in second.log.read_text()
+    assert numbers(old) + numbers(second.file) == list(range(1, 26))
+    assert gaps(second.file) == []
+
+
+def test_a_full_disk_leaves_it_as_it_is_and_says_so(segment: Segment, tmp_path: Path) -> None:
+    """The limit is that of a file's size; the index of this one needs more than its frames leave."""
+    writer = segment.writer("cell")
+    with Process(segment, tmp_path) as first:
+        publish(writer, 20)
+        until(lambda: first.file.is_file() and len(numbers_of(first)) == 20, "what was published")
+        kill(first.popen.pid)
+        first.popen.wait()
+    old = first.file
+    before = old.read_bytes()
+    limit = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({len(before)}, resource.RLIM_INFINITY))"
+    with Process(segment, tmp_path, before=limit) as second:
+        until(lambda: "stays as it is: " in second.log.read_text() if second.log.exists() else False, "the word of it")
+        second.popen.kill()
+    assert f"{old} stays as it is: [Errno {errno.EFBIG}]" in second.log.read_text()
+    assert before.startswith(old.read_bytes())
+    assert numbers(old) == list(range(1, 21))
+
+
+def numbers_of(process: Process) -> list[int]:
+    return numbers(process.file) if process.file.stat().st_size else []
+
+
+def closed(file: Path) -> bool:
+    with Reader(file) as reader:
+        return reader.records.footer() is not None

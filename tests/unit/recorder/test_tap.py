@@ -1,0 +1,146 @@
+"""Starts and ends of processes, and changes of the configuration, in a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from shmio.recorder import recorder as recorder_module
+from shmio.recorder import tap as tap_module
+from shmio.recorder.attach import Attachment
+from shmio.recorder.tap import Watch
+from shmio.recording.format.encoding import Life, ProcessChange, decode_process, encode_json
+from shmio.recording.reading.reader import Reader
+from shmio.segment import Activity, ProcessSpec, Report, Segment
+from shmio.segment.processes import Phase, ProcessSlot, Supervised
+from tests.unit.recorder.harness import changes, recorder
+
+
+def to(slot: ProcessSlot, phase: Phase, pid: int, restarts: int = 0, why: str = "") -> None:
+    """As supervisor and process would tell."""
+    slot.report = Report(pid, Activity.RUNNING)
+    slot.supervised = Supervised(phase, restarts, 0, why)
+
+
+def told(watch: Watch) -> list[tuple[str, str, int, str]]:
+    return [(change.name, change.what, change.pid, change.why) for change in watch.look()]
+
+
+def test_a_life_is_told(segment: Segment) -> None:
+    slot = segment.processes.find("cell")
+    watch = Watch(segment)
+    to(slot, Phase.STARTING, 7)
+    assert told(watch) == []
+    to(slot, Phase.RUNNING, 7)
+    assert told(watch) == [("cell", "started", 7, "")]
+    assert told(watch) == []
+    to(slot, Phase.BACKOFF, 7, 0, "killed by SIGKILL")
+    assert told(watch) == [("cell", "died", 7, "killed by SIGKILL")]
+    to(slot, Phase.STARTING, 7, 1)
+    assert told(watch) == []
+    to(slot, Phase.RUNNING, 8, 1)
+    assert told(watch) == [("cell", "started", 8, "")]
+    to(slot, Phase.FATAL, 8, 1, "no such layout")
+    assert told(watch) == [("cell", "gave up", 8, "no such layout")]
+    to(slot, Phase.RUNNING, 9, 2)
+    assert told(watch) == [("cell", "started", 9, "")]
+    to(slot, Phase.STOPPED, 9, 2)
+    assert told(watch) == [("cell", "ended", 9, "")]
+
+
+def test_one_whose_end_was_over_between_two_looks_is_told(segment: Segment) -> None:
+    slot = segment.processes.find("cell")
+    to(slot, Phase.RUNNING, 7)
+    watch = Watch(segment)
+    to(slot, Phase.STARTING, 7, 1, "killed by SIGKILL")
+    assert told(watch) == [("cell", "died", 7, "killed by SIGKILL")]
+    to(slot, Phase.RUNNING, 8, 1)
+    assert told(watch) == [("cell", "started", 8, "")]
+    to(slot, Phase.STARTING, 8, 1, "restarting")
+    assert told(watch) == [("cell", "ended", 8, "restarting")]
+    to(slot, Phase.RUNNING, 9, 2)
+    assert told(watch) == [("cell", "started", 9, "")]
+    to(slot, Phase.RUNNING, 10, 3)
+    assert told(watch) == [("cell", "ended", 9, ""), ("cell", "started", 10, "")]
+
+
+def test_a_process_that_a_reload_takes_out_or_adds_is_told(segment: Segment) -> None:
+    slot = segment.processes.find("cell")
+    to(slot, Phase.RUNNING, 7)
+    watch = Watch(segment)
+    segment.processes.remove(slot)
+    to(segment.processes.add(ProcessSpec("press", "source")), Phase.RUNNING, 9)
+    assert told(watch) == [("cell", "removed", 7, ""), ("press", "started", 9, "")]
+
+
+def test_a_recording_says_how_processes_are_and_what_happens_to_them(
+    segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tap_module, "TURN_S", 0.0)
+    slot = segment.processes.find("cell")
+    to(slot, Phase.RUNNING, 7)
+    work = recorder(segment, tmp_path)
+    work.turn()
+    work.turn()
+    to(slot, Phase.BACKOFF, 7, 0, "killed by SIGKILL")
+    work.turn()
+    assert work.close()
+    found = changes(work.output.path)
+    assert found == [
+        ProcessChange("cell", "source", 7, Life.IS, "", 0),
+        ProcessChange("cell", "source", 7, Life.DIED, "killed by SIGKILL", 0),
+    ]
+
+
+def test_what_there_was_no_room_for_is_how_things_stand_afterwards(
+    segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tap_module, "TURN_S", 0.0)
+    slot = segment.processes.find("cell")
+    work = recorder(segment, tmp_path)
+    work.turn()
+    with monkeypatch.context() as full:
+        full.setattr(type(work.output), "full", True)
+        to(slot, Phase.RUNNING, 7)
+        work.turn()
+    work.turn()
+    assert work.close()
+    found = changes(work.output.path)
+    assert found == [ProcessChange("cell", "source", 7, Life.IS, "", 0)]
+
+
+def test_a_configuration_that_changes_is_attached_again(
+    segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder_module, "CONFIG_S", 0.0)
+    texts = [b"one", b"one", b"two", b"two", b""]
+    now = [texts[0]]
+
+    def attachments(source: str | None, _: int) -> list[Attachment]:
+        config = Attachment("config/supervisor.toml", "application/toml", now[0], 5)
+        return [config] if source is None and now[0] else []
+
+    work = recorder(segment, tmp_path, attachments=attachments)
+    for text in texts:
+        now[0] = text
+        work.turn()
+    now[0] = texts[-1]
+    assert work.close()
+    content = work.output.path.read_bytes()
+    assert content.count(b"\x16\x00\x00\x00config/supervisor.toml\x10\x00\x00\x00application/toml\x03") == 2 + 0
+    with Reader(work.output.path) as reader:
+        list(reader.messages())
+        entry = reader.attachments["config/supervisor.toml"]
+        assert reader.records.read(entry.at, entry.size) == b"two"
+
+
+@pytest.mark.parametrize("data", [b"", b"{}", b'{"name": 1}', b"[" * 5000])
+def test_what_is_no_change_is_refused(data: bytes) -> None:
+    with pytest.raises(ValueError, match=r"."):
+        decode_process(data)
+
+
+def test_a_change_comes_out_as_it_went_in() -> None:
+    change = ProcessChange("cell", "source", 7, Life.DIED, "grün", 3)
+    assert decode_process(encode_json(change)) == change

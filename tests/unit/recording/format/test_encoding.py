@@ -1,0 +1,82 @@
+"""Messages of a recording as bytes, and bytes that are none."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from shmio.recording.format.encoding import (
+    Gap,
+    Reason,
+    decode_event,
+    decode_frame,
+    decode_gap,
+    differ,
+    encode_event,
+    encode_frame,
+    encode_json,
+    restore,
+)
+from shmio.segment import Event, Frame, Provenance, Quality
+
+u64, i64, u32 = st.integers(0, 2**64 - 1), st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**32 - 1)
+u8, u16 = st.integers(0, 255), st.integers(0, 65535)
+quality = st.sampled_from(Quality)
+images = st.integers(0, 50).flatmap(
+    lambda size: st.tuples(st.binary(min_size=size, max_size=size), st.none() | st.binary(min_size=size, max_size=size))
+)
+
+
+@given(
+    st.tuples(u64, u64, i64, i64, i64, u32, quality, st.sampled_from(Provenance), u64, u32, st.text(max_size=60)),
+    images,
+    st.tuples(u32, u64, u64),
+)
+def test_a_frame(fields: tuple[int, ...], images: tuple[bytes, bytes | None], header: tuple[int, int, int]) -> None:
+    """Of both versions, whatever the message's own header says."""
+    frame = Frame._make((*fields, *images))
+    data = encode_frame(frame)
+    assert decode_frame(data) == frame
+    assert restore(differ(data, *header), *header) == data
+
+
+@given(
+    st.tuples(u64, u16, u64, u64, i64, i64, i64, u32, quality, u32, u64, u32, u32, u32, u8, u32, u64),
+    st.binary(max_size=256),
+    st.text(max_size=60),
+)
+def test_an_event(fields: tuple[int, ...], data: bytes, text: str) -> None:
+    event = Event._make((*fields[:-1], data, text, fields[-1]))
+    assert decode_event(encode_event(event)) == event
+
+
+def test_a_gap() -> None:
+    gap = Gap("cell", 1, "frames", 5, 9, 5, Reason.OVERTAKEN, 10, 20)
+    assert decode_gap(encode_json(gap)) == gap
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"count": 4},
+        {"first": 10, "count": 0},
+        {"what": "trees"},
+        {"first": 0, "count": 10},
+        {"after_ns": -(1 << 63)},
+        {"before_ns": -1},
+    ],
+)
+def test_a_gap_that_contradicts_itself(change: dict[str, object]) -> None:
+    fields = {"source": "c", "block": 1, "what": "frames", "first": 5, "last": 9, "count": 5, "reason": "overtaken"}
+    with pytest.raises(ValueError, match="contradicts"):
+        decode_gap(encode_json(Gap(**fields | change)))  # type: ignore[arg-type]
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_a_message_or_refused(data: bytes) -> None:
+    for decode in (decode_frame, decode_event, decode_gap):
+        with suppress(ValueError):
+            decode(data)

@@ -1,0 +1,240 @@
+"""Recordings whose bytes were changed: it is found, it is told where, and all the rest is read."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from mcap.opcode import Opcode
+
+from shmio.errors import RecordingError
+from shmio.recorder import follower
+from shmio.recording.check import Findings, check
+from shmio.recording.format.damage import Damage
+from shmio.recording.format.records import MAGIC, Record
+from shmio.recording.reading.reader import Message, Reader
+from shmio.segment import Frame, Segment
+from tests.unit.recorder.harness import publish, recorder
+
+any_change = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+def found_in(file: Path) -> Findings:
+    with Reader(file) as reader:
+        return check(reader)
+
+
+def read_on(file: Path) -> tuple[list[Message], list[Damage]]:
+    """All messages that can be read, and where others are lost."""
+    damage: list[Damage] = []
+    with Reader(file) as reader:
+        return list(reader.messages(damaged=damage.append)), damage
+
+
+def records(file: Path, opcode: Opcode) -> list[Record]:
+    with Reader(file) as reader:
+        return [record for record in reader.records.walk() if record.opcode == opcode]
+
+
+def by_chunk(file: Path) -> list[list[Message]]:
+    with Reader(file) as reader:
+        walk = [record for record in reader.records.walk() if record.opcode == Opcode.CHUNK]
+    messages, _ = read_on(file)
+    with Reader(file) as reader:
+        counts = [len(list(reader.raw(record))) for record in walk]
+    return [messages[sum(counts[:turn]) : sum(counts[: turn + 1])] for turn in range(len(walk))]
+
+
+@pytest.fixture
+def file(recording: bytes, tmp_path: Path) -> Path:
+    """A recording of several chunks with a gap, as it was written."""
+    path = tmp_path / "x.mem"
+    path.write_bytes(recording)
+    return path
+
+
+def test_what_was_written_is_whole(file: Path, recording: bytes) -> None:
+    found = found_in(file)
+    assert found.whole, (found.damage, found.problems)
+    assert found.chunks == len(records(file, Opcode.CHUNK)) > 4
+    assert found.messages == len(read_on(file)[0])
+    file.write_bytes(recording[: records(file, Opcode.CHUNK)[-1].start])
+    assert found_in(file).whole, "what a killed recorder leaves is not damaged"
+
+
+@any_change
+@given(data=st.data())
+def test_no_byte_changes_unseen(file: Path, recording: bytes, data: st.DataObject) -> None:
+    changed = bytearray(recording)
+    changed[data.draw(st.integers(0, len(changed) - 1))] ^= data.draw(st.integers(1, 255))
+    file.write_bytes(changed)
+    try:
+        with Reader(file) as reader:
+            assert not check(reader).whole or not reader.records.closed
+    except RecordingError:  # no recording any more
+        pass
+
+
+@any_change
+@given(data=st.data())
+def test_no_piece_is_taken_out_unseen(file: Path, recording: bytes, data: st.DataObject) -> None:
+    begin = data.draw(st.integers(0, len(recording) - 1))
+    end = data.draw(st.integers(begin + 1, len(recording)))
+    file.write_bytes(recording[:begin] + recording[end:])
+    try:
+        with Reader(file) as reader:
+            assert not check(reader).whole or not reader.records.closed
+    except RecordingError:
+        pass
+
+
+def test_of_each_damaged_chunk_it_is_told_where_it_is_and_the_rest_is_read(file: Path, recording: bytes) -> None:
+    chunks, walk = by_chunk(file), records(file, Opcode.CHUNK)
+    for turn, record in enumerate(walk):
+        changed = bytearray(recording)
+        changed[record.at + record.size - 1] ^= 1
+        file.write_bytes(changed)
+        messages, [damage] = read_on(file)
+        assert messages == [message for number, some in enumerate(chunks) if number != turn for message in some]
+        assert (damage.first, damage.last) == (record.at, record.at + record.size - 1)
+        assert f"the chunk at byte {record.at} is damaged" in damage.why
+        assert damage.after_ns == (max(m.log_ns for m in chunks[turn - 1]) if turn else 0)
+        assert damage.before_ns == (min(m.log_ns for m in chunks[turn + 1]) if turn + 1 < len(chunks) else 0)
+        found = found_in(file)
+        assert found.damage == [damage]
+        numbers = [message.item.number for message in chunks[turn] if isinstance(message.item, Frame)]
+        if numbers and turn + 1 < len(chunks):
+            gap = 11 if turn == 2 else numbers[0]
+            lost = f"cell, block 1: frames {gap} to {numbers[-1]} are neither there nor in a gap"
+            assert lost in found.problems
+
+
+@pytest.mark.parametrize("opcode", [Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.METADATA])
+@pytest.mark.parametrize("size", [0, 1, 5000, 1 << 40])
+def test_a_wrong_length_costs_no_chunk_but_its_own(file: Path, recording: bytes, opcode: Opcode, size: int) -> None:
+    whole = by_chunk(file)
+    chunks = records(file, Opcode.CHUNK)
+    for record in records(file, opcode)[:3]:
+        changed = bytearray(recording)
+        changed[record.at - 8 : record.at] = struct.pack("<Q", size)
+        file.write_bytes(changed)
+        messages, [damage] = read_on(file)
+        assert messages == [
+            message for some, chunk in zip(whole, chunks, strict=True) if chunk != record for message in some
+        ]
+        assert damage.first == record.start
+        with Reader(file) as reader:
+            assert not check(reader).whole
+            assert reader.records.closed
+
+
+@pytest.mark.parametrize("field", [0, 8])
+def test_times_of_a_chunk_that_are_not_its_messages_are_told(file: Path, recording: bytes, field: int) -> None:
+    """The start and the end that its header tells; no CRC of its own covers them."""
+    chunk = records(file, Opcode.CHUNK)[1]
+    changed = bytearray(recording)
+    changed[chunk.at + field] ^= 1
+    file.write_bytes(changed)
+    found = found_in(file)
+    assert found.problems == [f"the chunk at byte {chunk.at}: its times are not those of its messages"]
+    assert found.damage == []
+
+
+def test_without_its_layout_a_block_is_checked_as_far_as_can_be(file: Path, recording: bytes) -> None:
+    record = records(file, Opcode.ATTACHMENT)[-1]
+    changed = bytearray(recording)
+    changed[record.at + record.size - 9] ^= 1
+    file.write_bytes(changed)
+    found = found_in(file)
+    assert f"the attachment at byte {record.at} is damaged" in found.damage[0].why
+    assert found.problems == [], "the numbers are all there"
+
+
+def test_a_hole_over_the_end_of_a_chunk_is_one_damage(file: Path, recording: bytes) -> None:
+    """As a bad sector leaves it."""
+    first, second = records(file, Opcode.CHUNK)[2:4]
+    whole = by_chunk(file)
+    changed = bytearray(recording)
+    changed[first.at + 50 : second.at + 60] = bytes(second.at + 60 - first.at - 50)
+    file.write_bytes(changed)
+    messages, [damage] = read_on(file)
+    assert messages == [m for number, some in enumerate(whole) if number not in (2, 3) for m in some]
+    assert damage.first <= first.at + 50
+    assert damage.last >= second.at + 59
+
+
+def test_only_what_is_lost_of_the_time_asked_for_is_told(file: Path, recording: bytes) -> None:
+    chunks, record = by_chunk(file), records(file, Opcode.CHUNK)[2]
+    changed = bytearray(recording)
+    changed[record.at - 5] ^= 1  # its length, which is seen wherever it is
+    file.write_bytes(changed)
+    damage: list[Damage] = []
+    times = {"early": (0, chunks[0][-1].log_ns), "late": (chunks[-1][0].log_ns, 1 << 63), "there": (0, 1 << 63)}
+    told = {}
+    for name, (from_ns, to_ns) in times.items():
+        with Reader(file) as reader:
+            list(reader.messages(from_ns=from_ns, to_ns=to_ns, damaged=damage.append))
+        told[name], damage = len(damage), []
+    assert told == {"early": 0, "late": 0, "there": 1}
+
+
+def test_without_the_end_what_its_first_chunk_described_is_lost_and_told(file: Path, recording: bytes) -> None:
+    """The summary of a file that was closed describes its channels once more."""
+    chunks, expected = records(file, Opcode.CHUNK), [message for some in by_chunk(file)[1:] for message in some]
+    changed = bytearray(recording)
+    changed[chunks[0].at + chunks[0].size - 1] ^= 1
+    file.write_bytes(changed)
+    closed, _ = read_on(file)
+    assert closed == expected
+    file.write_bytes(changed[: chunks[-1].at + chunks[-1].size])
+    messages, damage = read_on(file)
+    topics = {message.channel.topic for message in messages}
+    assert topics < {message.channel.topic for message in closed}
+    assert damage
+
+
+def test_pieces_that_look_like_chunks_are_not_searched_for_ever(file: Path, recording: bytes) -> None:
+    record = records(file, Opcode.CHUNK)[0]
+    bad = bytearray(recording[record.start : record.at + record.size])
+    bad[-1] ^= 1
+    meta = records(file, Opcode.METADATA)[0]
+    begin = recording[: meta.at + meta.size]
+    file.write_bytes(begin + b"\xff" * 20 + bytes(bad) * 99 + recording[record.start :])
+    messages, _ = read_on(file)
+    assert messages
+    file.write_bytes(begin + b"\xff" * 20 + bytes(bad) * 101 + recording[record.start :])
+    with Reader(file) as reader:
+        assert list(reader.messages(damaged=lambda _: None)) == []
+        assert "ends within a record" in reader.records.damage or reader.records.closed
+
+
+def test_numbers_that_nobody_accounts_for_are_told(
+    segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A recorder that lost frames without a word."""
+    work = recorder(segment, tmp_path)
+    writer = segment.writer("cell")
+    publish(writer, 5)
+    work.turn()
+    with monkeypatch.context() as broken:
+        broken.setattr(follower.Follower, "_entries", lambda self, side: iter(_dropped(side)))
+        publish(writer, 3)
+        work.turn()
+    publish(writer, 2)
+    assert work.close()
+    assert found_in(work.output.path).problems == ["cell, block 1: frames 6 to 8 are neither there nor in a gap"]
+
+
+def _dropped(side: follower._Side[Frame]) -> list[follower.Entry]:
+    assert side.held is not None
+    side.last, side.held = side.held.number, None
+    return []
+
+
+def test_what_is_no_recording_of_ours_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.mem").write_bytes(MAGIC + struct.pack("<BQ", Opcode.HEADER, 8) + bytes(8))
+    with pytest.raises(RecordingError, match="no recording of shmio"):
+        found_in(tmp_path / "x.mem")

@@ -1,0 +1,169 @@
+"""The link of a block whose model is elsewhere: two processes at its ends, here two mappings of one segment."""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import pytest
+
+from shmio.errors import ConfigError, FormatError
+from shmio.layout.model import Layout, Register
+from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
+from shmio.segment.header import SectionKind, read_sections, table_state
+from shmio.segment.model_channel import Ask, Joined, Link, ends_of
+
+LAYOUT = Layout(
+    "DRIVE",
+    None,
+    12,
+    False,
+    (
+        Register("target", "REAL", (), 0, None, 4, 1),
+        Register("axis/position", "REAL", (), 4, None, 4, 1),
+        Register("axis/moving", "BOOL", (), 8, 0, 1, 1),
+        Register("axis/ready", "BOOL", (), 8, 1, 1, 1),
+        Register("lamps", "BOOL", ((0, 7),), 10, 0, 1, 8),
+    ),
+)
+HOLD = """
+import sys, time
+from shmio.segment import Segment
+with Segment.open(sys.argv[1], writable=True) as segment:
+    assert segment.blocks["drive"].link.join("held")
+    print("joined", flush=True)
+    time.sleep(3600)
+"""
+
+
+@pytest.fixture
+def segment(instance: str) -> Iterator[Segment]:
+    attributes = Attributes("remote", stepped=True, outputs=("axis",), inouts=("lamps",))
+    blocks = [BlockSpec("drive", LAYOUT, 20_000_000, 500_000_000, 1 << 20, attributes)]
+    blocks.append(BlockSpec("panel", LAYOUT, 20_000_000, 500_000_000, 1 << 20))
+    with Segment.create(instance, blocks, [ProcessSpec("drive", "source")]) as segment:
+        yield segment
+        segment.unlink()
+
+
+def link_of(segment: Segment) -> Link:
+    link = segment.blocks["drive"].link
+    assert link is not None
+    return link
+
+
+def ask(step: int, doubt: str = "") -> Ask:
+    return Ask(0, step, step * 1000, 1000, 77, doubt, struct.pack(">f8x", step), bytes(12))
+
+
+def test_only_a_block_with_outputs_has_one(segment: Segment) -> None:
+    assert segment.blocks["panel"].link is None
+    assert link_of(segment).frame_size == LAYOUT.size
+    assert link_of(segment).model() is None
+
+
+def test_what_is_asked_is_answered(segment: Segment) -> None:
+    with Segment.open(segment.instance, writable=True) as other:
+        source, model = link_of(segment), link_of(other)
+        source.asked.begin()
+        assert model.newest() is None
+        assert model.join("belt")
+        assert source.model() == Joined(1, os.getpid(), "belt")
+        number = source.ask(ask(5, "input target keeps its value"), 123)
+        assert source.answer_to(number) is None
+        found = model.newest()
+        assert found == ask(5, "input target keeps its value")._replace(number=number)
+        assert found is not None
+        model.answer(found, 456, b"\1" * 12)
+        answer = source.answer_to(number)
+        assert answer is not None
+        assert (answer.image, answer.failure) == (b"\1" * 12, None)
+        again = source.ask(ask(5), 123)
+        assert source.answer_to(again) is None, "the same step, and another ask"
+        model.answer(found, 456, b"\2" * 12)
+        assert source.answer_to(again) is None, "a late answer"
+        model.answer(found._replace(number=again), 456, b"\3" * 12, "ä" * 200)
+        answer = source.answer_to(again)
+        assert answer is not None
+        assert answer.failure == "ä" * 128
+
+
+def test_one_model_at_a_time_and_each_is_told_from_the_one_before(segment: Segment) -> None:
+    with (
+        Segment.open(segment.instance, writable=True) as first,
+        Segment.open(segment.instance, writable=True) as second,
+    ):
+        source = link_of(segment)
+        assert link_of(first).join("one")
+        assert not link_of(second).join("two")
+        assert source.model() == Joined(1, os.getpid(), "one")
+        seen = source.answered.doorbell()
+        link_of(first).leave()
+        assert source.answered.doorbell() != seen, "a source that waits looks"
+        assert source.model() is None
+        assert link_of(second).join("ä" * 200)
+        assert source.model() == Joined(2, os.getpid(), "ä" * 51)
+
+
+def test_a_model_has_computed_once_a_step_of_it_was_done_even_by_one_that_has_left(segment: Segment) -> None:
+    source = link_of(segment)
+    source.asked.begin()
+    with Segment.open(segment.instance, writable=True) as other:
+        model = link_of(other)
+        assert model.join("belt")
+        found = ask(5)._replace(number=source.ask(ask(5), 123))
+        model.answer(found, 456, b"\1" * 12, "it has failed")
+        assert not source.computed()
+        model.answer(found, 456, b"\1" * 12)
+        assert source.computed()
+        assert source.model() == Joined(1, os.getpid(), "belt"), "nothing else has changed"
+        model.leave()
+        assert model.join("belt")
+        assert source.computed()
+
+
+def test_a_killed_process_has_left(segment: Segment) -> None:
+    command = [sys.executable, "-c", HOLD, segment.instance]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as holder:
+        try:
+            assert holder.stdout is not None
+            assert holder.stdout.readline() == b"joined\n"
+            assert link_of(segment).model() == Joined(1, holder.pid, "held")
+        finally:
+            holder.kill()
+            holder.wait()
+        assert link_of(segment).model() is None
+
+
+def test_inputs_and_outputs_are_those_that_the_patterns_say() -> None:
+    ends = ends_of(LAYOUT, ["axis"], ["lamps"])
+    assert [register.path for register in ends.inputs] == ["target", "lamps"]
+    assert [register.path for register in ends.outputs] == ["axis/position", "axis/moving", "axis/ready", "lamps"]
+    assert ends_of(LAYOUT, ["**"], []).inputs == ()
+
+
+@pytest.mark.parametrize(
+    ("outputs", "inouts", "message"),
+    [
+        (["axis", "axes"], [], "outputs: 'axes' names no register of DRIVE"),
+        (["axis"], ["lamps/3"], "inouts: 'lamps/3' names no register of DRIVE; it takes whole registers"),
+        ([""], [], "outputs: "),
+        (["axis"], ["axis/moving"], "inouts: axis/moving is among outputs, too"),
+    ],
+)
+def test_patterns_that_name_nothing_are_refused(outputs: list[str], inouts: list[str], message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        ends_of(LAYOUT, outputs, inouts)
+    assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize("size", [0, 1 << 40, 2**64 - 1])
+def test_one_that_contradicts_itself_is_refused(segment: Segment, size: int) -> None:
+    entries = read_sections(segment.memory, segment.header, table_state(segment.memory)[1], "")
+    (entry,) = [entry for entry in entries if entry.kind == SectionKind.LINK]
+    segment.memory[entry.offset : entry.offset + 8] = struct.pack("<Q", size)
+    with pytest.raises(FormatError, match="block drive: the link's rings do not fit in its section"):
+        Segment.open(segment.instance)

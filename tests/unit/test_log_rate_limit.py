@@ -1,0 +1,33 @@
+"""What clients can have logged again and again does not fill the log."""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from shmio.log_rate_limit import LINES, TURN_S, Ration
+
+
+def test_lines_of_a_kind_are_rationed_and_the_rest_is_counted(caplog: pytest.LogCaptureFixture) -> None:
+    now_s = 100.0
+    log = logging.getLogger("test.ration")
+    ration = Ration(lambda: now_s)
+    log.addFilter(ration)
+    try:
+        for number in range(LINES + 5):
+            log.warning("step failed: %s", number)
+        log.warning("another kind: %s", 1)
+        assert [record.getMessage() for record in caplog.records] == [
+            *(f"step failed: {number}" for number in range(LINES)), "another kind: 1",
+        ]  # fmt: skip
+        caplog.clear()
+        now_s += TURN_S
+        for text in ("a", "b"):
+            log.warning("step failed: %s", text)
+        log.warning("another kind: %s", 2)
+        assert [record.getMessage() for record in caplog.records] == [
+            "step failed: a (5 more like this were left out before)", "step failed: b", "another kind: 2",
+        ]  # fmt: skip
+    finally:
+        log.removeFilter(ration)
