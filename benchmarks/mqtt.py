@@ -7,6 +7,7 @@ which 20 REALs move.
 
 from __future__ import annotations
 
+import os
 import statistics
 import struct
 import subprocess
@@ -39,7 +40,9 @@ STAMPED = Layout("STAMPED", None, 8, False, (Register("Stamp", "LINT", (), 0, No
 @contextmanager
 def segment(layout: Layout) -> Iterator[Segment]:
     block = BlockSpec("cell", layout, round(PERIOD_S * 1e9), 60_000_000_000, 1 << 24)
-    with Segment.create("bench-mqtt", [block], [ProcessSpec("cell", "source"), ProcessSpec("mqtt", "mqtt")]) as made:
+    with Segment.create(
+        f"bench-{os.getpid()}", [block], [ProcessSpec("cell", "source"), ProcessSpec("mqtt", "mqtt")]
+    ) as made:
         try:
             yield made
         finally:

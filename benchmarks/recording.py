@@ -9,6 +9,7 @@ if frames were laid out otherwise. CPU is that of a recorder's process beside a 
 from __future__ import annotations
 
 import json
+import os
 import random
 import struct
 import subprocess
@@ -222,7 +223,7 @@ def cpu(duration_s: float) -> None:
         processes = [ProcessSpec("cell", "source"), ProcessSpec("recorder", "recorder")]
         with (
             tempfile.TemporaryDirectory() as folder,
-            Segment.create(f"bench-recording-{hertz}", blocks, processes) as segment,
+            Segment.create(f"bench-{os.getpid()}-{hertz}", blocks, processes) as segment,
         ):
             try:
                 with recorder(segment, Path(folder)) as pid:

@@ -22,7 +22,7 @@ def printed(benchmark: str) -> str:
     """Run a benchmark; all it prints."""
     command = [sys.executable, f"benchmarks/{benchmark}.py", "--quick"]
     run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=100, check=False)
-    assert (run.returncode, run.stderr) == (0, ""), run.stdout
+    assert (run.returncode, run.stderr) == (0, ""), run.stdout + run.stderr
     return run.stdout
 
 

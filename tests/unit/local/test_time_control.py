@@ -345,7 +345,7 @@ def test_a_killed_owner_leaves_time_to_the_next(instance: str) -> None:
 import sys
 from dataclasses import replace
 from shmio.segment import Segment
-from shmio.segment.coordinator import Coordinator
+from shmio.local.time_control import Coordinator
 segment = Segment.open(sys.argv[1], writable=True)
 coordinator = Coordinator(segment, soft_s=0.001, hard_s=60)
 coordinator.set_playing(True)

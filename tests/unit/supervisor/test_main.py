@@ -144,7 +144,8 @@ def test_stop_by_request_answers_when_the_instance_is_gone(launch: Launch) -> No
     cell.wait_state("running")
     where = cell.request(Where())
     assert where.pop("read_ns") <= time.time_ns()
-    assert where == {"ok": True, "config": str(cell.folder / "supervisor.toml"), "log_dir": str(cell.folder)}
+    config, log_dir = str(cell.folder / "supervisor.toml"), str(cell.folder)
+    assert where == {"ok": True, "config": config, "log_dir": log_dir, "listen": {}}
     assert cell.request(Stop()) == {"ok": True}
     assert cell.instance not in instances()
     assert cell.wait_end() == 0
