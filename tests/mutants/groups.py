@@ -18,8 +18,8 @@ class Group:
 
 GROUPS: Final = {
     "segment": Group(
-        ("shmio/segment/*.py", "shmio/segment/*.h", "shmio/segment/_atomics.c"),
-        ("tests/unit/segment", "tests/native"),
+        ("shmio/segment/*.py", "shmio/segment/*.h", "shmio/segment/_atomics.c", "shmio/local/*.py"),
+        ("tests/unit/segment", "tests/unit/local", "tests/native"),
     ),
     "s7": Group(
         ("shmio/connectors/s7/*.py",),
@@ -42,6 +42,10 @@ GROUPS: Final = {
         ),
         (
             "tests/unit/connectors/test_*.py",
+            "tests/unit/connectors/commands",
+            "tests/unit/connectors/injection",
+            "tests/unit/connectors/models",
+            "tests/unit/local/test_writer.py",
             "tests/unit/layout/values/test_write.py",
             "tests/unit/segment/test_command*.py",
             "tests/unit/segment/test_change.py",
@@ -49,19 +53,16 @@ GROUPS: Final = {
     ),
     "streams": Group(
         (
-            "shmio/endpoints/grpc/streams/wakeups.py",
-            "shmio/endpoints/grpc/feed*.py",
+            "shmio/endpoints/grpc/streams/*.py",
             "shmio/endpoints/grpc/commands/followers.py",
-            "shmio/endpoints/grpc/outbox*.py",
-            "shmio/endpoints/grpc/streams/back_pressure.py",
             "shmio/endpoints/grpc/commands/publish.py",
             "shmio/endpoints/grpc/services/simlog_v2.py",
         ),
-        ("tests/unit/endpoints/test_*.py",),
+        ("tests/unit/endpoints/grpc",),
     ),
     "recorder": Group(
         ("shmio/recorder/*.py", "shmio/recording/format/records.py"),
-        ("tests/unit/recording", "tests/unit/dump"),
+        ("tests/unit/recorder", "tests/unit/recording"),
     ),
 }
 
