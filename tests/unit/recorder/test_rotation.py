@@ -17,11 +17,13 @@ from shmio.connectors.replay.recording import Recording
 from shmio.local.time_control import Coordinator
 from shmio.recorder import output as output_module
 from shmio.recorder.attach import no_attachments
+from shmio.recorder.follower import Entry
 from shmio.recorder.keeper import Keeper
 from shmio.recorder.output import Output
 from shmio.recorder.series import Series
 from shmio.recorder.tap import Tap
 from shmio.recording.check import check
+from shmio.recording.format.encoding import Gap, Place, Reason
 from shmio.recording.reading.reader import Reader
 from shmio.segment import Event, EventKind, Record, Segment
 from shmio.testing.cell import until
@@ -70,11 +72,31 @@ def test_files_follow_each_other_without_a_frame_twice_or_missing(segment: Segme
         with Reader(before) as reader:
             assert check(reader).whole
             assert reader.records.footer()
-            end = [message.channel.section for message in reader.messages()]
+            *_, last = (message for message in reader.messages() if message.channel.source == "cell")
         with Reader(file) as reader:
             begin = next(reader.messages()).channel
-            assert reader.places[end[0]].frame == numbers(before)[-1]
+            end = Place(numbers(before)[-1], numbers(before, kind=Event)[-1], last.log_ns)
+            assert reader.places[last.channel.section] == end
             assert begin.after == (numbers(before)[-1] if begin.topic == "cell/frames" else begin.after)
+
+
+def test_a_gap_at_the_end_of_a_file_belongs_to_it(segment: Segment, tmp_path: Path) -> None:
+    """The writer died, say, and nothing later has shown what the ring lost."""
+    work = series(segment, tmp_path, rotate_mb=0.001)
+    publish(segment.writer("cell"), 100)
+    work.turn()
+    cell = work.tap.followers[0]
+    gap = Gap("cell", cell.number, "frames", 101, 110, 10, Reason.OVERTAKEN, 0, 0)
+    now_ns = work.tap.now()
+    work.put([Entry(now_ns, cell, gap)])
+    work.recorder._writer.flush()
+    work.tend()
+    assert work.close() == []
+    first, second = files(tmp_path)
+    assert gaps(first) == [gap]
+    with Reader(second) as reader:
+        list(reader.messages())
+        assert reader.places[cell.block.section] == Place(110, 1, now_ns)
 
 
 def test_what_the_ring_lost_between_two_files_is_one_gap_in_the_second(segment: Segment, tmp_path: Path) -> None:

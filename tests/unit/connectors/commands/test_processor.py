@@ -208,6 +208,16 @@ def test_what_no_cycle_carried_out_in_time_expires(bench: Bench) -> None:
     assert device == []
 
 
+def test_at_its_very_deadline_a_command_is_carried_out(bench: Bench) -> None:
+    bench.now_ns = 1_000
+    number = bench.accepted(Write(0, 0, b"\1\2"), deadline_ns=1_000)
+    device: list[Write] = []
+    bench.desk.carry_out(confirm(device))
+    event = bench.event()
+    assert (event.kind, event.command) == (EventKind.WRITTEN, number)
+    assert device == [Write(0, 0, b"\1\2")]
+
+
 def test_nothing_is_accepted_while_the_device_is_away_and_nothing_done_when_it_is_back(bench: Bench) -> None:
     number = bench.accepted(Write(0, 0, b"\0\0"))
     bench.desk.close("cable out")

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 import pytest
 
 from shmio.connectors.base import Connector
-from shmio.connectors.injection.layers import Owner
+from shmio.connectors.injection.layers import MAX_INJECTIONS, Owner
 from shmio.connectors.loop import SourceLoop, WallClock
 from shmio.connectors.schedule import Schedule
 from shmio.errors import CommandError, PathError
@@ -296,6 +296,16 @@ def test_what_cannot_be_is_refused(rig: Rig) -> None:
     del rig.owners[5]
     with pytest.raises(CommandError, match="nobody has the command queue"):
         rig.other.inject(["speed"])
+
+
+def test_what_the_segment_has_no_room_for_is_refused(rig: Rig) -> None:
+    name = "\1" * 256  # six characters each in the document that everybody reads
+    laid: list[int] = []
+    with pytest.raises(CommandError, match="too much for the injections of one source"):
+        laid.extend(rig.client.inject(["speed"], name=name) for _ in range(MAX_INJECTIONS))
+    assert [standing.id for standing in rig.block.standing.read()] == laid
+    rig.client.lift(laid[0])
+    rig.client.inject(["speed"], name=name)
 
 
 def test_toward_a_device_that_is_not_armed_nothing_is_injected(segment: Segment) -> None:
