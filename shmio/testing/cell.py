@@ -67,17 +67,26 @@ class Cell:
             check=False,
         )
 
+    def output(self, command: str, *arguments: str) -> str:
+        """Run one of our commands; return what it prints.
+
+        Raises:
+            AssertionError: The command failed. The message has its error output and the instance's logs.
+
+        """
+        done = self.run(command, *arguments)
+        if done.returncode:
+            line = " ".join((command, *arguments))
+            raise AssertionError(f"{line}: exit status {done.returncode}\n{done.stdout}{done.stderr}\n{self.logs()}")
+        return done.stdout
+
     def up(self) -> None:
         """Start it detached; returns when it runs."""
-        done = self.supervisor("up", "--detach")
-        if done.returncode:
-            raise AssertionError(done.stderr)
+        self.output("shmio-supervisor", "up", "--detach")
 
     def down(self) -> None:
         """Stop it; returns when it is gone."""
-        done = self.supervisor("down")
-        if done.returncode:
-            raise AssertionError(done.stderr)
+        self.output("shmio-supervisor", "down")
 
     def status(self) -> dict[str, Any]:
         """What ``status --json`` prints, without a process for each look."""

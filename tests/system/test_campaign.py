@@ -148,7 +148,7 @@ def test_a_campaign_runs_twice_with_the_same_seed_and_is_in_the_recording(cell: 
     assert all(80 <= value <= 120 for pair in first.values() for value in pair if isinstance(value, int))
     cell.down()
     (file,) = (cell.folder / "dumps").glob("*.mem")
-    recorded = cell.run("shmio-dump", "cat", "--json", str(file), "cell/Outputs/99").stdout
+    recorded = cell.output("shmio-dump", "cat", "--json", str(file), "cell/Outputs/99")
     events = [line for line in map(json.loads, recorded.splitlines()) if line.get("text") == "noise"]
     assert [line["kind"] for line in events].count("activated") == 3, events[:5]
     seeds = [line["laid"]["seed"] for line in events if line["laid"]]
@@ -181,7 +181,7 @@ def test_a_recorded_campaign_is_run_again_and_does_the_same(make_cell: Callable[
     second = run("again.toml")
     found = cell.run("shmio-dump", "diff", str(first), str(second), "--ignore", "times")
     assert found.returncode == 0, found.stdout
-    told = cell.run("shmio-dump", "cat", str(second)).stdout
+    told = cell.output("shmio-dump", "cat", str(second))
     assert " activated" in told
     assert " deactivated" in told
 
@@ -198,7 +198,7 @@ def test_the_configuration_declares_and_a_reload_changes_without_a_restart(cell:
         local.write({"cell/Outputs/98": 5, "cell/Outputs/99": 0x80})
         until(lambda: local["cell/Outputs/98"] == 77, "injected")
         assert local.read("cell/Outputs/98").provenance == "injected"
-        listed = cell.run("shmio", "inject", "--list").stdout
+        listed = cell.output("shmio", "inject", "--list")
         assert re.search(r"cell/Outputs/98 /out, .*supervisor.toml, .*set, seed \d+: active.*blind", listed), listed
         file.write_text(plain + CONFIGURED.replace("77", "78"))
         assert "injection blind: changed at cell" in cell.supervisor("reload").stdout

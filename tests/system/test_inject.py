@@ -56,7 +56,7 @@ def injecting(cell: Cell, *arguments: str) -> Iterator[subprocess.Popen[str]]:
 
 
 def get(cell: Cell, path: str) -> dict[str, object]:
-    shown: dict[str, dict[str, object]] = json.loads(cell.run("shmio", "get", "--json", path).stdout)
+    shown: dict[str, dict[str, object]] = json.loads(cell.output("shmio", "get", "--json", path))
     return shown[path]
 
 
@@ -82,7 +82,7 @@ def test_all_consumers_see_the_injected_value_until_the_command_ends(cell: Cell)
         assert get(cell, POSITION)["value"] != -1.5
         assert get(cell, "panel/speed")["value"] == 0.5
         until(lambda: next(stream).value != "-1.5", "the subscriber, without subscribing anew")
-        assert cell.run("shmio", "inject").stdout == ""
+        assert cell.output("shmio", "inject") == ""
 
 
 def test_what_is_written_meets_the_injection_and_not_the_device(cell: Cell) -> None:
@@ -110,7 +110,7 @@ def test_one_is_kept_or_lifted_after_a_time(cell: Cell) -> None:
     both = cell.run("shmio", "inject", "--for", "1", "--keep", POSITION, "11")
     assert (both.returncode, both.stdout) == (2, "")
     assert "argument --keep: not allowed with argument --for" in both.stderr
-    assert cell.run("shmio", "inject").stdout == ""
+    assert cell.output("shmio", "inject") == ""
 
 
 def test_a_kept_one_stays_until_it_is_lifted(cell: Cell) -> None:
@@ -118,14 +118,14 @@ def test_a_kept_one_stays_until_it_is_lifted(cell: Cell) -> None:
     assert kept.returncode == 0, kept.stderr
     number = kept.stdout.partition(":")[0]
     assert get(cell, POSITION)["value"] == 11
-    assert json.loads(cell.run("shmio", "inject", "--json").stdout)[0]["registers"] == [POSITION]
-    assert cell.run("shmio", "inject", "--lift", number).stdout.startswith(f"{number}: lifted from cell")
+    assert json.loads(cell.output("shmio", "inject", "--json"))[0]["registers"] == [POSITION]
+    assert cell.output("shmio", "inject", "--lift", number).startswith(f"{number}: lifted from cell")
     assert get(cell, POSITION)["value"] != 11
     again = cell.run("shmio", "inject", "--lift", number)
     assert (again.returncode, again.stderr) == (1, f"there is no injection {number}; shmio inject lists them\n")
     cell.run("shmio", "inject", "--keep", POSITION, "11", "panel/speed", "2")
-    assert len(cell.run("shmio", "inject", "--lift-all").stdout.splitlines()) == 2
-    assert cell.run("shmio", "inject").stdout == ""
+    assert len(cell.output("shmio", "inject", "--lift-all").splitlines()) == 2
+    assert cell.output("shmio", "inject") == ""
 
 
 def test_a_program_injects(cell: Cell) -> None:

@@ -16,12 +16,12 @@ AXIS = "cell/Robot_800/Axs1_Pos"
 
 def info(cell: Cell, file: Path) -> dict[str, Any]:
     """``info --json`` of a file of the cell."""
-    found: dict[str, Any] = json.loads(cell.run("shmio-dump", "info", "--json", str(file)).stdout)
+    found: dict[str, Any] = json.loads(cell.output("shmio-dump", "info", "--json", str(file)))
     return found
 
 
 def values(cell: Cell, file: Path) -> list[dict[str, Any]]:
-    lines = cell.run("shmio-dump", "cat", "--json", str(file), AXIS).stdout.splitlines()
+    lines = cell.output("shmio-dump", "cat", "--json", str(file), AXIS).splitlines()
     return [line for line in map(json.loads, lines) if "frame" in line]
 
 
@@ -57,7 +57,7 @@ def test_log_mode_records_a_cell_through_a_killed_recorder(make_cell: Callable[.
     checked = cell.run("shmio-dump", "verify", str(first), str(second))
     assert (checked.returncode, checked.stdout.count("no damage")) == (0, 2), checked.stdout
     assert len(values(cell, second)) > 1
-    events = [json.loads(line) for line in cell.run("shmio-dump", "cat", "--json", str(second)).stdout.splitlines()]
+    events = [json.loads(line) for line in cell.output("shmio-dump", "cat", "--json", str(second)).splitlines()]
     assert [event for event in events if "source" in event][-1]["kind"] == "stopped", "to the source's last event"
     assert values(cell, second)[-1]["quality"] == "bad"
 
@@ -111,7 +111,7 @@ def test_a_reload_is_recorded_in_the_same_file(make_cell: Callable[..., Cell]) -
     )
     old, new, second = found["blocks"]
     assert old["layout_hash"] == second["layout_hash"] != new["layout_hash"]
-    lines = cell.run("shmio-dump", "cat", "--json", str(recording), "cell/Robot_800/Axis1", "--from", "0").stdout
+    lines = cell.output("shmio-dump", "cat", "--json", str(recording), "cell/Robot_800/Axis1", "--from", "0")
     assert all(
         set(line["values"]) == {"Robot_800/Axis1"} for line in map(json.loads, lines.splitlines()) if "frame" in line
     )
@@ -138,7 +138,7 @@ def test_notes_and_deaths_stand_in_the_recording(make_cell: Callable[..., Cell])
     until(lambda: cell.processes()["cell"]["state"] == "running" and cell.processes()["cell"]["pid"] != pid, "its end")
     cell.down()
     [file] = (cell.folder / "dumps").iterdir()
-    printed = cell.run("shmio-dump", "cat", str(file)).stdout
+    printed = cell.output("shmio-dump", "cat", str(file))
     assert f"process cell died, pid {pid}: killed by SIGKILL" in printed
     assert "process recorder is, pid" in printed
     notes = re.findall(r": noted by program \d: (.*)", printed)

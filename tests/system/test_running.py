@@ -39,9 +39,9 @@ def test_another_process_receives_changing_values(running: Cell) -> None:
 
 def test_the_users_tool_reads_the_cell(running: Cell) -> None:
     until(lambda: running.processes()["cell"]["quality"] == "good", "good quality")
-    listed = json.loads(running.run("shmio", "list", "--json").stdout)
+    listed = json.loads(running.output("shmio", "list", "--json"))
     assert len(listed) == 22
-    got = json.loads(running.run("shmio", "get", "--json", AXIS, "cell/Inputs/3").stdout)
+    got = json.loads(running.output("shmio", "get", "--json", AXIS, "cell/Inputs/3"))
     assert set(got) == {AXIS, "cell/Inputs/3"}
     assert set(got[AXIS]) == {"value", "quality", "reason", "provenance", "source_time", "age_s"}
     assert (got[AXIS]["quality"], got[AXIS]["provenance"]) == ("good", "live")

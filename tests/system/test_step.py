@@ -123,7 +123,7 @@ def step(cell: Cell, *arguments: str) -> dict[str, Any]:
 
 
 def get(cell: Cell, *paths: str) -> list[Any]:
-    shown = json.loads(cell.run("shmio", "get", "--json", *paths).stdout)
+    shown = json.loads(cell.output("shmio", "get", "--json", *paths))
     assert {reading["quality"] for reading in shown.values()} == {"good"}, shown
     return [shown[path]["value"] for path in paths]
 
@@ -142,7 +142,7 @@ def test_the_command_steps_and_tells_the_time(make_line: Callable[[str], Cell]) 
     assert get(line, "panel/limit") == [3.0]
     assert step(line, "--count", "3")["step"] == 6
     assert get(line, "belt/position", "gate/closed") == [pytest.approx(0.55), False]
-    assert line.run("shmio", "step").stdout == "virtual time 0.400 s, step 7, steps of 50 ms\n"
+    assert line.output("shmio", "step") == "virtual time 0.400 s, step 7, steps of 50 ms\n"
     assert "virtual time 0.400 s, step 7, steps of 50 ms" in line.supervisor("status").stdout
     assert line.status()["clock"]["time_s"] == 0.4
 
@@ -227,7 +227,7 @@ def test_a_step_that_has_failed_is_told_alike_on_the_host_and_by_grpc(line: Cell
 
 
 def test_how_far_a_step_goes_is_told_as_it_was_asked_for(line: Cell) -> None:
-    told = line.run("shmio", "step", "--dt-ms", "20", "--count", "2").stdout
+    told = line.output("shmio", "step", "--dt-ms", "20", "--count", "2")
     assert re.fullmatch(r"virtual time [0-9.]+ s, step [0-9]+ of 20 ms, step size 50 ms\n", told), told
     refused = line.run("shmio", "step", "--pause", "--dt-ms", "20")
     assert (refused.returncode, refused.stderr) == (1, "--pause does no step: leave out --dt-ms\n")

@@ -71,7 +71,7 @@ def test_what_is_set_comes_out_of_the_controller_for_every_subscriber(cell: Cell
         assert (done.returncode, done.stdout, done.stderr) == (0, f"{PLACE}  written\n", "")
         assert next(out).value == "42"
         assert next(into).value == "42"
-    assert json.loads(cell.run("shmio", "get", "--json", PLACE).stdout)[PLACE]["value"] == 42
+    assert json.loads(cell.output("shmio", "get", "--json", PLACE))[PLACE]["value"] == 42
 
 
 def test_what_is_published_comes_out_of_the_controller_for_every_subscriber(cell: Cell) -> None:
