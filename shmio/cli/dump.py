@@ -11,9 +11,10 @@ from pathlib import Path
 
 from shmio import __version__
 from shmio.cli.interrupt import undone_by_signals
-from shmio.cli.run import add_full, add_json, complete, run, wants_error_json
+from shmio.cli.run import add_full, add_json, complete, run
 
 PROGRAM = "shmio-dump"
+SOME_FILES = "print JSON: one object, or a list for several files"
 IGNORABLE = ("times", "cycle", "reason", "events", "ends")
 """What ``diff`` may pass over: shmio.recording.compare, which is not imported for other verbs."""
 
@@ -38,7 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return status
 
     with undone_by_signals():  # a file that is being made is removed again
-        return run(PROGRAM, command, error_json=wants_error_json(arguments))
+        return run(PROGRAM, command, arguments)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -80,11 +81,11 @@ def _parser() -> argparse.ArgumentParser:
 
     info = verb("info", "tell what is in recordings")
     info.add_argument("files", nargs="+", type=Path, metavar="FILE")
-    info.add_argument("--json", action="store_true", help="print JSON: one object, or a list for several files")
+    add_json(info, SOME_FILES)
 
     verify = verb("verify", "read all of recordings, and tell what is damaged; exit status 1 if anything is")
     verify.add_argument("files", nargs="+", type=Path, metavar="FILE")
-    verify.add_argument("--json", action="store_true", help="print JSON: one object, or a list for several files")
+    add_json(verify, SOME_FILES)
 
     recover = verb("recover", "write what is whole of a damaged recording to a new file")
     recover.add_argument("file", type=Path, metavar="FILE")
@@ -124,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     diff.add_argument("--tolerance", type=_amount, default=0.0, metavar="X", help="REAL and LREAL may differ by this")
     diff.add_argument("--relative", type=_amount, default=0.0, metavar="X", help="or by this part of the larger one")
-    diff.add_argument("--json", action="store_true", help="print a JSON object")
+    add_json(diff)
 
     merge = verb("merge", "write several recordings of one run to one new file")
     merge.add_argument("files", nargs="+", type=Path, metavar="FILE")
@@ -143,8 +144,8 @@ def _parser() -> argparse.ArgumentParser:
     _times(cat)
     add_full(cat)
     forms = cat.add_mutually_exclusive_group()
-    for form, text in (("json", "print a JSON object a line"), ("csv", "print CSV")):
-        forms.add_argument(f"--{form}", dest="form", action="store_const", const=form, default="table", help=text)
+    add_json(forms, "print a JSON object a line")
+    forms.add_argument("--csv", action="store_true", help="print CSV")
     return parser
 
 

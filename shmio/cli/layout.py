@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from shmio import __version__
-from shmio.cli.run import complete, dumps, run
+from shmio.cli.run import add_json, complete, dumps, run
 from shmio.errors import ConfigError, LayoutError
 from shmio.layout.compiler import Program, Source
 from shmio.layout.document import describe
@@ -45,12 +45,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         default=[],
         help="the size of a type whose members are not known; it becomes bytes without meaning",
     )
-    parser.add_argument("--json", action="store_true", help="print JSON: one object, or a list for several blocks")
+    add_json(parser, "print JSON: one object, or a list for several blocks")
     parser.add_argument("--version", action="version", version=f"shmio {__version__}")
     complete(parser)
     options = parser.parse_intermixed_args(arguments)
     names, sizes = [options.file, *options.types], dict(options.type_bytes)
-    return run(parser.prog, lambda: _compile(names, options.block, sizes, as_json=options.json))
+    return run(parser.prog, lambda: _compile(names, options.block, sizes, as_json=options.json), options)
 
 
 def _size(text: str) -> tuple[str, int]:
@@ -62,16 +62,16 @@ def _size(text: str) -> tuple[str, int]:
 
 
 def _compile(names: Sequence[str], block: str | None, sizes: Mapping[str, int], *, as_json: bool) -> int:
+    program = Program([_read(name) for name in names])
+    if block is not None and block.lower() not in {held.name.lower() for held in program.blocks}:
+        program.compile(())  # which says so if the sources are damaged
+        held = ", ".join(held.name for held in program.blocks)
+        raise ConfigError(f"--block: no data block {block!r}; there are: {held}")
     try:
-        program = Program([_read(name) for name in names])
-        if block is not None and block.lower() not in {held.name.lower() for held in program.blocks}:
-            program.compile(())  # which says so if the sources are damaged
-            held = ", ".join(held.name for held in program.blocks)
-            raise ConfigError(f"--block: no data block {block!r}; there are: {held}")
         compiled = program.compile(None if block is None else (block,), sizes)
     except LayoutError as error:
-        _complain(error.diagnostics)
-        return 1
+        _complain(one for one in error.diagnostics if one.severity == "warning")  # its text has the errors
+        raise
     _complain(compiled.warnings)
     _complain(f"warning: --type-bytes: nothing is of the type {name!r}" for name in compiled.unused)
     for layout in compiled.layouts:

@@ -8,11 +8,12 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from types import MappingProxyType
 from typing import Any, TextIO
 
-from shmio.errors import ConfigError, ControlError, LayoutError, ShmioError
+from shmio.errors import CommandError, ConfigError, ControlError, LayoutError, ShmioError
 from shmio.logs import printable
 
 MAX_SECONDS = 86_400
@@ -20,22 +21,32 @@ SHOWN_CHARACTERS = 60
 """Of a value, on a terminal."""
 
 
-def run(program: str, command: Callable[[], int | None], *, error_json: bool = False) -> int:
+class PartlyDoneError(CommandError):
+    """A command failed when some of it was done; ``found``: what its JSON tells of that, beside the error."""
+
+    def __init__(self, message: str, found: Mapping[str, object]) -> None:
+        super().__init__(message)
+        self.found = found
+
+
+def run(program: str, command: Callable[[], int | None], options: argparse.Namespace) -> int:
     """Run a command: 0 done, 1 failed with one line on standard error, 128 + n ended by signal n as shells have it.
 
-    Wrong usage is argparse's, which exits with 2. ``error_json``: a failure is told on standard output, too, as
-    ``{"error": "…"}``.
+    Wrong usage is argparse's, which exits with 2. With ``--json`` a failure is told on standard output, too, as
+    ``{"error": "…"}``, whatever the command.
     """
+    as_json = getattr(options, "json", False)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")  # a terminal that is not UTF-8
     try:
         status = command() or 0
         sys.stdout.flush()
     except (ConfigError, ControlError, LayoutError) as error:  # which tell all that is wrong, a line each
-        _tell(str(error), error_json=error_json)
+        _tell(str(error), as_json=as_json)
         return 1
     except ShmioError as error:
-        _tell(str(error).replace("\n", "\\n"), error_json=error_json)
+        found = error.found if isinstance(error, PartlyDoneError) else {}
+        _tell(str(error).replace("\n", "\\n"), found, as_json=as_json)
         return 1
     except KeyboardInterrupt:
         return 130
@@ -43,7 +54,7 @@ def run(program: str, command: Callable[[], int | None], *, error_json: bool = F
         _give_up_output()  # who read it went away (`| head`)
         return 141
     except OSError as error:
-        _tell(f"{error.filename or program}: {error.strerror}", error_json=error_json)
+        _tell(f"{error.filename or program}: {error.strerror}", as_json=as_json)
         _give_up_output()
         return 1
     return status
@@ -69,10 +80,10 @@ def say_json(value: Any) -> None:
         print(dumps(value), flush=True)
 
 
-def _tell(error: str, *, error_json: bool) -> None:
+def _tell(error: str, found: Mapping[str, object] = MappingProxyType({}), *, as_json: bool) -> None:
     sys.stderr.write("".join(f"{printable(line)}\n" for line in error.split("\n")))
-    if error_json:
-        say_json({"error": error})
+    if as_json:
+        say_json({**found, "error": error})
 
 
 def _give_up_output() -> None:
@@ -105,15 +116,9 @@ def seconds(text: str) -> float:
     return seconds
 
 
-def add_json(parser: argparse.ArgumentParser, text: str = "print one JSON object") -> None:
-    """Add ``--json``, also for errors: see :func:`wants_error_json`."""
+def add_json(parser: argparse._ActionsContainer, text: str = "print one JSON object") -> None:
+    """Add ``--json``, to which :func:`run` holds for errors, too."""
     parser.add_argument("--json", action="store_true", help=f"{text}; an error, too")
-    parser.set_defaults(error_json=True)
-
-
-def wants_error_json(options: argparse.Namespace) -> bool:
-    """Whether an error is told as JSON, too."""
-    return getattr(options, "error_json", False) and options.json
 
 
 def add_full(parser: argparse.ArgumentParser) -> None:

@@ -9,8 +9,8 @@ import shlex
 from collections.abc import Sequence
 
 from shmio.cli.cell import Cell, Selected
-from shmio.cli.run import dumps, seconds
-from shmio.errors import CommandError, PathError, ValueRangeError
+from shmio.cli.run import PartlyDoneError, dumps, seconds
+from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.layout.glob import select
 from shmio.layout.model import Register
 from shmio.layout.source.lists import split_array
@@ -84,11 +84,18 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
         for values in wanted.values():
             outcomes |= zip(values, cell.write(values, options.timeout), strict=True)
         failed = [(path, outcome) for path, outcome in outcomes.items() if not outcome.done]
+        if failed:
+            more = f" (and {len(failed) - 1} more)" if failed[1:] else ""
+            raise CommandError(_complaint(*failed[0]) + more)
+    except ShmioError as error:
+        if options.json and outcomes:
+            raise PartlyDoneError(str(error), _described(outcomes)) from error
+        raise
     finally:  # also of what was written before a later source took nothing
-        _print(outcomes, options.json, failed[0][1].text if failed else "")
-    if failed:
-        more = f" (and {len(failed) - 1} more)" if failed[1:] else ""
-        raise CommandError(_complaint(*failed[0]) + more)
+        if not options.json:
+            _print(outcomes, failed[0][1].text if failed else "")
+    if options.json:
+        print(dumps(_described(outcomes)))
     return 0
 
 
@@ -152,11 +159,13 @@ def _target(cell: Cell, path: str) -> Selected:
     raise PathError(f"{path}: set takes one register, not a pattern; this one matches {some}")
 
 
-def _print(outcomes: dict[str, Outcome], as_json: bool, complaint: str) -> None:
-    """Each outcome; for people without the reason that the error line gives."""
-    if as_json:
-        print(dumps({path: {"outcome": str(end.kind), "reason": end.text} for path, end in outcomes.items()}))
-        return
+def _described(outcomes: dict[str, Outcome]) -> dict[str, object]:
+    """Each outcome, for programs."""
+    return {path: {"outcome": str(end.kind), "reason": end.text} for path, end in outcomes.items()}
+
+
+def _print(outcomes: dict[str, Outcome], complaint: str) -> None:
+    """Each outcome, for people: without the reason that the error line gives."""
     width = max((len(printable(path)) for path in outcomes), default=0)
     for path, end in outcomes.items():
         reason = f": {printable(end.text)}" if end.text and end.text != complaint else ""

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from shmio import __version__
-from shmio.cli.run import add_json, at_least, complete, run, wants_error_json
+from shmio.cli.run import add_json, at_least, complete, run
 from shmio.plan.replay import add_arguments
 
 PROGRAM = "shmio-supervisor"
@@ -27,7 +27,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         status: int = verb.execute(arguments)
         return status
 
-    return run(PROGRAM, command, error_json=wants_error_json(arguments))
+    return run(PROGRAM, command, arguments)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -54,8 +54,7 @@ def _parser() -> argparse.ArgumentParser:
     add_arguments(up)
     up.add_argument("--report", type=int, help=argparse.SUPPRESS)  # descriptor on which a detached one tells its start
     verb("down", "stop the instance", target)
-    status = verb("status", "tell how the instance and its processes are", target)
-    status.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(verb("status", "tell how the instance and its processes are", target))
     text = "tell which instances run on this host, from which files, and where they listen"
     add_json(verb("list", text, argparse.ArgumentParser(add_help=False)), "print a JSON list")
     add_json(verb("reload", "take what has changed in the configuration; leave alone what has not", target))

@@ -14,7 +14,7 @@ from shmio.cli import set as set_verb
 from shmio.cli.cell import Cell
 from shmio.cli.interrupt import ended_by_interrupt
 from shmio.cli.local import Local
-from shmio.cli.run import complete, run
+from shmio.cli.run import add_json, complete, run
 from shmio.cli.target import target
 from shmio.layout.spelling import may_be_foreign, topic_path
 from shmio.local.attach import Attachment
@@ -49,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             local = Local(attachment)
             return verb(local, _spelled(local, arguments))
 
-    return run(PROGRAM, command)
+    return run(PROGRAM, command, arguments)
 
 
 def _spelled(cell: Cell, arguments: argparse.Namespace) -> argparse.Namespace:
@@ -72,7 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     common = argparse.ArgumentParser(add_help=False)
     common.add_argument("-c", dest="config", type=Path, metavar="FILE", help="the instance of this supervisor.toml")
     common.add_argument("--instance", metavar="NAME", help="a running instance (default: the only one)")
-    common.add_argument("--json", action="store_true", help="print JSON")
+    add_json(common, "print JSON")
     common.add_argument("--host", metavar="HOST:PORT", help="an instance's gRPC endpoint, on any host; or unix:PATH")
     common.add_argument("--ca", type=Path, metavar="FILE", help="with --host: use TLS, and trust this authority (PEM)")
     common.add_argument("--certificate", type=Path, metavar="FILE", help="our own certificate (PEM), if it asks for it")

@@ -73,9 +73,9 @@ def execute(arguments: argparse.Namespace) -> int:
 
 
 def _printer(arguments: argparse.Namespace, views: Sequence[View]) -> Printer:
-    if arguments.form == "csv":
+    if arguments.csv:
         return Csv(views)
-    return JsonLines() if arguments.form == "json" else Table(room(arguments))
+    return JsonLines() if arguments.json else Table(room(arguments))
 
 
 def _nothing(found: Survey) -> str:

@@ -20,22 +20,26 @@ def each(
 ) -> int:
     """Print what ``look`` finds in each file, as ``lines`` or JSON; 1 if one of them is damaged, or no recording.
 
+    In JSON, what is no recording has its error in its place.
+
     ``look``: OSError, RecordingError: it is none.
     """
-    found, failed = [], False
+    found: list[dict[str, Any]] = []
+    failed = False
     for file in arguments.files:
         try:
             described = look(file)
         except (RecordingError, OSError) as error:
             text = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
             print(printable(text), file=sys.stderr)
+            found.append({"error": text})
             failed = True
             continue
         failed = failed or bool(described["damage"])
         found.append(described)
         if not arguments.json:
             print("\n".join(map(printable, lines(described))), flush=True)
-    if arguments.json and found:
+    if arguments.json:
         print(dumps(found[0] if len(arguments.files) == 1 else found, indent=2))
     return int(failed)
 

@@ -82,7 +82,7 @@ def test_table_hides_control_characters(tmp_path: Path, capsys: pytest.CaptureFi
 def test_errors_name_their_place(files: tuple[str, str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main([files[0], "--json"]) == 1
     captured = capsys.readouterr()
-    assert captured.out == ""
+    assert json.loads(captured.out) == {"error": captured.err.rstrip()}
     assert captured.err.startswith(f"{files[0]}:1:29: error: expected a known type, found 'T'")
     assert len(captured.err.splitlines()) == 1
 

@@ -199,6 +199,7 @@ def test_json_is_an_object_by_path(device: Device, capsys: pytest.CaptureFixture
     assert json.loads(out) == {
         "cell/count": {"outcome": "refused", "reason": "locked"},
         "cell/run": {"outcome": "written", "reason": ""},
+        "error": "cell/count: the source refused it: locked",
     }
     assert err == "cell/count: the source refused it: locked\n"
 

@@ -1,0 +1,86 @@
+"""With ``--json`` every command tells its failure on standard output, too, as one object."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import pytest
+
+from shmio.cli import dump, layout, supervisor, user
+
+Main = Callable[[Sequence[str]], int]
+NOT_THERE = ["--instance", "not-there"]
+FAILING: dict[Main, dict[str, list[str]]] = {
+    user.main: {
+        "list": NOT_THERE,
+        "get": [*NOT_THERE, "cell/a"],
+        "watch": [*NOT_THERE, "cell/a"],
+        "set": [*NOT_THERE, "cell/a", "1"],
+        "inject": NOT_THERE,
+        "step": NOT_THERE,
+        "replay": NOT_THERE,
+    },
+    dump.main: {
+        "record": NOT_THERE,
+        "info": ["no.mem"],
+        "verify": ["no.mem"],
+        "cut": ["no.mem", "-o", "part.mem"],
+        "export": ["no.mem", "-o", "x.csv"],
+        "diff": ["no.mem", "neither.mem"],
+        "cat": ["no.mem"],
+    },
+    supervisor.main: {
+        "status": ["-c", "no.toml"],
+        "list": [],
+        "reload": NOT_THERE,
+        "check": ["-c", "no.toml"],
+        "logs": NOT_THERE,
+    },
+}
+"""Words with which each verb that has ``--json`` fails; ``list`` of instances never does."""
+
+
+def verbs_with_json(parser: argparse.ArgumentParser) -> Iterator[str]:
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            yield from (name for name, verb in action.choices.items() if "--json" in verb.format_help())
+
+
+@pytest.mark.parametrize("module", [user, dump, supervisor])
+def test_each_verb_with_json_is_tried(module: object) -> None:
+    parser: argparse.ArgumentParser = module._parser()  # type: ignore[attr-defined]
+    main: Main = module.main  # type: ignore[attr-defined]
+    assert set(verbs_with_json(parser)) == set(FAILING[main])
+
+
+@pytest.mark.parametrize(
+    ("main", "words"),
+    [
+        *((main, [verb, *words]) for main, verbs in FAILING.items() for verb, words in verbs.items() if words),
+        (user.main, ["get", "--host", "unix:no.sock", "cell/a"]),
+        (layout.main, ["no.db"]),
+    ],
+    ids=lambda value: " ".join(value[:2]) if isinstance(value, list) else "",
+)
+def test_a_failure_is_an_object(
+    main: Main, words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main([*words, "--json"]) == 1
+    out, err = capsys.readouterr()
+    assert err
+    assert json.loads(out) == {"error": err.rstrip("\n")}
+
+
+def test_of_several_files_each_has_its_place(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("empty.mem").touch()
+    assert dump.main(["info", "--json", "no.mem", "empty.mem"]) == 1
+    out, err = capsys.readouterr()
+    assert [one["error"] for one in json.loads(out)] == err.splitlines()
+    assert len(err.splitlines()) == 2
