@@ -105,6 +105,9 @@ class Cell(Protocol):
     def clock(self) -> ClockState:
         """How time stands."""
 
+    def real_sources(self) -> list[str]:
+        """Names of the sources that steps do not move: those with a device."""
+
     def step(self, dt_s: float | None, count: int) -> None:
         """Move time by so many steps."""
 

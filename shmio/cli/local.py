@@ -132,6 +132,11 @@ class Local:
         """How time stands."""
         return self.attachment.clock
 
+    def real_sources(self) -> list[str]:
+        """Names of the sources that steps do not move: those with a device."""
+        blocks = map(self.attachment.block, self.attachment.sources)
+        return [block.source for block in blocks if not block.attributes.stepped]
+
     def step(self, dt_s: float | None, count: int) -> None:
         """Move time by so many steps."""
         for _ in range(count):

@@ -164,6 +164,10 @@ class Remote:
             mode, now.step, now.time_ns, 0, now.step, now.step_size_ns, now.playing, now.rate, note=now.note
         )
 
+    def real_sources(self) -> list[str]:
+        """Names of the sources that steps do not move; an endpoint of version 0.1 tells of none."""
+        return [one["name"] for one in self._client.status()["processes"] if one.get("real_time")]
+
     def step(self, dt_s: float | None, count: int) -> None:
         """Move time by so many steps."""
         with self._client.steps(count, dt_s) as steps:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 
 import msgspec
 
@@ -33,6 +34,7 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="step at RATE times real time (default: 1) until Ctrl-C; then time stands",
     )
     how.add_argument("--pause", action="store_true", help="have time stand, and do no step")
+    parser.add_argument("--yes", action="store_true", help="do not ask where time is real and sources have devices")
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
@@ -40,6 +42,8 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
     dt_s = None if options.dt_ms is None else options.dt_ms / 1000
     if options.pause and dt_s is not None:
         raise CommandError("--pause does no step: leave out --dt-ms")
+    if not options.yes:
+        _ask(cell)
     if options.play is not None:
         _play(cell, options.play, dt_s)
     elif options.pause:
@@ -49,6 +53,20 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
     clock = clock_status(cell.clock)
     print(dumps(msgspec.to_builtins(clock)) if options.json else clock_line(clock, options.dt_ms))
     return 0
+
+
+def _ask(cell: Cell) -> None:
+    """Ask before the devices' real time and the instance's part. CommandError: the answer is no, or nobody is there."""
+    if cell.clock.virtual or not (real := cell.real_sources()):
+        return
+    who = f"{real[0]} goes" if len(real) == 1 else f"{real[0]} and {len(real) - 1} more go"
+    what = f"the instance's time is real: a step makes it stand until a restart, while {who} on in real time"
+    if sys.stdin is None or not sys.stdin.isatty():
+        raise CommandError(f"{what}; to step all the same: --yes")
+    sys.stderr.write(f"{what}. Go on? [y/N] ")
+    sys.stderr.flush()
+    if sys.stdin.readline().strip().lower() not in ("y", "yes"):
+        raise CommandError("time was left as it is")
 
 
 def _play(cell: Cell, rate: float, dt_s: float | None) -> None:

@@ -286,5 +286,6 @@ def _process(found: Any) -> dict[str, Any]:
             "cycle": source.cycle if source.HasField("cycle") else None,
             "rate_hz": source.rate_hz,
             "overruns": source.overruns,
+            "real_time": source.real_time,
         }
     return process

@@ -33,13 +33,17 @@ class ProcessStatus(msgspec.Struct, kw_only=True):
 
 
 class SourceStatus(ProcessStatus, kw_only=True):
-    """A source: its process, and the newest frame of its block. ``cycle`` is null before the first."""
+    """A source: its process, and the newest frame of its block. ``cycle`` is null before the first.
+
+    ``real_time``: steps do not move it, as it has a device.
+    """
 
     quality: str
     reason: str
     cycle: int | None
     rate_hz: float
     overruns: int
+    real_time: bool
 
 
 class SupervisorStatus(msgspec.Struct):
@@ -218,6 +222,7 @@ def _process(
         cycle=cycle,
         rate_hz=counters.get("rate_mhz", 0) / 1000 if current and quality is not Quality.BAD else 0.0,
         overruns=counters.get("overruns", 0),
+        real_time=not block.attributes.stepped,
     )
 
 

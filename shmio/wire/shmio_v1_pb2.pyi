@@ -901,18 +901,20 @@ class Process(_message.Message):
     def __init__(self, name: _Optional[str] = ..., kind: _Optional[str] = ..., pid: _Optional[int] = ..., state: _Optional[str] = ..., restarts: _Optional[int] = ..., uptime_s: _Optional[float] = ..., note: _Optional[str] = ..., counters: _Optional[_Mapping[str, int]] = ..., source: _Optional[_Union[SourceState, _Mapping]] = ...) -> None: ...
 
 class SourceState(_message.Message):
-    __slots__ = ("quality", "reason", "cycle", "rate_hz", "overruns")
+    __slots__ = ("quality", "reason", "cycle", "rate_hz", "overruns", "real_time")
     QUALITY_FIELD_NUMBER: _ClassVar[int]
     REASON_FIELD_NUMBER: _ClassVar[int]
     CYCLE_FIELD_NUMBER: _ClassVar[int]
     RATE_HZ_FIELD_NUMBER: _ClassVar[int]
     OVERRUNS_FIELD_NUMBER: _ClassVar[int]
+    REAL_TIME_FIELD_NUMBER: _ClassVar[int]
     quality: str
     reason: str
     cycle: int
     rate_hz: float
     overruns: int
-    def __init__(self, quality: _Optional[str] = ..., reason: _Optional[str] = ..., cycle: _Optional[int] = ..., rate_hz: _Optional[float] = ..., overruns: _Optional[int] = ...) -> None: ...
+    real_time: bool
+    def __init__(self, quality: _Optional[str] = ..., reason: _Optional[str] = ..., cycle: _Optional[int] = ..., rate_hz: _Optional[float] = ..., overruns: _Optional[int] = ..., real_time: bool = ...) -> None: ...
 
 class StepRequest(_message.Message):
     __slots__ = ("dt_ns",)

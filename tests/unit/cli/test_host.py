@@ -277,6 +277,18 @@ def test_step(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
     simulate(instance, run)
 
 
+def test_step_asks_where_a_source_has_a_device(segment: Segment, capsys: pytest.CaptureFixture[str]) -> None:
+    def test(remote: Output, local: Output, _: Plant) -> None:
+        refused = remote("step")
+        assert refused == local("step")
+        assert (refused[0], "cell goes on in real time; to step all the same: --yes" in refused[2]) == (1, True)
+        assert remote("step", "--pause", "--yes")[0] == 0
+        assert remote("step", "--pause")[0] == 0, "it is not asked for again"
+
+    with Segment.open(segment.instance, writable=True) as opened:  # as another process, which sees who supervises
+        both(opened, capsys, test)
+
+
 def test_step_here(instance: str, capsys: pytest.CaptureFixture[str]) -> None:
     with stepped_segment(instance, "sim") as segment:
         model = Model(segment, "sim")

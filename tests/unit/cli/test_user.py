@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import signal
 import subprocess
@@ -15,6 +16,7 @@ from shmio.cli import target
 from shmio.cli.local import Local
 from shmio.cli.user import main
 from shmio.layout.model import Layout, Register
+from shmio.local.status import read_status
 from shmio.segment import BlockSpec, Segment
 from tests.unit.cli.terminal import Terminal
 
@@ -100,6 +102,52 @@ def test_a_step_and_a_rate_have_limits(
         main(["step", *words])
     assert stop.value.code == 2
     assert problem in capsys.readouterr().err
+
+
+class Keyboard(io.StringIO):
+    """Standard input of somebody at a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+REAL = "the instance's time is real: a step makes it stand until a restart, while cell goes on in real time"
+
+
+def mode(instance: str) -> str:
+    clock = read_status(instance).clock
+    return clock.mode if clock else ""
+
+
+@pytest.mark.parametrize("words", [(), ("--play",), ("--pause",)])
+def test_real_time_is_taken_from_a_device_by_no_script_that_does_not_say_so(
+    running: str, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]
+) -> None:
+    assert main(["step", "--instance", running, *words]) == 1
+    assert capsys.readouterr().err == f"{REAL}; to step all the same: --yes\n"
+    assert mode(running) == "wall"
+
+
+def test_real_time_is_taken_from_a_device_once_it_was_agreed_to(
+    running: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["step", "--instance", running, "--pause", "--json"]
+    for answer in ("\n", "n\n", ""):
+        monkeypatch.setattr("sys.stdin", Keyboard(answer))
+        assert main(command) == 1
+        told = capsys.readouterr()
+        assert (told.out, told.err) == ("", f"{REAL}. Go on? [y/N] time was left as it is\n")
+    assert mode(running) == "wall"
+    monkeypatch.setattr("sys.stdin", Keyboard("y\n"))
+    assert main(command) == 0
+    assert json.loads(capsys.readouterr().out)["mode"] == "virtual"
+    monkeypatch.setattr("sys.stdin", None)
+    assert main(command) == 0, "it is not asked for again"
+
+
+def test_who_says_yes_is_not_asked(running: str) -> None:
+    assert main(["step", "--instance", running, "--pause", "--yes"]) == 0
+    assert mode(running) == "virtual"
 
 
 def test_watch_ends_with_ctrl_c(running: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -95,7 +95,7 @@ def test_all_is_well(cell: Cell, instance: str) -> None:
     assert source.uptime_s >= 0
     assert isinstance(source, SourceStatus)
     assert (source.quality, source.reason, source.cycle) == ("good", "", 5)
-    assert (source.rate_hz, source.overruns) == (49.9, 3)
+    assert (source.rate_hz, source.overruns, source.real_time) == (49.9, 3, True)
     assert "rate_mhz" not in source.counters
     assert grpc.counters == {"streams": 7, "messages": 3, "dropped": 0, "published": 1, "refused": 250}
     assert type(grpc) is ProcessStatus, "quality is for sources"

@@ -108,6 +108,7 @@ def _process(process: SourceStatus | ProcessStatus) -> wire.Process:
     if isinstance(process, SourceStatus):
         found.source.quality, found.source.reason = process.quality, process.reason
         found.source.rate_hz, found.source.overruns = process.rate_hz, process.overruns
+        found.source.real_time = process.real_time
         if process.cycle is not None:
             found.source.cycle = process.cycle
     return found
