@@ -28,8 +28,8 @@ LOOK_S: Final = 0.2
 SLOWEST_S: Final = 20.0
 """So long each test may take, and ten times what it takes without a fault."""
 PR_SET_PDEATHSIG: Final = 1
-NATIVE: Final = "tests/native/test_stress"
-"""Tests of C alone."""
+NATIVE: Final = "tests/native/"
+"""The processes that these tests start run C alone."""
 STARTS: Final = {"subprocess.Popen", "os.posix_spawn", "os.fork", "os.exec"}
 
 
@@ -113,8 +113,12 @@ class Judge:
         return Verdict(mutant, caught, len(names), time.monotonic() - begun_s)
 
     def _plan(self, changed: Change | None, broken: Path) -> tuple[list[str], Callable[[list[str], float], list[str]]]:
-        """The tests, those first that end soonest, and what runs them."""
-        usable = sorted((name for name in self._known if self._known[name].passed), key=lambda n: self._known[n].took_s)
+        """The tests, those of the module first, then those that end soonest, and what runs them."""
+
+        def turn(name: str) -> tuple[bool, float]:
+            return Path(name.partition("::")[0]).stem != f"test_{broken.stem}", self._known[name].took_s
+
+        usable = sorted((name for name in self._known if self._known[name].passed), key=turn)
         if changed is None:
             return usable, self._anew
         lines = changed.lines

@@ -27,8 +27,12 @@ from shmio.segment import (
     instances,
     segment_size,
 )
+from shmio.segment._atomics import RAW_OFFSET
 from shmio.segment.cursor import Cursor
 from shmio.segment.header import GENERATION_OFFSET, HEADER_SIZE
+from shmio.segment.processes import SUPERVISOR_LOCK
+from shmio.segment.segment import PREFIX
+from shmio.segment.shm import SharedObject, unlink
 
 LAYOUT = Layout(
     "DB1", 1, 6, False, (Register("speed", "REAL", (), 0, None, 4, 1), Register("on", "BOOL", (), 4, 0, 1, 1))
@@ -73,6 +77,46 @@ def test_a_second_supervisor_is_refused_with_the_pid_of_the_first(instance: str)
     with Segment.create(instance, [block()], PROCESSES) as segment:
         with pytest.raises(AlreadyRunningError, match=f"pid {os.getpid()}"):
             Segment.create(instance, [block()], PROCESSES)
+        segment.unlink()
+
+
+@pytest.mark.parametrize("cleared", [False, True])
+def test_one_that_another_supervisor_takes_for_left_over_is_given_up(
+    instance: str, monkeypatch: pytest.MonkeyPatch, cleared: bool
+) -> None:
+    """The other one comes between creation and lock; it may have removed the name again already."""
+    create = SharedObject.create
+    others = []
+
+    def overtaken(name: str, group: str | None = None) -> SharedObject:
+        shared = create(name, group)
+        other = SharedObject.open(name, writable=True)
+        assert other.try_lock(SUPERVISOR_LOCK)
+        if cleared:
+            unlink(name)
+            other.unlock(SUPERVISOR_LOCK)
+        others.append(other)
+        return shared
+
+    monkeypatch.setattr(SharedObject, "create", overtaken)
+    with pytest.raises(AlreadyRunningError, match=f"just starting instance {instance}"):
+        Segment.create(instance, [block()], PROCESSES)
+    for other in others:
+        assert other.size == 0, "it is the other one's by now"
+        assert other.current() is not cleared
+        other.close()
+    unlink(PREFIX + instance)
+
+
+def test_a_ring_without_a_readable_frame_is_told_with_the_remedy(instance: str) -> None:
+    with Segment.create(instance, [block()], PROCESSES) as segment:
+        writer = segment.writer("cell")
+        assert segment.blocks["cell"].latest() is None
+        writer.publish(b"unique", cycle=0)
+        at = bytes(segment.memory).find(b"unique") - RAW_OFFSET
+        segment.memory[at : at + 8] = (2 * 9 + 1).to_bytes(8, "little")  # a later frame is being written there
+        with pytest.raises(SegmentError, match=r"turns faster.*ring_mb"):
+            segment.blocks["cell"].latest()
         segment.unlink()
 
 
