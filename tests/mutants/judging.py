@@ -119,8 +119,9 @@ class Judge:
             return Path(name.partition("::")[0]).stem != f"test_{broken.stem}", self._known[name].took_s
 
         usable = sorted((name for name in self._known if self._known[name].passed), key=turn)
+        python = [name for name in usable if not name.startswith(NATIVE)]
         if changed is None:
-            return usable, self._anew
+            return python if broken.suffix == ".py" else usable, self._anew
         lines = changed.lines
         covering = [
             name
@@ -128,9 +129,8 @@ class Judge:
             if any(file == str(broken) and first in lines for file, first in self._known[name].calls)
         ]
         if not covering:  # called while a module is imported, or in other processes only
-            return usable, self._anew
-        starting = [name for name in usable if self._known[name].starts_processes and name not in covering]
-        beyond = [name for name in starting if not name.startswith(NATIVE)]
+            return python, self._anew
+        beyond = [name for name in python if self._known[name].starts_processes and name not in covering]
 
         def run(names: list[str], limit_s: float) -> list[str]:
             def apply() -> None:

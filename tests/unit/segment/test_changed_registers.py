@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Layout, Register
+from shmio.layout.topic import find
 from shmio.layout.values.codec import codec
 from shmio.segment.changed_registers import ChangeScan
 
@@ -56,6 +57,16 @@ def test_every_single_bit(bit: int) -> None:
     changed = ChangeScan(LAYOUT.registers).changed(old, bytes(new))
     assert changed == naive(old, bytes(new))
     assert len(changed) <= 1
+
+
+@pytest.mark.parametrize(("low", "high"), [(0, 3), (2, 5), (0, 7), (3, 8), (5, 19), (8, 19), (16, 19), (19, 19)])
+def test_of_a_slice_of_a_row_of_bits_its_own_bits_alone(low: int, high: int) -> None:
+    layout = compile_sources([Source("x.toml", b'[registers]\nrow = "ARRAY[0..19] OF BOOL"')]).layouts[0]
+    part = find(layout, f"row/{low}..{high}")
+    for bit in range(layout.size * 8):
+        new = bytearray(layout.size)
+        new[bit // 8] |= 1 << bit % 8
+        assert ChangeScan([part]).changed(bytes(layout.size), bytes(new)) == ([0] if low <= bit <= high else []), bit
 
 
 def test_bytes_are_compared_not_values() -> None:
