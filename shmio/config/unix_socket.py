@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from shmio.config.folder import unwritable
 from shmio.errors import EndpointError
 
 
@@ -35,8 +36,8 @@ def obstacle(path: str) -> str | None:
     folder = Path(path).parent
     if not folder.is_dir():
         return f"there is no folder {folder}: mkdir -p it, or choose another path"
-    if not os.access(folder, os.W_OK | os.X_OK):
-        return f"the folder {folder} cannot be written"
+    if (found := unwritable(folder)) and not found.full:
+        return found.reason
     try:
         mode = os.lstat(path).st_mode
     except FileNotFoundError:

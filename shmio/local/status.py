@@ -132,7 +132,8 @@ def status_of(segment: Segment, remedy: str, asking: str = "") -> InstanceStatus
         status.state = str(InstanceState.DEGRADED)
     else:
         status.supervisor = SupervisorStatus(pid, _seconds(now_ns - segment.supervised_since_ns))
-        status.state = str(_state(state, processes))
+        status.note = segment.note
+        status.state = str(_state(state, processes, status.note))
         if silence := supervisor_silence(segment):
             status.state, status.note = str(InstanceState.DEGRADED), silence
     status.processes = processes
@@ -160,12 +161,12 @@ def supervisor_silence(segment: Segment) -> str | None:
     )
 
 
-def _state(told: InstanceState, processes: list[SourceStatus | ProcessStatus]) -> InstanceState:
+def _state(told: InstanceState, processes: list[SourceStatus | ProcessStatus], note: str) -> InstanceState:
     """The state as told while starting or stopping; else by what is read here, which is newer."""
     if told not in (InstanceState.RUNNING, InstanceState.DEGRADED):
         return told
     running = [p.state == str(Phase.RUNNING) and not complaint(p.kind, p.note) for p in processes]
-    return assess(running, [Quality[p.quality.upper()] for p in processes if isinstance(p, SourceStatus)])
+    return assess(running, [Quality[p.quality.upper()] for p in processes if isinstance(p, SourceStatus)], note)
 
 
 def complaint(kind: str, note: str) -> str:
@@ -173,12 +174,12 @@ def complaint(kind: str, note: str) -> str:
     return note if kind in ("mqtt", "grpc") or (kind == "recorder" and not note.startswith("to ")) else ""
 
 
-def assess(running: Sequence[bool], qualities: Sequence[Quality | None]) -> InstanceState:
+def assess(running: Sequence[bool], qualities: Sequence[Quality | None], note: str = "") -> InstanceState:
     """State of an instance after its start: degraded when a process is not running or a source is bad.
 
-    ``running``: of each process, whether it runs without a :func:`complaint`.
+    ``running``: of each process, whether it runs without a :func:`complaint`. ``note``: what else is wrong.
     """
-    healthy = all(running) and not any(q in (None, Quality.BAD) for q in qualities)
+    healthy = not note and all(running) and not any(q in (None, Quality.BAD) for q in qualities)
     return InstanceState.RUNNING if healthy else InstanceState.DEGRADED
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from shmio import realtime
 from shmio.config import Config, Mqtt
+from shmio.config.folder import unwritable
 from shmio.config.mqtt.accounts import read_accounts, read_password
 from shmio.config.mqtt.tls import client_context, server_context
 from shmio.config.tls import read_tls
@@ -17,8 +18,8 @@ from shmio.config.tokens import read_tokens
 from shmio.errors import ConfigError
 
 
-def check_host(config: Config, catching: Callable[[], AbstractContextManager[None]]) -> None:
-    """Group, priorities, folders of log files and recordings, TLS files, tokens. Nothing is made.
+def check_host(config: Config, catching: Callable[[], AbstractContextManager[None]]) -> list[str]:
+    """Group, priorities, folders of log files and recordings, TLS files, tokens; warnings. Nothing is made.
 
     ``catching``: what makes a context that keeps a ConfigError for later.
     """
@@ -30,11 +31,12 @@ def check_host(config: Config, catching: Callable[[], AbstractContextManager[Non
     for index, emulator in enumerate(config.emulator):
         with catching():
             _check_priority(f"emulator[{index}]", emulator.realtime_priority)
+    warnings: list[str] = []
     with catching():
-        _check_folder("instance.log_dir", config.log_dir)
+        warnings += _check_folder("instance.log_dir", config.log_dir)
     if config.recorder:
         with catching():
-            _check_folder("recorder.directory", config.path(config.recorder.directory))
+            warnings += _check_folder("recorder.directory", config.path(config.recorder.directory))
     if config.grpc:
         with catching():
             if config.grpc.tls:
@@ -44,6 +46,7 @@ def check_host(config: Config, catching: Callable[[], AbstractContextManager[Non
     if config.mqtt:
         with catching():
             _check_mqtt(config.mqtt)
+    return warnings
 
 
 def _check_mqtt(mqtt: Mqtt) -> None:
@@ -82,14 +85,11 @@ def _check_priority(key: str, priority: int | None) -> None:
         raise ConfigError(f"{key}.{error}") from None
 
 
-def _check_folder(key: str, folder: Path) -> None:
-    """Whether it is there, or can be made, and can be written."""
-    try:
-        place = next(path for path in (folder, *folder.parents) if path.exists())
-    except OSError as error:  # a name too long, a folder above that cannot be searched
-        raise ConfigError(f"{key}: {folder}: {error.strerror}") from None
-    if not place.is_dir():
-        raise ConfigError(f"{key}: {place} is no folder")
-    if not os.access(place, os.W_OK | os.X_OK):
-        why = "cannot be written" if place == folder else f"cannot be made: no permission in {place}"
-        raise ConfigError(f"{key}: {folder} {why}")
+def _check_folder(key: str, folder: Path) -> list[str]:
+    """ConfigError: it cannot be made or written. A warning if its disk is full: the plant is served all the same."""
+    found = unwritable(folder)
+    if found is None:
+        return []
+    if found.full:
+        return [f"{key}: {found.reason}"]
+    raise ConfigError(f"{key}: {found.reason}")

@@ -73,7 +73,7 @@ def prepare(file: Path, mode: str = "live", keys: Mapping[str, Any] | None = Non
             faults.raise_any()
             faults = Faults(file, msgspec.to_builtins(config))  # its sources are not those of the file
         files = LayoutFiles(config)
-        check_host(config, faults.catching)
+        notices += check_host(config, faults.catching)
         if not faults:
             with faults.catching():
                 check_listening(config)

@@ -29,6 +29,8 @@ CONTROL_SIZE: Final = 256
 SUPERVISED_SINCE_OFFSET: Final = 496
 HEARTBEAT_OFFSET: Final = 504
 SUPERVISOR_CELL: Final = 512
+NOTE_CELL: Final = 528
+NOTE_SIZE: Final = 488
 CONFIG_OFFSET: Final = 1024
 CONFIG_SIZE: Final = 3072
 
@@ -239,6 +241,16 @@ def read_supervisor(memory: memoryview) -> tuple[int, State]:
         return 0, State.STARTING
     pid, state = _SUPERVISOR.unpack(data)
     return pid, State(state) if state <= State.STOPPED else State.STOPPED
+
+
+def write_note(memory: memoryview, note: str) -> None:
+    """Tell what is wrong with the instance itself; empty: nothing."""
+    _atomics.cell_write(memory, NOTE_CELL, cut(note, NOTE_SIZE).ljust(NOTE_SIZE, b"\0"))
+
+
+def read_note(memory: memoryview) -> str:
+    """The same, as the supervisor last wrote it."""
+    return text(_atomics.cell_read(memory, NOTE_CELL, NOTE_SIZE) or b"")
 
 
 def text(field: bytes) -> str:

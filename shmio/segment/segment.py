@@ -326,6 +326,11 @@ class Segment:
         return header.read_supervisor(self.memory)
 
     @property
+    def note(self) -> str:
+        """What the supervisor last told to be wrong with the instance itself; empty: nothing."""
+        return header.read_note(self.memory)
+
+    @property
     def supervisor_heartbeat_ns(self) -> int:
         """CLOCK_MONOTONIC of the supervisor's last beat."""
         return _atomics.load64(self.memory, header.HEARTBEAT_OFFSET)
@@ -340,9 +345,10 @@ class Segment:
         """Whether a supervisor is alive."""
         return self.shared.locked(SUPERVISOR_LOCK)
 
-    def set_state(self, pid: int, state: State) -> None:
-        """Tell supervisor and state; the supervisor's alone."""
+    def set_state(self, pid: int, state: State, note: str = "") -> None:
+        """Tell supervisor and state, and what is wrong beside the processes; the supervisor's alone."""
         header.write_supervisor(self.memory, pid, state)
+        header.write_note(self.memory, note)
         supervisor_beat(self.memory)
 
     def lead_to(self, control: str, config: Path) -> None:

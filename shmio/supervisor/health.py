@@ -11,6 +11,7 @@ from shmio.local.status import assess
 from shmio.segment import Quality, Segment
 from shmio.segment import State as InstanceState
 from shmio.supervisor.fleet import Fleet
+from shmio.supervisor.log_folder import LogFolder
 from shmio.supervisor.managed import log
 from shmio.supervisor.notify import Notifier
 from shmio.supervisor.states import State
@@ -23,12 +24,18 @@ class Health:
     """What the segment, the service manager and the log are told about an instance."""
 
     def __init__(
-        self, segment: Segment, fleet: Fleet, notifier: Notifier, on_state: Callable[[InstanceState], None]
+        self,
+        segment: Segment,
+        fleet: Fleet,
+        notifier: Notifier,
+        logs: LogFolder,
+        on_state: Callable[[InstanceState], None],
     ) -> None:
         """``on_state`` is told each new state."""
         self._segment = segment
         self._fleet = fleet
         self._notifier = notifier
+        self._logs = logs
         self._on_state = on_state
         self._state = InstanceState.STARTING
         self._qualities: list[Quality | None] = []
@@ -48,28 +55,29 @@ class Health:
 
     def tell(self, now_ns: int, *, started: bool, stopping: bool) -> None:
         """Publish the state of the instance, which is the supervisor's heartbeat too."""
-        state = self._assess(now_ns) if started and not stopping else InstanceState.STARTING
+        note = self._logs.problem(now_ns)
+        state = self._assess(now_ns, note) if started and not stopping else InstanceState.STARTING
         if stopping:
             state = InstanceState.STOPPING
-        self._segment.set_state(os.getpid(), state)
+        self._segment.set_state(os.getpid(), state, note)
         self._notifier.beat(now_ns)
         if state is not self._state:
             if self._state is InstanceState.STARTING and state is not InstanceState.STOPPING:
                 self._notifier.ready()
             self._state = state
-            reasons = ", ".join(self._weak()) if state is InstanceState.DEGRADED else ""
+            reasons = ", ".join([*self._weak(), *filter(None, [note])]) if state is InstanceState.DEGRADED else ""
             told = f"{state}: {reasons}" if reasons else str(state)
             log.info("instance %s", told)
             self._notifier.status(told)
             self._on_state(state)
 
-    def _assess(self, now_ns: int) -> InstanceState:
+    def _assess(self, now_ns: int, note: str) -> InstanceState:
         if now_ns - self._qualities_ns >= QUALITY_S * 1e9 or len(self._qualities) != len(self._segment.blocks):
             self._qualities, self._qualities_ns = self.look(), now_ns
             for managed in self._fleet:
                 managed.listen()
         well = [m.life.state is State.RUNNING and not m.complaint for m in self._fleet]
-        return assess(well, self._qualities)
+        return assess(well, self._qualities, note)
 
     def _weak(self) -> list[str]:
         """What makes the instance degraded."""

@@ -21,6 +21,7 @@ from shmio.supervisor import policy
 from shmio.supervisor.control import Answer, ControlServer, Reload, Request, Restart, Stop
 from shmio.supervisor.fleet import TICK_S, Fleet
 from shmio.supervisor.health import Health
+from shmio.supervisor.log_folder import LogFolder
 from shmio.supervisor.managed import brief, log
 from shmio.supervisor.notify import Notifier
 from shmio.supervisor.policy import Limits
@@ -125,7 +126,8 @@ class Supervisor:
             self._control = ControlServer(path, self._selector, self._handle)
             stack.callback(self._control.close)
             self._fleet = Fleet(self._segment, self._selector, self._limits, self._modules)
-            self._health = Health(self._segment, self._fleet, self._notifier, self._on_state)
+            logs = LogFolder(self._plan.log_dir)
+            self._health = Health(self._segment, self._fleet, self._notifier, logs, self._on_state)
             self._changer = Changer(self._fleet, self._segment, self._notifier, self._plan, self._replan, self._limits)
             if found:  # until all of it is ours, a failure leaves it for the next attempt
                 for slot, child in found.children:

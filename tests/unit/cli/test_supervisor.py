@@ -431,6 +431,11 @@ TAKEN = "is the port of emulator[0].listen (127.0.0.1:1102) already; choose anot
         ('name = "a50"', 'name = "a50"\nlog_dir = "db201.db"', "instance.log_dir: "),
         ('name = "a50"', 'name = "a50"\nlog_dir = "db201.db/logs"', "instance.log_dir: "),
         ('directory = "dumps"', 'directory = "db201.db"', "recorder.directory: "),
+        (
+            'directory = "dumps"',
+            'directory = "/proc/dumps"',
+            "recorder.directory: /proc/dumps cannot be made",
+        ),
         ('directory = "dumps"', f'directory = "{"x" * 300}"', "recorder.directory: "),
         ("[grpc]", '[grpc]\ntls = {certificate = "db201.db", key = "k"}', "grpc.tls.key: "),
         ("[grpc]", '[grpc]\ntls = {certificate = "db201.db", key = "db201.db"}', "grpc.tls.certificate: "),

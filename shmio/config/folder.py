@@ -1,0 +1,61 @@
+"""Whether a folder can be written, found out by writing: permissions alone do not tell of full and read-only disks."""
+
+from __future__ import annotations
+
+import errno
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+_PROBE: Final = bytes(4096)  # a file without data has room on a full disk, too
+_FULL: Final = (errno.ENOSPC, errno.EDQUOT)
+_NO_UNNAMED: Final = (errno.EOPNOTSUPP, errno.EISDIR)
+_MEANING: Final = {
+    errno.ENOENT: "its file system takes no files: choose another folder",
+    errno.EROFS: "it is mounted read-only: remount it, or choose another folder",
+    errno.ENOSPC: "the disk is full: make room, or choose another folder",
+    errno.EDQUOT: "the disk quota is used up: make room, or choose another folder",
+    errno.EACCES: "no permission: let this user write there, or choose another folder",
+    errno.EPERM: "no permission: let this user write there, or choose another folder",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Obstacle:
+    """Why a folder cannot be written, and what to do. ``full``: there is no room, which may change at any time."""
+
+    reason: str
+    full: bool = False
+
+
+def unwritable(folder: Path) -> Obstacle | None:
+    """Why no file can be made in a folder, which may have to be made first, and what to do; None if one can.
+
+    Nothing is left there. The file system may take its time to answer.
+    """
+    try:
+        place = next(path for path in (folder, *folder.parents) if path.exists())
+    except OSError as error:  # a name too long, a folder above that cannot be searched
+        return Obstacle(f"{folder}: {error.strerror}")
+    if not place.is_dir():
+        return Obstacle(f"{place} is no folder")
+    try:
+        _write(place)
+    except OSError as error:
+        what = f"{folder} cannot be written" if place == folder else f"{folder} cannot be made in {place}"
+        return Obstacle(f"{what}: {_MEANING.get(error.errno or 0, error.strerror)}", error.errno in _FULL)
+    return None
+
+
+def _write(folder: Path) -> None:
+    try:
+        descriptor = os.open(folder, os.O_TMPFILE | os.O_WRONLY | os.O_CLOEXEC, 0o600)
+    except OSError as error:
+        if error.errno not in _NO_UNNAMED:
+            raise
+        descriptor, name = tempfile.mkstemp(prefix=".shmio-", dir=folder)
+        Path(name).unlink()
+    with os.fdopen(descriptor, "wb", buffering=0) as file:
+        file.write(_PROBE)

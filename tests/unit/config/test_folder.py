@@ -1,0 +1,66 @@
+"""Whether a folder can be written: as who writes there will find it, and with nothing left behind."""
+
+from __future__ import annotations
+
+import errno
+import os
+from pathlib import Path
+
+import pytest
+
+from shmio.config.folder import Obstacle, unwritable
+
+
+@pytest.mark.parametrize("place", ["", "new", "new/and/deeper"])
+def test_one_that_can_be_written_stays_as_it_is(place: str, tmp_path: Path) -> None:
+    assert unwritable(tmp_path / place) is None
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", [errno.EOPNOTSUPP, errno.EISDIR])
+def test_a_file_system_without_unnamed_files_is_tried_with_one_that_has_a_name(
+    kind: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    really, made = os.open, []
+
+    def refuse_unnamed(path: str, flags: int, *rest: int, **named: int) -> int:
+        if flags & os.O_TMPFILE == os.O_TMPFILE:
+            raise OSError(kind, os.strerror(kind))
+        made.append(path)
+        return really(path, flags, *rest, **named)
+
+    monkeypatch.setattr(os, "open", refuse_unnamed)
+    assert unwritable(tmp_path) is None
+    assert len(made) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("number", "told"),
+    [
+        (errno.ENOSPC, "the disk is full: make room"),
+        (errno.EDQUOT, "the disk quota is used up: make room"),
+        (errno.EROFS, "it is mounted read-only: remount it"),
+        (errno.EACCES, "no permission: let this user write there"),
+        (errno.EIO, "Input/output error"),
+    ],
+)
+def test_what_is_wrong_is_told_with_what_to_do(
+    number: int, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> int:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(os, "open", refuse)
+    for folder, what in (("", "cannot be written"), ("/new", f"cannot be made in {tmp_path}")):
+        found = unwritable(Path(f"{tmp_path}{folder}"))
+        assert found is not None
+        assert found.reason.startswith(f"{tmp_path}{folder} {what}: {told}")
+        assert found.full == ("make room" in told)
+
+
+def test_a_file_system_that_takes_no_files_is_found_out_as_root_too(tmp_path: Path) -> None:
+    for folder in ("/proc", "/proc/logs"):
+        assert "its file system takes no files: choose another folder" in str(unwritable(Path(folder)))
+    (tmp_path / "file").touch()
+    assert unwritable(tmp_path / "file/logs") == Obstacle(f"{tmp_path}/file is no folder")
