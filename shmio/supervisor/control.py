@@ -91,6 +91,9 @@ REQUEST_S: Final = 2.0
 """Time that a client has to send its request."""
 TURN_S: Final = 0.5
 """How often a waiting client looks whether the supervisor still is."""
+CONNECT_S: Final = 0.05
+"""How often it is tried to connect while too many others wait."""
+_TOO_MANY: Final = "too many control connections at once"
 _CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
 
@@ -168,12 +171,19 @@ class ControlServer:
         if not _trusted(client):
             _send(client, {"error": "only the supervisor's own user and root may control it"})
             client.close()
-        elif len(self._clients) >= MAX_CLIENTS:
-            _send(client, {"error": "too many control connections at once"})
+        elif not self._has_room():
+            _send(client, {"error": _TOO_MANY})
             client.close()
         else:
             self._clients[client] = bytearray(), time.monotonic() + REQUEST_S
             self._selector.register(client, selectors.EVENT_READ, lambda: self._receive(client))
+
+    def _has_room(self) -> bool:
+        """Whether one more can be served, if need be in place of who has waited longest without a request."""
+        silent = (client for client, (_, deadline) in self._clients.items() if deadline is not None)
+        if len(self._clients) >= MAX_CLIENTS and (longest := next(silent, None)):
+            self.answer(longest, {"error": _TOO_MANY})
+        return len(self._clients) < MAX_CLIENTS
 
     def _receive(self, client: socket.socket) -> None:
         if client not in self._clients:  # answered by what came before it in the same round
@@ -254,8 +264,7 @@ def request(
         deadline = time.monotonic() + timeout_s
         received = bytearray()
         try:
-            client.settimeout(timeout_s)
-            client.connect(path)
+            _connect(client, path, deadline, lost)
             client.sendall(msgspec.json.encode(message) + b"\n")
             while not received.endswith(b"\n"):
                 data = _wait(client, deadline, lost)
@@ -275,6 +284,22 @@ def request(
     if "error" in answer:
         raise ControlError(str(answer["error"]))
     return answer
+
+
+def _connect(client: socket.socket, path: str, deadline: float, lost: Callable[[], str | None]) -> None:
+    """Connect, as soon as there is room among those that wait for the supervisor; TimeoutError, ControlError."""
+    while True:
+        client.settimeout(max(0.001, deadline - time.monotonic()))
+        try:
+            client.connect(path)
+        except BlockingIOError:  # no room: a UNIX socket does not wait for it
+            if reason := lost():
+                raise ControlError(reason) from None
+            if time.monotonic() >= deadline:
+                raise TimeoutError from None
+            time.sleep(CONNECT_S)
+        else:
+            return
 
 
 def _wait(client: socket.socket, deadline: float, lost: Callable[[], str | None]) -> bytes:

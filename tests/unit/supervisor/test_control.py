@@ -10,7 +10,7 @@ import stat
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import msgspec
@@ -136,6 +136,32 @@ def test_a_client_stops_waiting_when_there_is_no_point(tmp_path: Path) -> None:
             control.request(str(tmp_path / "s"), Where(), 3600, lambda: "it is asleep")
 
 
+def test_a_client_waits_until_there_is_room(tmp_path: Path) -> None:
+    """Of a UNIX socket that has as many as may wait, connect says so at once."""
+    path = str(tmp_path / "s")
+    with ExitStack() as stack:
+        listener = stack.enter_context(socket.socket(socket.AF_UNIX))
+        listener.bind(path)
+        listener.listen(0)
+        first = stack.enter_context(socket.socket(socket.AF_UNIX))
+        first.connect(path)
+        with pytest.raises(ControlError, match="has not answered within 0 s"):
+            control.request(path, Where(), 0)
+        with pytest.raises(ControlError, match="it is asleep"):
+            control.request(path, Where(), 3600, lambda: "it is asleep")
+
+        def make_room() -> None:  # once it has seen that there is none
+            stack.enter_context(listener.accept()[0])
+            with listener.accept()[0] as client:
+                client.recv(4096)
+                client.sendall(b'{"ok": true}\n')
+
+        thread = threading.Thread(target=make_room)
+        answer = control.request(path, Where(), 3600, lambda: None if thread.is_alive() else thread.start())
+        thread.join()
+    assert answer == {"ok": True}
+
+
 def test_a_request_may_come_in_pieces(served: Served) -> None:
     client = served.client(b'{"do": ')
     assert served.requests == []
@@ -182,12 +208,16 @@ def test_a_silent_client_is_dropped_when_its_time_is_over(served: Served, monkey
 
 
 def test_too_many_clients_are_turned_away(served: Served) -> None:
-    clients = [served.client() for _ in range(control.MAX_CLIENTS)]
-    assert answer_to(served.client()) == {"error": "too many control connections at once"}
+    refused = {"error": "too many control connections at once"}
+    silent = [served.client() for _ in range(control.MAX_CLIENTS)]
+    clients = [served.client(b'{"do": "where"}\n') for _ in silent]
+    assert [answer_to(client) for client in silent] == [refused] * len(silent), "the silent make room"
+    assert len(served.requests) == control.MAX_CLIENTS
+    assert answer_to(served.client()) == refused, "those that are served do not"
     clients.pop().close()
     served.turn()
     clients.append(served.client(b'{"do": "where"}\n'))
-    assert served.requests[0][0] == Where()
+    assert len(served.requests) == control.MAX_CLIENTS + 1
     for client in clients:
         client.close()
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,7 @@ import pytest
 from shmio.errors import ControlError
 from shmio.plan.processes import Job
 from shmio.segment import Segment, instances
+from shmio.supervisor import control
 from shmio.supervisor.control import Restart, Stop, Where
 from tests.unit.supervisor.harness import CELL, DEADLINE_S, HERE, ROOT, Launch, until
 
@@ -327,3 +330,31 @@ def test_the_segment_tells_who_supervises(launch: Launch, runtime: Path) -> None
         assert segment.supervised
         assert segment.supervisor[0] == cell.process.pid
         assert segment.header.control == str(runtime / "shmio" / f"{cell.instance}.sock")
+
+
+def test_rude_clients_of_the_control_socket_keep_nobody_away(launch: Launch) -> None:
+    cell = launch()
+    cell.wait_state("running")
+    with Segment.open(cell.instance) as segment:
+        path = segment.header.control
+
+    def connected(stack: ExitStack) -> socket.socket:
+        client = stack.enter_context(socket.socket(socket.AF_UNIX))
+        client.connect(path)  # waits until there is room, as it has no time-out yet
+        client.settimeout(DEADLINE_S)
+        return client
+
+    with ExitStack() as stack:
+        for _ in range(3 * control.MAX_CLIENTS):
+            connected(stack)  # never sends
+        for _ in range(control.MAX_CLIENTS):
+            connected(stack).sendall(b'{"do": "where"}\n')  # never reads
+        endless = connected(stack)
+        with pytest.raises((BrokenPipeError, ConnectionResetError)):
+            endless.sendall(b" " * (64 << 20))  # dropped, or the supervisor would have to keep it all
+        for _ in range(control.MAX_CLIENTS):
+            connected(stack).sendall(b'{"do"')  # never ends
+        assert cell.request(Restart("plc")) == {"ok": True}
+        assert cell.status().state == "running"
+        assert cell.request(Stop()) == {"ok": True}
+    assert cell.wait_end() == 0
