@@ -58,7 +58,16 @@ GROUPS: Final = {
             "shmio/endpoints/grpc/commands/publish.py",
             "shmio/endpoints/grpc/services/simlog_v2.py",
         ),
-        ("tests/unit/endpoints/grpc",),
+        (
+            "tests/unit/endpoints/grpc/commands",
+            "tests/unit/endpoints/grpc/services",
+            "tests/unit/endpoints/grpc/streams",
+            "tests/unit/endpoints/grpc/test_grpc.py",
+            "tests/unit/endpoints/grpc/test_inject_v2.py",
+            "tests/unit/endpoints/grpc/test_limits.py",
+            "tests/unit/endpoints/grpc/test_stepping.py",
+            "tests/unit/endpoints/grpc/test_structures.py",
+        ),
     ),
     "recorder": Group(
         ("shmio/recorder/*.py", "shmio/recording/format/records.py"),
