@@ -11,7 +11,9 @@ from pathlib import Path
 import pytest
 
 from shmio.errors import RecordingError
+from shmio.recorder import output as module
 from shmio.recorder.output import Output, create
+from shmio.testing.cell import until
 
 NOW = datetime(2026, 11, 21, 8, 30, 5, tzinfo=UTC)
 
@@ -98,3 +100,24 @@ def test_a_failed_fsync_is_not_forgotten(tmp_path: Path, monkeypatch: pytest.Mon
     calls.put(True)
     assert not output.close(30)
     assert (output.problem, output.written, output.synced) == (doubt, 30, 10)
+
+
+@pytest.mark.parametrize("call", ["pwrite", "fsync"])
+def test_a_disk_that_does_not_answer_is_named_until_it_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
+) -> None:
+    answered, really = threading.Event(), getattr(os, call)
+
+    def held(*arguments: object) -> object:
+        answered.wait(30)
+        return really(*arguments)
+
+    monkeypatch.setattr(os, call, held)
+    monkeypatch.setattr(module, "SLOW_S", -1.0)
+    output = Output(*create(tmp_path, "a50", NOW), limit_bytes=100, fsync_s=1e-9)
+    output.write(b"x")
+    output.flush()
+    until(lambda: output.problem.startswith(f"{output.path}: the disk has not answered for "), call)
+    answered.set()
+    assert output.close(30)
+    assert output.problem == ""

@@ -9,6 +9,7 @@ import pytest
 import zstandard
 from mcap.opcode import Opcode
 
+from shmio.recorder import predecessor
 from shmio.recorder.predecessor import places
 from shmio.recording.format.encoding import Place
 from shmio.recording.format.records import MAGIC, Record
@@ -51,6 +52,18 @@ def test_a_large_file_that_is_no_recording_is_not_searched_to_its_end(segment: S
     found, beats = look(segment, tmp_path)
     assert found == {}
     assert 1 <= beats < 10
+
+
+def test_of_many_files_those_are_looked_into_that_are_named_last(
+    segment: Segment, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file.rename(tmp_path / f"{segment.instance}-20000101T000000Z.mem")
+    publish(segment.writer("cell"), 5, first=20)
+    work = recorder(segment, tmp_path)
+    assert work.close()
+    monkeypatch.setattr(predecessor, "MAX_FILES", 1)
+    found, _ = look(segment, tmp_path)
+    assert found["cell"].frame == 25
 
 
 def test_a_search_behind_damage_beats(segment: Segment, file: Path) -> None:

@@ -6,15 +6,16 @@ from pathlib import Path
 
 import pytest
 
+from shmio.recorder import attach
 from shmio.recorder import recorder as recorder_module
 from shmio.recorder import tap as tap_module
 from shmio.recorder.attach import Attachment
-from shmio.recorder.tap import Watch
+from shmio.recorder.tap import Tap, Watch
 from shmio.recording.format.encoding import Life, ProcessChange, decode_process, encode_json
 from shmio.recording.reading.reader import Reader
 from shmio.segment import Activity, ProcessSpec, Report, Segment
 from shmio.segment.processes import Phase, ProcessSlot, Supervised
-from tests.unit.recorder.harness import changes, recorder
+from tests.unit.recorder.harness import changes, publish, recorder
 
 
 def to(slot: ProcessSlot, phase: Phase, pid: int, restarts: int = 0, why: str = "") -> None:
@@ -133,6 +134,32 @@ def test_a_configuration_that_changes_is_attached_again(
         list(reader.messages())
         entry = reader.attachments["config/supervisor.toml"]
         assert reader.records.read(entry.at, entry.size) == b"two"
+
+
+def test_the_largest_file_is_attached_and_a_larger_one_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(attach, "MAX_FILE_BYTES", 10)
+    file = tmp_path / "supervisor.toml"
+    files = attach.ConfigFiles(file)
+    file.write_bytes(bytes(10))
+    assert [(one.name, one.data) for one in files(None, 0)] == [("config/supervisor.toml", bytes(10))]
+    file.write_bytes(bytes(11))
+    for _ in range(2):
+        assert files(None, 0) == []
+    assert [record.getMessage() for record in caplog.records] == [f"{file} is not attached: larger than 10 bytes"]
+
+
+def test_behind_many_entries_the_next_turn_comes_sooner(segment: Segment) -> None:
+    tap = Tap(segment)
+    tap.take()
+    calm_s = tap.pause_s
+    publish(segment.writer("cell"), 1)
+    tap.take()
+    assert tap.pause_s == calm_s
+    publish(segment.writer("cell"), 300)
+    tap.take()
+    assert tap.pause_s < calm_s
 
 
 @pytest.mark.parametrize("data", [b"", b"{}", b'{"name": 1}', b"[" * 5000])
