@@ -96,7 +96,7 @@ def connect_aio(
     token_in_plain_text: bool = False,
     timeout_s: float = 10.0,
 ) -> client.Client:
-    """The same for asyncio."""
+    """The same for asyncio, to be made and used within an event loop: its methods are awaited."""
     return client.Client(
         Target(address, _path(ca), _path(certificate), _path(key), token, token_in_plain_text), timeout_s
     )

@@ -58,8 +58,8 @@ class Held:
     """What is known of an injection that stands."""
 
     def __init__(self, found: Any) -> None:
-        """``found``: the first answer. RemoteError: it is none."""
-        if not found.HasField("laid"):
+        """``found``: the first answer, None if there was none. RemoteError: it is none."""
+        if found is None or not found.HasField("laid"):
             raise RemoteError("the endpoint's first answer to Inject is none")
         self.number: int = found.laid.number
         self._tables = Tables()

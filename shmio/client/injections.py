@@ -64,7 +64,7 @@ class Declared:
 
 def declared(found: Any) -> tuple[Declared, ...]:
     """Of Declare's first answer. RemoteError: it is none."""
-    if not found.HasField("declared"):
+    if found is None or not found.HasField("declared"):
         raise RemoteError("the endpoint's first answer to Declare is none")
     return tuple(Declared(one.source, one.number, one.name, one.seed) for one in found.declared.injections)
 

@@ -1,4 +1,4 @@
-"""Declared injections as a program with asyncio holds them."""
+"""Declared injections as a program holds them."""
 
 from __future__ import annotations
 
@@ -7,36 +7,45 @@ from contextlib import suppress
 from typing import Any, Protocol, Self
 
 from shmio.client import injections
-from shmio.client.aio.calls import receive
-from shmio.client.calls import Target
+from shmio.client.aio.transport import Stream
 from shmio.client.injections import Happening
 from shmio.errors import CommandError, PathError
 
 
-class Lifter(Protocol):
-    """What it needs of its client."""
+class Lift(Protocol):
+    """Lifts an injection of a source by its number."""
 
-    target: Target
-
-    async def lift(self, source: str, number: int) -> None:
-        """Lift an injection."""
+    async def __call__(self, source: str, number: int) -> None:
+        """Lift it. PathError, CommandError: it cannot be."""
 
 
 class Campaign(AsyncIterator[Happening]):
-    """As :class:`shmio.client.Campaign`."""
+    """What was declared. Iterate over it for what is done: it ends when nothing of it stands. For one task.
 
-    def __init__(self, call: Any, first: Any, client: Lifter, *, keep: bool) -> None:
-        self._call = call
-        self._client = client
+    ``declared``: in the order of the declarations, with their seeds.
+    """
+
+    def __init__(self, stream: Stream, first: Any, lift: Lift, *, keep: bool) -> None:
+        self._stream = stream
+        self._lift = lift
         self._keep = keep
         self.declared = injections.declared(first)
         self._left = dict.fromkeys((one.source, one.number) for one in self.declared)
         self._happened: list[Happening] = injections.happenings(first)
 
+    @classmethod
+    async def lay(cls, stream: Stream, lift: Lift, *, keep: bool) -> Self:
+        """What the answers to Declare begin with."""
+        try:
+            return cls(stream, await anext(stream, None), lift, keep=keep)
+        except BaseException:
+            stream.close()
+            raise
+
     async def __anext__(self) -> Happening:
-        """As that of :class:`shmio.client.Campaign`."""
+        """The next one, waited for. RemoteError: the record is not read fast enough, or the instance has ended."""
         while not self._happened:
-            self._happened = injections.happenings(await receive(self._call, self._client.target.fail))
+            self._happened = injections.happenings(await anext(self._stream))
         happened = self._happened.pop(0)
         if happened.what == "lifted":
             self._left.pop((happened.source, happened.number), None)
@@ -48,9 +57,9 @@ class Campaign(AsyncIterator[Happening]):
         try:
             for source, number in () if self._keep else left:
                 with suppress(PathError, CommandError):  # it was over, or a reload has taken its source away
-                    await self._client.lift(source, number)
+                    await self._lift(source, number)
         finally:
-            self._call.cancel()  # what still stands goes with it
+            self._stream.close()  # what still stands goes with it
 
     async def __aenter__(self) -> Self:
         return self

@@ -8,58 +8,50 @@ from typing import Any, Self, Unpack
 import grpc
 
 from shmio.client import calls, injection, injections, replay
-from shmio.client.aio.calls import receive
 from shmio.client.aio.campaign import Campaign
 from shmio.client.aio.injection import Shadow
-from shmio.client.aio.model import Simulation, Step, serve
+from shmio.client.aio.model import Simulation
 from shmio.client.aio.steps import Steps
+from shmio.client.aio.transport import CLOSED, Channel, Duplex, Step, Stream, sleep
 from shmio.client.arrays import InjectResponse, ReadResponse, SimulateResponse, SubscribeResponse
 from shmio.client.calls import Clock, Outcome, Target
 from shmio.client.injections import Injection, Lifted
 from shmio.client.layout import BlockLayout, layouts
-from shmio.client.model import PATIENCE_S
+from shmio.client.model import PATIENCE_S, RETRY_S, Rejoining
 from shmio.client.replay import Wish
 from shmio.client.update import Snapshot, Tables, Update
-from shmio.errors import CommandError
+from shmio.errors import CommandError, ConflictError, RemoteError
 from shmio.model.replay_status import Playing
 from shmio.wire import shmio_v1_pb2 as wire
 from shmio.wire.shmio_v1_pb2_grpc import ShmioStub
 
 
 class Client:
-    """As :class:`shmio.client.Client`, to be made and used within an event loop. Close it, or use ``async with``."""
+    """An instance at the other end of a connection. Several tasks may use it. Close it, or use ``async with``.
+
+    Errors are those of a local program: PathError, ValueRangeError, CommandError, QualityError; EndpointError: more
+    than the endpoint gives to one client, or all; RemoteError: it cannot be reached, or does not let us.
+    """
 
     def __init__(self, target: Target, timeout_s: float = 10.0) -> None:
         """``timeout_s``: of calls that are answered at once."""
         self.target = target
-        self._timeout_s = timeout_s
-        credentials = target.credentials
-        self._channel = (
-            grpc.aio.insecure_channel(target.address, calls.OPTIONS)
-            if credentials is None
-            else grpc.aio.secure_channel(target.address, credentials, calls.OPTIONS)
-        )
-        self._stub: Any = ShmioStub(self._channel)  # type: ignore[no-untyped-call]
-        self._read = self._channel.unary_unary(
+        self._channel = Channel(target, timeout_s)
+        connection = self._channel.grpc
+        self._stub: Any = ShmioStub(connection)  # type: ignore[no-untyped-call]
+        self._read = connection.unary_unary(
             f"/{calls.SERVICE}/Read", wire.ReadRequest.SerializeToString, ReadResponse.FromString
         )
-        self._inject: Any = self._channel.stream_stream(f"/{calls.SERVICE}/Inject", None, InjectResponse.FromString)
-        self._simulate: Any = self._channel.stream_stream(
-            f"/{calls.SERVICE}/Simulate", None, SimulateResponse.FromString
-        )
-        self._subscribe = self._channel.unary_stream(
+        self._subscribe = connection.unary_stream(
             f"/{calls.SERVICE}/Subscribe", wire.SubscribeRequest.SerializeToString, SubscribeResponse.FromString
         )
+        self._inject: Any = connection.stream_stream(f"/{calls.SERVICE}/Inject", None, InjectResponse.FromString)
+        self._simulate: Any = connection.stream_stream(f"/{calls.SERVICE}/Simulate", None, SimulateResponse.FromString)
 
     async def layouts(self, *sources: str) -> dict[str, BlockLayout]:
         """The blocks of these sources, or of all, by source. PathError: no such source."""
-        call = self._stub.GetLayouts(
-            wire.GetLayoutsRequest(sources=sources), timeout=self._timeout_s, metadata=self.target.metadata
-        )
-        try:
-            parts = [part async for part in call]
-        except grpc.RpcError as error:
-            self.target.fail(error)
+        request = wire.GetLayoutsRequest(sources=sources)
+        parts = await Stream(self._channel, self._stub.GetLayouts, request, timeout_s=self._channel.timeout_s).to_list()
         return {block.source: block for block in layouts(parts)}
 
     async def status(self) -> dict[str, Any]:
@@ -67,10 +59,18 @@ class Client:
         return calls.status(await self._call(self._stub.GetStatus, wire.GetStatusRequest()))
 
     async def read(self, *patterns: str, originals: bool = False) -> Snapshot:
-        """As :meth:`shmio.client.Client.read`."""
+        """Registers as of now: paths, elements, slices, structures, globs, or a source; of each source one frame.
+
+        ``originals``: what the source delivered, too, where an injection shows something else. PathError,
+        ValueRangeError: too much for one call.
+        """
         tables = Tables()
         request = calls.read_request(patterns, originals=originals, tables=())
         return Snapshot(tables.updates(await self._call(self._read, request)))
+
+    async def __getitem__(self, path: str) -> Any:
+        """A register's good value; PathError, and QualityError with the reason when there is none."""
+        return (await self.read(path))[path]
 
     def subscribe(
         self,
@@ -80,16 +80,26 @@ class Client:
         max_rate_hz: float = 0.0,
         deadband: float = 0.0,
     ) -> Subscription:
-        """As :meth:`shmio.client.Client.subscribe`."""
+        """The present values of all, then what changes: see :class:`Update`. PathError comes with the first one.
+
+        ``every_frame``: all frames in order, losses counted; else the newest, at most ``max_rate_hz`` a second of
+        each source, and of numbers only what differs from what came before by more than ``deadband``. ``frames``: raw
+        frames of the sources instead of values.
+        """
         request = calls.subscribe_request(
             patterns, every_frame=every_frame, frames=frames, max_rate_hz=max_rate_hz, deadband=deadband
         )
-        return Subscription(self._subscribe(request, metadata=self.target.metadata), self.target)
+        return Subscription(Stream(self._channel, self._subscribe, request))
 
     async def write(
         self, values: Mapping[str, object], timeout_s: float | None = None, *, until_accepted: bool = False
     ) -> list[Outcome]:
-        """As :meth:`shmio.client.Client.write`."""
+        """Write registers, arrays or elements of one source, all or none; what became of each, by the source.
+
+        ``timeout_s``: how long the source may take until it begins; default: 2 s, or three of its cycles.
+        ``until_accepted``: do not wait for what the device says. PathError, ValueRangeError, CommandError: nothing has
+        been sent.
+        """
         request = calls.write_request(values, timeout_s, until_accepted=until_accepted)
         answer = await self._call(self._stub.Write, request, (timeout_s or 0) + calls.WRITE_PATIENCE_S)
         return calls.outcomes(values, answer.outcomes)
@@ -105,28 +115,28 @@ class Client:
         for_s: float | None = None,
         originals: bool = False,
     ) -> Shadow:
-        """As :meth:`shmio.client.Client.inject`."""
+        """Lay a shadow over registers, elements, slices, structures or patterns of one source, all /out or all /in.
+
+        It is lifted when it is closed, at the end of its ``async with`` block, when this program ends, or ``for_s``
+        later; with ``keep`` only when somebody lifts it. ``originals``: iterate over it for what it stands over.
+        ``ranges``: bytes and bits of a frame besides, or alone: then ``source`` says whose, as ``cell`` or
+        ``cell/in``. PathError, ValueRangeError; CommandError: the source refuses it.
+        """
         first = injection.lay(
             patterns, ranges=ranges, source=source, priority=priority, keep=keep, name=name, for_s=for_s,
             originals=originals,
         )  # fmt: skip
-        call = self._inject(metadata=self.target.metadata)
-        try:
-            await call.write(first)
-            found = await call.read()
-        except grpc.RpcError as error:
-            self.target.fail(error)
-        return Shadow(call, injection.Held(found), self.target)
+        return await Shadow.lay(self._channel, self._inject, first)
 
     async def declare(self, declarations: Iterable[Mapping[str, Any]], *, keep: bool = False) -> Campaign:
-        """As :meth:`shmio.client.Client.declare`."""
+        """Lay injections that their sources run by themselves, all or none: tables as ``[[injection]]`` has them.
+
+        They are lifted when it is closed, at the end of its ``async with`` block, or when this program ends; with
+        ``keep`` when they are over, or somebody lifts them. Iterate over it for what is done with them.
+        ValueRangeError: one that cannot be; CommandError: a source refuses it.
+        """
         request = injections.declare_request(declarations, keep=keep)
-        call = self._stub.Declare(request, metadata=self.target.metadata)
-        try:
-            first = await call.read()
-        except grpc.RpcError as error:
-            self.target.fail(error)
-        return Campaign(call, first, self, keep=keep)
+        return await Campaign.lay(Stream(self._channel, self._stub.Declare, request), self.lift, keep=keep)
 
     async def injections(self, *sources: str) -> list[Injection]:
         """What stands at present, on these sources or all; of each the innermost first."""
@@ -145,8 +155,12 @@ class Client:
         return found
 
     async def simulation(self, source: str, name: str = "") -> Simulation:
-        """As :meth:`shmio.client.Client.simulation`."""
-        return await Simulation.join(self._simulate, self.target, source, name)
+        """Join a source of the connector ``remote`` as its model, to be told its steps and to answer them.
+
+        ``name``: for messages. PathError: no such source; CommandError: it has no model elsewhere; ConflictError: it
+        has another one already; LostError, RemoteError.
+        """
+        return await Simulation.join(self._channel, self._simulate, source, name)
 
     async def simulate(
         self,
@@ -157,8 +171,32 @@ class Client:
         start: Callable[[Simulation], object] | None = None,
         patience_s: float = PATIENCE_S,
     ) -> None:
-        """As :meth:`shmio.client.Client.simulate`; ``step`` may be a coroutine function. Ends when it is cancelled."""
-        await serve(lambda: self.simulation(source, name), step, start, patience_s)
+        """Be the model of a source until this client is closed, or its task is interrupted.
+
+        ``step(time_s, dt_s, inputs)`` gives outputs by their paths, all or some; what it raises is the reason why the
+        step failed, which the log of ``shmio.client`` tells, too. ``start`` is called with the :class:`Simulation`
+        whenever it has joined. An instance that is not there, or goes, is waited for ``patience_s``. Errors as of
+        :meth:`simulation`.
+        """
+        rejoining = Rejoining(patience_s)
+        while True:
+            try:
+                async with await self.simulation(source, name) as simulation:
+                    if start is not None:
+                        start(simulation)
+                    rejoining.joined()
+                    async for work in simulation:
+                        await simulation.compute(work, step, rejoining)
+                    return
+            except (RemoteError, ConflictError) as error:
+                if not self._channel.closed and not rejoining.patient(error):
+                    raise
+            except CLOSED:
+                if not self._channel.closed:
+                    raise
+            if self._channel.closed:
+                return
+            await sleep(RETRY_S)
 
     async def clock(self) -> Clock:
         """How time stands."""
@@ -173,8 +211,9 @@ class Client:
         return Clock.of(await self._call(self._stub.Step, request, calls.STEP_PATIENCE_S))
 
     def steps(self, count: int = 0, dt_s: float | None = None) -> Steps:
-        """As :meth:`shmio.client.Client.steps`."""
-        return Steps(self._stub.Steps(metadata=self.target.metadata), self.target, count, dt_s)
+        """Take time over, and move it by so many steps, by one call: see :class:`Steps`. ValueRangeError."""
+        requests = calls.steps_requests(count, dt_s)
+        return Steps(Duplex(self._channel, self._stub.Steps, *requests), count)
 
     async def set_step_size(self, dt_s: float) -> Clock:
         """How far a step goes that does not say it; takes time over. CommandError, ValueRangeError."""
@@ -199,7 +238,7 @@ class Client:
 
     async def _call(self, method: Callable[..., Any], request: Any, timeout_s: float | None = None) -> Any:
         try:
-            return await method(request, timeout=timeout_s or self._timeout_s, metadata=self.target.metadata)
+            return await method(request, timeout=timeout_s or self._channel.timeout_s, metadata=self.target.metadata)
         except grpc.RpcError as error:
             self.target.fail(error)
 
@@ -215,24 +254,26 @@ class Client:
 
 
 class Subscription(AsyncIterator[Update]):
-    """Updates as they come; ends when it, or its client, is closed."""
+    """Updates as they come; ends when it, or its client, is closed. For one task, :meth:`close` for any."""
 
-    def __init__(self, call: Any, target: Target) -> None:
-        self._call = call
-        self._target = target
+    def __init__(self, stream: Stream) -> None:
+        self._stream = stream
         self._tables = Tables()
         self._waiting: Iterator[Update] = iter(())
 
     async def __anext__(self) -> Update:
-        """As that of :class:`shmio.client.Subscription`."""
+        """The next one, waited for. The arrays of its table change with the one after it.
+
+        RemoteError: the instance has ended; PathError, ValueRangeError, EndpointError: it refuses.
+        """
         while True:
             for update in self._waiting:
                 return update
-            self._waiting = self._tables.all_of(await receive(self._call, self._target.fail))
+            self._waiting = self._tables.all_of(await anext(self._stream))
 
     def close(self) -> None:
         """End it."""
-        self._call.cancel()
+        self._stream.close()
 
     async def __aenter__(self) -> Self:
         return self

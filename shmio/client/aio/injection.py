@@ -1,37 +1,46 @@
-"""An injection as a program with asyncio holds it."""
+"""An injection as a program holds it."""
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator, Mapping
-from contextlib import suppress
 from typing import Any, Self
 
-import grpc
-
 from shmio.client import calls, injection
-from shmio.client.calls import Outcome, Target
+from shmio.client.aio.transport import Background, Channel, Condition, Duplex
+from shmio.client.calls import Outcome
 from shmio.client.update import Update
 from shmio.errors import CommandError, RemoteError, ShmioError
 
 
 class Shadow(AsyncIterator[Update]):
-    """As :class:`shmio.client.Shadow`."""
+    """An injection that stands. Several tasks may give values; one may iterate over the originals.
 
-    def __init__(self, call: Any, held: injection.Held, target: Target) -> None:
-        self._call = call
+    ``table``: the registers that it stands over, and the originals by now.
+    """
+
+    def __init__(self, channel: Channel, stream: Duplex, held: injection.Held) -> None:
+        self._channel = channel
+        self._stream = stream
         self._held = held
-        self._target = target
         self.number = held.number
         """By which anybody may lift it."""
         self.table = held.table
-        self._answers: dict[int, asyncio.Future[Any]] = {}
+        self._turn = Condition()
+        self._answers: dict[int, Any] = {}  # by sequence number: None until it has come
         self._updates: list[Update] = []
         self._error: ShmioError | None = None
         self._over = False
-        self._news = asyncio.Event()
-        self._turn = asyncio.Lock()
-        self._reading = asyncio.get_running_loop().create_task(self._read())
+        self._reading = Background(self._read, f"shadow-{self.number}")
+
+    @classmethod
+    async def lay(cls, channel: Channel, method: Any, first: bytes) -> Self:
+        """Lay it; what :meth:`Client.inject` says."""
+        stream = Duplex(channel, method, first)
+        try:
+            return cls(channel, stream, injection.Held(await anext(stream, None)))
+        except BaseException:
+            stream.close()
+            raise
 
     async def set(
         self,
@@ -39,19 +48,27 @@ class Shadow(AsyncIterator[Update]):
         arrays: injection.Arrays | None = None,
         raw: injection.Raw = (),
     ) -> list[Outcome]:
-        """As :meth:`shmio.client.Shadow.set`."""
+        """Give values by path, by the columns of ``table``, or as raw bytes; wait for what became of them.
+
+        PathError, ValueRangeError; CommandError: it was lifted; RemoteError.
+        """
         values, raw = values or {}, list(raw)
-        self._check()
-        sequence, data = self._held.request(values, arrays, raw, answered=True)
-        answer = self._answers[sequence] = asyncio.get_running_loop().create_future()
-        await self._write(data)
+        async with self._turn:
+            self._check()
+            sequence, data = self._held.request(values, arrays, raw, answered=True)
+            self._answers[sequence] = None
         try:
-            outcome = await asyncio.wait_for(answer, calls.WRITE_PATIENCE_S)
-        except TimeoutError:
-            raise RemoteError(f"{self._target.address}: it did not answer in time") from None
+            await self._stream.write(data)
+            async with self._turn:
+                if not await self._turn.wait_until(
+                    lambda: self._answers[sequence] is not None or self._over, calls.WRITE_PATIENCE_S
+                ):
+                    raise RemoteError(f"{self._channel.target.address}: it did not answer in time")
+                if self._answers[sequence] is None:
+                    self._check()
+                return injection.ends(values, self._answers[sequence], more=bool(arrays or raw))
         finally:
-            self._answers.pop(sequence, None)
-        return injection.ends(values, outcome, more=bool(arrays or raw))
+            del self._answers[sequence]
 
     async def send(
         self,
@@ -59,23 +76,23 @@ class Shadow(AsyncIterator[Update]):
         arrays: injection.Arrays | None = None,
         raw: injection.Raw = (),
     ) -> None:
-        """As :meth:`shmio.client.Shadow.send`."""
-        self._check()
-        await self._write(self._held.request(values or {}, arrays, raw, answered=False)[1])
+        """The same without waiting. A value that is wrong ends the injection, which the next call tells."""
+        async with self._turn:
+            self._check()
+            _, data = self._held.request(values or {}, arrays, raw, answered=False)
+        await self._stream.write(data)
 
     async def __anext__(self) -> Update:
         """The next original, waited for; ends when it is over. Asked for with ``originals``."""
-        while not self._updates:
-            self._news.clear()
-            if self._held.waits:
+        async with self._turn:
+            if not self._updates:
+                await self._turn.wait_until(lambda: self._held.waits or self._over)
+                if not self._held.waits:
+                    if self._error is not None:
+                        raise self._error
+                    raise StopAsyncIteration
                 self._updates.extend(self._held.originals())
-            elif self._error is not None:
-                raise self._error
-            elif self._over:
-                raise StopAsyncIteration
-            else:
-                await self._news.wait()
-        return self._updates.pop(0)
+            return self._updates.pop(0)
 
     def _check(self) -> None:
         if self._error is not None:
@@ -83,41 +100,29 @@ class Shadow(AsyncIterator[Update]):
         if self._over:
             raise CommandError(f"the injection {self.number} is over")
 
-    async def _write(self, data: bytes) -> None:
-        async with self._turn:
-            try:
-                await self._call.write(data)
-            except (grpc.RpcError, asyncio.InvalidStateError):
-                await asyncio.wait((self._reading,))
-                self._check()
-
     async def _read(self) -> None:
         error: ShmioError | None = None
         try:
-            while (found := await self._call.read()) is not grpc.aio.EOF:
-                self._held.keep(found)
-                for answer in found.answers:
-                    if (waiting := self._answers.get(answer.sequence)) and not waiting.done():
-                        waiting.set_result(answer.outcome)
-                self._news.set()
-        except grpc.RpcError as caught:
-            error = None if self._call.cancelled() else self._target.error(caught)
+            async for found in self._stream:
+                async with self._turn:
+                    self._held.keep(found)
+                    self._answers |= {
+                        answer.sequence: answer.outcome for answer in found.answers if answer.sequence in self._answers
+                    }
+                    self._turn.notify_all()
         except ShmioError as caught:
             error = caught
         finally:
-            self._error, self._over = error, True
-            self._news.set()
-            for waiting in self._answers.values():
-                if not waiting.done():
-                    waiting.set_exception(error or CommandError(f"the injection {self.number} is over"))
+            async with self._turn:
+                self._error, self._over = error, True
+                self._turn.notify_all()
 
     async def close(self) -> None:
         """Lift it, unless it is to be kept."""
-        with suppress(grpc.RpcError, asyncio.InvalidStateError):
-            await self._call.done_writing()
-        await asyncio.wait((self._reading,), timeout=10)
-        self._call.cancel()
-        await asyncio.wait((self._reading,))
+        await self._stream.finish()
+        await self._reading.join(self._channel.timeout_s)
+        self._stream.close()
+        await self._reading.join()
 
     async def __aenter__(self) -> Self:
         return self

@@ -1,114 +1,74 @@
-"""A model as a program with asyncio serves it."""
+"""A model as its program serves it."""
 
 from __future__ import annotations
 
-import asyncio
-import inspect
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-from contextlib import suppress
-from typing import Any, NoReturn, Self
-
-import grpc
+from collections.abc import AsyncIterator, Mapping
+from typing import Any, Self
 
 from shmio.client import model
-from shmio.client.aio.calls import receive
-from shmio.client.calls import Target
-from shmio.client.model import Member, Part, Work
-from shmio.errors import ConflictError, RemoteError
-
-_Outputs = Mapping[str, object] | None
-Step = Callable[[float, float, model.Values], _Outputs | Awaitable[_Outputs]]
-"""As that of :mod:`shmio.client.sync.model`; it may be a coroutine function."""
+from shmio.client.aio.transport import Channel, Duplex, Step, outputs_of
+from shmio.client.model import Member, Part, Rejoining, Work
 
 
 class Simulation(Member, AsyncIterator[Work]):
-    """As :class:`shmio.client.sync.model.Simulation`."""
+    """A source that this program computes: iterate over the steps, and answer each. Close it, or use ``async with``.
 
-    def __init__(self, call: Any, part: Part, target: Target) -> None:
+    For one task, :meth:`close` for any.
+    """
+
+    def __init__(self, stream: Duplex, part: Part) -> None:
         super().__init__(part)
-        self._call = call
-        self._target = target
-        self._closed = False
+        self._stream = stream
 
     @classmethod
-    async def join(cls, method: Any, target: Target, source: str, name: str) -> Self:
-        """Join a source."""
-        call = method(metadata=target.metadata)
+    async def join(cls, channel: Channel, method: Any, source: str, name: str) -> Self:
+        """Join a source; what :meth:`Client.simulation` says."""
+        stream = Duplex(channel, method, model.join(source, name))
         try:
-            with suppress(asyncio.InvalidStateError):  # it has ended already, and says why
-                await call.write(model.join(source, name))
-            found = await call.read()
-            return cls(call, Part(None if found is grpc.aio.EOF else found), target)
-        except grpc.RpcError as error:
-            target.fail(error)
+            return cls(stream, Part(await anext(stream, None)))
         except BaseException:
-            call.cancel()
+            stream.close()
             raise
 
     async def __anext__(self) -> Work:
-        """As that of :class:`shmio.client.sync.model.Simulation`."""
-        self._work = self._part.take(await receive(self._call, self._fail))
+        """The next step, waited for; ends when it, or its client, is closed.
+
+        LostError: the endpoint has ended, or a reload has changed the source; RemoteError.
+        """
+        self._work = self._part.take(await anext(self._stream))
         return self._work
 
     async def done(self, outputs: Mapping[str, object]) -> None:
-        """Answer the present step with outputs by their paths. PathError, ValueRangeError: nothing has been sent."""
+        """Answer the present step with outputs by their paths; those that are left out keep what they have.
+
+        PathError, ValueRangeError: nothing has been sent.
+        """
         await self._answer(self._part.done(self._present(), outputs))
 
     async def fail(self, reason: str) -> None:
-        """Answer the present step: it has failed, and why."""
+        """Answer the present step: it has failed, and why. Nothing of it is shown."""
         await self._answer(self._part.failed(self._present(), reason))
 
-    async def compute(self, work: Work, step: Step, rejoining: model.Rejoining) -> None:
+    async def compute(self, work: Work, step: Step, rejoining: Rejoining) -> None:
         """Answer a step with what a program's code says to it, and with what that raises."""
         rejoining.heed(self._part, work)
         try:
-            found = step(work.time_s, work.dt_s, work.inputs)
-            outputs = await found if inspect.isawaitable(found) else found
+            outputs = await outputs_of(step(work.time_s, work.dt_s, work.inputs))
             answer = rejoining.answer(self._part, work, outputs)
         except Exception as error:  # noqa: BLE001  whatever it is, the step has failed with it
             answer = rejoining.failed(self._part, work, error)
         await self._answer(answer)
 
-    def _fail(self, error: Any) -> NoReturn:
-        if self._closed:
-            raise StopAsyncIteration
-        self._target.fail(error)
-
     async def _answer(self, data: bytes) -> None:
         self._work = None
-        with suppress(grpc.RpcError, asyncio.InvalidStateError):  # it is over, which the next step tells
-            await self._call.write(data)
+        await self._stream.write(data)
 
     def close(self) -> None:
         """Leave: steps fail until another joins."""
-        self._closed = True
-        self._call.cancel()
+        self._stream.close()
 
     async def __aenter__(self) -> Self:
         return self
 
     async def __aexit__(self, *_: object) -> None:
         self.close()
-
-
-async def serve(
-    join: Callable[[], Awaitable[Simulation]],
-    step: Step,
-    start: Callable[[Simulation], object] | None,
-    patience_s: float,
-) -> None:
-    """Compute a source until its client is closed; what :meth:`Client.simulate` says."""
-    rejoining = model.Rejoining(patience_s)
-    while True:
-        try:
-            async with await join() as simulation:
-                if start is not None:
-                    start(simulation)
-                rejoining.joined()
-                async for work in simulation:
-                    await simulation.compute(work, step, rejoining)
-                return
-        except (RemoteError, ConflictError) as error:
-            if not rejoining.patient(error):
-                raise
-            await asyncio.sleep(model.RETRY_S)

@@ -1,59 +1,63 @@
-"""Many steps by one call, for asyncio."""
+"""Many steps by one call."""
 
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Iterator
 from typing import Any, Self
 
-import grpc
-
 from shmio.client import calls
-from shmio.client.aio.calls import receive
-from shmio.client.calls import Stepped, Target
+from shmio.client.aio.transport import Duplex
+from shmio.client.calls import Stepped
+from shmio.errors import CommandError, ShmioError
 
 
 class Steps(AsyncIterator[Stepped]):
-    """As :class:`shmio.client.Steps`."""
+    """Steps of time on one stream, which costs less than a call for each. Close it, or use ``async with``.
 
-    def __init__(self, call: Any, target: Target, count: int, dt_s: float | None) -> None:
-        """ValueRangeError."""
-        self._call = call
-        self._target = target
+    For one task. Iterate over it for those that :meth:`Client.steps` has asked for, in their order: each when all
+    streams have what has changed in it, while the next ones go on; and, for a program that does something between
+    them, :meth:`step`.
+    """
+
+    def __init__(self, stream: Duplex, count: int) -> None:
+        """``count``: how many steps the stream has asked for."""
+        self._stream = stream
         self._left = count
         self._waiting: Iterator[Any] = iter(())
-        self._requests = calls.steps_requests(count, dt_s)
 
     async def __anext__(self) -> Stepped:
-        """As that of :class:`shmio.client.Steps`."""
+        """The next one that is done, waited for; ends when all that were asked for are.
+
+        CommandError: it failed, or another program owns time, and none of those behind it is done; ValueRangeError,
+        RemoteError.
+        """
         if not self._left:
             raise StopAsyncIteration
-        await self._ask()
         while True:
             for found in self._waiting:
                 self._left -= 1
                 return Stepped.of(found)
-            self._waiting = iter((await receive(self._call, self._target.fail)).steps)
+            try:
+                self._waiting = iter((await anext(self._stream)).steps)
+            except ShmioError:
+                self.close()
+                raise
 
     async def step(self, dt_s: float | None = None) -> Stepped:
-        """As that of :class:`shmio.client.Steps`."""
-        self._requests += calls.steps_requests(1, dt_s)
+        """Do one more, and wait for it, and for those that were asked for before. Errors as of iterating."""
+        await self._stream.write(*calls.steps_requests(1, dt_s))
         self._left += 1
-        async for found in self:
-            last = found
+        last = None
+        async for done in self:
+            last = done
+        if last is None:
+            raise CommandError("the steps were closed: none is done any more")
         return last
 
-    async def _ask(self) -> None:
-        requests, self._requests = self._requests, []
-        try:
-            for request in requests:
-                await self._call.write(request)
-        except grpc.RpcError as error:
-            self._target.fail(error)
-
     def close(self) -> None:
-        """As that of :class:`shmio.client.Steps`."""
+        """Ask for no more: a step that was begun is done, those behind it are not."""
         self._left = 0
-        self._call.cancel()
+        self._stream.close()
 
     async def __aenter__(self) -> Self:
         return self

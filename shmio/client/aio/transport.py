@@ -1,0 +1,143 @@
+"""Calls and waiting with asyncio; :mod:`shmio.client.sync.transport` offers the same names for threads."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from typing import Any, Final
+
+import grpc
+
+from shmio.client.calls import OPTIONS, Target
+from shmio.client.model import Values
+from shmio.errors import RemoteError
+
+Outputs = Mapping[str, object] | None
+Step = Callable[[float, float, Values], Outputs | Awaitable[Outputs]]
+"""Computes outputs from ``(time_s, dt_s, inputs)``: those of ``time_s``, ``dt_s`` after the step before.
+
+It may be a coroutine function.
+"""
+CLOSED: Final = grpc.aio.UsageError
+"""What grpcio raises for a call on a channel that was closed."""
+sleep: Final = asyncio.sleep
+
+
+async def outputs_of(found: Outputs | Awaitable[Outputs]) -> Outputs:
+    """What a step has computed."""
+    return await found if inspect.isawaitable(found) else found
+
+
+class Channel:
+    """The connection of one client."""
+
+    def __init__(self, target: Target, timeout_s: float) -> None:
+        self.target = target
+        self.timeout_s = timeout_s
+        """Of calls that are answered at once."""
+        self.closed = False
+        credentials = target.credentials
+        self.grpc = (
+            grpc.aio.insecure_channel(target.address, OPTIONS)
+            if credentials is None
+            else grpc.aio.secure_channel(target.address, credentials, OPTIONS)
+        )
+
+    async def close(self) -> None:
+        """End all calls, and the connection."""
+        self.closed = True
+        await self.grpc.close()
+
+
+class Stream(AsyncIterator[Any]):
+    """The answers to one request; ends when it, or its channel, is closed. ShmioError: why the endpoint ended it."""
+
+    def __init__(self, channel: Channel, method: Any, *request: Any, timeout_s: float | None = None) -> None:
+        self._channel = channel
+        self._closed = False
+        self._call = method(*request, timeout=timeout_s, metadata=channel.target.metadata)
+
+    async def __anext__(self) -> Any:
+        found = grpc.aio.EOF
+        try:
+            with _closing():
+                found = await self._call.read()
+        except grpc.RpcError as error:
+            if not (self._closed or self._channel.closed):
+                self._channel.target.fail(error)
+        if found is grpc.aio.EOF:
+            raise StopAsyncIteration
+        return found
+
+    async def to_list(self) -> list[Any]:
+        """All of them. RemoteError: the channel was closed meanwhile."""
+        found = [one async for one in self]
+        if self._channel.closed:
+            raise RemoteError(f"{self._channel.target.address}: the client was closed")
+        return found
+
+    def close(self) -> None:
+        """End it."""
+        self._closed = True
+        self._call.cancel()
+
+
+class Duplex(Stream):
+    """A stream that takes further requests; the first ones go with the first use."""
+
+    def __init__(self, channel: Channel, method: Any, *first: Any) -> None:
+        super().__init__(channel, method)
+        self._first = first
+        self._turn = asyncio.Lock()  # gRPC takes one message after the other
+
+    async def __anext__(self) -> Any:
+        if self._first:
+            await self.write()
+        return await super().__anext__()
+
+    async def write(self, *requests: Any) -> None:
+        """Send requests. If the stream is over they are dropped: reading says why."""
+        async with self._turn:
+            requests, self._first = (*self._first, *requests), ()
+            with suppress(grpc.RpcError, asyncio.InvalidStateError), _closing():
+                for request in requests:
+                    await self._call.write(request)
+
+    async def finish(self) -> None:
+        """Say that no more requests follow."""
+        with suppress(grpc.RpcError, asyncio.InvalidStateError), _closing():
+            await self._call.done_writing()
+
+
+@contextmanager
+def _closing() -> Iterator[None]:
+    """Suppress the cancellation of a call by close; that of the task goes on."""
+    try:
+        yield
+    except asyncio.CancelledError:
+        if (task := asyncio.current_task()) is not None and task.cancelling():
+            raise
+
+
+class Condition(asyncio.Condition):
+    """Has several wait for each other."""
+
+    async def wait_until(self, predicate: Callable[[], bool], timeout_s: float | None = None) -> bool:
+        """Wait for it; whether it has come true in time."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await self.wait_for(predicate)
+        return predicate()
+
+
+class Background:
+    """A coroutine that runs beside the program."""
+
+    def __init__(self, run: Callable[[], Coroutine[Any, Any, None]], name: str) -> None:
+        self._task = asyncio.get_running_loop().create_task(run(), name=name)
+
+    async def join(self, timeout_s: float | None = None) -> None:
+        """Wait for its end, at most so long."""
+        await asyncio.wait((self._task,), timeout=timeout_s)

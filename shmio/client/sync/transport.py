@@ -1,0 +1,123 @@
+"""Calls and waiting with threads; :mod:`shmio.client.aio.transport` offers the same names for asyncio."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Final
+
+import grpc
+
+from shmio.client.calls import OPTIONS, Target
+from shmio.client.model import Values
+from shmio.errors import RemoteError
+
+Outputs = Mapping[str, object] | None
+Step = Callable[[float, float, Values], Outputs]
+"""Computes outputs from ``(time_s, dt_s, inputs)``: those of ``time_s``, ``dt_s`` after the step before."""
+CLOSED: Final = ValueError
+"""What grpcio raises for a call on a channel that was closed."""
+sleep: Final = time.sleep
+
+
+def outputs_of(found: Outputs) -> Outputs:
+    """What a step has computed."""
+    return found
+
+
+class Channel:
+    """The connection of one client."""
+
+    def __init__(self, target: Target, timeout_s: float) -> None:
+        self.target = target
+        self.timeout_s = timeout_s
+        """Of calls that are answered at once."""
+        self.closed = False
+        credentials = target.credentials
+        self.grpc = (
+            grpc.insecure_channel(target.address, OPTIONS)
+            if credentials is None
+            else grpc.secure_channel(target.address, credentials, OPTIONS)
+        )
+
+    def close(self) -> None:
+        """End all calls, and the connection."""
+        self.closed = True
+        self.grpc.close()
+
+
+class Stream(Iterator[Any]):
+    """The answers to one request; ends when it, or its channel, is closed. ShmioError: why the endpoint ended it."""
+
+    def __init__(self, channel: Channel, method: Any, request: Any, *, timeout_s: float | None = None) -> None:
+        self._channel = channel
+        self._closed = False
+        self._call = method(request, timeout=timeout_s, metadata=channel.target.metadata)
+
+    def __next__(self) -> Any:
+        try:
+            return next(self._call)
+        except grpc.RpcError as error:
+            if self._closed or self._channel.closed:
+                raise StopIteration from None
+            self._channel.target.fail(error)
+
+    def to_list(self) -> list[Any]:
+        """All of them. RemoteError: the channel was closed meanwhile."""
+        found = list(self)
+        if self._channel.closed:
+            raise RemoteError(f"{self._channel.target.address}: the client was closed")
+        return found
+
+    def close(self) -> None:
+        """End it."""
+        self._closed = True
+        self._call.cancel()
+
+
+class Duplex(Stream):
+    """A stream that takes further requests; the first ones go at once."""
+
+    def __init__(self, channel: Channel, method: Any, *first: Any) -> None:
+        self._requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.write(*first)
+        super().__init__(channel, method, iter(self._requests.get, None))
+
+    def __next__(self) -> Any:
+        try:
+            return super().__next__()
+        except BaseException:
+            self.finish()  # grpcio's thread waits for requests until then
+            raise
+
+    def write(self, *requests: Any) -> None:
+        """Send requests. If the stream is over they are dropped: reading says why."""
+        for request in requests:
+            self._requests.put(request)
+
+    def finish(self) -> None:
+        """Say that no more requests follow."""
+        self._requests.put(None)
+
+    def close(self) -> None:
+        """End it."""
+        self.finish()
+        super().close()
+
+
+class Condition(threading.Condition):
+    """Has several wait for each other."""
+
+    def wait_until(self, predicate: Callable[[], bool], timeout_s: float | None = None) -> bool:
+        """Wait for it; whether it has come true in time."""
+        return self.wait_for(predicate, timeout_s)
+
+
+class Background(threading.Thread):
+    """A function that runs beside the program, and does not keep it from ending."""
+
+    def __init__(self, run: Callable[[], None], name: str) -> None:
+        super().__init__(target=run, name=name, daemon=True)
+        self.start()
