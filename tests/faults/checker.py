@@ -20,7 +20,7 @@ from tests.faults.checks import Counts, Source
 from tests.faults.pulse import Pulse
 from tests.faults.truth import Truth
 
-NOTES: Final = ("landed", "guarded", "given")
+NOTES: Final = ("landed", "guarded", "given", "chained")
 """The truths of a source beside that of what its PLC's program did; see :class:`Source`."""
 TELL_S: Final = 0.1
 SLACK_NS: Final = 1_000_000_000

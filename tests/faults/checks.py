@@ -5,13 +5,14 @@ A check tells what it finds to ``complain``, a function that takes one line.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from shmio.segment import Frame, Quality
-from tests.faults.plc import OTHERS, SHOWN_AT, WORD
+from tests.faults.configuration import CHAINED, DECLARED
+from tests.faults.plc import CHAINED_AT, DECLARED_AT, OTHERS, SHOWN_AT, WORD
 from tests.faults.truth import Truth, Words, generations, places
 
 Complain = Callable[[str], None]
@@ -40,6 +41,8 @@ class Source:
     """What came into the word that injections stand before."""
     given: Truth | None = None
     """What injections were about to give, of the word that shows that and of the one they stand before."""
+    chained: Truth | None = None
+    """The same of the word over which several stand: multiples of 4 of the inner client, and one more of the outer."""
 
     @property
     def oldest_ns(self) -> int:
@@ -69,6 +72,7 @@ class FrameCheck:
     _last: Frame | None = None
     _words: Words | None = None
     _shown: int = 0
+    _chained: int = 0
     _started_ns: int = 0
 
     def __post_init__(self) -> None:
@@ -157,13 +161,16 @@ class FrameCheck:
             self.counts.since_ns = max(self.counts.since_ns, since_ns)
 
     def _injected(self, frame: Frame, given: Truth) -> None:
-        """One word is injected over: the PLC has 0 there, and consumers see that or what had been given by then."""
-        at = self._own + SHOWN_AT
-        raw, shown = (int.from_bytes(image[at : at + WORD], "big") for image in (frame.raw, frame.image))
-        if raw:
-            self._say(frame, f"tells {raw}, which was injected, as what the PLC has")
-        if frame.image[:at] != frame.raw[:at] or frame.image[at + WORD :] != frame.raw[at + WORD :]:
+        """Of words that are injected over the PLC has 0, and consumers see that or what had been given by then."""
+        places = (SHOWN_AT, DECLARED_AT, CHAINED_AT)
+        for raw in (word_at(frame.raw, place) for place in places):
+            if raw:
+                self._say(frame, f"tells {raw}, which was injected, as what the PLC has")
+        if _without(frame.image, places) != _without(frame.raw, places):
             self._say(frame, "an injection over one word has changed others")
+        if any(frame.raw):
+            self._declared(frame)
+        shown = word_at(frame.image, SHOWN_AT)
         if not shown:
             return
         since_ns = given.since_ns(shown)
@@ -172,6 +179,26 @@ class FrameCheck:
         elif shown < self._shown:
             self._say(frame, f"shows {shown}, injected before {self._shown}")
         self._shown = shown
+
+    def _declared(self, frame: Frame) -> None:
+        """What the configuration declares stands in every frame, and over what clients give."""
+        declared, chained = word_at(frame.image, DECLARED_AT), word_at(frame.image, CHAINED_AT) - CHAINED
+        if declared != DECLARED:
+            self._say(frame, f"shows {declared}, where declared injections make {DECLARED}")
+        if self.source.chained is None or not chained:
+            return
+        origin = chained & ~3
+        if chained - origin > 1 or not self._given_by((origin, chained), frame.publish_ns):
+            self._say(frame, f"shows {chained} of a chain, which nobody had given by then")
+            return
+        if origin < self._chained:
+            self._say(frame, f"shows {chained} of a chain, given before {self._chained}")
+        self._chained = origin
+
+    def _given_by(self, values: Iterable[int], when_ns: int) -> bool:
+        assert self.source.chained is not None
+        times_ns = [self.source.chained.since_ns(value) for value in values]
+        return all(since_ns is not None and since_ns <= when_ns for since_ns in times_ns)
 
     def age(self, frame: Frame, now_ns: int) -> None:
         """What is good now was in the PLC not long ago."""
@@ -191,6 +218,20 @@ class FrameCheck:
                 f"(when it was published, for {(published_ns or 0) / 1e6:.1f} ms; stale_ms is "
                 f"{self.source.stale_ns / 1e6:.0f})",
             )
+
+
+def word_at(image: bytes, place: int) -> int:
+    """One of the words that the program leaves to others."""
+    at = len(image) - OTHERS + place
+    return int.from_bytes(image[at : at + WORD], "big")
+
+
+def _without(image: bytes, places: Iterable[int]) -> bytes:
+    rest = bytearray(image)
+    for place in places:
+        at = len(image) - OTHERS + place
+        rest[at : at + WORD] = bytes(WORD)
+    return bytes(rest)
 
 
 @dataclass
@@ -230,6 +271,21 @@ class Process:
 
 
 Processes = Mapping[str, Process]
+
+UNTOUCHED_NS = 2_000_000_000
+"""Who does not need what is broken has values that are no older than this on a machine that is not overloaded."""
+BYSTANDERS = ("grpc", "stream", "newest")
+"""How the counts begin of those who follow a source without a pause, and do not need the broker."""
+
+
+def check_bystanders(counts: Mapping[str, Counts], now_ns: int, allowed_ns: float, complain: Complain) -> bool:
+    """While the broker alone is broken the others go on; whether they do."""
+    for name, each in counts.items():
+        age_ns = now_ns - each.since_ns
+        if name.startswith(BYSTANDERS) and each.since_ns and age_ns > allowed_ns:
+            complain(f"{name} has had nothing new for {age_ns / 1e9:.1f} s, and only the broker was broken")
+            return False
+    return True
 
 
 def check_restarts(

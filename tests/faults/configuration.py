@@ -14,6 +14,8 @@ PERIODS_MS: Final = {"fast": 5, "block": 20, "demo": 20}
 STALE_MS: Final = {"fast": 300, "block": 500, "demo": 500}
 NAMES: Final = ("rest", "other")
 """What the words after the first are called; another name is another layout, of the same size."""
+INJECTED: Final = ("fast", "block")
+"""The sources that the configuration declares injections for."""
 EXTRA: Final = "extra"
 """A source that comes and goes."""
 EMULATED: Final = "plc.db"
@@ -28,6 +30,8 @@ _DB = """DATA_BLOCK DB{number}
       remote : LWord;
       shown : LWord;
       guarded : LWord;
+      declared : LWord;
+      chained : LWord;
    END_STRUCT;
 BEGIN
 END_DATA_BLOCK
@@ -46,6 +50,37 @@ stale_ms = {stale_ms}
 writable = ["command", "remote", "guarded"]
 armed = true
 """
+DECLARED: Final = (7 + 5) * 3
+"""What two declared injections, one over the other, make of the 0 that the PLC has: another order makes 22 of it."""
+CHAINED: Final = 1 << 32
+"""What the declared injection adds that is outermost of a chain."""
+PRIORITY: Final = 10
+"""Of that one: higher than any client's."""
+_INJECTIONS = """
+[[injection]]
+name = "{name}_times"
+target = "{name}/declared"
+operation = "scale"
+value = 3
+priority = 2
+[[injection]]
+name = "{name}_plus"
+target = "{name}/declared"
+operation = "offset"
+value = 5
+priority = 1
+[[injection]]
+name = "{name}_set"
+target = "{name}/declared"
+operation = "set"
+value = 7
+[[injection]]
+name = "{name}_chained"
+target = "{name}/chained"
+operation = "offset"
+value = {chained}
+priority = {priority}
+"""
 _OTHERS = """
 [[emulator]]
 name = "plc"
@@ -57,6 +92,7 @@ listen = "{plc}"
 listen = ["{grpc}"]
 [mqtt]
 listen = "{mqtt}"
+backlog_mb = 1
 [recorder]
 """
 
@@ -77,6 +113,12 @@ class Configuration:
             self._write_layout(name, NAMES[0])
         (folder / EMULATED).write_bytes((folder / "demo.db").read_bytes())
         self._write()
+
+    @property
+    def names(self) -> dict[str, str]:
+        """By source, what the words after its first are called at present."""
+        texts = {source: (self._folder / f"{source}.db").read_text() for source in SIZES}
+        return {source: next(name for name in NAMES if f" {name} :" in text) for source, text in texts.items()}
 
     def relayout(self, source: str) -> None:
         """Give a source's registers other names."""
@@ -101,4 +143,6 @@ class Configuration:
             port = self._ports.get(name, self._ports["plc"]).port
             times = {"period_ms": PERIODS_MS[layout], "stale_ms": STALE_MS[layout]}
             text += _SOURCE.format(name=name, layout=layout, port=port, number=NUMBER, **times)
+        for name in INJECTED:
+            text += _INJECTIONS.format(name=name, chained=CHAINED, priority=PRIORITY)
         self.file.write_text(text + _OTHERS.format(layout=EMULATED, **self._addresses))

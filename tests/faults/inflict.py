@@ -66,10 +66,7 @@ class ProcessInflictor:
         return pid
 
     def _pause(self, fault: Fault) -> None:
-        pid = self._pid(fault.target)
-        kill(pid, signal.SIGSTOP)
-        time.sleep(fault.for_s)
-        kill(pid, signal.SIGCONT)
+        pause(self._pid(fault.target), fault.for_s)
 
     def _hang(self, fault: Fault) -> None:
         pid = self._pid(fault.target)
@@ -97,6 +94,8 @@ class Inflictor(ProcessInflictor):
             "clock": lambda f: self._rig.set_clock(f.number % 3 and round((f.number / 2**31 - 1) * 30 * DAY_NS)),
             "midwrite": lambda f: self._mid_write.strike(f.number),
             "shm_full": lambda f: fill(SHM, f.for_s),
+            "broker_kill": lambda f: kill(broker(self._pid(f.target))),
+            "broker_pause": lambda f: pause(broker(self._pid(f.target)), f.for_s),
         }
 
     def inflict(self, fault: Fault) -> None:
@@ -123,9 +122,7 @@ class Inflictor(ProcessInflictor):
             time.sleep(fault.for_s)
             device.start()
         elif fault.kind == "plc_pause":
-            kill(device.pid, signal.SIGSTOP)
-            time.sleep(fault.for_s)
-            kill(device.pid, signal.SIGCONT)
+            pause(device.pid, fault.for_s)
         elif fault.kind == "cut":
             proxy.cut(reset=chance.random() < 0.5)
         elif fault.kind == "late":
@@ -149,6 +146,19 @@ class Inflictor(ProcessInflictor):
             time.sleep(fault.for_s)
             proxy.delay(0.0, 0.0)
         proxy.pass_all()
+
+
+def pause(pid: int, for_s: float) -> None:
+    """Stop a process for a while."""
+    kill(pid, signal.SIGSTOP)
+    time.sleep(for_s)
+    kill(pid, signal.SIGCONT)
+
+
+def broker(pid: int) -> int:
+    """The broker itself: mosquitto, a child of the instance's process ``pid``; or that one, where it is in Python."""
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return int(children[0]) if children else pid
 
 
 def fill(folder: Path, for_s: float) -> None:

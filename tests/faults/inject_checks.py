@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -82,3 +83,66 @@ class LifeCheck:
     def _tell(self, problem: str) -> None:
         self._told = True
         self.complain(f"the injection {self.name} {problem}")
+
+
+INNER: Final = "inner"
+OUTER: Final = "outer"
+SHOWN_NS: Final = 200_000_000
+"""A frame that was published so long after what stands has changed shows that."""
+QUIET_NS: Final = 600_000_000
+"""Who has given no heartbeat for this long, three of them, has not run all the time."""
+
+
+@dataclass
+class ChainCheck:
+    """Holds the word that two clients inject over to who of them stands; see :mod:`~tests.faults.chaining`.
+
+    The inner one gives multiples of 4, and the outer one gives 1 more.
+    """
+
+    source: Source
+    complain: Complain
+    counts: Counts = field(default_factory=Counts)
+    _standing: AbstractSet[str] | None = None
+    _since_ns: int = 0
+    _relayed: bool = False
+    _missed_ns: dict[str, int] = field(default_factory=dict)
+
+    def begin(self) -> None:
+        """Another pair."""
+        self._missed_ns = {}
+
+    def look(self, shown: int, publish_ns: int, now_ns: int, standing: AbstractSet[str] | None) -> bool:
+        """See the newest frame; whether it shows what the outer one gave.
+
+        ``standing``: who stood before it was read and afterwards; None: that was not the same.
+        """
+        if standing is None or standing != self._standing:
+            self._standing, self._since_ns, self._relayed = standing, now_ns, False
+            return False
+        self.counts.values += shown != 0
+        outer = shown % 4 == 1
+        settled = publish_ns > self._since_ns + SHOWN_NS
+        if standing == {INNER, OUTER}:
+            if self._relayed and not outer:
+                self._say(f"shows {shown}, which the inner injection gives, past the outer one")
+            self._relayed |= outer
+            self.counts.good += outer
+            return outer
+        if settled and standing == {INNER} and outer:
+            self._say(f"shows {shown}, which the outer injection gave, but only the inner one stands")
+        if settled and not standing and shown:
+            self._say(f"shows {shown}, but none stands")
+        return False
+
+    def stay(self, laid: AbstractSet[str], standing: AbstractSet[str], now_ns: int, undisturbed_ns: int) -> None:
+        """Who was laid stands until its client ends; ``undisturbed_ns``: since when nobody who carries it was hit."""
+        self._missed_ns = {part: at_ns for part, at_ns in self._missed_ns.items() if part in laid - standing}
+        for part in laid - standing:
+            missed_ns = self._missed_ns.setdefault(part, now_ns)
+            if now_ns - missed_ns > 2 * QUIET_NS and undisturbed_ns < missed_ns - QUIET_NS:
+                self._say(f"the {part} injection is gone, but its client is there")
+                self._missed_ns[part] = now_ns
+
+    def _say(self, problem: str) -> None:
+        self.complain(f"{self.source.name}, chain: {problem}")

@@ -17,11 +17,11 @@ from shmio.local.attach import Attachment
 from shmio.segment import EventKind
 from shmio.segment.standing_injections import Standing
 from tests.faults.checker import Checker
-from tests.faults.checks import Counts, Source
-from tests.faults.inject_checks import GuardCheck, LifeCheck
+from tests.faults.checks import Counts, Source, word_at
+from tests.faults.inject_checks import QUIET_NS, SHOWN_NS, GuardCheck, LifeCheck
 from tests.faults.injector import WAYS, Order
 from tests.faults.local import attached
-from tests.faults.plc import OTHERS, SHOWN_AT, WORD
+from tests.faults.plc import SHOWN_AT
 
 PAUSE_S: Final = 0.05
 BEGIN_S: Final = 20.0
@@ -30,9 +30,6 @@ EFFECT_NS: Final = 90 * 10**9
 """Some injection has an effect within this time, whatever happens."""
 KEPT_NS: Final = 1_500_000_000
 """So long one that is kept is watched."""
-QUIET_NS: Final = 600_000_000
-"""Who has given no heartbeat for this long, three of them, has not run all the time."""
-SHOWN_NS: Final = 200_000_000
 NUMBERS: Final = 1000
 """Values that are set aside for one client."""
 REMEMBERED: Final = 100
@@ -155,7 +152,7 @@ class Injecting:
         keep = way != "v1" and chance.random() < 0.3
         order = Order(
             description.instance, description.grpc, way, source, direction, keep, f"n{first}", first,
-            self._given[source],
+            self._given[source], "shown" if direction == "out" else "guarded",
         )  # fmt: skip
         section = self._attachment.block(source).section
         client = Client(order)
@@ -206,7 +203,7 @@ class Injecting:
             self._attachment.lift(target.source.name, one.id)
 
     def _standing(self, source: str) -> list[Standing]:
-        return [one for one in self._attachment.injections()[source] if not one.lifted]
+        return standing(self._attachment, source, "n")
 
     def _tick(self, target: Target, order: Order | None = None) -> None:
         """Write before the injection, and look at what is shown, as its neighbours do."""
@@ -237,10 +234,14 @@ class Injecting:
         target.guard.look(target.past[0])
 
 
+def standing(attachment: Attachment, source: str, initial: str) -> list[Standing]:
+    """The injections over a source whose names begin so."""
+    return [one for one in attachment.injections()[source] if one.name.startswith(initial)]
+
+
 def _shown(image: bytes) -> int:
     """What the word that is injected over shows."""
-    at = len(image) - OTHERS + SHOWN_AT
-    return int.from_bytes(image[at : at + WORD], "big")
+    return word_at(image, SHOWN_AT)
 
 
 def main() -> None:

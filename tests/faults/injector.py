@@ -28,7 +28,11 @@ WAYS = ("local", "v1", "shmio")
 
 @dataclass(frozen=True)
 class Order:
-    """What the client is to do. ``first``: the first of the values to give over ``/out``, each one above the last."""
+    """What the client is to do.
+
+    ``first``: the first of the values to give over ``/out``, each ``step`` above the last. ``relay``: instead it gives
+    one more than what comes from further in.
+    """
 
     instance: str
     grpc: str
@@ -40,11 +44,16 @@ class Order:
     first: int
     given: str
     """The file of truth for what it is about to give."""
+    register: str
+    """The word that it injects over."""
+    step: int = 1
+    priority: int = 0
+    relay: bool = False
 
     @property
     def word(self) -> str:
-        """The word that it injects over."""
-        return f"{self.source}/{'shown' if self.direction == 'out' else 'guarded'}"
+        """Its path."""
+        return f"{self.source}/{self.register}"
 
     def to_json(self) -> str:
         """As an argument of a command line."""
@@ -78,11 +87,12 @@ class Client:
         number = self.order.first
         while not self.stopping.wait(PAUSE_S):
             yield self.note(number)
-            number += 1
+            number += self.order.step
 
     def note(self, number: int) -> int:
-        """Put down that this value may be seen from now on."""
-        self._given.land(number, time.monotonic_ns())
+        """Put down that this value may be seen from now on; the same original may come to a client more than once."""
+        if self._given.since_ns(number) is None:
+            self._given.land(number, time.monotonic_ns())
         return number
 
 
@@ -157,16 +167,20 @@ def own(client: Client) -> None:
     path = f"{order.word}/{order.direction}"
     with (
         Remote(Target(order.grpc)) as remote,
-        remote.inject(path, keep=order.keep, name=order.name, originals=order.direction == "in") as shadow,
-    ):
+        remote.inject(
+            path, priority=order.priority, keep=order.keep, name=order.name,
+            originals=order.relay or order.direction == "in",
+        ) as shadow,
+    ):  # fmt: skip
         client.stands()
-        if order.direction == "out":
+        if order.direction == "out" and not order.relay:
             for number in client.numbers():
                 shadow.set({order.word: number})
             return
         client.when_told(shadow.close)
         for update in shadow:
-            shadow.send({order.word: client.note(int(update[order.word]) + 1)})
+            if value := int(update[order.word]):  # 0: nobody gives anything
+                shadow.send({order.word: client.note(value + 1)})
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ from typing import Final, Self
 from tests.faults.checker import Description
 from tests.faults.checks import Counts
 
-MODULES: Final = ("local", "remote", "mqtt", "churn", "writing", "injecting", "recorded")
+MODULES: Final = ("local", "remote", "mqtt", "churn", "writing", "injecting", "chaining", "recorded")
 LATE: Final = ("slow", "recorded", "injected")
 """How the counts begin of those who see values long after they were published, or one source after the other."""
 END_S: Final = 200.0
@@ -25,6 +25,7 @@ class Panel:
     def __init__(self, description: Description, environment: dict[str, str], complain: Callable[[str], None]) -> None:
         self.counts: dict[str, Counts] = {}
         self._complain = complain
+        self._silent = set(MODULES)
         self._checkers: list[tuple[subprocess.Popen[str], threading.Thread]] = []
         for module in MODULES:
             popen = subprocess.Popen(
@@ -45,11 +46,13 @@ class Panel:
             if "violation" in message:
                 self._complain(f"{module}, at {message['at_ns']}: {message['violation']}")
             else:
+                self._silent.discard(module)
                 self.counts |= {name: Counts(**counts) for name, counts in message["counts"].items()}
 
     def behind(self, when_ns: int) -> list[str]:
         """Who has not seen a good value yet that the PLC got after ``when_ns``. Who is late anyway is not asked."""
-        return [n for n, counts in self.counts.items() if counts.since_ns <= when_ns and not n.startswith(LATE)]
+        late = [n for n, counts in self.counts.items() if counts.since_ns <= when_ns and not n.startswith(LATE)]
+        return [*self._silent, *late]
 
     def check(self) -> None:
         """Complain of checkers that are not there any more."""

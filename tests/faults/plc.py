@@ -1,7 +1,7 @@
 """An emulated S7 PLC, as a process, whose block changes all the time and that keeps the truth about it.
 
-``python -m tests.faults.plc TRUTH LANDED GUARDED PORT SIZE PERIOD_MS``. The program leaves the last four words of the
-block to others. What is written to the first two of them is noted in LANDED, what is written to the last one in
+``python -m tests.faults.plc TRUTH LANDED GUARDED PORT SIZE PERIOD_MS``. The program leaves the last six words of the
+block to others. What is written to the first two of them is noted in LANDED, what is written to the fourth in
 GUARDED, further files of truth, before it is answered. It prints a line when it listens, and ends with its standard
 input.
 """
@@ -19,11 +19,14 @@ from tests.faults.truth import Truth, image, places
 
 NUMBER = 7
 WORD = 8
-OTHERS = 4 * WORD
+OTHERS = 6 * WORD
 """What the program leaves to others, at the block's end: a word for local writers, one for those by gRPC, one that
-nobody writes and injections show something else for, and one that injections stand before."""
+nobody writes and injections show something else for, one that injections stand before, and two more that nobody writes:
+one for declared injections alone, and one for a chain of them and of clients'."""
 SHOWN_AT = 2 * WORD
-"""Where among them the one is that injections show something else for."""
+"""Where among them the one is that one client's injection shows something else for."""
+DECLARED_AT = 4 * WORD
+CHAINED_AT = 5 * WORD
 
 
 class Noting:
@@ -32,7 +35,7 @@ class Noting:
     def __init__(self, block: bytearray, landed: Truth, guarded: Truth) -> None:
         self._lock = threading.Lock()
         self._block = block
-        self._notes = (landed, landed, None, guarded)
+        self._notes = (landed, landed, None, guarded, None, None)
         self._last = [bytes(WORD)] * len(self._notes)
 
     def __enter__(self) -> None:

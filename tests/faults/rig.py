@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Final, Self
 
@@ -174,19 +174,27 @@ class Rig(Instance):
     def description(self, seed: int) -> Description:
         """What checkers are told."""
         sources = []
-        for name, size in SIZES.items():
-            period_ns, stale_ns, tolerance_ns = (ms * 10**6 for ms in (PERIODS_MS[name], STALE_MS[name], TOLERANCE_MS))
-            source = Source(name, size, period_ns, stale_ns, tolerance_ns, one_pdu=size < 900)
+        for source in self.sources():
+            name = source.name
             files = {"truth": f"{name}.truth"} | {part: f"{name}.{part}.truth" for part in NOTES}
             known = name in self.devices
             paths = {field: str(self.folder / file) if known else None for field, file in files.items()}
-            sources.append(asdict(source) | paths)
+            sources.append(asdict(replace(source, truth=None)) | paths)
         with Segment.open(self.instance) as segment:
             rings = {name: block.ring.slot_count * block.period_ns for name, block in segment.blocks.items()}
         reader, recordings = str(self.folder / "reader"), str(self.folder / "dumps")
         return Description(
             self.instance, str(self.grpc), str(self.mqtt), seed, reader, recordings, rings, tuple(sources)
         )
+
+    def sources(self) -> list[Source]:
+        """All that are always there, with the truth of those whose PLC is ours."""
+        found = []
+        for name, size in SIZES.items():
+            period_ns, stale_ns, tolerance_ns = (ms * 10**6 for ms in (PERIODS_MS[name], STALE_MS[name], TOLERANCE_MS))
+            truth = self.devices[name].truth if name in self.devices else None
+            found.append(Source(name, size, period_ns, stale_ns, tolerance_ns, one_pdu=size < 900, truth=truth))
+        return found
 
     def reload(self, change: Callable[[Configuration], None]) -> None:
         """Change the configuration and have the instance take it."""

@@ -9,8 +9,9 @@ from typing import Final
 
 SOURCES: Final = ("fast", "block")
 """Sources whose PLC is behind a proxy and keeps the truth."""
-WORKERS: Final = ("fast", "block", "demo", "plc", "grpc", "mqtt", "recorder")
-"""Processes that the supervisor starts: sources, an emulator that feeds ``demo``, the endpoints, the recorder."""
+BROKER: Final = "broker"
+WORKERS: Final = ("fast", "block", "demo", "plc", "grpc", "mqtt", BROKER, "recorder")
+"""Processes that the supervisor starts: sources, an emulator of ``demo``, endpoints, the broker, the recorder."""
 SUPERVISOR: Final = "supervisor"
 
 PROCESS_FAULTS: Final = {"kill": 6, "pause": 3, "hang": 1, "restart": 3, "torn": 2, "relayout": 2}
@@ -25,11 +26,13 @@ OTHER_FAULTS: Final = {
     "midwrite": 3,
     "reload": 2,
     "shm_full": 2,
+    "broker_kill": 2,
+    "broker_pause": 2,
 }
 WEIGHTS: Final = PROCESS_FAULTS | DEVICE_FAULTS | OTHER_FAULTS
 """How often each kind comes, relative to the others."""
 
-RESTARTING: Final = {"kill", "hang", "restart", "torn"}
+RESTARTING: Final = {"kill", "hang", "restart", "torn", "broker_kill"}
 """Kinds after which the target is another process."""
 RENEWING: Final = {"relayout"}
 """Kinds after which the target is new: another process, and its restarts count from 0."""
@@ -79,8 +82,8 @@ def _fault(kind: str, chance: random.Random) -> Fault:
         target = chance.choice(("fast", "block", "demo") if kind in ("torn", "relayout") else WORKERS)
     elif kind in DEVICE_FAULTS:
         target = f"device of {chance.choice(SOURCES)}"
-    elif kind.startswith(SUPERVISOR):
-        target = SUPERVISOR
+    elif kind.startswith((SUPERVISOR, BROKER)):
+        target = kind.partition("_")[0]
     # Short of the 5 s after which a process counts as hanging, or long enough for it to be replaced.
     for_s = chance.uniform(0.05, 3.0)
     return Fault(kind, target, chance.uniform(0, 1), for_s, chance.getrandbits(32))

@@ -7,20 +7,21 @@ import time
 import traceback
 from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Iterable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 from shmio.segment import instances
-from tests.faults.checks import Counts, Processes, check_restarts
-from tests.faults.inflict import Inflictor
+from tests.faults.checks import UNTOUCHED_NS, Counts, Processes, check_bystanders, check_restarts
+from tests.faults.inflict import Inflictor, broker
 from tests.faults.midwrite import MidWrite
 from tests.faults.panel import Panel
 from tests.faults.pulse import Pulse
 from tests.faults.resources import Resources
+from tests.faults.retained import retained, wrong
 from tests.faults.rig import Instance, Rig, marked
-from tests.faults.schedule import RENEWING, RESTARTING, Fault, Round, rounds
+from tests.faults.schedule import BROKER, RENEWING, RESTARTING, Fault, Round, rounds
 
 RECOVERY_S: Final = 30.0
 """All is well again within this time after a fault, at the latest."""
@@ -33,6 +34,8 @@ HISTORY: Final = 20
 MOST_VIOLATIONS: Final = 10
 """So many are kept; the others are counted."""
 END_S: Final = 5.0
+RETAINED_S: Final = 5.0
+"""So long after all is well something else may be retained than what is so."""
 
 Say = Callable[[str], None]
 
@@ -133,6 +136,7 @@ class Suite(Run):
         ``seen``: whether the checkers have seen enough by then; default: anything. On a loaded machine that takes time.
         """
         begun_s = well_s = time.monotonic()
+        self._pulse = Pulse()
         with ExitStack() as stack:
             rig = stack.enter_context(Rig(self._folder, self._instance))
             mid_write = MidWrite(f"{self._instance}-torn", rig.environment, self.complain)
@@ -147,7 +151,7 @@ class Suite(Run):
                 if self._stopping.is_set() or (faults is None and time.monotonic() - well_s > for_s):
                     break
                 self._round(rig, panel, turn)
-                resources.look({name: process.pid for name, process in rig.processes().items()})
+                resources.look(pids(rig))
             until_s = time.monotonic() + SEEN_S
             while not (seen(panel.counts) or self._stopping.is_set() or time.monotonic() > until_s):
                 time.sleep(LOOK_S)
@@ -169,12 +173,16 @@ class Suite(Run):
         threads = [threading.Thread(target=self._inflict, args=(fault, begun_s, ended)) for fault in turn.faults]
         for thread in threads:
             thread.start()
-        for thread in threads:
-            thread.join()
+        bystanders = all(fault.target == BROKER for fault in turn.faults)
+        while any(thread.is_alive() for thread in threads):
+            self._pulse.beat()
+            bystanders = bystanders and self._go_on(panel)
         hit = {fault.target for fault in turn.faults if fault.kind in RESTARTING}
         renewed = {fault.target for fault in turn.faults if fault.kind in RENEWING}
         ended_ns, last = max(ended)
-        took_s = self._await_recovery(rig, panel, ended_ns, {name: before[name] for name in hit | renewed})
+        took_s = self._await_recovery(
+            rig, panel, ended_ns, {name: before[name] for name in hit | renewed}, bystanders=bystanders
+        )
         self.record.rounds += 1
         self.record.faults.update(fault.kind for fault in turn.faults)
         if took_s is not None:
@@ -191,6 +199,8 @@ class Suite(Run):
             self.complain("the instance has another segment, but its supervisor was not hit")
         check_restarts(before, rig.processes(), hit, renewed, replaced=replaced, complain=self.complain)
         self.check_processes(rig)
+        if any(fault.target in (BROKER, "mqtt") for fault in turn.faults):
+            self._check_retained(rig)
         panel.check()
         self._stopping.wait(turn.rest_s)
 
@@ -210,19 +220,36 @@ class Suite(Run):
             self.complain(f"{fault} failed: {traceback.format_exc()}")
         ended.append((time.monotonic_ns(), fault.kind))
 
-    def _await_recovery(self, rig: Rig, panel: Panel, ended_ns: int, hit: Processes) -> float | None:
+    def _go_on(self, panel: Panel) -> bool:
+        """Whether those who do not need the broker go on; else that is told."""
+        allowed_ns = UNTOUCHED_NS * self._pulse.slowness + 3 * self._pulse.held_up_ns
+        return check_bystanders(panel.counts, time.monotonic_ns(), allowed_ns, self.complain)
+
+    def _check_retained(self, rig: Rig) -> None:
+        """Who subscribes now gets what is so now, and nothing else."""
+        until_s = time.monotonic() + RETAINED_S * self._pulse.slowness
+        sources, names = rig.sources(), rig.configuration.names
+        while problems := wrong(retained(rig.mqtt, f"shmio/{rig.instance}"), sources, names, self._pulse.slowness):
+            self._pulse.beat()
+            if time.monotonic() > until_s:
+                self.complain(f"retained by the broker: {'; '.join(problems)}")
+                return
+
+    def _await_recovery(
+        self, rig: Rig, panel: Panel, ended_ns: int, hit: Processes, *, bystanders: bool = False
+    ) -> float | None:
         """Wait until everybody has values newer than ``ended_ns``; how long that took in s, None: too long.
 
-        ``hit``: processes of before that are to have successors.
+        ``hit``: processes of before that are to have successors. ``bystanders``: whether only the broker was broken.
         """
-        pulse = Pulse()
-        while (took_ns := time.monotonic_ns() - ended_ns) < RECOVERY_S * 1e9 * pulse.slowness:
+        while (took_ns := time.monotonic_ns() - ended_ns) < RECOVERY_S * 1e9 * self._pulse.slowness:
+            bystanders = bystanders and self._go_on(panel)
             behind = panel.behind(ended_ns)
-            if panel.counts and not behind and rig.status().state == "running":
+            if not behind and rig.status().state == "running":
                 now = rig.processes()
                 if not any(name in now and now[name].pid == process.pid for name, process in hit.items()):
                     return took_ns / 1e9
-            pulse.beat()
+            self._pulse.beat()
         status = rig.status()
         ill = [f"{p.name}: {p.state} {p.note}" for p in status.processes if p.state != "running"]
         self.complain(
@@ -233,3 +260,12 @@ class Suite(Run):
     def _epoch(self, rig: Rig) -> str:
         """What tells one segment of an instance from the next."""
         return str((Path("/dev/shm") / f"shmio-{rig.instance}").stat().st_ino)
+
+
+def pids(rig: Rig) -> dict[str, int | None]:
+    """Of the processes that must not grow: mosquitto, too, which is the broker's child."""
+    found = {name: process.pid for name, process in rig.processes().items()}
+    if (pid := found[BROKER]) is not None:
+        with suppress(OSError):  # it is just gone
+            found["mosquitto"] = broker(pid)
+    return found

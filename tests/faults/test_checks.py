@@ -11,14 +11,24 @@ import pytest
 
 from shmio.segment import Frame, Provenance, Quality
 from tests.faults import report
-from tests.faults.checks import Complain, FrameCheck, Process, Source, ValueCheck, check_restarts
-from tests.faults.plc import OTHERS, SHOWN_AT, WORD
+from tests.faults.checks import (
+    Complain,
+    Counts,
+    FrameCheck,
+    Process,
+    Source,
+    ValueCheck,
+    check_bystanders,
+    check_restarts,
+)
+from tests.faults.configuration import CHAINED, DECLARED
+from tests.faults.plc import CHAINED_AT, DECLARED_AT, OTHERS, SHOWN_AT, WORD
 from tests.faults.resources import Resources
 from tests.faults.suite import Record
 from tests.faults.truth import ENTRIES, Truth, generations, image, places
 
 MS = 1_000_000
-SIZE = 56
+SIZE = 72
 PERIOD_NS, STALE_NS, TOLERANCE_NS = 20 * MS, 500 * MS, 50 * MS
 STARTED_NS = 1_000 * MS
 FIRST = 50
@@ -52,8 +62,8 @@ def check(source: Source, found: list[str]) -> FrameCheck:
 
 
 def block(generation: int) -> bytes:
-    """The last words are not the program's; one of them stays 0, whatever is injected over it."""
-    others = b"\xff" * SHOWN_AT + bytes(WORD) + b"\xff" * WORD
+    """The last words are not the program's; three of them stay 0, whatever is injected over them."""
+    others = b"\xff" * SHOWN_AT + bytes(WORD) + b"\xff" * WORD + bytes(2 * WORD)
     return image(generation, places(SIZE - OTHERS)) + others
 
 
@@ -139,11 +149,14 @@ def test_a_frame_that_stays_turns_bad_in_time(check: FrameCheck, found: list[str
     assert found == []
 
 
-def injected(number: int, shown: int, **changes: Any) -> Frame:
-    """A good frame over which ``shown`` is injected."""
+def injected(number: int, shown: int, declared: int = DECLARED, chained: int = CHAINED, **changes: Any) -> Frame:
+    """A good frame over which ``shown`` is injected, and what the configuration declares."""
     one = good(number, **changes)
-    at = SIZE - OTHERS + SHOWN_AT
-    return one._replace(effective=one.raw[:at] + shown.to_bytes(WORD, "big") + one.raw[at + WORD :])
+    effective = bytearray(one.raw)
+    for place, word in ((SHOWN_AT, shown), (DECLARED_AT, declared), (CHAINED_AT, chained)):
+        at = SIZE - OTHERS + place
+        effective[at : at + WORD] = word.to_bytes(WORD, "big")
+    return one._replace(effective=bytes(effective))
 
 
 def test_what_is_injected_was_given_and_leaves_the_rest_alone(source: Source, tmp_path: Path, found: list[str]) -> None:
@@ -152,7 +165,7 @@ def test_what_is_injected_was_given_and_leaves_the_rest_alone(source: Source, tm
     given.land(7, good(2).publish_ns)
     check = FrameCheck(replace(source, given=given), found.append)
     check.begin(STARTED_NS)
-    feed(check, (good(1), 0), (injected(2, 6), 0), (injected(3, 7), 0), (good(4), 0), (injected(5, 0), 0))
+    feed(check, (injected(1, 0), 0), (injected(2, 6), 0), (injected(3, 7), 0), (injected(4, 0), 0), (injected(5, 0), 0))
     assert found == []
     other = injected(10, 7)
     effective = other.image[:8] + b"?" + other.image[9:]
@@ -162,6 +175,43 @@ def test_what_is_injected_was_given_and_leaves_the_rest_alone(source: Source, tm
     expected = ("shows 6, injected before 7", "shows 8, which nobody", "has changed others", "tells 6, which was")
     assert [any(part in line for line in found) for part in expected] == [True] * 4
     given.close()
+
+
+def test_what_is_declared_stands_in_every_frame_over_what_clients_give(
+    source: Source, tmp_path: Path, found: list[str]
+) -> None:
+    chained = Truth(tmp_path / "chained", create=True)
+    for value in (8, 9, 12):
+        chained.land(value, good(1).publish_ns)
+    chained.land(13, good(5).publish_ns)
+    check = FrameCheck(replace(source, given=chained, chained=chained), found.append)
+    check.begin(STARTED_NS)
+    never_one = frame(0, raw=bytes(SIZE), quality=Quality.BAD, reason="no answer", cycle=25)
+    feed(check, (never_one, 0))
+    values = enumerate((0, 8, 9, 8, 12), 1)
+    feed(check, *((injected(number, 0, chained=CHAINED + value), 0) for number, value in values))
+    assert found == []
+    feed(check, (injected(6, 0, chained=CHAINED + 9), 0), (injected(7, 0, chained=CHAINED + 10), 0))
+    feed(check, (injected(8, 0, chained=CHAINED + 16), 0), (injected(9, 0, chained=12), 0))
+    feed(check, (injected(10, 0, chained=CHAINED + 13, publish_ns=good(5).publish_ns - 1), 0), (injected(11, 0, 22), 0))
+    expected = (
+        "shows 9 of a chain, given before 12",
+        *(f"shows {value} of a chain, which nobody had given" for value in (10, 16, 12 - CHAINED, 13)),
+        f"shows 22, where declared injections make {DECLARED}",
+    )
+    assert [any(part in line for line in found) for part in expected] == [True] * len(expected), found
+    chained.close()
+
+
+def test_who_does_not_need_the_broker_goes_on(found: list[str]) -> None:
+    def goes_on(**ages_ms: int) -> bool:
+        counts = {name.replace("_", " "): Counts(since_ns=5000 * MS - ms * MS) for name, ms in ages_ms.items()}
+        return check_bystanders(counts, 5000 * MS, 2000 * MS, found.append)
+
+    assert goes_on(mqtt_cell=4000, slow_cell=4000, stream_cell=1999, newest_cell=100, grpc_cell_0=5000)
+    assert found == []
+    assert not goes_on(stream_cell=100, grpc_cell_0=2001)
+    assert found == ["grpc cell 0 has had nothing new for 2.0 s, and only the broker was broken"]
 
 
 def test_good_beyond_its_age_is_found(check: FrameCheck, found: list[str]) -> None:

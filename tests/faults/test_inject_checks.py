@@ -9,7 +9,7 @@ import pytest
 
 from shmio.segment import EventKind
 from tests.faults.checks import Source
-from tests.faults.inject_checks import LIFTED_NS, GuardCheck, LifeCheck
+from tests.faults.inject_checks import INNER, LIFTED_NS, OUTER, QUIET_NS, SHOWN_NS, ChainCheck, GuardCheck, LifeCheck
 from tests.faults.truth import Truth
 
 S = 1_000_000_000
@@ -107,3 +107,63 @@ def test_one_that_is_kept_stays(found: list[str]) -> None:
     assert found == []
     life.look(20 * S, stands=False, awake_since_ns=0, slack_ns=0)
     assert found == ["the injection n1 was to be kept, but is gone"]
+
+
+BOTH = {INNER, OUTER}
+
+
+def test_a_chain_shows_its_outermost(source: Source, found: list[str]) -> None:
+    chain = ChainCheck(source, found.append)
+    told = [
+        chain.look(shown, now_ns, now_ns, standing)
+        for now_ns, (shown, standing) in enumerate(
+            [
+                (0, set()),
+                (8, {INNER}),
+                (8, {INNER}),
+                (8, BOTH),
+                (8, BOTH),
+                (9, BOTH),
+                (13, BOTH),
+                (13, None),
+                (12, {INNER}),
+            ]
+        )
+    ]
+    assert told == [False] * 5 + [True] * 2 + [False] * 2
+    chain.look(16, SHOWN_NS + 9, SHOWN_NS + 9, {INNER})
+    chain.look(16, SHOWN_NS + 9, SHOWN_NS + 10, set())  # the frame is of before
+    chain.look(0, 3 * SHOWN_NS, 3 * SHOWN_NS, set())
+    assert found == []
+    assert (chain.counts.values, chain.counts.good) == (5, 2)
+
+
+@pytest.mark.parametrize(
+    ("shown", "standing", "problem"),
+    [
+        ((9, 12), BOTH, "shows 12, which the inner injection gives, past the outer one"),
+        ((9, 0), BOTH, "shows 0, which the inner injection gives, past the outer one"),
+        ((8, 9), {INNER}, "shows 9, which the outer injection gave"),
+        ((0, 9), set(), "shows 9, but none stands"),
+    ],
+)
+def test_a_chain_in_the_wrong_order_is_found(
+    source: Source, found: list[str], shown: tuple[int, int], standing: set[str], problem: str
+) -> None:
+    chain = ChainCheck(source, found.append)
+    for turn, value in enumerate((0, *shown)):
+        chain.look(value, turn * 2 * SHOWN_NS, turn * 2 * SHOWN_NS, standing)
+    assert len(found) == 1
+    assert problem in found[0]
+
+
+def test_one_of_a_chain_that_goes_without_its_clients_end_is_found(source: Source, found: list[str]) -> None:
+    chain = ChainCheck(source, found.append)
+    for now_ns in range(0, 10 * QUIET_NS, QUIET_NS):
+        chain.stay({INNER}, BOTH, now_ns, 0)
+        chain.stay(BOTH, {INNER}, now_ns, now_ns - 1)  # who carries it has just been killed
+        chain.stay({INNER}, {INNER}, now_ns, 0)
+    assert found == []
+    for now_ns in range(0, 4 * QUIET_NS, QUIET_NS):
+        chain.stay(BOTH, {INNER}, now_ns, -2 * QUIET_NS)
+    assert found == ["cell, chain: the outer injection is gone, but its client is there"]

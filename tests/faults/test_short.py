@@ -11,7 +11,7 @@ import pytest
 
 from tests.faults import report, suite
 from tests.faults.checks import Counts
-from tests.faults.schedule import DEVICE_FAULTS, SOURCES, SUPERVISOR, WEIGHTS, Fault, Round, rounds
+from tests.faults.schedule import BROKER, DEVICE_FAULTS, SOURCES, SUPERVISOR, WEIGHTS, Fault, Round, rounds
 from tests.faults.stepping import STEPPER, WORKERS, Stepping
 from tests.faults.suite import Record, Suite
 
@@ -21,7 +21,10 @@ SEED = 11
 SHORT_S = 0.3
 PIECE_S = 5.0
 NUMBER = 0x1234_5678
-TARGETS = {"kill": "fast", "hang": "grpc", "pause": "block", "restart": "plc", "torn": "fast", "relayout": "block"}
+TARGETS = {
+    "kill": "fast", "hang": "grpc", "pause": "block", "restart": "plc", "torn": "fast", "relayout": "block",
+    "broker_kill": BROKER, "broker_pause": BROKER,
+}  # fmt: skip
 
 
 def one(*targets: tuple[str, str]) -> Round:

@@ -10,10 +10,13 @@ import numpy as np
 
 from shmio.connectors.injection.campaign import Blocks, Campaign
 from shmio.connectors.injection.declared import Declared
-from shmio.connectors.injection.layers import Injection, Injections, Owner, covering, shadow
+from shmio.connectors.injection.layers import Bits, Injection, Injections, Owner, covering, shadow
 from shmio.connectors.injection.published import Chain, about, pieces
 from shmio.connectors.output import Output
+from shmio.layout.values.write import Write, apply
 from shmio.segment import Command, CommandKind, Direction, EventKind
+from shmio.segment.events import EVENT_SLOTS
+from shmio.segment.standing_injections import Standing
 
 LOOK_NS: Final = 400_000_000
 """How often it is looked whether the clients are still there: a shadow is to go within a second."""
@@ -135,20 +138,43 @@ class Injector:
         """Go on with what stood when the source's process before this one ended: consumers see the same values on."""
         block = self._writer.block
         last = block.latest()
-        seen = np.frombuffer(last.image if last else bytes(block.layout.size), np.uint8)
+        raw, image = (last.raw, last.image) if last else (bytes(block.layout.size),) * 2
+        seen = np.frombuffer(image, np.uint8)
         if last is not None:
             self.campaign.seen(last)
-        for standing in block.standing.read():
-            if standing.running is not None:
-                self.campaign.resume(standing, standing.running, seen)
+        standing = block.standing.read()
+        covers = [_cover(one, block.layout.size) for one in standing]
+        for place, one in enumerate(standing):
+            if one.running is not None:
+                self.campaign.resume(one, one.running, seen)
                 continue
-            cover = np.zeros(block.layout.size, np.uint8)
-            for offset, size, mask in standing.ranges:
-                cover[offset : offset + size] = mask
-            direction = Direction.IN if standing.direction == "in" else Direction.OUT
-            self._chain.restore(
-                Injection(
-                    standing.id, direction, standing.priority, standing.keep, standing.name,
-                    Owner(standing.writer, standing.pid), cover, seen.copy(),
-                )
-            )  # fmt: skip
+            direction = Direction.IN if one.direction == "in" else Direction.OUT
+            owner = Owner(one.writer, one.pid)
+            layer = Injection(one.id, direction, one.priority, one.keep, one.name, owner, covers[place], seen.copy())
+            self._chain.restore(layer)
+            hidden = np.zeros(block.layout.size, np.uint8)
+            for outer, cover in zip(standing[place + 1 :], covers[place + 1 :], strict=True):
+                if outer.direction == "out" and outer.active:
+                    hidden |= cover & layer.cover
+            if direction is Direction.OUT and hidden.any():
+                layer.values ^= (layer.values ^ self._given(layer, raw)) & hidden
+
+    def _given(self, layer: Injection, raw: bytes) -> Bits:
+        """The values that a client has given, where consumers see what injections further out make of them.
+
+        The events know them, as far as the ring goes back.
+        """
+        values = self.injections.before(raw, layer)
+        events = self._writer.block.events
+        for number in range(max(1, events.head() - EVENT_SLOTS + 1), events.head() + 1):
+            event = events.read(number)
+            if event is not None and event.kind == EventKind.SHADOWED and event.injection == layer.id:
+                apply(Write(event.offset, event.mask, event.data), values.data)
+        return values
+
+
+def _cover(standing: Standing, size: int) -> Bits:
+    cover = np.zeros(size, np.uint8)
+    for offset, count, mask in standing.ranges:
+        cover[offset : offset + count] = mask
+    return cover

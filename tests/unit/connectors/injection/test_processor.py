@@ -6,8 +6,10 @@ import json
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
+import msgspec
 import pytest
 
+from shmio.config import Declaration
 from shmio.connectors.base import Connector
 from shmio.connectors.injection.layers import MAX_INJECTIONS, Owner
 from shmio.connectors.loop import SourceLoop, WallClock
@@ -278,6 +280,20 @@ def test_injections_outlive_the_sources_process(rig: Rig) -> None:
     assert rig.value("speed") == 98
     del rig.owners[4]
     rig.sees({"speed": 0})
+
+
+def test_values_beneath_other_injections_outlive_the_sources_process(rig: Rig) -> None:
+    inner, outer = (rig.client.inject(["speed"], name=name) for name in ("inner", "outer"))
+    more = {"name": "more", "target": "cell/speed", "operation": "offset", "value": 100, "priority": 1}
+    rig.client.declare(msgspec.convert(more, Declaration))
+    rig.client.shadow(inner, {"speed": 7})
+    rig.client.shadow(outer, {"speed": 9})
+    rig.sees({"speed": 109})
+    rig.stop()
+    rig.start()
+    assert rig.value("speed") == 109, "it was added twice"
+    rig.client.lift(outer)
+    rig.sees({"speed": 107})
 
 
 def test_what_cannot_be_is_refused(rig: Rig) -> None:
