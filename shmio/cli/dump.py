@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from shmio import __version__
-from shmio.cli.interrupt import undone_by_signals
+from shmio.cli.interrupt import ended_by_interrupt, undone_by_signals
 from shmio.cli.run import add_full, add_json, complete, run
 
 PROGRAM = "shmio-dump"
@@ -33,8 +33,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     if around and arguments.when is None:
         parser.error("--before and --after are for --when: without a condition all is recorded, from now on")
 
+    with ended_by_interrupt():
+        verb = importlib.import_module(f"shmio.cli.recordings.{arguments.verb}")  # each needs other parts of shmio
+
     def command() -> int:
-        verb = importlib.import_module(f"shmio.cli.recordings.{arguments.verb}")
         status: int = verb.execute(arguments)
         return status
 

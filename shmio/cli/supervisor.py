@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from shmio import __version__
+from shmio.cli.interrupt import ended_by_interrupt
 from shmio.cli.run import add_json, at_least, complete, run
 from shmio.plan.replay import add_arguments
 
@@ -22,8 +23,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     complete(parser)
     arguments = parser.parse_args(argv)
 
-    def command() -> int:
+    with ended_by_interrupt():
         verb = importlib.import_module(f"shmio.cli.instance.{arguments.verb}")  # each needs other parts of shmio
+
+    def command() -> int:
         status: int = verb.execute(arguments)
         return status
 

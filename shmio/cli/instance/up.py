@@ -16,6 +16,7 @@ from pathlib import Path
 
 import msgspec
 
+from shmio.cli.interrupt import ended_by_interrupt
 from shmio.cli.run import say
 from shmio.cli.target import config_file, option_for
 from shmio.errors import ControlError
@@ -58,7 +59,8 @@ def execute(arguments: argparse.Namespace) -> int:
     file, keys = config_file(arguments), given(arguments)
     if arguments.detach:
         return _detach(file, arguments.mode, options(keys))
-    from shmio.cli.instance import start  # noqa: PLC0415
+    with ended_by_interrupt():
+        from shmio.cli.instance import start  # noqa: PLC0415
 
     if arguments.report is not None:
         return start.detached(file, arguments.mode, keys, arguments.report)

@@ -49,3 +49,46 @@ def test_ctrl_c_while_it_loads_is_no_traceback(name: str) -> None:
         [sys.executable, "-c", INTERRUPTED.format(name=name)], capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
+
+
+SWALLOWED = """
+import importlib.abc, os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a test may run with it ignored
+class Interrupting(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == {library!r}:
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+                sum(range(1000))
+            except KeyboardInterrupt:
+                pass
+sys.meta_path.insert(0, Interrupting())
+from shmio.cli import entry
+sys.argv[1:] = {words!r}
+sys.exit(entry.{name}())
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "library"),
+    [
+        ("shmio", ["step", "--instance", "not-there"], "msgspec"),
+        ("shmio", ["get", "--host", "unix:no.sock", "cell/a"], "grpc"),
+        ("shmio_dump", ["info", "no.mem"], "shmio.cli.recordings.info"),
+        ("shmio_supervisor", ["status", "--instance", "not-there"], "shmio.cli.instance.status"),
+        ("shmio_supervisor", ["up", "-c", "no.toml"], "shmio.cli.instance.start"),
+    ],
+)
+def test_ctrl_c_leaves_no_half_of_a_library(name: str, words: list[str], library: str) -> None:
+    """C code may swallow the exception that it would be, and go on with what it has not got."""
+    program = SWALLOWED.format(name=name, words=words, library=library)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+
+
+def test_a_command_to_another_host_does_not_wait_for_grpc_s_threads() -> None:
+    program = ["import atexit, sys; from shmio.cli import entry", "atexit.register(print, 'waited')"]
+    program += ["sys.argv[1:] = ['get', '--host', 'unix:no.sock', 'cell/a']", "sys.exit(entry.shmio())"]
+    done = subprocess.run([sys.executable, "-c", "\n".join(program)], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "there is no such socket" in done.stderr

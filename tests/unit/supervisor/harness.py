@@ -20,7 +20,7 @@ from shmio.supervisor import control
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[2]
-DEADLINE_S = 120.0
+DEADLINE_S = 100.0
 
 Job = tuple[str, str, list[str]]
 CELL: list[Job] = [("plc", "emulator", ["good"]), ("cell", "source", ["good"]), ("grpc", "grpc", ["good"])]
