@@ -136,7 +136,8 @@ def test_real_time_is_taken_from_a_device_once_it_was_agreed_to(
         monkeypatch.setattr("sys.stdin", Keyboard(answer))
         assert main(command) == 1
         told = capsys.readouterr()
-        assert (told.out, told.err) == ("", f"{REAL}. Go on? [y/N] time was left as it is\n")
+        assert json.loads(told.out) == {"error": "time was left as it is"}
+        assert told.err == f"{REAL}. Go on? [y/N] time was left as it is\n"
     assert mode(running) == "wall"
     monkeypatch.setattr("sys.stdin", Keyboard("y\n"))
     assert main(command) == 0
