@@ -10,7 +10,7 @@ import argparse
 import queue
 import sys
 
-from paho.mqtt.client import Client, ConnectFlags, MQTTMessage
+from paho.mqtt.client import Client, ConnectFlags, MQTTMessage, topic_matches_sub
 from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
@@ -39,6 +39,8 @@ def main() -> int:
     def heard(_client: Client, _data: object, message: MQTTMessage) -> None:
         nonlocal seen
         if 0 < arguments.count <= seen:  # it came before we had left
+            return
+        if not any(topic_matches_sub(topic, message.topic) for topic in topics):  # aMQTT sends more than was asked for
             return
         print(message.topic.removeprefix(f"{prefix}/"), message.payload.decode() or "no good value", flush=True)
         seen += 1

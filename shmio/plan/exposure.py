@@ -9,6 +9,7 @@ from typing import Final
 
 from shmio.config import Config, UnixAddress, parse_address
 from shmio.config.listening import encrypted
+from shmio.endpoints.mqtt.broker.program import find_mosquitto
 
 FIRST_UID: Final = 1000
 NOBODY: Final = 65534
@@ -57,10 +58,13 @@ def _grpc(config: Config) -> Iterator[str]:
 def _mqtt(config: Config) -> Iterator[str]:
     """The same for our own broker; an external one has its own rules."""
     mqtt = config.mqtt
-    if mqtt is None or not mqtt.listen or not any(source.writable for source in config.source):
+    if mqtt is None or not mqtt.listen:
+        return
+    if find_mosquitto() is None:
+        yield f"publish everything, values too, by MQTT at {mqtt.listen}, where aMQTT asks for no account"
         return
     free = any(account.name is None and "write" in account.roles for account in mqtt.account)
-    if free and not (mqtt.tls and mqtt.tls.ca):
+    if free and not (mqtt.tls and mqtt.tls.ca) and any(source.writable for source in config.source):
         yield f"write by MQTT at {mqtt.listen}"
 
 

@@ -15,6 +15,7 @@ from shmio.config.mqtt.accounts import read_accounts, read_password
 from shmio.config.mqtt.tls import client_context, server_context
 from shmio.config.tls import read_tls
 from shmio.config.tokens import read_tokens
+from shmio.endpoints.mqtt.broker.program import choose_broker
 from shmio.errors import ConfigError
 
 
@@ -59,11 +60,8 @@ def _check_mqtt(mqtt: Mqtt) -> None:
             read_password(mqtt.password_file)
         else:
             read_accounts(mqtt.password_file, mqtt.account)
-    if mqtt.broker == "mosquitto":
-        from shmio.endpoints.mqtt.broker import mosquitto  # noqa: PLC0415
-
-        if mosquitto.find() is None:
-            raise ConfigError(mosquitto.NONE)
+    if not external:
+        choose_broker(mqtt)
 
 
 def _check_group(name: str | None) -> None:

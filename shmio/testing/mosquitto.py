@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shutil
 import socket
 import subprocess
@@ -10,8 +9,8 @@ import time
 from pathlib import Path
 
 from shmio.config import Address
+from shmio.endpoints.mqtt.broker.program import find_mosquitto
 
-PLACES = f"{os.environ.get('PATH', os.defpath)}:/usr/sbin:/usr/local/sbin"
 PATIENCE_S = 20.0
 TETHER = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
 """Of util-linux: what it starts dies with the thread that starts it, so that a test run that is killed leaves none."""
@@ -19,7 +18,7 @@ TETHER = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
 
 def missing() -> str:
     """Why there can be none here; empty: there can."""
-    return "" if shutil.which("mosquitto", path=PLACES) else "mosquitto is not installed: apt-get install mosquitto"
+    return "" if find_mosquitto() else "mosquitto is not installed: apt-get install mosquitto"
 
 
 class Mosquitto:
@@ -46,7 +45,7 @@ class Mosquitto:
 
     def start(self) -> None:
         """Start it; returns when it listens."""
-        program = shutil.which("mosquitto", path=PLACES) or "mosquitto"
+        program = find_mosquitto() or "mosquitto"
         with (self.folder / "mosquitto.log").open("ab") as log:
             self._process = subprocess.Popen([*TETHER, program, "-c", self._file], stdout=log, stderr=log)
         until_s = time.monotonic() + PATIENCE_S

@@ -65,7 +65,7 @@ def test_clients_see_and_drive_the_cell(make_cell: Callable[..., Cell], broker: 
 def test_a_killed_broker_comes_back_and_its_bridge_goes_on(
     make_cell: Callable[..., Cell], broker: Address, program: str
 ) -> None:
-    with running(make_cell, broker, more=f'broker = "{program}"\n') as cell:
+    with running(make_cell, broker, more=f'broker = "{program}"\n{EVERYBODY}') as cell:
         before = cell.processes()
         kill(before["broker"]["pid"])
         until(lambda: cell.processes()["broker"]["restarts"] == 1, "the broker is started again")
@@ -105,12 +105,11 @@ def test_a_killed_edge_node_leaves_its_will_and_is_born_again(make_cell: Callabl
         told(listener, "NDEATH/a50")
 
 
-def test_accounts_do_what_their_roles_allow(
-    make_cell: Callable[..., Cell], broker: Address, program: str, tmp_path: Path
-) -> None:
+@pytest.mark.skipif(bool(missing()), reason=missing())
+def test_accounts_do_what_their_roles_allow(make_cell: Callable[..., Cell], broker: Address, tmp_path: Path) -> None:
     (tmp_path / "accounts").write_text("anna:secret\nbert:hidden\n")
     (tmp_path / "accounts").chmod(0o600)
-    more = f'broker = "{program}"\npassword_file = "accounts"\n{EVERYBODY}name = "bert"\n'
+    more = f'password_file = "accounts"\n{EVERYBODY}name = "bert"\n'
     viewer, writer = (dict(zip(("username", "password"), one, strict=True)) for one in WHO)
     with running(make_cell, broker, more=more) as cell:
         with (

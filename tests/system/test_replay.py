@@ -35,6 +35,8 @@ MQTT = """
 [mqtt]
 listen = "{broker}"
 prefix = "shmio/test"
+[[mqtt.account]]
+roles = ["read", "write"]
 [[mqtt.topic]]
 match = "cell/Robot_800/Axs1_Pos"
 payload = "json"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import hmac
 import re
 import secrets
 from collections.abc import Sequence
@@ -49,7 +48,7 @@ def read_accounts(name: str, roles: Sequence[MqttAccount] = ()) -> dict[str, str
             raise ConfigError(f"{KEY}: {name}: line {number}: this name has a line already")
         if user != user.strip() or secret != secret.strip():
             raise ConfigError(f"{KEY}: {name}: line {number}: a blank beside the colon, or at an end, would count")
-        known = _parts(secret)
+        known = _is_hash(secret)
         if not known and _HASH.match(secret):
             raise ConfigError(
                 f"{KEY}: {name}: line {number}: a hash of a kind that is not known here, or a damaged one: use "
@@ -71,38 +70,18 @@ def hashed(password: str) -> str:
     return f"$7${ROUNDS}${base64.b64encode(salt).decode()}${base64.b64encode(digest).decode()}"
 
 
-def matches(password: str, secret: str) -> bool:
-    """Whether a password is the one of such a hash."""
-    parts = _parts(secret)
-    if parts is None:
-        return False
-    rounds, salt, digest = parts
-    if rounds:
-        found = hashlib.pbkdf2_hmac("sha512", password.encode(), salt, rounds, len(digest))
-    else:
-        found = hashlib.sha512(password.encode() + salt).digest()
-    return hmac.compare_digest(found, digest)
-
-
-def _parts(secret: str) -> tuple[int, bytes, bytes] | None:
-    """(rounds, salt, digest) of a hash; 0 rounds: salted SHA-512 alone. None: it is none."""
+def _is_hash(secret: str) -> bool:
+    """Whether this is a hash that mosquitto knows: ``$7$ROUNDS$SALT$DIGEST``, or ``$6$SALT$DIGEST``."""
     fields = secret.split("$")
     try:
-        if fields[:2] == ["", "7"] and len(fields) == 5 and 0 < int(fields[2]) <= 10_000_000:
-            return (
-                int(fields[2]),
-                _bytes(fields[3]),
-                _bytes(fields[4]),
-            )
-        if fields[:2] == ["", "6"] and len(fields) == 4:
-            return 0, _bytes(fields[2]), _bytes(fields[3])
+        pbkdf2 = fields[:2] == ["", "7"] and len(fields) == 5 and 0 < int(fields[2]) <= 10_000_000
+        if not pbkdf2 and not (fields[:2] == ["", "6"] and len(fields) == 4):
+            return False
+        for part in fields[-2:]:
+            base64.b64decode(part, validate=True)
     except ValueError:
-        return None
-    return None
-
-
-def _bytes(text: str) -> bytes:
-    return base64.b64decode(text, validate=True)
+        return False
+    return True
 
 
 def _read(name: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pwd
+import sys
 from pathlib import Path
 
 import pytest
@@ -40,6 +41,7 @@ def host_of(monkeypatch: pytest.MonkeyPatch, *users: pwd.struct_passwd) -> None:
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SHMIO_MOSQUITTO", sys.executable)  # there is some program
     Path("cell.toml").write_text('[registers]\nMode = "INT"\n')
 
 
@@ -74,6 +76,18 @@ def test_ways_in_that_ask_nobody_who_it_is(
     if line is not None:
         assert said is not None
         assert said in line
+
+
+def test_amqtt_lets_everybody_publish_values(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    host_of(monkeypatch, user("ada", 1001 + os.geteuid()))
+    Path("supervisor.toml").write_text(BASE.format(writable="[]") + MQTT + FREE)
+    assert main(["check"]) == 0
+    assert "note: " not in capsys.readouterr().out
+    monkeypatch.setenv("SHMIO_MOSQUITTO", "")
+    assert main(["check"]) == 0
+    assert "ada) may publish everything, values too, by MQTT at 127.0.0.1:1883" in capsys.readouterr().out
 
 
 def test_who_else_can_log_in(monkeypatch: pytest.MonkeyPatch) -> None:

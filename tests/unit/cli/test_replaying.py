@@ -77,7 +77,7 @@ def test_its_sources_take_the_places_of_the_configurations(file: Path) -> None:
 
 def test_frames_of_a_source_that_is_left_out_need_not_be_published(file: Path) -> None:
     config = file.with_name("supervisor.toml")
-    mqtt = '[mqtt]\nlisten = "127.0.0.1:1883"\nprefix = "shmio/test"\n'
+    mqtt = '[mqtt]\nlisten = "127.0.0.1:1883"\nprefix = "shmio/test"\n[[mqtt.account]]\nroles = ["read", "write"]\n'
     config.write_text(f"""{CONFIG}{mqtt}
 [[mqtt.topic]]
 match = ["panel", "cell"]

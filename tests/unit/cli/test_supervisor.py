@@ -548,8 +548,14 @@ def test_a_pattern_that_names_nothing_is_odd(
 
 @pytest.mark.parametrize(("roles", "odd"), [('["read", "write"]', True), ('["read"]', False)])
 def test_a_broker_that_lets_everybody_write_is_odd(
-    example: Edit, roles: str, odd: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    example: Edit,
+    roles: str,
+    odd: bool,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    monkeypatch.setenv("SHMIO_MOSQUITTO", sys.executable)  # there is some program
     (tmp_path / "accounts").write_text("anna:secret\n")
     (tmp_path / "accounts").chmod(0o600)
     example('listen = "127.0.0.1:1883"', 'listen = "0.0.0.0:1883"\ninsecure = true\npassword_file = "accounts"')
@@ -558,6 +564,18 @@ def test_a_broker_that_lets_everybody_write_is_odd(
     output = capsys.readouterr().out
     assert ("whoever reaches 0.0.0.0:1883 may publish commands, also without an account" in output) is odd
     assert "mqtt.password_file: anna may read alone: [[mqtt.account]] gives it the role write" in output
+
+
+def test_a_broker_for_other_hosts_needs_mosquitto(
+    example: Edit, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example('listen = "127.0.0.1:1883"', 'listen = "0.0.0.0:1883"\ninsecure = true')
+    monkeypatch.setenv("SHMIO_MOSQUITTO", "")
+    for verb in ("check", "up"):
+        assert main([verb]) == 1
+        error = capsys.readouterr().err
+        assert "mqtt.listen: 0.0.0.0:1883 can be reached from other hosts" in error
+        assert "needs mosquitto" in error
 
 
 @pytest.mark.parametrize("key", ["dbNumber = 7", 'block = "db7"'])

@@ -1,1 +1,1 @@
-"""The broker that the instance starts itself: mosquitto, or aMQTT where it is missing."""
+"""The broker that the instance starts itself: mosquitto, or aMQTT for development."""

@@ -1,4 +1,4 @@
-"""What the clients of our own broker may do: the same rules for mosquitto and for the one in Python.
+"""What the clients of our own broker may do: the rules that mosquitto enforces.
 
 Nobody but the bridge publishes values, status and results: its account is made anew at each start of the broker, and is
 let in by the UNIX socket alone.
@@ -31,21 +31,6 @@ class Rights(NamedTuple):
     read: bool
     filters: Sequence[str]
 
-    def may_publish(self, topic: str) -> bool:
-        """Whether this is one of them."""
-        return any(re.fullmatch(_pattern(one), topic, re.DOTALL) for one in self.filters)
-
-
-EVERYTHING: Final = Rights(True, ["#"])
-
-
-class Guest(NamedTuple):
-    """Who has connected to the broker in Python. ``account``: None: he shows none."""
-
-    account: str | None
-    client_id: str
-    rights: Rights
-
 
 def rights(settings: Mqtt, instance: str, accounts: Iterable[str] | None) -> dict[str | None, Rights]:
     """Of each account, by its name; None: of who shows none. ``accounts``: names of those with a password, if asked."""
@@ -66,13 +51,6 @@ def _commands(settings: Mqtt, instance: str) -> Iterator[str]:
     if node := settings.sparkplug:
         name = node.node or instance
         yield from (f"spBv1.0/{node.group}/NCMD/{name}", f"spBv1.0/{node.group}/DCMD/{name}/+", "spBv1.0/STATE/+")
-
-
-def _pattern(topics: str) -> str:
-    levels = ["[^/]*" if level == "+" else re.escape(level) for level in topics.split("/")]
-    if levels[-1] != re.escape("#"):
-        return "/".join(levels)
-    return "/".join(levels[:-1]) + "(/.*)?" if levels[1:] else ".*"
 
 
 def new_secret(place: Path) -> str:

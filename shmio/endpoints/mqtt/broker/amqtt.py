@@ -1,74 +1,68 @@
-"""aMQTT as our own broker, where there is no mosquitto: pure Python, in this process, MQTT 3.1.1."""
+"""aMQTT, unpatched, as our own broker where there is no mosquitto: MQTT 3.1.1, for development on one host.
+
+Every program that reaches it may publish and subscribe to everything: aMQTT publishes last wills without asking its
+plugins, and replaces a client's session before it asks who connects, so that no role could be enforced.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import ssl
-from asyncio import StreamReader, StreamWriter
-from collections.abc import Mapping
+from asyncio import IncompleteReadError, StreamReader, StreamWriter
 from pathlib import Path
 from typing import Final
 
-from amqtt.adapters import BufferReader
-from amqtt.mqtt.connect import ConnectPacket
-from amqtt.plugins.base import BaseAuthPlugin
-from amqtt.session import Session
+from amqtt.adapters import StreamReaderAdapter, StreamWriterAdapter
+from amqtt.broker import Broker
 
 from shmio.config import Address, Mqtt
-from shmio.config.mqtt.accounts import matches, read_accounts
-from shmio.config.mqtt.tls import server_context
-from shmio.endpoints.mqtt.broker.access import BRIDGE, EVERYTHING, Guest, Rights, new_secret, rights
-from shmio.endpoints.mqtt.broker.amqtt_bounds import Hub
-from shmio.endpoints.mqtt.broker.amqtt_shares import MAX_CONNECTIONS, Refusals
-from shmio.endpoints.mqtt.broker.amqtt_streams import PEER, BridgesWriter, Reader, Writer, greeted
+from shmio.endpoints.mqtt.broker.access import new_secret
 from shmio.endpoints.mqtt.broker.directory import SOCKET
 from shmio.errors import EndpointError
 from shmio.worker import BEAT_S, Worker
 
 GREETING_S: Final = 10.0
-TOO_MANY: Final = f"client %s is refused: there are {MAX_CONNECTIONS}; for more, use another broker"
 _LISTENER: Final = "default"
-_NOT_AUTHORIZED: Final = b"\x20\x02\x00\x05"
-"""MQTT 3.1.1, section 3.2: a CONNACK."""
+_CONFIG: Final = {
+    "listeners": {_LISTENER: {"type": "external"}},  # we accept the connections, one listener being a UNIX socket
+    "plugins": {"amqtt.plugins.authentication.AnonymousAuthPlugin": {}},
+}
+_UNSUPPORTED: Final = b"\x20\x03\x00\x84\x00"
+"""MQTT 5.0, section 3.2: a CONNACK that refuses the protocol's version."""
 
-
-class Everybody(BaseAuthPlugin):  # type: ignore[misc]  # the library's classes have no types
-    """Admits everybody: who may not come in does not come so far."""
-
-    async def authenticate(self, *, session: Session) -> bool:  # noqa: ARG002  the library gives it
-        """True."""
-        return True
+log = logging.getLogger("shmio.mqtt")
 
 
 async def serve(worker: Worker, settings: Mqtt, place: Path) -> None:
-    """Be the broker until told to stop. EndpointError: the address cannot be listened on; ConfigError."""
-    accounts = read_accounts(settings.password_file, settings.account) if settings.password_file else None
-    given = rights(settings, worker.segment.instance, accounts)
-    logging.getLogger("amqtt").setLevel(logging.ERROR)
-    logging.getLogger("transitions").setLevel(logging.ERROR)
-    refusals = Refusals()
-    broker = Hub(
-        {
-            "listeners": {_LISTENER: {"type": "external"}},
-            "plugins": {f"{__name__}.{Everybody.__name__}": {}},
-        },
-        refusals,
-    )
+    """Run the broker until the worker is stopped.
+
+    Raises:
+        EndpointError: It cannot listen on the address.
+
+    """
+    for library in ("amqtt", "transitions"):
+        logging.getLogger(library).setLevel(logging.ERROR)
+    broker = Broker(_CONFIG)
     await broker.start()
-    address = Address.parse(str(settings.listen))
-    context = server_context(settings.tls) if settings.tls else None
-    connections = _Connections(broker, accounts, given, {BRIDGE: new_secret(place)}, refusals)
+    new_secret(place)  # the bridge's client ids contain it: others, not knowing them, cannot take them over
     servers: list[asyncio.Server] = []
+
+    async def take(reader: StreamReader, writer: StreamWriter) -> None:
+        await _serve(broker, reader, writer)
+
     try:
-        servers.append(await asyncio.start_unix_server(connections.take_bridge, place / SOCKET))
-        servers.append(await _listen(connections, address, context))
+        servers.append(await asyncio.start_unix_server(take, place / SOCKET))
+        address = Address.parse(str(settings.listen))
+        try:
+            servers.append(await asyncio.start_server(take, address.host, address.port))
+        except OSError as error:
+            raise EndpointError(f"cannot listen on {address}: {error.strerror}") from None
         worker.running()
         stopping = asyncio.Event()
         loop = asyncio.get_running_loop()
         worker.on_stop(lambda: loop.call_soon_threadsafe(stopping.set))
         while not stopping.is_set():
-            worker.report((0, 0, refusals.count))
+            worker.report()
             try:
                 await asyncio.wait_for(stopping.wait(), BEAT_S)
             except TimeoutError:
@@ -79,86 +73,47 @@ async def serve(worker: Worker, settings: Mqtt, place: Path) -> None:
         await broker.shutdown()
 
 
-async def _listen(connections: _Connections, address: Address, context: ssl.SSLContext | None) -> asyncio.Server:
+async def _serve(broker: Broker, reader: StreamReader, writer: StreamWriter) -> None:
+    """One client's connection, until it ends."""
     try:
-        return await asyncio.start_server(connections.take, address.host, address.port, ssl=context)
-    except OSError as error:
-        raise EndpointError(f"cannot listen on {address}: {error.strerror}") from None
+        begun = await asyncio.wait_for(_until_version(reader), GREETING_S)
+        if begun.endswith(b"MQTT\5"):
+            writer.write(_UNSUPPORTED)  # aMQTT would wait for more of what it takes for version 3.1.1
+        else:
+            await broker.external_connected(_Reader(reader, begun), _Writer(writer), _LISTENER)
+    except (OSError, TimeoutError, IncompleteReadError):
+        pass  # the client is gone, or speaks another protocol
+    except Exception as error:  # noqa: BLE001  such as "dictionary changed size": others subscribed at the same time
+        log.warning("aMQTT ended a connection, for %r; the client has to connect again", error)
+    finally:
+        writer.close()
 
 
-class _Connections:
-    """Gives the broker who connects, as many at once as there may be."""
-
-    def __init__(
-        self,
-        broker: Hub,
-        accounts: Mapping[str, str] | None,
-        given: Mapping[str | None, Rights],
-        bridge: Mapping[str, str],
-        refusals: Refusals,
-    ) -> None:
-        """``accounts``: names and hashes of who may come by the address, None: anybody; ``given``: what they may do.
-
-        ``bridge``: the account that comes by the UNIX socket.
-        """
-        self._broker, self._refusals = broker, refusals
-        self._guests = _Door(accounts, given)
-        self._bridge = _Door(bridge, {BRIDGE: EVERYTHING})
-        self._open: set[StreamWriter] = set()
-
-    async def take_bridge(self, reader: StreamReader, writer: StreamWriter) -> None:
-        """Of the UNIX socket."""
-        await self._serve(reader, writer, BridgesWriter(writer, self._open, PEER, self._refusals), self._bridge)
-
-    async def take(self, reader: StreamReader, writer: StreamWriter) -> None:
-        """Of the address."""
-        host, port, *_ = writer.get_extra_info("peername") or ("?", 0)
-        client = f"{host}:{port}"
-        if len(self._open) >= MAX_CONNECTIONS:
-            self._refusals.tell(TOO_MANY, client)
-            writer.close()
-            return
-        self._open.add(writer)
-        try:
-            await self._serve(reader, writer, Writer(writer, self._open, client, self._refusals), self._guests)
-        finally:
-            self._open.discard(writer)
-
-    async def _serve(self, reader: StreamReader, writer: StreamWriter, adapter: Writer, door: _Door) -> None:
-        try:
-            begun = await asyncio.wait_for(greeted(reader, writer), GREETING_S)
-            # Before the library sees it: that would end whoever has the client's name, and only then ask who it is.
-            guest = None if begun is None else await door.ask(begun)
-            if begun is None:
-                return
-            if guest is None or not self._broker.lets(guest):
-                writer.write(_NOT_AUTHORIZED)
-            else:
-                taken = Reader(reader, begun, adapter.client, self._refusals, guest)
-                await self._broker.external_connected(taken, adapter, _LISTENER)
-        except (OSError, TimeoutError, asyncio.IncompleteReadError):
-            pass  # it is gone, or speaks something else
-        finally:
-            writer.close()
+async def _until_version(reader: StreamReader) -> bytes:
+    """Read what a client sends first, up to the protocol's version in a CONNECT."""
+    head = await reader.readexactly(2)
+    while head[-1] & 0x80 and len(head) < 5:  # the packet's length has one to four bytes
+        head += await reader.readexactly(1)
+    return head + await reader.readexactly(7)
 
 
-class _Door:
-    """Asks who connects by one way."""
+class _Reader(StreamReaderAdapter):  # type: ignore[misc]  # the library's classes have no types
+    """Reads again what was read before, then the rest."""
 
-    def __init__(self, accounts: Mapping[str, str] | None, given: Mapping[str | None, Rights]) -> None:
-        self._accounts, self._given = accounts, given
+    def __init__(self, reader: StreamReader, begun: bytes) -> None:
+        super().__init__(reader)
+        self._begun = begun
 
-    async def ask(self, connect: bytes) -> Guest | None:
-        """Who has sent a CONNECT; None: nobody who is let in."""
-        try:
-            packet = await ConnectPacket.from_stream(BufferReader(connect))
-            client_id, name, password = packet.client_id or "", packet.username, packet.password or ""
-        except Exception:  # noqa: BLE001 - whatever the library makes of garbage, it shows no account
-            client_id, name, password = "", None, ""
-        if self._accounts is None:
-            name = None  # it is not asked whose
-        if name is not None:
-            secret = (self._accounts or {}).get(name)
-            if secret is None or not await asyncio.to_thread(matches, password, secret):
-                return None
-        return Guest(name, client_id, self._given[name]) if name in self._given else None
+    async def read(self, n: int = -1) -> bytes:
+        """Read ``n`` bytes."""
+        head, self._begun = self._begun[:n], self._begun[n:]
+        rest: bytes = await super().read(n - len(head)) if len(head) < n else b""
+        return head + rest
+
+
+class _Writer(StreamWriterAdapter):  # type: ignore[misc]
+    """Names the clients of the UNIX socket, which have no address; aMQTT refuses a client without."""
+
+    def get_peer_info(self) -> tuple[str, int]:
+        """The client's host and port."""
+        return super().get_peer_info() or ("bridge", 0)

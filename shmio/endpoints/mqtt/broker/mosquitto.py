@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import os
 import re
-import shutil
 import socket
 import subprocess
 import sys
@@ -21,12 +20,6 @@ from shmio.endpoints.mqtt.broker.access import BRIDGE, ID, Rights, new_secret, r
 from shmio.endpoints.mqtt.broker.directory import SOCKET, write_private
 from shmio.errors import EndpointError
 
-PLACES: Final = ("/usr/local/sbin", "/usr/sbin", "/sbin")
-"""Beside the PATH: Debian has it where users do not look."""
-NONE: Final = (
-    'mqtt.broker: "mosquitto" is not on this machine; install it (Debian: apt install mosquitto), or write '
-    '"embedded", which uses a slower one without it'
-)
 START_S: Final = 10.0
 STOP_S: Final = 3.0
 MAX_PACKET_BYTES: Final = 1 << 21
@@ -36,14 +29,6 @@ MAX_QUEUED_BYTES: Final = 64 << 20
 _STAMP: Final = re.compile(r"^\d+: ")
 
 log = logging.getLogger("shmio.mqtt")
-
-
-def find() -> str | None:
-    """Its path: as the environment says, or where it usually is; None: it is not on this machine, or not wanted."""
-    named = os.environ.get("SHMIO_MOSQUITTO")
-    if named is not None:
-        return shutil.which(named) if named else None
-    return shutil.which("mosquitto", path=os.pathsep.join([os.environ.get("PATH", os.defpath), *PLACES]))
 
 
 def configuration(settings: Mqtt, place: Path, *, anonymous: bool) -> str:

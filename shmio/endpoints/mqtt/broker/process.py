@@ -1,4 +1,4 @@
-"""The process of our own broker: mosquitto where it is on the machine, else one in Python."""
+"""The process of our own broker: mosquitto where it is on the machine, else aMQTT."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import msgspec
 from shmio.config import Mqtt
 from shmio.endpoints.mqtt.broker import mosquitto
 from shmio.endpoints.mqtt.broker.directory import folder, prepare, remove
-from shmio.errors import ConfigError
+from shmio.endpoints.mqtt.broker.program import choose_broker
 from shmio.worker import BEAT_S, Worker
 
 log = logging.getLogger("shmio.mqtt")
@@ -19,17 +19,19 @@ log = logging.getLogger("shmio.mqtt")
 def run(worker: Worker) -> None:
     """Serve until told to stop."""
     settings = msgspec.convert(worker.config, Mqtt)
-    program = mosquitto.find()
-    if program is None and settings.broker == "mosquitto":
-        raise ConfigError(mosquitto.NONE)
+    program = choose_broker(settings)
     place = folder(worker.segment)
     prepare(place)
     try:
         if program is not None:
             _run(worker, mosquitto.Mosquitto(program, settings, worker.segment.instance, place), settings)
         else:
-            log.info("no mosquitto on this machine: aMQTT on %s", settings.listen)
-            from shmio.endpoints.mqtt.broker import amqtt  # noqa: PLC0415  a large library, for those who need it
+            log.warning(
+                "no mosquitto on this machine: aMQTT on %s, for development: every program of this host may publish "
+                "everything, values too",
+                settings.listen,
+            )
+            from shmio.endpoints.mqtt.broker import amqtt  # noqa: PLC0415  of the extra, and large
 
             asyncio.run(amqtt.serve(worker, settings, place))
     finally:

@@ -43,9 +43,6 @@ class Process:
     def __init__(self, segment: Segment, **config: Any) -> None:
         self.stopping, self.ready = threading.Event(), threading.Event()
         self.failure: Exception | None = None
-        self.refused = 0
-        """As its counters tell."""
-        self._told = threading.Condition()
         self._stops: list[Callable[[], object]] = []
         self._worker: Any = SimpleNamespace(
             name="broker",
@@ -55,20 +52,10 @@ class Process:
             stopping=self.stopping,
             on_stop=self._stops.append,
             running=self.ready.set,
-            report=self._report,
+            report=lambda: None,
         )
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
-
-    def _report(self, counters: tuple[int, ...] = (0, 0, 0)) -> None:
-        with self._told:
-            self.refused = counters[2]
-            self._told.notify_all()
-
-    def until_refused(self, count: int) -> None:
-        """Wait until it tells that so many were."""
-        with self._told:
-            assert self._told.wait_for(lambda: self.refused >= count, TIMEOUT_S), self.refused
 
     def _run(self) -> None:
         try:
@@ -87,7 +74,7 @@ class Process:
 
 
 @contextmanager
-def serving(segment: Segment, address: Address, program: str, **config: Any) -> Iterator[Process]:
+def serving(segment: Segment, address: Address, program: str = "embedded", **config: Any) -> Iterator[Process]:
     """Unless ``account`` says otherwise, who shows none may do everything."""
     config.setdefault("prefix", PREFIX)
     config.setdefault("account", [{"roles": ["read", "write"], "publish": ["#"]}])

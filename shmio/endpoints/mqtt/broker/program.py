@@ -1,0 +1,75 @@
+"""Which program is our own broker: mosquitto, or aMQTT for development where there is none."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from importlib.util import find_spec
+from typing import Final
+
+from shmio.config import Address, Mqtt
+from shmio.errors import ConfigError
+
+PLACES: Final = ("/usr/local/sbin", "/usr/sbin", "/sbin")
+"""Searched after the PATH: Debian installs mosquitto where users do not look."""
+INSTALL: Final = "install mosquitto (Debian: apt install mosquitto)"
+EXTRA: Final = "pip install 'shmio[broker]'"
+MISSING: Final = f'mqtt.broker: "mosquitto" is not on this machine; {INSTALL}'
+NEITHER: Final = (
+    f"mqtt.broker: there is no MQTT broker on this machine; {INSTALL}, or, for development on this host alone, "
+    f"aMQTT ({EXTRA})"
+)
+EVERYBODY: Final = frozenset(("read", "write"))
+
+
+def find_mosquitto() -> str | None:
+    """Find mosquitto.
+
+    Returns:
+        The program that ``SHMIO_MOSQUITTO`` names, if it is set; else the one in the PATH or the usual places. None:
+        there is none, or ``SHMIO_MOSQUITTO`` is empty.
+
+    """
+    named = os.environ.get("SHMIO_MOSQUITTO")
+    if named is not None:
+        return shutil.which(named) if named else None
+    return shutil.which("mosquitto", path=os.pathsep.join([os.environ.get("PATH", os.defpath), *PLACES]))
+
+
+def choose_broker(settings: Mqtt) -> str | None:
+    """Choose the program that is our own broker.
+
+    Returns:
+        The path of mosquitto; None: aMQTT.
+
+    Raises:
+        ConfigError: The program is not installed, or only aMQTT is, and cannot do what the settings demand.
+
+    """
+    program = find_mosquitto()
+    if program is not None:
+        return program
+    if settings.broker == "mosquitto":
+        raise ConfigError(MISSING)
+    for demand in _only_mosquitto(settings):
+        raise ConfigError(
+            f"{demand}, which needs mosquitto, and it is not on this machine: {INSTALL}; aMQTT is for development: "
+            'it listens on loopback alone, and everybody may do everything (one [[mqtt.account]], roles = ["read", '
+            '"write"], no name)'
+        )
+    if find_spec("amqtt") is None:
+        raise ConfigError(NEITHER)
+    return None
+
+
+def _only_mosquitto(settings: Mqtt) -> Iterator[str]:
+    """What the settings demand that aMQTT does not enforce: keys, with what they say."""
+    if not Address.parse(str(settings.listen)).loopback:
+        yield f"mqtt.listen: {settings.listen} can be reached from other hosts"
+    if settings.tls is not None:
+        yield "mqtt.tls: the broker encrypts"
+    if settings.password_file is not None:
+        yield "mqtt.password_file: clients have accounts"
+    if not any(account.name is None and set(account.roles) >= EVERYBODY for account in settings.account):
+        yield "mqtt.account: not everybody may read and write"
