@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 from pathlib import Path
@@ -74,6 +75,7 @@ def test_a_line_without_end_is_given_in_parts(files: list[Path]) -> None:
 
 
 def test_a_follower_of_no_folder_is_an_error(tmp_path: Path) -> None:
+    gc.collect()  # what tests before have left is not to be closed meanwhile
     open_before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208
     with pytest.raises(OSError, match="No such file"):
         Follower([tmp_path / "none" / "a.log"])
