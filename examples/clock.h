@@ -32,6 +32,7 @@ static inline uint64_t clock_page(const uint8_t *base, uint64_t size, uint64_t t
  * calls has checked that the page lies within the mapping, aligned. */
 static inline int64_t present_ns(const uint8_t *base, uint64_t page)
 {
+    int64_t ahead = 0;
     for (unsigned attempt = 0; page && attempt < 16; attempt++) { /* of the two copies one is whole at any time */
         uint64_t cell = page + (attempt % 2 ? 320 : 64), words[4];
         uint64_t sequence = atomic_load_explicit(CLOCK_WORD(cell), memory_order_acquire);
@@ -39,13 +40,16 @@ static inline int64_t present_ns(const uint8_t *base, uint64_t page)
             words[i] = atomic_load_explicit(CLOCK_WORD(cell + 8 + 8 * i), memory_order_relaxed);
         atomic_thread_fence(memory_order_acquire);
         if (sequence % 2 || atomic_load_explicit(CLOCK_WORD(cell), memory_order_relaxed) != sequence) continue;
-        if ((uint32_t)words[0] == 0) break; /* wall */
+        if ((uint32_t)words[0] == 0) { /* wall */
+            ahead = (int64_t)(words[2] - words[3]);
+            break;
+        }
         uint64_t started = atomic_load_explicit(CLOCK_WORD(40), memory_order_relaxed);
         return (int64_t)(started + words[2] - (words[0] >> 33 & 1 ? words[3] : 0)); /* a step under way: before it */
     }
     struct timespec now;
     clock_gettime(CLOCK_MONOTONIC, &now);
-    return now.tv_sec * INT64_C(1000000000) + now.tv_nsec;
+    return now.tv_sec * INT64_C(1000000000) + now.tv_nsec + ahead;
 }
 
 #endif

@@ -117,5 +117,8 @@ class Cell(Protocol):
     def pause(self) -> None:
         """Have it step no more by itself."""
 
+    def release(self) -> None:
+        """Have it be real again."""
+
     def replay(self, wanted: Wanted) -> list[Playing]:
         """Move what plays recordings, if anything is wanted; how they play then."""

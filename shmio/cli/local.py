@@ -150,6 +150,10 @@ class Local:
         """Have it step no more by itself."""
         self.attachment.pause()
 
+    def release(self) -> None:
+        """Have it be real again."""
+        self.attachment.release()
+
     def replay(self, wanted: Wanted) -> list[Playing]:
         """Move what plays recordings, if anything is wanted; how they play then."""
         replay = self.attachment.replay

@@ -182,6 +182,10 @@ class Remote:
         """Have it step no more by itself."""
         self._client.pause()
 
+    def release(self) -> None:
+        """Have it be real again."""
+        self._client.release()
+
     def replay(self, wanted: Wanted) -> list[Playing]:
         """Move what plays recordings, if anything is wanted; how they play then."""
         wish = msgspec.to_builtins(wanted)  # what is wanted alone

@@ -16,7 +16,7 @@ from shmio.errors import CommandError, ValueRangeError
 from shmio.local.status import clock_status
 from shmio.local.time_control import MAX_RATE, MAX_STEP_NS, MIN_STEP_NS, check_step
 
-HELP = "Step the instance's time: from the first step on nothing else moves it."
+HELP = "Step the instance's time: from the first step on nothing else moves it, until it is released."
 LOOK_S = 0.2
 
 
@@ -34,20 +34,23 @@ def arguments(parser: argparse.ArgumentParser) -> None:
         help="step at RATE times real time (default: 1) until Ctrl-C; then time stands",
     )
     how.add_argument("--pause", action="store_true", help="have time stand, and do no step")
+    how.add_argument("--release", action="store_true", help="have time be real again, and do no step")
     parser.add_argument("--yes", action="store_true", help="do not ask where time is real and sources have devices")
 
 
 def execute(cell: Cell, options: argparse.Namespace) -> int:
     """Step, play or pause, and tell the time then. TimeError, ValueRangeError, CommandError."""
     dt_s = None if options.dt_ms is None else options.dt_ms / 1000
-    if options.pause and dt_s is not None:
-        raise CommandError("--pause does no step: leave out --dt-ms")
-    if not options.yes:
+    if dt_s is not None and (options.pause or options.release):
+        raise CommandError(f"{'--pause' if options.pause else '--release'} does no step: leave out --dt-ms")
+    if not options.yes and not options.release:
         _ask(cell)
     if options.play is not None:
         _play(cell, options.play, dt_s)
     elif options.pause:
         cell.pause()
+    elif options.release:
+        cell.release()
     else:
         cell.step(dt_s, options.count)
     clock = clock_status(cell.clock)
@@ -60,7 +63,7 @@ def _ask(cell: Cell) -> None:
     if cell.clock.virtual or not (real := cell.real_sources()):
         return
     who = f"{real[0]} goes" if len(real) == 1 else f"{real[0]} and {len(real) - 1} more go"
-    what = f"the instance's time is real: a step makes it stand until a restart, while {who} on in real time"
+    what = f"the instance's time is real: a step makes it stand until it is released, while {who} on in real time"
     if sys.stdin is None or not sys.stdin.isatty():
         raise CommandError(f"{what}; to step all the same: --yes")
     sys.stderr.write(f"{what}. Go on? [y/N] ")

@@ -24,6 +24,10 @@ class Schedule:
         self._period_ns = period_ns
         self._last: int | None = None
 
+    def moved(self, ahead_ns: int, lead: int) -> Schedule:
+        """One that counts by a clock that is so far ahead, and so many cycles beyond that."""
+        return Schedule(self._start_ns - ahead_ns - lead * self._period_ns, self._period_ns)
+
     def next(self, now_ns: int) -> Due:
         """The cycle after the last one given, or a later one if that is wholly past."""
         current = self.at(now_ns)

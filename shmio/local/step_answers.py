@@ -11,7 +11,7 @@ from shmio.segment.frame import Quality
 from shmio.segment.segment import Segment
 
 _NOBODY: Final = "no source lives on the instance's clock: steps move none; those with a device go on in real time"
-_REAL: Final = "; a restart of the instance brings real time back"
+_REAL: Final = "; shmio step --release brings real time back"
 _STANDS: Final = f"it stands until it is stepped{_REAL}"
 
 

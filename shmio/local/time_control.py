@@ -96,6 +96,42 @@ class Coordinator:
             for slot in self._segment.processes:
                 self._segment.clock.slot_bell(slot.index).ring()
 
+    def release(self, patience_s: float = 0.0) -> None:
+        """Have time be real again, from where it stands; it is nobody's then. Nothing, if it is real already.
+
+        ``patience_s`` as of :meth:`take_over`. TimeError: another living process owns time, or it was never real.
+        """
+        with self._turn:
+            self.check_release()
+            if not self._owns:
+                self._take_lock(time.monotonic_ns() + round(patience_s * 1e9))
+            clock = self._segment.clock
+            state = clock.told()
+            if state.virtual:
+                # Each source looks at the page before it publishes: none of theirs is later than this.
+                offset_ns = state.time_ns - (time.monotonic_ns() - self._segment.header.started_ns)
+                self._write(
+                    state._replace(
+                        mode=ClockMode.WALL, dt_ns=0, playing=False, stepping=False, owner=0, note="",
+                        resumed_ns=state.time_ns, offset_ns=offset_ns,
+                    )
+                )  # fmt: skip
+            self._segment.shared.unlock(self._lock_byte)
+            self._owns = False
+            clock.bell.ring()  # once more: who waits for the lock
+            for slot in self._segment.processes:
+                clock.slot_bell(slot.index).ring()
+
+    def check_release(self) -> None:
+        """TimeError: time cannot be released here, whoever owns it."""
+        if not self._segment.shared.writable:
+            raise TimeError("this attachment only reads: attach with writable=True")
+        if self._segment.clock.stepped:
+            raise TimeError(
+                f'the time of instance {self._segment.instance!r} is virtual from its start (clock = "stepped" in its '
+                'configuration): there is no real time to go back to; for that start it with clock = "wall"'
+            )
+
     def set_step_size(self, dt_ns: int) -> None:
         """How far a step goes that does not say it itself; takes time over.
 
@@ -193,17 +229,17 @@ class Coordinator:
             bell.wait(seen, min(rest_ns, TURN_NS))
 
     def _frozen(self, state: ClockState) -> ClockState:
-        """Virtual time that goes on from now."""
-        now_ns = self._segment.clock_ns(time.monotonic_ns())
-        step = max((self._cycle(block, now_ns) for block in self._participants()), default=0)
-        return state._replace(mode=ClockMode.VIRTUAL, step=step, done=step, time_ns=now_ns)
+        """Virtual time that goes on from now, and from this state of wall time."""
+        now_ns = self._segment.clock_ns(time.monotonic_ns()) + state.offset_ns
+        step = max([state.step, *(self._cycle(block, state, now_ns) for block in self._participants())])
+        return state._replace(mode=ClockMode.VIRTUAL, step=step, done=step, time_ns=now_ns, resumed_ns=0, offset_ns=0)
 
     def _participants(self) -> list[Block]:
         self._segment.refresh()
         return [block for block in self._segment.blocks.values() if block.attributes.stepped]
 
     @staticmethod
-    def _cycle(block: Block, now_ns: int) -> int:
+    def _cycle(block: Block, state: ClockState, now_ns: int) -> int:
         """The present cycle of a block that has free-run, or a later one if it has published such.
 
         One that plays a recording has the recording's cycles, which are no steps.
@@ -211,7 +247,7 @@ class Coordinator:
         if block.playhead is not None:
             return 0
         frame = block.latest()
-        return max(now_ns // block.period_ns, 0 if frame is None else frame.cycle)
+        return max(now_ns // block.period_ns + state.lead(block.period_ns), 0 if frame is None else frame.cycle)
 
     def _ring(self, sources: Sequence[str]) -> None:
         for slot in self._segment.processes:

@@ -58,6 +58,14 @@ class Timekeeper:
         if failure is not None:
             raise failure
 
+    def release(self) -> None:
+        """Have time be real again. TimeError, also of a step that has failed while it was played."""
+        self._check_running()
+        self._coordinator.check_release()
+        if self._player is not None:
+            self.pause()
+        self._coordinator.release(PATIENCE_S)
+
     def close(self) -> None:
         """Stop playing, and give time up."""
         try:
@@ -67,9 +75,12 @@ class Timekeeper:
             self._coordinator.close()
 
     def _take_over(self) -> None:
+        self._check_running()
+        self._coordinator.take_over(PATIENCE_S)
+
+    def _check_running(self) -> None:
         if not self._segment.shared.current():
             raise NotRunningError(f"instance {self._segment.instance!r} has stopped")
-        self._coordinator.take_over(PATIENCE_S)
 
     def _play(self, rate: float, dt_ns: int | None) -> None:
         due_ns = time.monotonic_ns()
@@ -103,8 +114,8 @@ class Timed:
         """Move time by ``dt_s`` (default: the step size), and wait until all sources on the clock have done so.
 
         From the first call on, of this or :meth:`pause` or :meth:`play`, only steps move time; this program owns it
-        until it detaches. The attachment must be ``writable``. TimeError: another program owns time, or the step
-        failed: who did not answer or failed, and why; ValueRangeError: not within 1 us and 1 h.
+        until it detaches, or calls :meth:`release`. The attachment must be ``writable``. TimeError: another program
+        owns time, or the step failed: who did not answer or failed, and why; ValueRangeError: not within 1 us and 1 h.
         """
         return self._time.step(_ns(dt_s))
 
@@ -115,6 +126,14 @@ class Timed:
     def pause(self) -> None:
         """Have time stand. TimeError: another program owns it, or a step failed while it was played."""
         self._time.pause()
+
+    def release(self) -> None:
+        """Have time be real again: it goes on from where it stands, and this program owns it no more.
+
+        Nothing, if it is real. TimeError: another program owns time, it was virtual from the instance's start, or a
+        step failed while it was played.
+        """
+        self._time.release()
 
 
 def _ns(dt_s: float | None) -> int | None:

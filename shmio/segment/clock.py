@@ -2,6 +2,15 @@
 
 The section is described in docs/reference/segment-format.md. The owner of time writes it (``coordinator``), anybody
 reads it, and each process has a bell there that is rung when the page has something for it to do.
+
+Real time that is given back (``Coordinator.release``) goes on from where virtual time stood, and cycles from the last
+step's number, so that neither ever goes back. What both count from is kept in the page, which has no other use for
+time and step while time is real; so every process, also one that starts later, counts alike:
+
+- clock = CLOCK_MONOTONIC - ``started`` + ``offset_ns``;
+- cycle of a block = clock // period + lead, lead = step - ``resumed_ns`` // period.
+
+All three are 0 until time is released for the first time. Devices' frames are stamped without the offset, always.
 """
 
 from __future__ import annotations
@@ -39,7 +48,7 @@ class ClockMode(IntEnum):
 
     WALL = 0
     VIRTUAL = 1
-    """Only steps do, from the moment when a program took time over until the instance ends."""
+    """Only steps do, from the moment when a program took time over until one releases it, or the instance ends."""
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -51,7 +60,8 @@ class ClockState(NamedTuple):
     ``step``: number of the last step asked for; ``time_ns``: the instance's clock after it, ``dt_ns`` before which it
     was that much less; in wall time ``time_ns`` is now. ``stepping``: that step is under way. ``done``: number of the
     last one that all participants have finished. ``owner``: pid of who moves time; 0: nobody. ``note``: whom a step
-    waits for, why the last one failed, or what it did not move.
+    waits for, why the last one failed, or what it did not move. ``resumed_ns``, ``offset_ns``: in wall time the clock
+    at which it was released, and how far it is ahead of the real time since the instance's start.
     """
 
     mode: ClockMode = ClockMode.WALL
@@ -65,6 +75,8 @@ class ClockState(NamedTuple):
     stepping: bool = False
     owner: int = 0
     note: str = ""
+    resumed_ns: int = 0
+    offset_ns: int = 0
 
     @property
     def virtual(self) -> bool:
@@ -75,6 +87,15 @@ class ClockState(NamedTuple):
     def present_ns(self) -> int:
         """The instance's clock: while a step is under way still what it was before that."""
         return self.time_ns - self.dt_ns if self.stepping else self.time_ns
+
+    @property
+    def basis(self) -> tuple[ClockMode, int, int, int]:
+        """What clock and cycles are counted from in wall time: it changes whenever time is taken over or released."""
+        return self.mode, self.step, self.resumed_ns, self.offset_ns
+
+    def lead(self, period_ns: int) -> int:
+        """In wall time: how far cycles of this period are ahead of the clock."""
+        return self.step - self.resumed_ns // period_ns
 
 
 class Bell:
@@ -128,7 +149,7 @@ class ClockPage:
     def write_new(memory: memoryview, offset: int, slots: int, *, virtual: bool, time_ns: int = 0) -> None:
         """The page of a new segment; ``virtual``: time stands at ``time_ns`` until somebody steps."""
         struct.pack_into("<II", memory, offset + _SLOTS_AT, slots, virtual)
-        state = ClockState(ClockMode.VIRTUAL if virtual else ClockMode.WALL, time_ns=time_ns)
+        state = ClockState(ClockMode.VIRTUAL, time_ns=time_ns) if virtual else ClockState()
         _cell(memory, offset).write(_pack(state))
 
     @property
@@ -144,7 +165,9 @@ class ClockPage:
         state = self.told()
         if state.playing and not self._owned():
             state = state._replace(playing=False)
-        return state if state.virtual else state._replace(time_ns=time.monotonic_ns() - self._started_ns)
+        if state.virtual:
+            return state
+        return state._replace(time_ns=time.monotonic_ns() - self._started_ns + state.offset_ns)
 
     def told(self) -> ClockState:
         """The page as its writer has left it, dead or alive. SegmentError."""
@@ -164,11 +187,12 @@ class ClockPage:
     def now_ns(self) -> int:
         """What ages of frames that live on this clock are taken against, comparable to CLOCK_MONOTONIC.
 
-        In wall time it is CLOCK_MONOTONIC.
+        In wall time it is CLOCK_MONOTONIC, as long as nobody has moved and released time.
         """
         mode, flags, _, time_ns, dt_ns = _TIME.unpack(self._state.read(_TIME.size))  # not all of it: each age asks
         if not mode:
-            return time.monotonic_ns()
+            offset_ns: int = time_ns - dt_ns
+            return time.monotonic_ns() + offset_ns
         present_ns: int = time_ns - dt_ns if flags & _STEPPING else time_ns
         return self._started_ns + present_ns
 
@@ -233,16 +257,20 @@ def _cell(memory: memoryview, offset: int) -> TwinCell:
 
 def _pack(state: ClockState) -> bytes:
     flags = (_PLAYING if state.playing else 0) | (_STEPPING if state.stepping else 0)
+    time_ns, dt_ns = state.time_ns, state.dt_ns
+    if not state.virtual:
+        time_ns, dt_ns = state.resumed_ns, state.resumed_ns - state.offset_ns
     return _STATE.pack(
-        state.mode, flags, state.step, state.time_ns, state.dt_ns, state.done, state.step_size_ns, state.rate,
-        state.owner, cut(state.note, _NOTE_SIZE),
+        state.mode, flags, state.step, time_ns, dt_ns, state.done, state.step_size_ns, state.rate, state.owner,
+        cut(state.note, _NOTE_SIZE),
     )  # fmt: skip
 
 
 def _unpack(data: bytes) -> ClockState:
     mode, flags, step, time_ns, dt_ns, done, step_size_ns, rate, owner, note = _STATE.unpack(data)
-    return ClockState(
+    state = ClockState(
         ClockMode.VIRTUAL if mode else ClockMode.WALL, step, time_ns, dt_ns, done, step_size_ns,
         bool(flags & _PLAYING), rate if math.isfinite(rate) and rate > 0 else 1.0, bool(flags & _STEPPING), owner,
         text(note),
     )  # fmt: skip
+    return state if mode else state._replace(dt_ns=0, resumed_ns=time_ns, offset_ns=time_ns - dt_ns)

@@ -954,6 +954,10 @@ class PauseRequest(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...
 
+class ReleaseRequest(_message.Message):
+    __slots__ = ()
+    def __init__(self) -> None: ...
+
 class WatchClockRequest(_message.Message):
     __slots__ = ()
     def __init__(self) -> None: ...

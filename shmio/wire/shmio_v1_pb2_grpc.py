@@ -114,6 +114,11 @@ class ShmioStub(object):
                 request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.PauseRequest.SerializeToString,
                 response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
                 _registered_method=True)
+        self.Release = channel.unary_unary(
+                '/shmio.v1.Shmio/Release',
+                request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.ReleaseRequest.SerializeToString,
+                response_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
+                _registered_method=True)
         self.WatchClock = channel.unary_stream(
                 '/shmio.v1.Shmio/WatchClock',
                 request_serializer=shmio_dot_wire_dot_shmio__v1__pb2.WatchClockRequest.SerializeToString,
@@ -241,6 +246,13 @@ class ShmioServicer(object):
         context.set_details('Method not implemented!')
         raise NotImplementedError('Method not implemented!')
 
+    def Release(self, request, context):
+        """Time goes by itself again, from where it stands; nothing, if it does.
+        """
+        context.set_code(grpc.StatusCode.UNIMPLEMENTED)
+        context.set_details('Method not implemented!')
+        raise NotImplementedError('Method not implemented!')
+
     def WatchClock(self, request, context):
         """How time stands: at once, then after each step and each change.
         """
@@ -336,6 +348,11 @@ def add_ShmioServicer_to_server(servicer, server):
             'Pause': grpc.unary_unary_rpc_method_handler(
                     servicer.Pause,
                     request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.PauseRequest.FromString,
+                    response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.SerializeToString,
+            ),
+            'Release': grpc.unary_unary_rpc_method_handler(
+                    servicer.Release,
+                    request_deserializer=shmio_dot_wire_dot_shmio__v1__pb2.ReleaseRequest.FromString,
                     response_serializer=shmio_dot_wire_dot_shmio__v1__pb2.Clock.SerializeToString,
             ),
             'WatchClock': grpc.unary_stream_rpc_method_handler(
@@ -780,6 +797,33 @@ class Shmio(object):
             target,
             '/shmio.v1.Shmio/Pause',
             shmio_dot_wire_dot_shmio__v1__pb2.PauseRequest.SerializeToString,
+            shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
+            options,
+            channel_credentials,
+            insecure,
+            call_credentials,
+            compression,
+            wait_for_ready,
+            timeout,
+            metadata,
+            _registered_method=True)
+
+    @staticmethod
+    def Release(request,
+            target,
+            options=(),
+            channel_credentials=None,
+            call_credentials=None,
+            insecure=False,
+            compression=None,
+            wait_for_ready=None,
+            timeout=None,
+            metadata=None):
+        return grpc.experimental.unary_unary(
+            request,
+            target,
+            '/shmio.v1.Shmio/Release',
+            shmio_dot_wire_dot_shmio__v1__pb2.ReleaseRequest.SerializeToString,
             shmio_dot_wire_dot_shmio__v1__pb2.Clock.FromString,
             options,
             channel_credentials,

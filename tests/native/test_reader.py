@@ -216,6 +216,10 @@ def test_what_lives_on_the_clock_is_as_old_as_that_says(reader: Path, instance: 
             writer.at_ns = made.clock.monotonic_ns(2 * hour_ns)
             number = writer.publish(image(), cycle=8)
             assert running.line()[:4] == (str(number), "8", "0", "good")
+            made.clock.write(ClockState(step=8, resumed_ns=2 * hour_ns, offset_ns=-10 * hour_ns))  # real time again
+            writer.at_ns = made.clock.now_ns() + hour_ns  # is not old, however slow the host is
+            number = writer.publish(image(), cycle=9)
+            assert running.line()[:4] == (str(number), "9", "0", "good")
 
 
 def test_an_instance_that_stops_ends_it(reader: Path, instance: str) -> None:

@@ -36,6 +36,7 @@ writable = ["speed"]
 name = "gate"
 connector = "simulation"
 model = "line:Gate"
+period_ms = 7
 writable = ["**"]
 [source.connections]
 position = "belt/position"
@@ -159,6 +160,34 @@ def test_wall_time_goes_on_until_it_is_taken_over(make_line: Callable[[str], Cel
     assert get(line, "belt/position") == [pytest.approx(before[0] + 0.1)]
 
 
+def test_real_time_comes_back_and_is_taken_over_again(make_line: Callable[[str], Cell]) -> None:
+    line = make_line("wall")
+
+    def runs() -> None:
+        [before], cycle = get(line, "belt/position"), line.processes()["belt"]["cycle"]
+        until(lambda: line.processes()["belt"]["cycle"] > cycle + 3, "it runs by itself")
+        assert get(line, "belt/position")[0] > before
+
+    moments = []
+    with shmio.attach(line.instance) as cell:
+        followed = [cell.block(source).cursor() for source in ("belt", "gate", "panel")]
+        for way in ((), ("--host", str(line.grpc))):
+            # More steps than there were periods, then more time than has passed.
+            moments += [step(line, *way, "--dt-ms", dt_ms, "--count", "30") for dt_ms in ("1", "60000")]
+            moments.append(step(line, *way, "--release"))
+            assert moments[-1]["mode"] == "wall"
+            runs()
+        pid = line.processes()["belt"]["pid"]
+        kill(pid)
+        until(lambda: line.processes()["belt"]["pid"] not in (None, pid), "its process is replaced")
+        runs()
+        for cursor in followed:
+            told = [(frame.cycle, frame.clock_ns) for frame in iter(cursor.poll, None)]
+            assert told == sorted(told), "neither cycles nor time go back"
+    times = [moment["time_s"] for moment in moments]
+    assert times == sorted(times)
+
+
 def test_it_plays_until_it_is_interrupted(line: Cell) -> None:
     begun_s = line.status()["clock"]["time_s"]
     with subprocess.Popen([BIN / "shmio", "step", "--play", "10"], cwd=line.folder, stdout=subprocess.PIPE) as player:
@@ -174,6 +203,12 @@ def test_it_plays_until_it_is_interrupted(line: Cell) -> None:
     clock = line.status()["clock"]
     assert not clock["playing"]
     assert step(line)["step"] == clock["step"] + 1
+
+
+def test_time_that_was_never_real_is_not_released(line: Cell) -> None:
+    told = [line.run("shmio", "step", "--release", *way).stderr for way in ((), ("--host", str(line.grpc)))]
+    assert all('virtual from its start (clock = "stepped" in its configuration)' in one for one in told)
+    assert step(line)["mode"] == "virtual"
 
 
 def test_a_program_steps_and_plays(line: Cell) -> None:

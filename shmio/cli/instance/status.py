@@ -11,6 +11,7 @@ from shmio.cli.target import config_option, target
 from shmio.errors import NotRunningError
 from shmio.local.status import ClockStatus, InstanceStatus, ProcessStatus, SourceStatus, read_status
 from shmio.logs import printable
+from shmio.segment.clock import ClockMode
 
 _HEADINGS = ("NAME", "KIND", "STATE", "PID", "RESTARTS", "UPTIME", "")
 
@@ -50,7 +51,9 @@ def _table(status: InstanceStatus) -> list[str]:
 
 
 def clock_line(clock: ClockStatus, dt_ms: float | None = None) -> str:
-    """Virtual time in one line. ``dt_ms``: by how much its steps were told to move it; None: by the step size."""
+    """Time in one line. ``dt_ms``: by how much its steps were told to move it; None: by the step size."""
+    if clock.mode == str(ClockMode.WALL):
+        return f"real time {clock.time_s:.3f} s"
     size = f"{clock.step_size_ms:g} ms"
     step = f"{clock.step}, steps of {size}" if dt_ms is None else f"{clock.step} of {dt_ms:g} ms, step size {size}"
     how = f", playing at {clock.rate:g} times real time" if clock.playing else ""

@@ -227,6 +227,10 @@ class Client:
         """Have time step no more by itself; takes it over. CommandError."""
         return Clock.of(await self._call(self._stub.Pause, wire.PauseRequest()))
 
+    async def release(self) -> Clock:
+        """Have time go by itself again, from where it stands; how it stands then. CommandError."""
+        return Clock.of(await self._call(self._stub.Release, wire.ReleaseRequest()))
+
     async def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
         """Move the sources that play recordings (:class:`Wish`); without a wish only tell how they play.
 

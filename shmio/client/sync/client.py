@@ -228,6 +228,10 @@ class Client:
         """Have time step no more by itself; takes it over. CommandError."""
         return Clock.of(self._call(self._stub.Pause, wire.PauseRequest()))
 
+    def release(self) -> Clock:
+        """Have time go by itself again, from where it stands; how it stands then. CommandError."""
+        return Clock.of(self._call(self._stub.Release, wire.ReleaseRequest()))
+
     def replay(self, **wish: Unpack[Wish]) -> list[Playing]:
         """Move the sources that play recordings (:class:`Wish`); without a wish only tell how they play.
 

@@ -282,7 +282,12 @@ class Campaign:
     def _time_ns(self, cycle: int) -> int:
         """The instance's clock at a cycle: in wall time as the schedule has it, however punctual the cycle was."""
         state = self._own.clock.read()
-        return state.time_ns if state.virtual else cycle * self._own.period_ns
+        if state.virtual:
+            return state.time_ns
+        period_ns = self._own.period_ns
+        if self._own.attributes.stepped:
+            return (cycle - state.lead(period_ns)) * period_ns
+        return cycle * period_ns + state.offset_ns  # a device's cycles are always those of real time
 
 
 def _seed(declaration: Declaration) -> int:

@@ -17,7 +17,7 @@ from shmio.connectors.source_status import Condition, Counters
 from shmio.errors import ShmioError
 from shmio.layout.values.write import Write
 from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
-from shmio.segment.clock import ClockPage
+from shmio.segment.clock import ClockPage, ClockState
 
 RESTARTED: Final = "its process was started anew within this step; it goes on with the next one"
 
@@ -91,7 +91,8 @@ class SteppedLoop:
         self._writer = writer
         self._page = writer.block.clock
         writer.utc_ns = self._page.utc_ns
-        self._schedule = schedule
+        self._from_start = self._schedule = schedule
+        self._basis = ClockState().basis  # what the schedule counts from
         self._clock = clock
         self._inputs = inputs
         self._output = Output(writer, clock.now_ns)
@@ -102,7 +103,7 @@ class SteppedLoop:
         )  # fmt: skip
         self._condition = Condition(writer)
         self._handled = 0  # the last step computed, or passed over
-        self._cycle: int | None = None  # the last one computed in wall time
+        self._time_ns: int | None = None  # the instance's clock at what was computed last
         self._published = False
         self.counters = Counters()
 
@@ -136,6 +137,7 @@ class SteppedLoop:
             return
         self._writer.cycle, self._handled = state.step, state.step
         self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
+        self._time_ns = state.time_ns
         if state.stepping and last is None:
             self._handled -= 1  # nothing is lost: it takes part
         elif state.stepping and last is not None and last.cycle < state.step:
@@ -147,6 +149,12 @@ class SteppedLoop:
 
     def _free_run(self) -> bool:
         """Wait for the next cycle of the schedule and compute it; True: told to stop."""
+        state = self._page.told()
+        if state.virtual:
+            return False
+        if state.basis != self._basis:
+            self._resume(state)
+        self._writer.at_ns = None
         due = self._schedule.next(self._clock.now_ns())
         self.counters.overruns += due.skipped
         while (now_ns := self._clock.now_ns()) < due.due_ns:
@@ -159,26 +167,32 @@ class SteppedLoop:
                 wait_ns = min(wait_ns, self._output.next_ns - now_ns)
             if self._clock.wait_ns(wait_ns):
                 return True
-            if self._page.read().virtual:
+            if self._page.told().basis != self._basis:
                 return False
         if self._clock.wait_ns(0):
             return True
-        if self._page.read().virtual:  # looked at after the time: see Coordinator.take_over
+        if self._page.told().basis != self._basis:  # looked at after the time: see Coordinator.take_over
             return False
         if now_ns >= self._schedule.due_ns(due.cycle + 1):  # held up while it waited
             self.counters.overruns += 1
             return False
         period_ns = self._writer.block.period_ns
-        passed = 1 if self._cycle is None else due.cycle - self._cycle
-        self._cycle = due.cycle
-        self._compute(due.cycle, due.cycle * period_ns, passed * period_ns)
+        time_ns = (due.cycle - state.lead(period_ns)) * period_ns
+        self._compute(due.cycle, time_ns, period_ns if self._time_ns is None else time_ns - self._time_ns)
         return False
+
+    def _resume(self, state: ClockState) -> None:
+        """Go on with real time, which was released."""
+        self._basis = state.basis
+        self._schedule = self._from_start.moved(state.offset_ns, state.lead(self._writer.block.period_ns))
 
     # ---- virtual time --------------------------------------------------------------------------------------------
 
     def _live(self) -> bool:
         """Do the step that is asked for, or what came between two; else wait. True: told to stop."""
         state = self._page.read()
+        if not state.virtual:
+            return False
         if state.stepping and state.step != self._handled:
             self._handled = state.step
             self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
@@ -199,7 +213,7 @@ class SteppedLoop:
 
     def _compute(self, cycle: int, time_ns: int, dt_ns: int) -> None:
         """One cycle, or one step."""
-        self._writer.cycle = cycle
+        self._writer.cycle, self._time_ns = cycle, time_ns
         self._published = False
         self.desk.release(cycle)
         self._carry_out()

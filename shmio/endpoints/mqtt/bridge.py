@@ -138,7 +138,9 @@ class Bridge:
             key.data(events)
         self._link_turn()
         self._follow()
+        held = [feed for feed in self._feeds.values() if feed.held]
         self.steps.look(self._feeds.values())
+        self._more.update(feed for feed in held if not feed.held)  # what came since the last step was not looked at
         for feed in list(self._more):
             self._look(feed)
         due_s = [TURN_S, *self._settle()]

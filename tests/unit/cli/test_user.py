@@ -111,7 +111,7 @@ class Keyboard(io.StringIO):
         return True
 
 
-REAL = "the instance's time is real: a step makes it stand until a restart, while cell goes on in real time"
+REAL = "the instance's time is real: a step makes it stand until it is released, while cell goes on in real time"
 
 
 def mode(instance: str) -> str:

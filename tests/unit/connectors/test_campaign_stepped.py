@@ -53,6 +53,24 @@ def played(instance: str, trouble: Callable[[int], None]) -> list[Shown]:
         return [(frame.cycle, frame.raw, frame.effective) for frame in models[1].frames() if frame.cycle]
 
 
+def test_a_campaign_goes_on_with_time_that_is_released(instance: str) -> None:
+    start_s = 3600.2
+    declared = Declaration("late", "one/sum", "set", value=7, start_s=start_s)
+    attributes = Attributes("simulation", ("given",), stepped=True)
+    block = BlockSpec("one", LAYOUT, PERIOD_NS, 500 * MS, 1 << 20, attributes, declared_document([declared]))
+    with Segment.create(instance, [block], [ProcessSpec("one", "source")]) as segment:
+        with Running(segment, "one", Adder()) as model:
+            coordinator = Coordinator(segment)
+            coordinator.step(3_600_000 * MS)
+            coordinator.release()
+            before = frame = model.next()
+            while frame.effective is None:
+                before, frame = frame, model.next()
+        assert before.cycle <= frame.cycle
+        assert frame.clock_ns >= start_s * 1e9, "by the instance's clock"
+        segment.unlink()
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_two_runs_are_the_same_frames(instance: str, seed: int) -> None:
     turns = random.Random(seed)

@@ -95,14 +95,14 @@ def test_a_step_that_moves_nothing_says_so(instance: str) -> None:
         coordinator = Coordinator(segment)
         assert coordinator.step() == Step(1, coordinator.read().time_ns, 50 * MS)
         assert coordinator.read().note.startswith("no source lives on the instance's clock: steps move none; ")
-        assert coordinator.read().note.endswith("; a restart of the instance brings real time back"), "not cut off"
+        assert coordinator.read().note.endswith("; shmio step --release brings real time back"), "not cut off"
 
 
 def test_time_that_is_taken_over_says_how_real_time_comes_back(instance: str) -> None:
     with built(instance, spec("a"), stepped=False) as segment, Participant(instance, "a"):
         coordinator = Coordinator(segment)
         coordinator.take_over()
-        told = "it stands until it is stepped; a restart of the instance brings real time back"
+        told = "it stands until it is stepped; shmio step --release brings real time back"
         assert coordinator.read().note == told
         coordinator.step()
         assert coordinator.read().note == ""
@@ -110,6 +110,60 @@ def test_time_that_is_taken_over_says_how_real_time_comes_back(instance: str) ->
         coordinator = Coordinator(segment)
         coordinator.take_over()
         assert coordinator.read().note.startswith("no source lives on the instance's clock")
+
+
+def test_time_that_is_released_is_real_and_never_goes_back(instance: str) -> None:
+    blocks = [spec("a"), spec("fast", period_ns=7 * MS), spec("slow", period_ns=1000 * MS)]
+    with built(instance, *blocks, stepped=False) as segment, ExitStack() as stack:
+        coordinator = Coordinator(segment)
+        parts = [stack.enter_context(Participant(instance, block.source)) for block in blocks]
+        number = 0
+        for dt_ns in (MS, 3_600_000 * MS):  # more steps than periods have passed; then more time than has
+            steps = [coordinator.step(dt_ns) for _ in range(20)]
+            assert [step.number for step in steps] == list(range(steps[0].number, steps[0].number + 20))
+            assert steps[0].number > number
+            number = steps[-1].number
+            coordinator.release()
+            state, real = segment.clock.told(), segment.clock.read()
+            assert (state.mode, state.owner, state.note) == (ClockMode.WALL, 0, "")
+            assert steps[-1].time_ns <= real.time_ns <= segment.clock.present_ns() < steps[-1].time_ns + 3_600_000 * MS
+            for block in segment.blocks.values():
+                assert state.lead(block.period_ns) + real.time_ns // block.period_ns >= number, "no cycle twice"
+            assert all(part.steps[-1][0] == number for part in parts)
+
+
+def test_time_that_is_real_is_left_as_it_is_by_a_release(instance: str) -> None:
+    with built(instance, spec("a"), stepped=False) as segment:
+        coordinator, before = Coordinator(segment), segment.clock.told()
+        coordinator.release()
+        assert segment.clock.told() == before
+        coordinator.take_over()
+        coordinator.release()
+        before = segment.clock.told()
+        coordinator.release()
+        coordinator.close()
+        assert segment.clock.told() == before
+
+
+def test_time_is_released_by_its_owner_or_by_anybody_if_it_is_nobodys(instance: str) -> None:
+    with built(instance, stepped=False) as segment, Segment.open(instance, writable=True) as other:
+        first, second = Coordinator(segment), Coordinator(other)
+        first.set_playing(True)
+        with pytest.raises(TimeError, match=rf"another program \(pid {os.getpid()}\), which plays it"):
+            second.release()
+        assert segment.clock.read().virtual
+        first.close()
+        second.release()
+        assert not segment.clock.read().virtual
+        with Segment.open(instance) as reader, pytest.raises(TimeError, match="writable=True"):
+            Coordinator(reader).release()
+
+
+def test_where_time_was_never_real_it_is_not_released(instance: str) -> None:
+    with built(instance) as segment:
+        with pytest.raises(TimeError, match=r'virtual from its start \(clock = "stepped"'):
+            Coordinator(segment).release()
+        assert segment.clock.read().virtual
 
 
 def test_where_real_time_never_was_no_restart_brings_it_back(instance: str) -> None:

@@ -78,6 +78,22 @@ def test_it_plays_until_it_is_paused_and_then_time_stands(cell: Attachment) -> N
     assert (made.number, made.time_ns) == (stands.step + 1, stands.time_ns + 50 * MS)
 
 
+def test_who_plays_can_release_time(instance: str) -> None:
+    with (
+        Segment.create(instance, [], []) as segment,
+        Attachment(Segment.open(instance, writable=True)) as cell,
+        Attachment(Segment.open(instance, writable=True)) as other,
+    ):
+        cell.play(rate=100)
+        with pytest.raises(TimeError, match="which plays it; stop that first"):
+            other.release()
+        cell.release()
+        assert not other.clock.virtual
+        assert other.step().number > 0, "time is nobody's"
+        other.release()
+        segment.unlink()
+
+
 def test_it_keeps_the_pace(cell: Attachment) -> None:
     """Never faster than asked for; how much slower depends on the machine."""
     begun_ns = cell.block().clock.read().time_ns

@@ -82,6 +82,20 @@ def test_the_present_is_before_the_step_that_is_under_way(segment: Segment) -> N
     assert segment.clock.now_ns() == segment.header.started_ns + 5_000_000_000
 
 
+def test_released_time_goes_on_from_where_it_stood_for_all_who_read(segment: Segment, instance: str) -> None:
+    segment.clock.write(STATE)
+    real = ClockState(step=12, done=11, resumed_ns=5_000_000_000, offset_ns=-7_000_000_000)
+    segment.clock.write(real)
+    with Segment.open(instance) as reader:
+        assert reader.clock.told() == real._replace(time_ns=5_000_000_000)
+        before_ns = time.monotonic_ns()
+        now_ns, state = reader.clock.now_ns(), reader.clock.read()
+        after_ns = time.monotonic_ns()
+        assert before_ns <= now_ns + 7_000_000_000 <= after_ns
+        assert now_ns <= reader.header.started_ns + state.time_ns <= after_ns - 7_000_000_000
+        assert (real.lead(20_000_000), real.lead(3_000_000_000)) == (12 - 250, 12 - 1)
+
+
 @pytest.mark.parametrize("copy", [64, 320])
 def test_a_writer_that_died_half_way_hides_nothing(segment: Segment, copy: int) -> None:
     segment.clock.write(STATE)

@@ -37,7 +37,7 @@ _SERVICES: Final[Mapping[str, Mapping[str, str]]] = {
         READ: "GetLayouts GetStatus Read Subscribe ListInjections WatchClock",
         WRITE: "Write Simulate",
         INJECT: "Inject Declare Lift LiftAll",
-        CONTROL: "Step Steps SetStepSize Play Pause Replay",
+        CONTROL: "Step Steps SetStepSize Play Pause Release Replay",
     },
     "com.ttsnetwork.simulator3.SimServerAPI": {
         READ: "subscribe",

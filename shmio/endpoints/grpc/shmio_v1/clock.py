@@ -1,4 +1,4 @@
-"""The calls of shmio.v1 about time: Step, Steps, SetStepSize, Play, Pause, WatchClock."""
+"""The calls of shmio.v1 about time: Step, Steps, SetStepSize, Play, Pause, Release, WatchClock."""
 
 from __future__ import annotations
 
@@ -89,6 +89,7 @@ class Clocks:
             "SetStepSize": unary(self.set_step_size, wire.SetStepSizeRequest.FromString, clock),
             "Play": unary(self.play, wire.PlayRequest.FromString, clock),
             "Pause": unary(self.pause, wire.PauseRequest.FromString, clock),
+            "Release": unary(self.release, wire.ReleaseRequest.FromString, clock),
             "WatchClock": grpc.unary_stream_rpc_method_handler(self.watch, wire.WatchClockRequest.FromString, clock),
         }
 
@@ -127,6 +128,10 @@ class Clocks:
     async def pause(self, _: wire.PauseRequest, context: Context) -> wire.Clock:
         """Step no more by itself; FAILED_PRECONDITION: time is not ours to move."""
         return await self._do(self._stepper.pause(), context)
+
+    async def release(self, _: wire.ReleaseRequest, context: Context) -> wire.Clock:
+        """Have time be real again; FAILED_PRECONDITION: it is not ours to release, or was never real."""
+        return await self._do(self._stepper.release(), context)
 
     async def watch(self, _: wire.WatchClockRequest, context: Context) -> AsyncIterator[wire.Clock]:
         """How time stands: at once, then after each step and change; who does not keep up sees the newest.

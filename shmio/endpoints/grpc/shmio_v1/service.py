@@ -151,6 +151,11 @@ class NativeService:
             for mark in late:
                 marks[mark].give_up()
 
+    def release(self) -> None:
+        """Time is real again: send whatever there is."""
+        for subscription in self._open:
+            subscription.wake()
+
     def move(self, sources: Collection[str]) -> None:
         """Have the streams of these sources go over to the blocks that there are by now."""
         self._simulations.move()

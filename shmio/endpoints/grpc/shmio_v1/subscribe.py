@@ -94,6 +94,10 @@ class Subscription:
         self.close()
         self._news.set()
 
+    def wake(self) -> None:
+        """Look for what may be sent by now."""
+        self._news.set()
+
     def move(self, sources: Collection[str]) -> None:
         """A reload has changed these sources."""
         self._moved |= dict.fromkeys(place for place in self._wanted if place.source in sources)

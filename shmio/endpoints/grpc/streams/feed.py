@@ -120,6 +120,16 @@ class Feed:
         """Show nothing any more but by :meth:`step`, if the block is on the instance's clock."""
         self._held = self.block.attributes.stepped
 
+    def release(self) -> None:
+        """Show every frame again, from the newest one on: it may have come after the last step."""
+        if not self._held:
+            return
+        self._held = self._stepped = False
+        newest = self.block.latest()
+        self._cursor = self.block.cursor(after=newest.number - 1 if newest else 0)
+        self._look()
+        self._settle()
+
     def step(self) -> None:
         """Show what differs between the values shown last and the newest frame, as of the step that is delivered.
 

@@ -31,6 +31,9 @@ class Other(Protocol):
     async def deliver(self, step: Step) -> None:
         """Send what has changed in a step, then that it is over, and wait until they have it."""
 
+    def release(self) -> None:
+        """Time is real again: send whatever there is."""
+
 
 class Delivery:
     """Delivers steps in one order to all streams, whoever has made them; for the event loop's thread.
@@ -53,6 +56,17 @@ class Delivery:
         self._hold.moment = moment
         for feed in self._feeds.values():
             feed.hold()
+
+    def end(self) -> None:
+        """Time is real again; while no step is :attr:`busy`."""
+        self._hold.on = False
+        for feed in list(self._feeds.values()):
+            try:
+                feed.release()
+            except SegmentError as error:
+                log.warning("time is real again: %s", str(error))
+        for other in self.others:
+            other.release()
 
     async def deliver(self, step: Step, mark: Callable[[], None]) -> bool:
         """Deliver a step, and ``mark`` it; False if it has been already.

@@ -233,6 +233,10 @@ class Stepper:
         """Step no more by itself; TimeError. ``end``: tell that it is not alive, until somebody moves time."""
         return await self._do(self._end_play(end))
 
+    async def release(self) -> Status:
+        """Have time be real again; TimeError: it is not ours to release, or was never real."""
+        return await self._do(self._end_virtual())
+
     async def stop(self) -> None:
         """Move nothing more. A successor goes on with what is played."""
         if self._rest is not None:
@@ -327,6 +331,16 @@ class Stepper:
             await self._change(partial(self._coordinator.set_playing, True, rate))
             self._player.begin()
         return self.timeline.status
+
+    async def _end_virtual(self) -> Status:
+        self._coordinator.check_release()
+        async with self._changing:
+            await self._player.end()
+            async with self._turn:
+                self._coordinator.release()
+                self._own(False)
+                self.timeline.ended = False
+            return self.timeline.status
 
     async def _end_play(self, end: bool) -> Status:
         async with self._changing:

@@ -78,6 +78,11 @@ class Marks:
                     listener.deliver(message)
                 self._set_timer()
 
+    def resume(self) -> None:
+        """Time goes by itself again."""
+        if any(mark is Mark.CLOCK for mark, _ in self._listeners):
+            self._set_timer()
+
     def stop(self) -> None:
         """Tell nothing any more."""
         if self._timer is not None:

@@ -115,7 +115,9 @@ class Timeline:
         state = self._clock.read()
         if state.virtual and not self.hold.on:
             self._delivery.begin(before(state))
-        if state.done > self.hold.moment.number and not self.steered:
+        elif self.hold.on and not state.virtual and not self._delivery.busy:  # else with the next look
+            self._end(state)
+        if state.virtual and state.done > self.hold.moment.number and not self.steered:
             step = Step(state.done, state.present_ns, state.dt_ns)
             if self._awaited or self._delivery.busy:
                 task = self._loop.create_task(self.deliver(step))
@@ -127,6 +129,12 @@ class Timeline:
         elif (status := self._status(state))[1:] != self._told:
             self._tell(status, state)
         return state
+
+    def _end(self, state: ClockState) -> None:
+        """Time was released: it goes by itself again."""
+        self._delivery.end()
+        self.marks.resume()
+        self._tell(self._status(state), state)
 
     def _attend(self) -> None:
         """Have steps wait for this process from now on, or no longer."""

@@ -34,7 +34,7 @@ class Still(NamedTuple):
 class Hold:
     """Whether time is virtual, and the step that was delivered last.
 
-    From then on what comes out of blocks on the instance's clock is shown step by step. Written in the event loop's
+    While it is, what comes out of blocks on the instance's clock is shown step by step. Written in the event loop's
     thread alone.
     """
 

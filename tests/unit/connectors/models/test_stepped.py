@@ -6,6 +6,7 @@ import struct
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from itertools import pairwise
 
 import msgspec
 import pytest
@@ -279,6 +280,40 @@ def test_who_takes_time_over_stops_what_ran_freely_and_its_cycles_go_on(instance
         assert all(f.clock_ns <= taken.time_ns for f in frames if f.cycle <= taken.step)
         cycles = [f.cycle for f in frames]
         assert cycles == sorted(set(cycles))
+
+
+def test_real_time_that_is_released_goes_on_where_virtual_time_stood(instance: str) -> None:
+    with built(instance, "sim", stepped=False) as segment:
+        source, coordinator, frames = Adder(), Coordinator(segment), []
+
+        def free(sim: Running) -> None:
+            released = segment.clock.told()
+            while (frame := sim.next()).cycle < released.step + 3:
+                frames.append(frame)
+            frames.append(frame)
+            assert 0 <= frame.age_ns(segment.blocks["sim"].now_ns()) < 3_600_000 * MS, "by the same clock"
+
+        with Running(segment, "sim", source) as sim:
+            frames.append(sim.next())
+            for dt_ms in (*[1] * 30, 3_600_000):  # numbers go beyond what periods have counted, time beyond the host's
+                coordinator.step(dt_ms * MS)
+            stepped = len(source.calls)
+            coordinator.release()
+            free(sim)
+            again = len(source.calls)
+            coordinator.take_over()
+            first, last = coordinator.step(20 * MS), coordinator.step(20 * MS)
+            assert last.number == first.number + 1
+            coordinator.release()
+            free(sim)
+        with Running(segment, "sim", Adder()) as sim:  # as after a restart
+            free(sim)
+    cycles = [frame.cycle for frame in frames if frame.quality is Quality.GOOD]
+    assert cycles == sorted(set(cycles))
+    assert [frame.clock_ns for frame in frames] == sorted(frame.clock_ns for frame in frames)
+    moments = [(before, time_ns - dt_ns) for (before, _), (time_ns, dt_ns) in pairwise(source.calls)]
+    assert all(before <= begun for before, begun in moments)
+    assert all(before == begun for before, begun in moments[stepped - 1 : again - 1]), "a model misses no time"
 
 
 class SlowToAccept(BlockWriter):

@@ -268,6 +268,25 @@ def test_a_step_goes_on_with_time_that_was_taken_over(tmp_path: Path, instance: 
 # ---- the process is another's successor ------------------------------------------------------------------------------
 
 
+def test_it_goes_on_with_real_time_that_is_released(tmp_path: Path, instance: str) -> None:
+    file = record(tmp_path, instance)
+    with built(instance, stepped=False) as segment, Playing(segment, file, speed=0.1) as cell:
+        frames = [cell.next()]
+        coordinator = Coordinator(segment)
+        coordinator.step(PERIOD_NS * 50)  # five frames
+        coordinator.release()
+        while counts(frames)[-1] < 9:
+            frames.append(cell.next())
+        coordinator.take_over()
+        assert coordinator.step(PERIOD_NS * 50).number > 1
+        coordinator.release()
+        while frames[-1].quality is Quality.GOOD:
+            frames.append(cell.next())
+    assert counts(frames[:-1]) == list(range(20)), "each once"
+    assert frames[-1].reason == OVER
+    assert [frame.clock_ns for frame in frames] == sorted(frame.clock_ns for frame in frames)
+
+
 def test_a_successor_goes_on_and_leaves_nothing_out(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     with built(instance) as segment:

@@ -20,14 +20,14 @@ MARK = f"{PREFIX}/simlog/step"
 
 
 @contextmanager
-def _models(instance: str, *sources: str) -> Iterator[Segment]:
+def _models(instance: str, *sources: str, virtual: bool = True) -> Iterator[list[Model]]:
     attributes = Attributes("simulation", ("goal",), stepped=True)
     blocks = [BlockSpec(source, LAYOUT, 20_000_000, STALE_NS, 1 << 20, attributes) for source in sources]
     processes = [*(ProcessSpec(source, "source") for source in sources), ProcessSpec("mqtt", "mqtt")]
-    with Segment.create(instance, blocks, processes, stepped=True) as segment:
+    with Segment.create(instance, blocks, processes, stepped=virtual) as segment:
         models = [Model(segment, source) for source in sources]
         try:
-            yield segment
+            yield models
         finally:
             for model in models:
                 model.stop()
@@ -36,7 +36,7 @@ def _models(instance: str, *sources: str) -> Iterator[Segment]:
 
 @pytest.fixture
 def models(instance: str) -> Iterator[Segment]:
-    with _models(instance, "one", "two") as segment:
+    with _models(instance, "one", "two"), Segment.open(instance, writable=True) as segment:
         yield segment
 
 
@@ -131,3 +131,26 @@ def test_no_step_waits_for_a_bridge_that_has_ended(models: Segment, broker: Mosq
             running.until(lambda: running.bridge.link.up)
             time.step()
         assert time.step().number == 2
+
+
+def test_when_time_is_released_changes_are_told_as_they_come(instance: str, broker: Mosquitto) -> None:
+    with (
+        _models(instance, "one", virtual=False) as (model,),
+        Segment.open(instance, writable=True) as segment,
+        listening(broker.address) as listener,
+        bridge(segment, broker.address),
+        coordinator(segment) as time,
+    ):
+        listener.until("one/row/out")
+        number = time.step(60_000_000_000).number
+        while json.loads(changes(listener)[-1][1])["step"] != number:
+            pass  # what was when time was taken over
+        model.image[0:4] = (7).to_bytes(4, "big")
+        model.publish(number)  # it waits for a step
+        time.release()
+        assert listener.message().payload == b"7"
+        model.image[0:4] = (8).to_bytes(4, "big")
+        model.publish(number + 1)
+        assert listener.message().payload == b"8"
+        assert time.step().number > number + 1
+        assert changes(listener)[-1][0] == "simlog/step"

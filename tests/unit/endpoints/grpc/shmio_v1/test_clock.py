@@ -99,6 +99,53 @@ def test_playing_and_watching(instance: str) -> None:
     simulate(instance, test)
 
 
+def test_released_time_is_told_and_what_is_published_then_waits_for_no_step(instance: str) -> None:
+    async def test(served: Endpoint, models: Models) -> None:
+        call = subscribe(served, "sim/count").call
+        clock = served.subscribe("/model/clock")
+        old = served.subscribe("sim/count/out")
+        first = await next_message(call)
+        (table,) = first.tables
+        await old.read()
+        watching = stub(served).WatchClock(wire.WatchClockRequest(), timeout=TIMEOUT_S)
+        async with connect_aio(f"127.0.0.1:{served.port}") as cell:
+            done = await cell.step(1800)
+            while not (await next_message(call)).HasField("step"):
+                pass
+            models["sim"].image[0:4] = (7).to_bytes(4, "big")
+            models["sim"].publish(done.step)  # as by a write that is shown at once: it waits for a step
+            released = await cell.release()
+            assert (released.virtual, released.time_ns >= done.time_ns) == (False, True)
+            while (await next_message(watching)).virtual:
+                pass
+            for count in (7, 8):
+                models["sim"].image[0:4] = count.to_bytes(4, "big")
+                if count == 8:
+                    models["sim"].publish(done.step + 1)
+                message = await next_message(call)
+                assert not message.HasField("step")
+                assert [values(table.registers, update.values) for update in message.updates] == [{"count": count}]
+            while (await asyncio.wait_for(old.read(), TIMEOUT_S)).value != "8":
+                pass
+            while (await asyncio.wait_for(clock.read(), TIMEOUT_S)).timeStamp.stamp.sec < 1800:
+                pass
+            told = [(await asyncio.wait_for(clock.read(), TIMEOUT_S)).timeStamp.stamp for _ in range(2)]
+            assert all(stamp.sec >= 1800 for stamp in told), "it ticks again"
+            assert (await cell.step()).step > done.step
+            while not (message := await next_message(call)).HasField("step"):
+                pass
+
+    simulate(instance, test, virtual=False)
+
+
+def test_time_that_was_never_real_is_not_released(instance: str) -> None:
+    async def test(served: Endpoint, _: Models) -> None:
+        code, text = await refusal(stub(served).Release(wire.ReleaseRequest(), timeout=TIMEOUT_S))
+        assert (code, "virtual from its start" in text) == (grpc.StatusCode.FAILED_PRECONDITION, True)
+
+    simulate(instance, test)
+
+
 def test_a_step_that_fails_says_why(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
         models["sim"].failure = "division by zero"
