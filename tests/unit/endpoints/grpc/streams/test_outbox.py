@@ -192,6 +192,21 @@ def test_when_all_streams_hold_too_much_those_with_more_than_their_part_give_way
     assert outboxes.dropped == hog.dropped + slow.dropped
 
 
+def test_of_its_failure_is_told_once_and_not_at_once() -> None:
+    """Whoever is told may change what is just being gone through."""
+
+    async def test() -> None:
+        outbox, told = Outbox(), list[str]()
+        outbox.on_failure = lambda: told.append(outbox.failure)
+        outbox.fail("too slow")
+        outbox.fail("too late")
+        assert told == []
+        await asyncio.sleep(0)
+        assert told == ["too slow"]
+
+    asyncio.run(test())
+
+
 def test_values_of_a_step_are_all_kept_or_the_stream_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "STEP_BOUND", TOPIC_BOUND + 5)
 
