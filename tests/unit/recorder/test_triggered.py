@@ -122,11 +122,11 @@ def test_it_may_be_of_a_source_that_is_not_recorded(segment: Segment, tmp_path: 
         segment, tmp_path, when="press/count = 1 and cell/count = 20", before_s=5, after_s=3,
         selection=Selection(["cell"]),
     )  # fmt: skip
-    bench.publish(10)
-    press = segment.writer("press")
-    press.at_ns = bench.writer.at_ns
-    publish(press, 1, first=1)
-    bench.publish(20)
+    press = segment.writer("press", Stamp(segment.header.started_ns + 100_000 * S, 100_000 * S))
+    for count in (10, 8, 12):  # what it publishes beside the 18 is within the file's time
+        bench.publish(count)
+        press.at_ns = bench.writer.at_ns
+        publish(press, 1, first=1)
     assert bench.close() == [list(range(15, 24))]
     with Reader(files(tmp_path)[0]) as reader:
         list(reader.messages())
