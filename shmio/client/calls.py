@@ -107,6 +107,11 @@ class Target:
         raise self.error(error) from None
 
 
+def unanswered(target: Target) -> RemoteError:
+    """A call has begun, and the endpoint does not answer."""
+    return RemoteError(f"{target.address}: the endpoint has not answered within {WRITE_PATIENCE_S:g} s")
+
+
 _REMOTE: Final[Mapping[grpc.StatusCode, type[RemoteError]]] = {
     grpc.StatusCode.UNAVAILABLE: LostError,
     grpc.StatusCode.UNAUTHENTICATED: UnknownClientError,

@@ -37,7 +37,7 @@ class Campaign(AsyncIterator[Happening]):
     async def lay(cls, stream: Stream, lift: Lift, *, keep: bool) -> Self:
         """What the answers to Declare begin with."""
         try:
-            return cls(stream, await anext(stream, None), lift, keep=keep)
+            return cls(stream, await stream.first(), lift, keep=keep)
         except BaseException:
             stream.close()
             raise

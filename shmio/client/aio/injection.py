@@ -37,7 +37,7 @@ class Shadow(AsyncIterator[Update]):
         """Lay it; what :meth:`Client.inject` says."""
         stream = Duplex(channel, method, first)
         try:
-            return cls(channel, stream, injection.Held(await anext(stream, None)))
+            return cls(channel, stream, injection.Held(await stream.first()))
         except BaseException:
             stream.close()
             raise

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import grpc
 
+from shmio.client import calls
 from shmio.client.calls import OPTIONS, Target
 from shmio.client.model import Values
 from shmio.errors import RemoteError
@@ -70,6 +71,14 @@ class Stream(AsyncIterator[Any]):
         if found is grpc.aio.EOF:
             raise StopAsyncIteration
         return found
+
+    async def first(self) -> Any:
+        """The first answer, None if it was closed. RemoteError: there is none in time; when more come nobody knows."""
+        try:
+            async with asyncio.timeout(calls.WRITE_PATIENCE_S):
+                return await anext(self, None)
+        except TimeoutError:
+            raise calls.unanswered(self._channel.target) from None
 
     async def to_list(self) -> list[Any]:
         """All of them. RemoteError: the channel was closed meanwhile."""

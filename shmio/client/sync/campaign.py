@@ -38,7 +38,7 @@ class Campaign(Iterator[Happening]):
     def lay(cls, stream: Stream, lift: Lift, *, keep: bool) -> Self:
         """What the answers to Declare begin with."""
         try:
-            return cls(stream, next(stream, None), lift, keep=keep)
+            return cls(stream, stream.first(), lift, keep=keep)
         except BaseException:
             stream.close()
             raise

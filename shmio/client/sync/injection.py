@@ -38,7 +38,7 @@ class Shadow(Iterator[Update]):
         """Lay it; what :meth:`Client.inject` says."""
         stream = Duplex(channel, method, first)
         try:
-            return cls(channel, stream, injection.Held(next(stream, None)))
+            return cls(channel, stream, injection.Held(stream.first()))
         except BaseException:
             stream.close()
             raise

@@ -10,6 +10,7 @@ from typing import Any, Final
 
 import grpc
 
+from shmio.client import calls
 from shmio.client.calls import OPTIONS, Target
 from shmio.client.model import Values
 from shmio.errors import RemoteError
@@ -63,6 +64,27 @@ class Stream(Iterator[Any]):
             if self._closed or self._channel.closed:
                 raise StopIteration from None
             self._channel.target.fail(error)
+
+    def first(self) -> Any:
+        """The first answer, None if it was closed. RemoteError: there is none in time; when more come nobody knows."""
+        late = threading.Event()
+
+        def give_up() -> None:
+            late.set()
+            self._call.cancel()
+
+        timer = threading.Timer(calls.WRITE_PATIENCE_S, give_up)
+        timer.daemon = True
+        timer.start()
+        try:
+            return next(self, None)
+        except RemoteError:
+            if late.is_set():
+                raise calls.unanswered(self._channel.target) from None
+            raise
+        finally:
+            timer.cancel()
+            timer.join()
 
     def to_list(self) -> list[Any]:
         """All of them. RemoteError: the channel was closed meanwhile."""

@@ -1,0 +1,62 @@
+"""An endpoint that takes calls and answers none: nobody waits for ever."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import grpc
+import pytest
+
+from shmio.client import Client, calls, connect, connect_aio
+from shmio.errors import RemoteError
+
+
+@pytest.fixture
+def silent(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+    over = threading.Event()
+
+    def wait(_requests: Any, _context: grpc.ServicerContext) -> Iterator[bytes]:
+        over.wait()
+        yield from ()
+
+    class Silent(grpc.GenericRpcHandler):
+        def service(self, _: Any) -> Any:
+            return grpc.stream_stream_rpc_method_handler(wait)
+
+    monkeypatch.setattr(calls, "WRITE_PATIENCE_S", 0.1)
+    server = grpc.server(ThreadPoolExecutor(4), [Silent()])
+    port = server.add_insecure_port("127.0.0.1:0")
+    server.start()
+    yield f"127.0.0.1:{port}"
+    over.set()
+    server.stop(None).wait()
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda client: client.layouts(),
+        lambda client: client.read("cell/a"),
+        lambda client: client.inject("cell/a"),
+        lambda client: client.declare([]),
+    ],
+    ids=["layouts", "read", "inject", "declare"],
+)
+def test_a_call_that_is_not_answered_ends(silent: str, ask: Callable[[Client], object]) -> None:
+    with connect(silent, timeout_s=0.1) as client, pytest.raises(RemoteError):
+        ask(client)
+
+
+def test_the_same_with_asyncio(silent: str) -> None:
+    async def ask() -> None:
+        async with connect_aio(silent, timeout_s=0.1) as client:
+            with pytest.raises(RemoteError, match="has not answered within"):
+                await client.inject("cell/a")
+            with pytest.raises(RemoteError, match="has not answered within"):
+                await client.declare([])
+
+    asyncio.run(ask())
