@@ -36,6 +36,7 @@ from shmio.segment import (  # fmt: skip
     Segment,
     Write,
 )
+from shmio.segment.clock import ClockState
 from shmio.segment.standing_injections import declared_document
 from shmio.testing.cell import until
 
@@ -179,6 +180,13 @@ def test_between_two_times_consumers_see_what_the_operation_makes(make: Callable
     assert (standing.running.state, standing.configured, standing.active) == ("over", True, False)
     told = {**msgspec.to_builtins(standing.running.declaration), "seed": standing.running.seed}
     assert json.loads(laid.data) == told, "what was declared is in the record, with the seed that was drawn"
+
+
+def test_times_are_the_instances_also_for_a_device_once_time_was_released(make: Callable[..., Rig]) -> None:
+    rig = make(declaration("drift", "cell/speed", "offset", value=100, start_s=3600.03, end_s=3600.05))
+    hour_ns = 3600 * 10**9
+    rig.segment.clock.write(ClockState(step=7, done=7, resumed_ns=hour_ns, offset_ns=hour_ns))
+    assert rig.follow("speed", RAMP[:6]) == [10, 20, 130, 140, 50, 60]
 
 
 def test_frames_are_as_ever_while_nothing_is_active(make: Callable[..., Rig]) -> None:
