@@ -46,6 +46,7 @@ def subscribe(cell: Cell, address: str, *options: str) -> subprocess.CompletedPr
     return subprocess.run(command, cwd=cell.folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
 
 
+@pytest.mark.timeout(600)  # a dozen commands, one after the other
 def test_tokens_come_and_go_with_reloads(guarded: Cell) -> None:
     address = str(guarded.grpc)
     guarded.up()
