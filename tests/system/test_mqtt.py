@@ -168,7 +168,7 @@ def connected(broker: Address, client_id: str, **account: str) -> int:
 
 def test_a_port_that_is_taken_is_told_before_anything_starts(make_cell: Callable[..., Cell], broker: Address) -> None:
     with socket.create_server((broker.host, broker.port)):
-        cell = make_cell(config=CONFIG + MQTT.replace("{broker}", str(broker)))
+        cell = make_cell(config=CONFIG + MQTT.replace("{broker}", str(broker)) + EVERYBODY)
         done = cell.supervisor("up", "--detach")
     assert done.returncode == 1
     assert f"broker: cannot listen on {broker}" in done.stderr
