@@ -3,41 +3,41 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import grpc
 import numpy as np
 import pytest
 import trustme
 
-from shmio.client import Client, Column, Quality, connect, connect_aio
+from shmio.client import Column, Quality, connect, connect_aio
 from shmio.errors import EndpointError, LostError, PathError, QualityError, RemoteError, ValueRangeError
 from shmio.segment import Quality as FrameQuality
 from shmio.segment import Segment
+from tests.unit.client.both import BOTH, Connect
 from tests.unit.endpoints.conftest import segment as segment  # noqa: PLC0414  the fixture
 from tests.unit.endpoints.harness import LAYOUT, Endpoint, image, serve
 
 
-def with_client(segment: Segment, test: Callable[[Endpoint, Client], None]) -> None:
-    """Run a test of the client that waits, in a thread, against an endpoint."""
+def with_client(segment: Segment, connects: Connect, test: Callable[[Endpoint, Any], Awaitable[None]]) -> None:
+    """Run a test of a client against an endpoint."""
 
     async def run(served: Endpoint) -> None:
-        def call() -> None:
-            with connect(f"127.0.0.1:{served.port}") as cell:
-                test(served, cell)
-
-        await asyncio.to_thread(call)
+        async with connects(f"127.0.0.1:{served.port}") as cell:
+            await test(served, cell)
 
     serve(segment, run)
 
 
-def test_values_by_path(segment: Segment) -> None:
-    def test(served: Endpoint, cell: Client) -> None:
+@BOTH
+def test_values_by_path(segment: Segment, connects: Connect) -> None:
+    async def test(served: Endpoint, cell: Any) -> None:
         served.publish(image(1.5, 2.5, True, b"\1\2", -7))
-        assert cell["cell/axis/position"] == np.float32(1.5)
-        found = cell.read("cell")
+        assert await cell["cell/axis/position"] == np.float32(1.5)
+        found = await cell.read("cell")
         assert found["cell/step"] == found["step"] == -7
         assert found["cell/running"]
         np.testing.assert_array_equal(found["cell/inputs"], np.array([1, 2], np.int32))
@@ -51,39 +51,41 @@ def test_values_by_path(segment: Segment) -> None:
         with pytest.raises(PathError):
             _ = found["x/nothing"]
 
-    with_client(segment, test)
+    with_client(segment, connects, test)
 
 
-def test_a_bad_value_is_not_given_for_a_good_one(segment: Segment) -> None:
-    def test(served: Endpoint, cell: Client) -> None:
+@BOTH
+def test_a_bad_value_is_not_given_for_a_good_one(segment: Segment, connects: Connect) -> None:
+    async def test(served: Endpoint, cell: Any) -> None:
         with pytest.raises(QualityError, match="cell/step: no data yet"):
-            _ = cell["cell/step"]
+            await cell["cell/step"]
         wrong = bytearray(image(step=3))
         wrong[17] = 200  # the length of a STRING[8]
         served.writer.publish(wrong, cycle=1)
-        assert cell["cell/step"] == 3
+        assert await cell["cell/step"] == 3
         with pytest.raises(QualityError, match=r"cell/name: the bytes are no STRING\[8\]"):
-            _ = cell["cell/name"]
-        assert cell.read("cell/name").of("cell/name")["cell/name"] is None
+            await cell["cell/name"]
+        assert (await cell.read("cell/name")).of("cell/name")["cell/name"] is None
         served.writer.publish(image(step=4), cycle=2, quality=FrameQuality.BAD, reason="cable out")
         with pytest.raises(QualityError, match="cell/step: cable out"):
-            _ = cell["cell/step"]
-        update = cell.read("cell/step").of("cell/step")
+            await cell["cell/step"]
+        update = (await cell.read("cell/step")).of("cell/step")
         assert (update["cell/step"], update.quality, str(update.quality)) == (4, Quality.BAD, "bad")
 
-    with_client(segment, test)
+    with_client(segment, connects, test)
 
 
-def test_a_subscription_gives_what_changes_as_arrays(segment: Segment) -> None:
-    def test(served: Endpoint, cell: Client) -> None:
+@BOTH
+def test_a_subscription_gives_what_changes_as_arrays(segment: Segment, connects: Connect) -> None:
+    async def test(served: Endpoint, cell: Any) -> None:
         served.publish(image(1.0, 2.0))
-        with cell.subscribe("cell/axis", "cell/inputs", every_frame=True) as stream:
-            update = next(stream)
+        async with cell.subscribe("cell/axis", "cell/inputs", every_frame=True) as stream:
+            update = await anext(stream)
             assert update.whole
             assert update.changed == ["cell/axis/position", "cell/axis/speed", "cell/inputs"]
             served.publish(image(1.0, 3.0, inputs=b"\0\5"))
             served.publish(image(1.0, 3.0, inputs=b"\0\5"))
-            update = next(stream)
+            update = await anext(stream)
             (ints, floats) = update.changes
             assert (ints.column, ints.slots.tolist(), ints.values.tolist()) == (Column.INT32, [1], [5])
             assert (floats.column, floats.slots.tolist(), floats.values.tolist()) == (Column.FLOAT, [1], [3.0])
@@ -91,20 +93,57 @@ def test_a_subscription_gives_what_changes_as_arrays(segment: Segment) -> None:
             assert update["cell/axis/position"] == 1.0
             assert update["inputs"].tolist() == [0, 5]
             assert update.table.arrays[Column.FLOAT].tolist() == [1.0, 3.0]
-            update = next(stream)
+            update = await anext(stream)
             assert (update.frame, update.missed, update.changes) == (3, 0, ())
-        with pytest.raises(StopIteration):
-            next(stream)
+        with pytest.raises(StopAsyncIteration):
+            await anext(stream)
 
-    with_client(segment, test)
+    with_client(segment, connects, test)
 
 
-def test_raw_frames_are_decoded_by_the_layout(segment: Segment) -> None:
-    def test(served: Endpoint, cell: Client) -> None:
+@BOTH
+@pytest.mark.parametrize("whole", [False, True], ids=["the stream", "the client"])
+def test_a_subscription_that_is_waited_for_ends_when_it_is_closed(
+    segment: Segment, connects: Connect, whole: bool
+) -> None:
+    async def test(served: Endpoint, cell: Any) -> None:
+        served.publish(image())
+        stream = cell.subscribe("cell/axis")
+        await anext(stream)
+        waiting = asyncio.create_task(anext(stream))
+        await asyncio.sleep(0)
+        if whole:
+            await cell.close()
+        else:
+            stream.close()
+        with pytest.raises(StopAsyncIteration):
+            await waiting
+
+    with_client(segment, connects, test)
+
+
+def test_who_waits_for_an_update_may_be_cancelled(segment: Segment) -> None:
+    async def test(served: Endpoint, cell: Any) -> None:
+        served.publish(image())
+        async with cell.subscribe("cell/axis") as stream:
+            await anext(stream)
+            waiting = asyncio.create_task(anext(stream))
+            await asyncio.sleep(0)
+            waiting.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await waiting
+
+    with_client(segment, connect_aio, test)
+
+
+@BOTH
+def test_raw_frames_are_decoded_by_the_layout(segment: Segment, connects: Connect) -> None:
+    async def test(served: Endpoint, cell: Any) -> None:
         served.writer.publish(image(1.5, 2.5, True, b"\1\2", -7), cycle=1, effective=image(9.0))
-        layout = cell.layouts("cell")["cell"]
-        with cell.subscribe("cell", frames=True) as stream:
-            update = next(stream)
+        layout = (await cell.layouts("cell"))["cell"]
+        assert layout.size == LAYOUT.size
+        async with cell.subscribe("cell", frames=True) as stream:
+            update = await anext(stream)
         assert layout.array(update.image)["axis/position"] == 9.0
         record = layout.array(update.raw)
         assert [record[name].tolist() for name in ("axis/position", "step", "inputs")] == [1.5, -7, [1, 2]]
@@ -116,34 +155,42 @@ def test_raw_frames_are_decoded_by_the_layout(segment: Segment) -> None:
         with pytest.raises(ValueError, match="a frame has 628 bytes, this has 1"):
             layout.array(b"x")
 
-    with_client(segment, test)
+    with_client(segment, connects, test)
 
 
-def test_errors_are_those_of_a_local_program(segment: Segment) -> None:
-    def test(_: Endpoint, cell: Client) -> None:
+@BOTH
+def test_errors_are_those_of_a_local_program(segment: Segment, connects: Connect) -> None:
+    async def test(_: Endpoint, cell: Any) -> None:
         with pytest.raises(PathError, match="no such register"):
-            cell.read("cell/nothing")
+            await cell.read("cell/nothing")
         with pytest.raises(ValueRangeError, match="no pattern is given"):
-            cell.read()
-        with pytest.raises(PathError), cell.subscribe("cell/nothing") as stream:
-            next(stream)
+            await cell.read()
+        with pytest.raises(PathError):
+            async with cell.subscribe("cell/nothing") as stream:
+                await anext(stream)
         with pytest.raises(PathError, match="no source 'x'"):
-            cell.layouts("x")
+            await cell.layouts("x")
 
-    with_client(segment, test)
+    with_client(segment, connects, test)
 
 
-def test_more_than_a_message_holds_is_told_with_what_to_do(segment: Segment) -> None:
-    def test(_: Endpoint, cell: Client) -> None:
+@BOTH
+def test_more_than_a_message_holds_is_told_with_what_to_do(segment: Segment, connects: Connect) -> None:
+    async def test(_: Endpoint, cell: Any) -> None:
         with pytest.raises(EndpointError, match=r"^too much for one message: give or ask for fewer values at once \("):
-            cell.write({"cell/name": "x" * (2 << 20)})
+            await cell.write({"cell/name": "x" * (2 << 20)})
 
-    with_client(segment, test)
+    with_client(segment, connects, test)
 
 
-def test_nobody_there() -> None:
-    with connect("127.0.0.1:1") as cell, pytest.raises(RemoteError, match=r"^127\.0\.0\.1:1: no instance serves there"):
-        cell.read("cell")
+@BOTH
+def test_nobody_there(connects: Connect) -> None:
+    async def test() -> None:
+        async with connects("127.0.0.1:1") as cell:
+            with pytest.raises(RemoteError, match=r"^127\.0\.0\.1:1: no instance serves there"):
+                await cell.read("cell")
+
+    asyncio.run(test())
 
 
 @pytest.mark.parametrize(
@@ -190,34 +237,11 @@ def test_a_token_goes_to_another_host_by_tls() -> None:
     connect("plant.example:8089", token="secret", token_in_plain_text=True).close()
 
 
-def test_status(segment: Segment) -> None:
-    def test(_: Endpoint, cell: Client) -> None:
-        status = cell.status()
+@BOTH
+def test_status(segment: Segment, connects: Connect) -> None:
+    async def test(_: Endpoint, cell: Any) -> None:
+        status = await cell.status()
         assert (status["instance"], status["mode"]) == (segment.instance, "live")
         assert {"state", "segment", "segment_bytes", "supervisor", "processes", "note"} <= set(status)
 
-    with_client(segment, test)
-
-
-def test_the_same_with_asyncio(segment: Segment) -> None:
-    async def test(served: Endpoint) -> None:
-        served.publish(image(1.0, step=3))
-        async with connect_aio(f"127.0.0.1:{served.port}") as cell:
-            assert (await cell.read("cell/step"))["cell/step"] == 3
-            assert (await cell.layouts())["cell"].size == LAYOUT.size
-            assert (await cell.status())["instance"] == segment.instance
-            async with cell.subscribe("cell/axis") as stream:
-                assert (await anext(stream))["cell/axis/position"] == 1.0
-                served.publish(image(2.0))
-                assert (await anext(stream))["cell/axis/position"] == 2.0
-                waiting = asyncio.ensure_future(anext(stream))
-                await asyncio.sleep(0)
-                waiting.cancel()
-                with pytest.raises(asyncio.CancelledError):
-                    await waiting
-            with pytest.raises(PathError):
-                await cell.read("cell/nothing")
-            with pytest.raises(PathError):
-                await cell.layouts("x")
-
-    serve(segment, test)
+    with_client(segment, connects, test)

@@ -12,12 +12,13 @@ from typing import Any
 import grpc
 import pytest
 
-from shmio.client import Client, Happening, connect, connect_aio
+from shmio.client import Client, Happening, connect
 from shmio.errors import CommandError, ValueRangeError
 from shmio.injection import Program
 from shmio.local.reading import View
 from shmio.segment import EventKind, Segment
 from shmio.wire import shmio_v1_pb2 as wire
+from tests.unit.client.both import BOTH, Connect
 from tests.unit.endpoints.grpc.commands.test_publish import with_plant
 from tests.unit.endpoints.grpc.shmio_v1.harness import stub
 from tests.unit.endpoints.grpc.shmio_v1.test_inject import seen, with_client
@@ -254,9 +255,10 @@ def test_what_a_client_that_is_gone_has_declared_is_not_looked_at_to_the_end(
     with_plant(segment, test)
 
 
-def test_with_asyncio(segment: Segment) -> None:
+@BOTH
+def test_what_is_done_is_told_to_both_clients(segment: Segment, connects: Connect) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
-        async with connect_aio(f"127.0.0.1:{served.port}") as cell:
+        async with connects(f"127.0.0.1:{served.port}") as cell:
             async with await cell.declare([OFFSET]) as campaign:
                 assert (await anext(campaign)).what == "injected"
                 assert (await anext(campaign)).what == "activated"

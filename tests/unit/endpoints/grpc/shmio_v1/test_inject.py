@@ -15,6 +15,7 @@ from shmio.client import Client, Column, Piece, Provenance, connect, connect_aio
 from shmio.errors import CommandError, PathError, RemoteError, ValueRangeError
 from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as wire
+from tests.unit.client.both import BOTH, Connect
 from tests.unit.endpoints.grpc.commands.test_publish import with_plant
 from tests.unit.endpoints.grpc.shmio_v1.harness import stub
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint
@@ -248,9 +249,10 @@ def test_messages_that_make_no_sense(segment: Segment) -> None:
     with_plant(segment, test)
 
 
-def test_with_asyncio(segment: Segment) -> None:
+@BOTH
+def test_values_given_and_originals_by_both_clients(segment: Segment, connects: Connect) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
-        async with connect_aio(f"127.0.0.1:{served.port}") as cell:
+        async with connects(f"127.0.0.1:{served.port}") as cell:
             async with await cell.inject("cell/axis", originals=True) as shadow:
                 assert (await anext(shadow))["cell/axis/position"] == 0.0
                 assert (await shadow.set({"cell/axis/position": 2.0}))[0].done

@@ -9,11 +9,12 @@ from typing import Any
 import grpc
 import pytest
 
-from shmio.client import Stepped, connect, connect_aio
+from shmio.client import Stepped, connect_aio
 from shmio.endpoints.grpc.shmio_v1 import clock
 from shmio.errors import CommandError, ValueRangeError
 from shmio.local.time_control import Step
 from shmio.wire import shmio_v1_pb2 as wire
+from tests.unit.client.both import BOTH, Connect
 from tests.unit.endpoints.grpc.shmio_v1.harness import stub, subscribe
 from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint
 from tests.unit.endpoints.stepped import Model, simulate
@@ -58,30 +59,31 @@ def test_what_is_written_between_two_steps_is_done_in_the_second(instance: str) 
     simulate(instance, test)
 
 
-def test_a_program_with_threads_does_the_same(instance: str) -> None:
-    def work(address: str) -> None:
-        with connect(address) as cell:
-            assert list(cell.steps(3)) == done(1, 2, 3)
-            assert list(cell.steps()) == []
-            with cell.steps(2) as stepping:
-                assert next(stepping) == done(4)[0]
-                assert stepping.step() == done(6)[0], "behind what was asked for before"
-                assert stepping.step() == done(7)[0]
-                assert list(stepping) == []
+@BOTH
+def test_steps_that_were_asked_for_before_come_first(instance: str, connects: Connect) -> None:
+    async def test(served: Endpoint, _: Models) -> None:
+        async with connects(target(served)) as cell:
+            assert [step async for step in cell.steps(3)] == done(1, 2, 3)
+            assert [step async for step in cell.steps()] == []
+            async with cell.steps(2) as stepping:
+                assert await anext(stepping) == done(4)[0]
+                assert await stepping.step() == done(6)[0], "behind what was asked for before"
+                assert await stepping.step() == done(7)[0]
+                assert [step async for step in stepping] == []
+            with pytest.raises(CommandError, match="closed"):
+                await stepping.step()
             with pytest.raises(ValueRangeError, match=r"from 0\.001 ms to 3600000 ms"):
                 cell.steps(1, 4000)
             with pytest.raises(ValueRangeError, match="-1 steps: from 0 to 4294967295"):
                 cell.steps(-1)
 
-    async def test(served: Endpoint, _: Models) -> None:
-        await asyncio.to_thread(work, target(served))
-
     simulate(instance, test)
 
 
-def test_the_first_that_fails_ends_it_and_those_behind_it_are_not_done(instance: str) -> None:
+@BOTH
+def test_the_first_that_fails_ends_it_and_those_behind_it_are_not_done(instance: str, connects: Connect) -> None:
     async def test(served: Endpoint, models: Models) -> None:
-        async with connect_aio(target(served)) as cell:
+        async with connects(target(served)) as cell:
             stepping = cell.steps()
             for _ in range(3):
                 await stepping.step()
@@ -94,6 +96,7 @@ def test_the_first_that_fails_ends_it_and_those_behind_it_are_not_done(instance:
             assert (await cell.clock()).step == 3
             with pytest.raises(CommandError, match="step 5: sim: division by zero"):
                 await stepping.step()
+            assert [step async for step in stepping] == []
             models["sim"].failure = ""
             assert [step.step async for step in cell.steps(2)] == [6, 7]
 
