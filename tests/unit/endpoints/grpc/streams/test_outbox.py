@@ -192,6 +192,22 @@ def test_when_all_streams_hold_too_much_those_with_more_than_their_part_give_way
     assert outboxes.dropped == hog.dropped + slow.dropped
 
 
+def test_behind_its_end_it_begins_anew() -> None:
+    async def test() -> None:
+        outbox = Outbox()
+        outbox.end()
+        assert await outbox.pop() is None
+        assert outbox.busy, "nobody waits"
+        popped = asyncio.ensure_future(outbox.pop())
+        await asyncio.sleep(0)
+        assert not outbox.busy
+        assert not popped.done()
+        StateLane(outbox).deliver(b"x")
+        assert await popped == b"x"
+
+    asyncio.run(test())
+
+
 def test_of_its_failure_is_told_once_and_not_at_once() -> None:
     """Whoever is told may change what is just being gone through."""
 
