@@ -197,10 +197,11 @@ def test_behind_its_end_it_begins_anew() -> None:
         outbox = Outbox()
         outbox.end()
         assert await outbox.pop() is None
-        assert outbox.busy, "nobody waits"
+        busy = [outbox.busy]
         popped = asyncio.ensure_future(outbox.pop())
         await asyncio.sleep(0)
-        assert not outbox.busy
+        busy.append(outbox.busy)
+        assert busy == [True, False], "busy while nobody waits for a message"
         assert not popped.done()
         StateLane(outbox).deliver(b"x")
         assert await popped == b"x"
