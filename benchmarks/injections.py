@@ -17,7 +17,7 @@ import msgspec
 from common import begin, db201, interleave, table
 
 from shmio.config import Declaration
-from shmio.connectors.commands.processor import CommandDesk
+from shmio.connectors.commands.processor import CommandProcessor
 from shmio.connectors.output import Image, Output
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Provenance, Quality, Segment
 from shmio.segment.standing_injections import declared_document
@@ -62,7 +62,7 @@ def publisher(stack: ExitStack, declared: list[Declaration]) -> Callable[[], Non
     )
     stack.callback(segment.unlink)
     output = Output(segment.writer("cell"))
-    CommandDesk(output, ["**"], lambda: 0, armed=True)
+    CommandProcessor(output, ["**"], lambda: 0, armed=True)
     image = bytes(LAYOUT.size)
     cycle = 0
 

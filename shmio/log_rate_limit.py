@@ -12,7 +12,7 @@ LINES: Final = 20
 TURN_S: Final = 10.0
 
 
-class Ration(logging.Filter):
+class LogRateLimit(logging.Filter):
     """Lets so many records of one kind, by its text without what is filled in, through in a turn; counts the others.
 
     The first of a later turn tells how many were left out. For loggers that any thread may use.

@@ -45,7 +45,7 @@ class Worker:
         self._take_role()
         self.before = self.slot.report
         """What the process before in this role reported last."""
-        self._heed_signals()
+        self._install_signal_handlers()
         self._report = Report(os.getpid(), Activity.STARTING, time.monotonic_ns())
         self.slot.report = self._report
         self.slot.beat()
@@ -105,7 +105,7 @@ class Worker:
         if self._rereads:
             call()
 
-    def _heed_signals(self) -> None:
+    def _install_signal_handlers(self) -> None:
         """Let SIGTERM set ``stopping``, and SIGHUP have it reread; Ctrl-C is the supervisor's.
 
         The handler itself must touch no lock: the main thread may hold that of the event it would set.
@@ -139,7 +139,7 @@ def main(run: Callable[[Worker], None]) -> int:
         worker.report(activity=Activity.STOPPING)
         worker.log.info("stopped")
     except ShmioError as error:
-        _tell(worker, str(error))
+        _report_failure(worker, str(error))
         return 2 if isinstance(error, (ConfigError, LayoutError)) else 1
     except Exception:
         logging.getLogger("shmio").exception("failed")
@@ -147,7 +147,7 @@ def main(run: Callable[[Worker], None]) -> int:
     return 0
 
 
-def _tell(worker: Worker | None, message: str) -> None:
+def _report_failure(worker: Worker | None, message: str) -> None:
     """Leave the reason where people look: the log and the process table."""
     if worker is None:
         sys.stderr.write(message + "\n")

@@ -34,7 +34,7 @@ REPLAY_TIMEOUT_S = 1.0
 HANG_MARGIN_S = 30.0  # beyond its time-outs: looking up a host name has none of ours
 
 
-class _Part(NamedTuple):
+class _LoopHandle(NamedTuple):
     """A loop, how to stop it, and how long one of its hooks may take."""
 
     loop: SourceLoop | SteppedLoop | ReplayLoop
@@ -45,16 +45,16 @@ class _Part(NamedTuple):
 def run(worker: Worker) -> None:
     """Poll and take commands in threads of their own; this one reports. A device that blocks one holds up no other."""
     sys.setswitchinterval(SWITCH_S)
-    part = _part(worker)
+    part = _loop_of(worker)
     loop = part.loop
     thread = threading.Thread(target=_guarded, args=(loop.run,), name="poll", daemon=True)
-    desk = threading.Thread(target=_guarded, args=(loop.desk.run,), name="commands", daemon=True)
+    commands = threading.Thread(target=_guarded, args=(loop.commands.run,), name="commands", daemon=True)
     thread.start()
-    desk.start()
+    commands.start()
     worker.running()
     rate = _Rate()
     while not worker.stopping.wait(BEAT_S):
-        if not thread.is_alive() or not desk.is_alive():
+        if not thread.is_alive() or not commands.is_alive():
             raise ConnectorError("the poll loop or the commands' thread ended by itself; its traceback is in the log")
         busy_s = _busy_s(loop.counters.busy_since_ns)
         if busy_s > part.timeout_s + HANG_MARGIN_S:
@@ -73,16 +73,16 @@ def run(worker: Worker) -> None:
         )
     part.stop()
     thread.join(timeout=min(part.timeout_s + 0.5, LAST_WORDS_S))
-    desk.join(timeout=1.0)
+    commands.join(timeout=1.0)
 
 
-def _part(worker: Worker) -> _Part:
+def _loop_of(worker: Worker) -> _LoopHandle:
     """What runs this source."""
     segment, name = worker.segment, worker.config["connector"]
     found = registry.load(name)
     options = registry.convert_options(name, worker.config["options"])
     if issubclass(found, Replayed):
-        return _replay(worker, options)
+        return _replay_loop(worker, options)
     source = found(options, segment.blocks[worker.name].layout)
     writer = segment.writer(worker.name)  # after its source: one that cannot be as configured has begun nothing
     schedule = Schedule(segment.header.started_ns, writer.block.period_ns)
@@ -95,7 +95,7 @@ def _part(worker: Worker) -> _Part:
             source, writer, schedule, clock, writable,
             allow_nonfinite=allow, armed=armed, owner_of=owner_of, blocks=blocks,
         )  # fmt: skip
-        return _Part(loop, clock.stop, source.timeout_s)
+        return _LoopHandle(loop, clock.stop, source.timeout_s)
     page_clock = PageClock(segment.clock, worker.slot.index)
     inputs = _inputs(source, writer, segment)
     stepped = SteppedLoop(
@@ -107,14 +107,14 @@ def _part(worker: Worker) -> _Part:
         page_clock.stop()
         source.interrupt()
 
-    return _Part(stepped, stop, source.timeout_s)
+    return _LoopHandle(stepped, stop, source.timeout_s)
 
 
-def _replay(worker: Worker, options: Any) -> _Part:
+def _replay_loop(worker: Worker, options: Any) -> _LoopHandle:
     """What plays a recording."""
-    from shmio.connectors.replay.beginning import begin  # noqa: PLC0415
     from shmio.connectors.replay.loop import ReplayLoop  # noqa: PLC0415  the other sources read no recordings
     from shmio.connectors.replay.source import Replay  # noqa: PLC0415
+    from shmio.connectors.replay.start import begin  # noqa: PLC0415
 
     segment = worker.segment
     source = Replay(options, worker.name)
@@ -133,7 +133,7 @@ def _replay(worker: Worker, options: Any) -> _Part:
         owner_of=partial(_owner_of, segment),
         blocks=partial(_blocks, segment),
     )
-    return _Part(loop, clock.stop, REPLAY_TIMEOUT_S)
+    return _LoopHandle(loop, clock.stop, REPLAY_TIMEOUT_S)
 
 
 def _inputs(source: Computed, writer: BlockWriter, segment: Segment) -> Inputs | None:

@@ -13,12 +13,12 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple, Protocol, TypeVar
 
 from shmio.connectors.base import Connector
-from shmio.connectors.commands.processor import CommandDesk
-from shmio.connectors.injection.campaign import Blocks
+from shmio.connectors.commands.processor import CommandProcessor
+from shmio.connectors.injection.declared_injections import Blocks
 from shmio.connectors.injection.processor import OwnerOf
 from shmio.connectors.output import Image, Output
 from shmio.connectors.schedule import Backoff, Schedule
-from shmio.connectors.source_status import Condition, Counters
+from shmio.connectors.source_status import Counters, QualityLog
 from shmio.errors import ConnectorError
 from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
 
@@ -84,13 +84,13 @@ class SourceLoop:
         owner_of: OwnerOf = lambda _: None,
         blocks: Blocks | None = None,
     ) -> None:
-        """``writable``: patterns of what commands may write. The rest: see :class:`CommandDesk`."""
+        """``writable``: patterns of what commands may write. The rest: see :class:`CommandProcessor`."""
         self._connector = connector
         self._writer = writer
         self._schedule = schedule
         self._clock = clock
         self._output = Output(writer, clock.now_ns)
-        self.desk = CommandDesk(
+        self.commands = CommandProcessor(
             self._output,
             writable if connector.can_write else None,
             clock.now_ns,
@@ -103,7 +103,7 @@ class SourceLoop:
         self._connected_ns: int | None = None
         self._accepting = False
         self._under_way: deque[_Submitted] = deque()
-        self._condition = Condition(writer)
+        self._condition = QualityLog(writer)
         self.counters = Counters()
 
     @property
@@ -124,7 +124,7 @@ class SourceLoop:
                 elif not self.poll(due.cycle):
                     break
         finally:
-            self.desk.stop()
+            self.commands.stop()
             self._connector.close()
             self._writer.cycle = max(self._writer.cycle, self._schedule.at(self._clock.now_ns()))
             self._disconnected(self._writer.cycle, "the source was stopped")
@@ -136,10 +136,10 @@ class SourceLoop:
         try:
             if self._connected_ns is None:
                 self._connect()
-            self.desk.release(cycle)
-            if self.desk.waiting:
+            self.commands.release(cycle)
+            if self.commands.waiting:
                 self._drain()
-                self._call(lambda: self.desk.carry_out(self._connector.write))
+                self._call(lambda: self.commands.carry_out(self._connector.write))
             end_ns = self._schedule.due_ns(cycle + 1)
             self._collect(end_ns, leave=self._connector.depth - 1)  # an answer that is late makes room within the cycle
             if len(self._under_way) < self._connector.depth:
@@ -188,7 +188,7 @@ class SourceLoop:
         self.counters.polls += 1
         if not self._accepting:  # not before an image has shown that the block is as its layout says
             self._accepting = True
-            self.desk.open()
+            self.commands.open()
         if self._connected_ns is not None and self._clock.now_ns() - self._connected_ns > STABLE_NS:
             self._backoff.reset()
 
@@ -213,7 +213,7 @@ class SourceLoop:
 
     def _disconnected(self, cycle: int, reason: str) -> None:
         """Publish one bad frame for each new reason, with the last bytes known; other measures are none."""
-        self.desk.close(reason)
+        self.commands.close(reason)
         if self._condition.tell(Quality.BAD, reason, cycle):
             provenance = self._connector.provenance
             raw, source_ns = self._output.raw, self._output.source_ns

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Final, NamedTuple
 
-from shmio.connectors.injection.layers import Injections
+from shmio.connectors.injection.layers import LayerStack
 from shmio.segment import BlockWriter, Provenance, Quality, Record, Stamp
 
 EXTRA_FRAMES: Final = 4
@@ -43,7 +43,7 @@ class Output:
 
     def __init__(self, writer: BlockWriter, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self.writer = writer
-        self.injections = Injections(writer.block.layout.size)
+        self.injections = LayerStack(writer.block.layout.size)
         """To be changed, and :meth:`show` called then, with ``turn`` held."""
         self.turn = threading.Lock()
         self.advance: Callable[[Image], Iterable[Record]] | None = None

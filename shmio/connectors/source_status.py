@@ -38,7 +38,7 @@ class Counters:
             self.busy_since_ns = 0
 
 
-class Condition:
+class QualityLog:
     """A source's quality as last told: in the log and in the block's events, once for each change."""
 
     def __init__(self, writer: BlockWriter) -> None:

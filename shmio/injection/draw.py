@@ -33,7 +33,7 @@ class Purpose(IntEnum):
     ANGLE = 2
 
 
-class Draw:
+class SeededRandom:
     """The numbers of one injection: of the activation ``run`` and, in it, of the cycle or write ``place``."""
 
     def __init__(self, seed: int, name: str) -> None:

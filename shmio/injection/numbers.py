@@ -24,7 +24,7 @@ _REAL_LIMIT: Final = float(np.float32(REAL_MAX))
 
 
 @dataclass(frozen=True)
-class Places:
+class ValueGroup:
     """All single values of one type. ``first``: number of the first among those of the injection."""
 
     element: ElementType
@@ -77,7 +77,7 @@ class Places:
         return np.where(set_bits, bits, np.uint8(0)), np.where(set_bits, np.uint8(0), bits)
 
 
-def places(registers: Iterable[Register], byte_order: ByteOrder) -> list[Places]:
+def places(registers: Iterable[Register], byte_order: ByteOrder) -> list[ValueGroup]:
     """The single values of registers and arrays, by type. ValueError: there are more than MAX_ELEMENTS."""
     found: dict[ElementType, list[tuple[int, int]]] = {}
     count = 0
@@ -96,7 +96,7 @@ def places(registers: Iterable[Register], byte_order: ByteOrder) -> list[Places]
         starts = np.array([byte for byte, _ in at], dtype=np.intp)
         shifts = np.array([bit for _, bit in at], dtype=np.uint8)
         index = starts if element.base == "BOOL" else starts[:, None] + np.arange(element.size)
-        groups.append(Places(element, first, index, shifts, number_type(element, byte_order)))
+        groups.append(ValueGroup(element, first, index, shifts, number_type(element, byte_order)))
         first += len(at)
     return groups
 
@@ -112,5 +112,5 @@ _NUMPY: Final = {
     "b": "i1", "B": "u1", "h": "i2", "H": "u2", "i": "i4", "I": "u4", "q": "i8", "Q": "u8", "f": "f4", "d": "f8",
 }  # fmt: skip
 
-Change = Callable[[Places, Values], Values]
+Change = Callable[[ValueGroup, Values], Values]
 """From the values of places to what they become."""

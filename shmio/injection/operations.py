@@ -13,15 +13,15 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from shmio.injection.draw import Draw
-from shmio.injection.numbers import Bytes, Change, Places
+from shmio.injection.draw import SeededRandom
+from shmio.injection.numbers import Bytes, Change, ValueGroup
 
 MAX_DELAY_CYCLES: Final = 10_000
 MAX_DELAY_BYTES: Final = 16_000_000
 """The most that the images held by one delay take."""
 
 
-class Moment(NamedTuple):
+class OperationContext(NamedTuple):
     """Which image: in the activation ``run`` that of ``place``, its cycles (over ``/in``: its writes) so far."""
 
     run: int
@@ -37,10 +37,10 @@ class Operation(ABC):
         """An activation begins: forget what was held."""
 
     @abstractmethod
-    def apply(self, image: Bytes, at: Moment) -> None:
+    def apply(self, image: Bytes, at: OperationContext) -> None:
         """Change the image in place; what is not covered may change, too: the caller takes what is."""
 
-    def passed(self, image: Bytes, at: Moment) -> None:  # noqa: B027  most need not know
+    def passed(self, image: Bytes, at: OperationContext) -> None:  # noqa: B027  most need not know
         """Told instead of :meth:`apply`: by chance this image stays as it is."""
 
     def resume(self, image: Bytes) -> None:  # noqa: B027
@@ -53,18 +53,18 @@ class Fixed(Operation):
     def __init__(self, values: Bytes) -> None:
         self._values = values
 
-    def apply(self, image: Bytes, at: Moment) -> None:  # noqa: ARG002, D102
+    def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: ARG002, D102
         image[:] = self._values
 
 
 class Arithmetic(Operation):
     """``offset``, ``scale``, ``clamp``: new numbers from the old ones."""
 
-    def __init__(self, places: Sequence[Places], change: Change) -> None:
+    def __init__(self, places: Sequence[ValueGroup], change: Change) -> None:
         self._places = places
         self._change = change
 
-    def apply(self, image: Bytes, at: Moment) -> None:  # noqa: ARG002, D102
+    def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: ARG002, D102
         with np.errstate(all="ignore"):
             for group in self._places:
                 group.put_numbers(image, self._change(group, group.numbers(image)))
@@ -73,13 +73,13 @@ class Arithmetic(Operation):
 class Noise(Operation):
     """``noise``: to each number another random one is added."""
 
-    def __init__(self, places: Sequence[Places], draw: Draw, amplitude: float, *, gaussian: bool) -> None:
+    def __init__(self, places: Sequence[ValueGroup], draw: SeededRandom, amplitude: float, *, gaussian: bool) -> None:
         self._places = places
         self._draw = draw
         self._amplitude = amplitude
         self._gaussian = gaussian
 
-    def apply(self, image: Bytes, at: Moment) -> None:  # noqa: D102
+    def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: D102
         count = self._places[-1].first + len(self._places[-1])
         if self._gaussian:
             noise = self._draw.gaussian(at.run, at.place, count) * self._amplitude
@@ -94,13 +94,13 @@ class Noise(Operation):
 class RandomRange(Operation):
     """``random`` from a range, both ends included for whole numbers."""
 
-    def __init__(self, places: Sequence[Places], draw: Draw, least: float, most: float) -> None:
+    def __init__(self, places: Sequence[ValueGroup], draw: SeededRandom, least: float, most: float) -> None:
         self._places = places
         self._draw = draw
         self._least = least
         self._most = most
 
-    def apply(self, image: Bytes, at: Moment) -> None:  # noqa: D102
+    def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: D102
         count = self._places[-1].first + len(self._places[-1])
         share = self._draw.uniform(at.run, at.place, count)
         for group in self._places:
@@ -115,12 +115,12 @@ class RandomRange(Operation):
 class RandomChoice(Operation):
     """``random`` from a set."""
 
-    def __init__(self, tables: Sequence[tuple[Places, Bytes]], draw: Draw) -> None:
+    def __init__(self, tables: Sequence[tuple[ValueGroup, Bytes]], draw: SeededRandom) -> None:
         """``tables``: places with the values (k, size) to choose from."""
         self._tables = tables
         self._draw = draw
 
-    def apply(self, image: Bytes, at: Moment) -> None:  # noqa: D102
+    def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: D102
         last = self._tables[-1][0]
         choice = self._draw.below(len(self._tables[0][1]), at.run, at.place, last.first + len(last))
         for group, table in self._tables:
@@ -141,7 +141,7 @@ class Freeze(Operation):
         """Hold what that one did."""
         self._held = image.copy()
 
-    def apply(self, image: Bytes, at: Moment) -> None:  # noqa: ARG002, D102
+    def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: ARG002, D102
         if self._held is None:
             self._held = image.copy()
         image[:] = self._held
@@ -165,12 +165,12 @@ class Drop(Operation):
         """Keep what consumers have seen."""
         self._held = image.copy()
 
-    def passed(self, image: Bytes, at: Moment) -> None:
+    def passed(self, image: Bytes, at: OperationContext) -> None:
         """A cycle that is not lost."""
         self._settle(at.cycle)
         self._passing = at.cycle, image.copy()
 
-    def apply(self, image: Bytes, at: Moment) -> None:  # noqa: D102
+    def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: D102
         self._settle(at.cycle)
         if self._held is None:
             self._held = image.copy()
@@ -199,7 +199,7 @@ class Delay(Operation):
         """The line is empty."""
         self._line.clear()
 
-    def apply(self, image: Bytes, at: Moment) -> None:  # noqa: D102
+    def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: D102
         if self._line and self._line[-1][0] == at.cycle:
             self._line.pop()
         self._line.append((at.cycle, at.time_ns, image.copy()))
@@ -209,7 +209,7 @@ class Delay(Operation):
             self._line.popleft()
         image[:] = self._line[0][2]
 
-    def due(self, cycle: int, time_ns: int, at: Moment) -> bool:
+    def due(self, cycle: int, time_ns: int, at: OperationContext) -> bool:
         """Whether what came then is to be seen by now."""
         return at.cycle - cycle >= self.cycles if self.cycles else at.time_ns - time_ns >= self.delay_ns
 
@@ -217,13 +217,13 @@ class Delay(Operation):
 class Flip(Operation):
     """``flip``: bits are turned over, the given ones, or a random one of all that are covered."""
 
-    def __init__(self, mask: Bytes | None, cover: Bytes, draw: Draw) -> None:
+    def __init__(self, mask: Bytes | None, cover: Bytes, draw: SeededRandom) -> None:
         """``mask``: the bits to turn; None: a random one of ``cover`` in each cycle or write."""
         self._mask = mask
         self._draw = draw
         self._places = np.flatnonzero(np.unpackbits(cover, bitorder="little"))
 
-    def apply(self, image: Bytes, at: Moment) -> None:  # noqa: D102
+    def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: D102
         if self._mask is not None:
             image ^= self._mask
             return

@@ -12,9 +12,9 @@ import numpy as np
 from shmio.config import Declaration
 from shmio.errors import ConfigError, PathError, ValueRangeError
 from shmio.injection.activation import Window
-from shmio.injection.draw import Draw
+from shmio.injection.draw import SeededRandom
 from shmio.injection.expression import Expression, parse
-from shmio.injection.numbers import Bytes, Places, Values, places
+from shmio.injection.numbers import Bytes, ValueGroup, Values, places
 from shmio.injection.operations import (
     MAX_DELAY_BYTES,
     MAX_DELAY_CYCLES,
@@ -41,7 +41,7 @@ from shmio.layout.values.text import from_text, wire_type
 NS: Final = 1_000_000_000
 MAX_REFERENCES: Final = 64
 
-Operate = Callable[[Draw], Operation]
+Operate = Callable[[SeededRandom], Operation]
 """Makes the operation as it begins, with what it draws from."""
 
 
@@ -166,7 +166,7 @@ def _clamp(declaration: Declaration, target: Target, layout: Layout, _period_ns:
     least = -math.inf if declaration.min is None else declaration.min
     most = math.inf if declaration.max is None else declaration.max
 
-    def clamp(_places: Places, values: Values) -> Values:
+    def clamp(_places: ValueGroup, values: Values) -> Values:
         clamped: Values = np.minimum(np.maximum(values, values.dtype.type(least)), values.dtype.type(most))
         return clamped
 
@@ -256,14 +256,14 @@ _OPERATIONS: Final[Mapping[str, Callable[[Declaration, Target, Layout, int], Ope
 }
 
 
-def _places(target: Target, layout: Layout) -> list[Places]:
+def _places(target: Target, layout: Layout) -> list[ValueGroup]:
     try:
         return places(target.registers, layout.byte_order)
     except ValueError as error:
         raise ConfigError(f"target: {error}") from None
 
 
-def _numbers(declaration: Declaration, target: Target, layout: Layout) -> list[Places]:
+def _numbers(declaration: Declaration, target: Target, layout: Layout) -> list[ValueGroup]:
     """The places of numbers; ConfigError: something else is among them."""
     for register in target.registers:
         if register.type == "BOOL" or not scalar_codec(register.element).plain:

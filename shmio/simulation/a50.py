@@ -183,7 +183,7 @@ _ORDERS = struct.Struct("< B HH")  # behind the outputs; of two bytes, the first
 _AXES: Final = {f"Axs{axis}_Pos": "REAL" for axis in range(1, 7)}
 
 
-class _Moment(NamedTuple):
+class _CellState(NamedTuple):
     time_s: float
     phase_s: float
     """Time in the cell's cycle, which stands still on hold."""
@@ -227,7 +227,7 @@ class A50Cell(Model):
             _drive(actuator, phase_s, opened >> place & 1, closed >> place & 1)
             for place, actuator in enumerate(ACTUATORS)
         ]
-        now = _Moment(
+        now = _CellState(
             time_s=time_s,
             phase_s=phase_s,
             cycles=int(cell_s // CYCLE_S) & 0xFFFF_FFFF,
@@ -246,7 +246,7 @@ class A50Cell(Model):
         (self.nc_axis_1,), (self.nc_axis_2,) = (track.pose(cell_s) for track in NC_AXES.values())
 
 
-def _inputs(now: _Moment) -> bytes:
+def _inputs(now: _CellState) -> bytes:
     heartbeat = _beat(now.time_s - 0.04)  # comes back after the plant's own delay
     phase_s = now.phase_s
     trolley_mm = 3000 * (smooth(phase_s / STEPS[10]) + smooth((phase_s - BEGINS[150]) / STEPS[150]))
@@ -268,7 +268,7 @@ def _inputs(now: _Moment) -> bytes:
     )
 
 
-def _outputs(now: _Moment) -> bytes:
+def _outputs(now: _CellState) -> bytes:
     conveying = now.step in CONVEYING
     return _OUTPUTS.pack(
         _bits(_beat(now.time_s), True, not now.hold, now.step == 10, now.step == 80),

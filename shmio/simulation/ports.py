@@ -26,7 +26,7 @@ class _Run(NamedTuple):
     values: slice
 
 
-class Bulk:
+class StructureCodec:
     """Registers that are single numbers: where each goes is worked out once."""
 
     def __init__(self, names: Sequence[str], runs: Sequence[_Run]) -> None:
@@ -36,7 +36,7 @@ class Bulk:
         self._values = itemgetter(*names)
 
     @classmethod
-    def of(cls, registers: Mapping[str, Register], byte_order: ByteOrder) -> Bulk | None:
+    def of(cls, registers: Mapping[str, Register], byte_order: ByteOrder) -> StructureCodec | None:
         """That of these, by their names; None: there are not two, or one is no number."""
         codes = [_code(register, byte_order) for register in registers.values()]
         if len(codes) < 2 or not all(codes):
@@ -100,7 +100,7 @@ class Port(Protocol):
 def port_of(path: str, registers: Mapping[str, Register], byte_order: ByteOrder, image: bytearray) -> Port:
     """The port of a declaration's registers, by their paths in it: a structure, or one register under ``""``."""
     ports = {member: RegisterPort(register, byte_order, image) for member, register in registers.items()}
-    return ports.get("") or StructurePort(path, ports, Bulk.of(registers, byte_order), image)
+    return ports.get("") or StructurePort(path, ports, StructureCodec.of(registers, byte_order), image)
 
 
 class RegisterPort:
@@ -135,7 +135,9 @@ class RegisterPort:
 class StructurePort:
     """A structure's registers."""
 
-    def __init__(self, path: str, ports: Mapping[str, RegisterPort], bulk: Bulk | None, image: bytearray) -> None:
+    def __init__(
+        self, path: str, ports: Mapping[str, RegisterPort], bulk: StructureCodec | None, image: bytearray
+    ) -> None:
         """``bulk``: all of them at once, if that can be."""
         self._path = path
         self._ports = ports

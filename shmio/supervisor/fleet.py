@@ -13,10 +13,10 @@ from typing import Final
 from shmio.plan.processes import Job
 from shmio.segment import ProcessSpec, Segment, Supervised, stale_segment
 from shmio.supervisor import policy
-from shmio.supervisor.managed import Managed, log, log_step
+from shmio.supervisor.managed import ManagedProcess, log, log_step
 from shmio.supervisor.policy import Limits
-from shmio.supervisor.process import Adopted, Child
-from shmio.supervisor.reconcile import Present, digest
+from shmio.supervisor.process import AdoptedProcess, ChildProcess
+from shmio.supervisor.reconcile import CurrentProcess, digest
 from shmio.supervisor.states import PHASES, Action, Event, State
 
 TICK_S: Final = 0.1
@@ -33,12 +33,12 @@ class Fleet:
         self._selector = selector
         self._limits = limits
         self._modules = modules
-        self._managed: dict[str, Managed] = {}
+        self._managed: dict[str, ManagedProcess] = {}
         self._ticked_ns = time.monotonic_ns()
         for slot in segment.processes:
-            self._managed[slot.name] = Managed(slot)
+            self._managed[slot.name] = ManagedProcess(slot)
 
-    def __iter__(self) -> Iterator[Managed]:
+    def __iter__(self) -> Iterator[ManagedProcess]:
         return iter(self._managed.values())
 
     @property
@@ -46,7 +46,7 @@ class Fleet:
         """Names of all."""
         return list(self._managed)
 
-    def named(self, name: str) -> Managed:
+    def named(self, name: str) -> ManagedProcess:
         """The process of this name; KeyError."""
         return self._managed[name]
 
@@ -55,10 +55,11 @@ class Fleet:
         """Rank and life of each, in the order of iteration."""
         return [(managed.rank, managed.life) for managed in self]
 
-    def present(self) -> dict[str, Present]:
+    def present(self) -> dict[str, CurrentProcess]:
         """What there is, for comparing with a plan. One that can never work as configured is not well."""
         return {
-            m.name: Present(m.slot.kind, m.slot.digest, m.life.state not in (State.STOPPED, State.FATAL)) for m in self
+            m.name: CurrentProcess(m.slot.kind, m.slot.digest, m.life.state not in (State.STOPPED, State.FATAL))
+            for m in self
         }
 
     def assign(self, job: Job) -> None:
@@ -66,7 +67,7 @@ class Fleet:
         managed = self._managed.get(job.name)
         if managed is None:
             slot = self._segment.processes.add(ProcessSpec(job.name, job.kind))
-            managed = self._managed[job.name] = Managed(slot)
+            managed = self._managed[job.name] = ManagedProcess(slot)
         managed.renew(job)
 
     def drop(self, name: str) -> None:
@@ -74,7 +75,7 @@ class Fleet:
         managed = self._managed.pop(name)
         self._segment.processes.remove(managed.slot)
 
-    def adopt(self, managed: Managed, child: Adopted) -> None:
+    def adopt(self, managed: ManagedProcess, child: AdoptedProcess) -> None:
         """Watch a living process that another supervisor has started."""
         managed.adopt(child)
         self._watch(managed, child)
@@ -107,7 +108,7 @@ class Fleet:
                 dying = managed.child if managed.life.killed else None
                 self.apply(managed, event, stale_segment.survivor(dying.pid) if dying else "")
 
-    def _evict(self, managed: Managed) -> None:
+    def _evict(self, managed: ManagedProcess) -> None:
         """Kill a process that holds the role and is not ours.
 
         A dead supervisor had started it in its last moment, and it was not there yet when all was taken over. Its end
@@ -124,7 +125,7 @@ class Fleet:
             os.close(worker.pidfd)
             managed.evicted_pid = pid
 
-    def apply(self, managed: Managed, event: Event, note: str = "") -> None:
+    def apply(self, managed: ManagedProcess, event: Event, note: str = "") -> None:
         """Let something happen to a process, and do what follows from it."""
         before = managed.life
         managed.life, action = policy.step(before, event, time.monotonic_ns(), self._limits, note)
@@ -142,29 +143,29 @@ class Fleet:
         log_step(managed, before, action, self._limits)
         managed.answer()
 
-    def _spawn(self, managed: Managed) -> None:
+    def _spawn(self, managed: ManagedProcess) -> None:
         job = managed.job
         place = self._segment.instance, self._segment.header.epoch
         description = job.describe(*place)
         managed.slot.digest = digest(job.identify(*place))
         try:
-            child = Child.spawn(self._modules[job.kind], description, job.log_file)
+            child = ChildProcess.spawn(self._modules[job.kind], description, job.log_file)
         except OSError as error:
             self.apply(managed, Event.EXIT, f"cannot be started: {error.strerror}")
             return
         managed.child = child
         self._watch(managed, child)
 
-    def _watch(self, managed: Managed, child: Child | Adopted) -> None:
+    def _watch(self, managed: ManagedProcess, child: ChildProcess | AdoptedProcess) -> None:
         self._selector.register(child.pidfd, selectors.EVENT_READ, lambda: self._on_exit(managed, child))
 
-    def _on_exit(self, managed: Managed, child: Child | Adopted) -> None:
+    def _on_exit(self, managed: ManagedProcess, child: ChildProcess | AdoptedProcess) -> None:
         self._selector.unregister(child.pidfd)
         code = child.reap()
         note = managed.end_note(child.pid, code)
         managed.child = None
         self.apply(managed, policy.ended(code), note)
 
-    def _publish(self, managed: Managed) -> None:
+    def _publish(self, managed: ManagedProcess) -> None:
         life = managed.life
         managed.slot.supervised = Supervised(PHASES[life.state], life.restarts, life.spawned_ns, life.note)

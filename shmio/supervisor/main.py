@@ -1,4 +1,4 @@
-"""The supervisor: one thread, one selector; ``fleet`` has the processes, ``changer`` brings them to a plan."""
+"""The supervisor: one thread, one selector; ``fleet`` has the processes, ``reload`` brings them to a plan."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from shmio.supervisor.log_folder import LogFolder
 from shmio.supervisor.managed import brief, log
 from shmio.supervisor.notify import Notifier
 from shmio.supervisor.policy import Limits
-from shmio.supervisor.reload import Changer
+from shmio.supervisor.reload import Reloader
 from shmio.supervisor.socketpath import socket_path
 from shmio.supervisor.states import Event, State
 from shmio.supervisor.takeover import take_over
@@ -48,10 +48,10 @@ def wake_on_signals(selector: selectors.BaseSelector, on_signal: Callable[[int],
 
         selector.register(receiver, selectors.EVENT_READ, receive)
         old_fd = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
-        heeded = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+        handled = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
         if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
-            heeded.remove(signal.SIGHUP)
-        old = {sign: signal.signal(sign, _wake) for sign in heeded}
+            handled.remove(signal.SIGHUP)
+        old = {sign: signal.signal(sign, _wake) for sign in handled}
         try:
             yield
         finally:
@@ -128,12 +128,14 @@ class Supervisor:
             self._fleet = Fleet(self._segment, self._selector, self._limits, self._modules)
             logs = LogFolder(self._plan.log_dir)
             self._health = Health(self._segment, self._fleet, self._notifier, logs, self._on_state)
-            self._changer = Changer(self._fleet, self._segment, self._notifier, self._plan, self._replan, self._limits)
+            self._reloader = Reloader(
+                self._fleet, self._segment, self._notifier, self._plan, self._replan, self._limits
+            )
             if found:  # until all of it is ours, a failure leaves it for the next attempt
                 for slot, child in found.children:
                     self._fleet.adopt(self._fleet.named(slot.name), child)
                     self._adopted[slot.name] = child.pid
-                self._changer.follow()
+                self._reloader.follow()
             else:
                 for job in self._plan.jobs:
                     self._fleet.assign(job)
@@ -183,7 +185,7 @@ class Supervisor:
         if not self._stopping:
             self._notifier.stopping()
         self._stopping = True
-        self._changer.drop()
+        self._reloader.drop()
 
     def _hasten(self) -> None:
         """Asked a second time: no more grace."""
@@ -201,13 +203,13 @@ class Supervisor:
         elif isinstance(request, Reload):
             self._reload(answer)
         else:
-            plan, read_ns = self._changer.plan, self._changer.read_ns
+            plan, read_ns = self._reloader.plan, self._reloader.read_ns
             listen = {job.name: told for job in plan.jobs if (told := job.listening[:MAX_ADDRESSES])}
             answer.ok(config=str(plan.config_file), read_ns=read_ns, log_dir=str(plan.log_dir), listen=listen)
 
     def _busy(self) -> str | None:
         """Why no request that changes something can be taken at present."""
-        return "the instance is stopping" if self._stopping else self._changer.busy()
+        return "the instance is stopping" if self._stopping else self._reloader.busy()
 
     def _restart(self, name: str, answer: Answer) -> None:
         if name not in self._fleet.names:
@@ -222,12 +224,12 @@ class Supervisor:
             managed.answer()  # one that is stuck is so before anything is done
 
     def _reload(self, answer: Answer) -> None:
-        log.info("asked to reload %s", self._changer.plan.config_file)
+        log.info("asked to reload %s", self._reloader.plan.config_file)
         reason = self._busy() or (None if self._started else "the instance is just starting: ask again when it runs")
         if reason:
             answer.error(reason)
         else:
-            self._changer.reload(answer)
+            self._reloader.reload(answer)
 
     def _replaced(self) -> list[str]:
         """What became of processes that were taken over and are configured otherwise by now, a line each."""
@@ -252,10 +254,10 @@ class Supervisor:
         if not self._stopping and now_ns - self._found_ns >= NAME_S * 1e9:
             self._found_ns = now_ns
             self._follow_name()
-        taking_over = self._changer.under_way
-        self._changer.step()
+        taking_over = self._reloader.under_way
+        self._reloader.step()
         if taking_over:
-            if not self._changer.under_way and not self._started:
+            if not self._reloader.under_way and not self._started:
                 self._started = True
                 self.history += self._replaced()
         elif not self._stopping and not self._started:

@@ -11,19 +11,19 @@ from shmio.segment import Activity, ProcessSlot
 from shmio.supervisor import policy
 from shmio.supervisor.control import Answer
 from shmio.supervisor.policy import Life, Limits
-from shmio.supervisor.process import Adopted, Child, describe_end
+from shmio.supervisor.process import AdoptedProcess, ChildProcess, describe_end
 from shmio.supervisor.states import Action, State
 
 log = logging.getLogger("shmio.supervisor")
 
 
-class Managed:
+class ManagedProcess:
     """A slot, the job that is to run there, its life, and its process while it has one."""
 
     def __init__(self, slot: ProcessSlot) -> None:
         self.slot = slot
         self.life = Life()
-        self.child: Child | Adopted | None = None
+        self.child: ChildProcess | AdoptedProcess | None = None
         self.waiting: list[Answer] = []
         self.evicted_pid = 0
         """The process last killed for holding the role of this one."""
@@ -68,7 +68,7 @@ class Managed:
         self.child.reread()
         return known
 
-    def adopt(self, child: Adopted) -> None:
+    def adopt(self, child: AdoptedProcess) -> None:
         """Take a process that another supervisor has started and that runs."""
         told = self.slot.supervised
         self.child = child
@@ -128,7 +128,7 @@ class Managed:
         self.waiting.clear()
 
 
-def log_step(managed: Managed, before: Life, action: Action | None, limits: Limits) -> None:
+def log_step(managed: ManagedProcess, before: Life, action: Action | None, limits: Limits) -> None:
     """Tell about one edge of the graph, unless it says nothing."""
     name, life = managed.name, managed.life
     if life.stuck:

@@ -20,7 +20,7 @@ _TAIL_BYTES = 4096
 _STAMP = re.compile(r"^\S+Z [A-Z]+ +\S+\[\d+\] ")  # what begins a line of shmio.logs
 
 
-class Child:
+class ChildProcess:
     """A running child process in a session of its own, which Ctrl-C at the terminal does not reach."""
 
     def __init__(self, popen: subprocess.Popen[bytes], log_file: Path, log_size: int) -> None:
@@ -31,7 +31,7 @@ class Child:
         self.pidfd = os.pidfd_open(popen.pid)
 
     @classmethod
-    def spawn(cls, module: str, description: bytes, log_file: Path) -> Child:
+    def spawn(cls, module: str, description: bytes, log_file: Path) -> ChildProcess:
         """Start ``python -m module`` with ``description`` as its standard input; OSError when the host cannot.
 
         What it prints, such as the traceback of an interpreter that dies, goes to the end of its log file.
@@ -86,7 +86,7 @@ class Child:
         return ""
 
 
-class Adopted:
+class AdoptedProcess:
     """A running process that another supervisor has started: not a child of this one, so it has no exit status."""
 
     def __init__(self, pid: int, pidfd: int) -> None:

@@ -14,7 +14,7 @@ from shmio.plan.processes import Plan
 from shmio.segment import Block, BlockSpec
 
 
-class Present(NamedTuple):
+class CurrentProcess(NamedTuple):
     """A process that the instance has. ``well``: it is there and works, or is being brought back."""
 
     kind: str
@@ -42,7 +42,7 @@ def digest(description: bytes) -> bytes:
     return hashlib.sha256(description).digest()
 
 
-def reconcile(plan: Plan, epoch: int, processes: Mapping[str, Present], blocks: Iterable[Block]) -> Changes:
+def reconcile(plan: Plan, epoch: int, processes: Mapping[str, CurrentProcess], blocks: Iterable[Block]) -> Changes:
     """Compare a plan with the processes, by name, and the blocks that there are.
 
     A source whose block is replaced is replaced with it: it writes to one block for life.

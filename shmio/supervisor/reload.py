@@ -22,7 +22,7 @@ from shmio.supervisor.states import Event, State
 SETTLED = (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED)
 
 
-class Change:
+class InstanceChange:
     """Brings an instance to a plan, a step at each call of :meth:`step`; what is as planned already is not touched."""
 
     def __init__(self, fleet: Fleet, segment: Segment, plan: Plan) -> None:
@@ -115,7 +115,7 @@ class Change:
         return done, problems
 
 
-class _Planning:
+class _PendingPlan:
     """A plan in the making: to compile a big layout takes seconds, and a file system may hang."""
 
     def __init__(self, replan: Callable[[], Plan], limit_s: float) -> None:
@@ -154,7 +154,7 @@ class _Planning:
         return self._plan
 
 
-class Changer:
+class Reloader:
     """The change of an instance that is under way, if any, and the plan that it follows by now."""
 
     def __init__(
@@ -174,8 +174,8 @@ class Changer:
         self._notifier = notifier
         self._replan = replan
         self._limits = limits
-        self._planning: _Planning | None = None
-        self._change: Change | None = None
+        self._planning: _PendingPlan | None = None
+        self._change: InstanceChange | None = None
         self._answer: Answer | None = None
 
     @property
@@ -193,7 +193,7 @@ class Changer:
 
     def follow(self) -> None:
         """Bring what was taken over to the plan. SegmentError: no room."""
-        self._change = Change(self._fleet, self._segment, self.plan)
+        self._change = InstanceChange(self._fleet, self._segment, self.plan)
 
     def reload(self, answer: Answer) -> None:
         """Plan anew, then follow that; refused while another reload is under way."""
@@ -202,7 +202,7 @@ class Changer:
             answer.error(reason)
             return
         self._notifier.reloading()
-        self._planning, self._answer = _Planning(self._replan, self._limits.plan_s), answer
+        self._planning, self._answer = _PendingPlan(self._replan, self._limits.plan_s), answer
 
     def drop(self) -> None:
         """Give up what is under way, for all is to stop."""
@@ -218,12 +218,12 @@ class Changer:
         if self._change is not None:
             self._follow(self._change)
 
-    def _begin(self, planning: _Planning) -> None:
+    def _begin(self, planning: _PendingPlan) -> None:
         try:
             plan = planning.result()
             if reason := refusal(plan, self.plan):
                 raise ShmioError(f"{plan.config_file}: {reason}")
-            self._change = Change(self._fleet, self._segment, plan)
+            self._change = InstanceChange(self._fleet, self._segment, plan)
         except Exception as error:  # noqa: BLE001 - whatever a connector's own check raises, what runs goes on
             expected = isinstance(error, ShmioError)
             reason = str(error) if expected else f"the reload failed: {brief(error)}"
@@ -232,7 +232,7 @@ class Changer:
             return
         self.plan, self.read_ns = plan, planning.read_ns
 
-    def _follow(self, change: Change) -> None:
+    def _follow(self, change: InstanceChange) -> None:
         if not change.step():
             if stuck := change.stuck:
                 self._tell(lambda answer: answer.error(f"{stuck}; the reload goes on as soon as it has ended"))

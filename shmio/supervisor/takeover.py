@@ -13,19 +13,19 @@ from shmio.plan.processes import Plan
 from shmio.segment import Activity, ProcessSlot, Segment, shm, stale_segment
 from shmio.segment.shm import SharedObject
 from shmio.supervisor.policy import Limits
-from shmio.supervisor.process import Adopted
+from shmio.supervisor.process import AdoptedProcess
 from shmio.supervisor.socketpath import remove_socket
 
 
 @dataclass
-class Found:
+class TakenOver:
     """A segment whose supervisor's lock is ours now, and the processes in it that go on."""
 
     segment: Segment
-    children: list[tuple[ProcessSlot, Adopted]] = field(default_factory=list)
+    children: list[tuple[ProcessSlot, AdoptedProcess]] = field(default_factory=list)
 
 
-def take_over(plan: Plan, control: str, limits: Limits) -> tuple[Found | None, list[str]]:
+def take_over(plan: Plan, control: str, limits: Limits) -> tuple[TakenOver | None, list[str]]:
     """What can be taken over for this plan, if anything; all else is stopped and removed. What was done, a line each.
 
     ``control``: path of the new control socket, to which the segment leads from now on.
@@ -36,14 +36,14 @@ def take_over(plan: Plan, control: str, limits: Limits) -> tuple[Found | None, l
     if shared is None:
         return None, []
     try:
-        segment, done = _fitting(shared, plan)
+        segment, done = _usable_segment(shared, plan)
         if segment is not None:
-            children, lines = _sort(segment, shared, limits)
+            children, lines = _adopt_or_end(segment, shared, limits)
             if segment.header.control != control:
                 remove_socket(segment.header.control)
             segment.lead_to(control, plan.config_file)
             segment.end_replaced()
-            return Found(segment, children), [*done, *lines]
+            return TakenOver(segment, children), [*done, *lines]
         done += stale_segment.clear_claimed(shared, plan.instance)
     except BaseException:
         shared.close()
@@ -52,7 +52,7 @@ def take_over(plan: Plan, control: str, limits: Limits) -> tuple[Found | None, l
     return None, done
 
 
-def _fitting(shared: SharedObject, plan: Plan) -> tuple[Segment | None, list[str]]:
+def _usable_segment(shared: SharedObject, plan: Plan) -> tuple[Segment | None, list[str]]:
     """The segment, if this plan's instance can go on in it; else why not, if that needs saying."""
     try:
         segment = stale_segment.read(shared, plan.instance)
@@ -78,25 +78,25 @@ def _fitting(shared: SharedObject, plan: Plan) -> tuple[Segment | None, list[str
     return segment, []
 
 
-def _sort(
+def _adopt_or_end(
     segment: Segment, shared: SharedObject, limits: Limits
-) -> tuple[list[tuple[ProcessSlot, Adopted]], list[str]]:
+) -> tuple[list[tuple[ProcessSlot, AdoptedProcess]], list[str]]:
     """The processes that run well; the others are ended.
 
     SegmentError: one cannot be told from a stranger's, or does not end.
     """
     living = {slot.name: slot for slot in segment.processes if slot.alive()}
-    fit: list[tuple[ProcessSlot, Adopted]] = []
+    fit: list[tuple[ProcessSlot, AdoptedProcess]] = []
     done, unfit = [], []
     deadline = time.monotonic() + stale_segment.GRACE_S
     while living:
         for name, slot in list(living.items()):
             worker = stale_segment.holder(slot, shared)
-            if worker is not None and (reason := _ails(slot, limits)):
+            if worker is not None and (reason := _unfit_reason(slot, limits)):
                 unfit.append(worker)
                 done.append(f"{name}, pid {worker.pid}, {reason}: it is replaced")
             elif worker is not None:
-                fit.append((slot, Adopted(worker.pid, worker.pidfd)))
+                fit.append((slot, AdoptedProcess(worker.pid, worker.pidfd)))
                 done.append(f"took over {name}, pid {worker.pid}, which had lost its supervisor")
             if worker is not None or not slot.alive():
                 del living[name]
@@ -120,7 +120,7 @@ def _sort(
     return fit, done
 
 
-def _ails(slot: ProcessSlot, limits: Limits) -> str | None:
+def _unfit_reason(slot: ProcessSlot, limits: Limits) -> str | None:
     """Why a living process cannot be taken over as it is; None if it can."""
     if slot.report.activity is not Activity.RUNNING:
         return f"was {slot.report.activity.name.lower()}"

@@ -49,7 +49,7 @@ class Run:
         schedule = Schedule(segment.header.started_ns, block.period_ns)
         self._clock = WallClock()
         self.loop = SourceLoop(rig.connector(), segment.writer("device"), schedule, self._clock, writable)
-        self._threads = [threading.Thread(target=run, daemon=True) for run in (self.loop.run, self.loop.desk.run)]
+        self._threads = [threading.Thread(target=run, daemon=True) for run in (self.loop.run, self.loop.commands.run)]
         for thread in self._threads:
             thread.start()
 
@@ -75,7 +75,7 @@ class Run:
     def stop(self) -> None:
         """End the loop, then hold all frames to what holds always."""
         self._clock.stop()
-        self.loop.desk.stop()
+        self.loop.commands.stop()
         for thread in self._threads:
             thread.join(PATIENCE_S)
             assert not thread.is_alive(), "the loop did not end"

@@ -6,13 +6,13 @@ import logging
 
 import pytest
 
-from shmio.log_rate_limit import LINES, TURN_S, Ration
+from shmio.log_rate_limit import LINES, TURN_S, LogRateLimit
 
 
 def test_lines_of_a_kind_are_rationed_and_the_rest_is_counted(caplog: pytest.LogCaptureFixture) -> None:
     now_s = 100.0
     log = logging.getLogger("test.ration")
-    ration = Ration(lambda: now_s)
+    ration = LogRateLimit(lambda: now_s)
     log.addFilter(ration)
     try:
         for number in range(LINES + 5):

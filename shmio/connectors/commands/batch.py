@@ -90,7 +90,7 @@ def ends(
     some were lost.
     """
     lost = any(isinstance(outcome, Lost) for outcome in outcomes)
-    told = _Told((write, outcome) for write, outcome in zip(writes, outcomes, strict=True) if outcome or lost)
+    told = _WriteOutcomes((write, outcome) for write, outcome in zip(writes, outcomes, strict=True) if outcome or lost)
     found = [_end(told.about(item.write), error) for item in items]
     for place, item in enumerate(items):
         if found[place][0] is not EventKind.WRITTEN:
@@ -102,7 +102,7 @@ def ends(
     return found
 
 
-class _Told:
+class _WriteOutcomes:
     """What became of writes, by where they are: thousands may have been refused.
 
     Those that were confirmed may be left out unless some were lost.

@@ -15,7 +15,7 @@ _EXPONENTS: Final = {"REAL": b"\x7f\x80\0\0", "LREAL": b"\x7f\xf0\0\0\0\0\0\0"}
 """The bits of the exponent, the most significant byte first; a number with all of them set is not finite."""
 
 
-class Finite:
+class FiniteCheck:
     """The REAL and LREAL values of a block that must stay finite: all but those that the configuration names."""
 
     def __init__(self, layout: Layout, allowed: Iterable[str]) -> None:

@@ -14,11 +14,11 @@ from typing import Final
 
 from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.commands.batch import End, Item, coalesce, ends, one_each, records
-from shmio.connectors.commands.finite import Finite
-from shmio.connectors.injection.campaign import Blocks
-from shmio.connectors.injection.layers import Injection, uncovered
-from shmio.connectors.injection.processor import Injector, OwnerOf
-from shmio.connectors.injection.published import meet, pieces
+from shmio.connectors.commands.finite import FiniteCheck
+from shmio.connectors.injection.declared_injections import Blocks
+from shmio.connectors.injection.layers import Layer, uncovered
+from shmio.connectors.injection.processor import InjectionProcessor, OwnerOf
+from shmio.connectors.injection.published import divert_command, pieces
 from shmio.connectors.output import Output
 from shmio.layout.values.write import Write, cover
 from shmio.segment import NO_WRITER, Command, CommandKind, EventKind, Record
@@ -37,7 +37,7 @@ _UNARMED: Final = "an injection toward a device needs `armed = true` in the sour
 log = logging.getLogger("shmio.source")
 
 
-class CommandDesk:
+class CommandProcessor:
     """Judges the commands of one block. :meth:`run` is for a thread of its own, all else for the loop's."""
 
     def __init__(
@@ -65,11 +65,11 @@ class CommandDesk:
         self._cannot = "this source's connector cannot write" if writable is None else ""
         layout = self._writer.block.layout
         self._writable = cover(layout, writable or ())
-        self._finite = Finite(layout, allow_nonfinite)
+        self._finite = FiniteCheck(layout, allow_nonfinite)
         self._most_bytes = MAX_WAITING_BLOCKS * layout.size
         refuse_in = self._cannot or ("" if armed else _UNARMED)
         blocks = blocks or (lambda: {output.writer.block.source: output.writer.block})
-        self._injector = Injector(output, self._writable, refuse_in, owner_of, blocks)
+        self._injections = InjectionProcessor(output, self._writable, refuse_in, owner_of, blocks)
         self._turn = threading.Lock()
         self._verdict = threading.Lock()  # held from the word that items are accepted until they wait
         self._closed = "the source is not connected yet"
@@ -89,7 +89,7 @@ class CommandDesk:
             self._closed = f"the source is not connected: {reason}"
             items, self._items = self._items, []
         self._end(items, [(EventKind.EXPIRED, reason)] * len(items))
-        self._injector.campaign.forget(reason)
+        self._injections.declared.forget(reason)
         self._make_room()
 
     def settle(self) -> None:
@@ -99,7 +99,7 @@ class CommandDesk:
 
     def release(self, cycle: int) -> None:
         """Send on what delays over ``/in`` have held for their time; before the cycle carries out what waits."""
-        for layer, write in self._injector.campaign.release(cycle):
+        for layer, write in self._injections.declared.release(cycle):
             command = Command(NO_WRITER, layer.id, self._writer.incarnation, FAR_NS, (write,))
             self._accept(command, layer)
 
@@ -152,7 +152,7 @@ class CommandDesk:
                 for writer in range(queues.writers):  # one of each in turn
                     taken |= self._take_one(writer)
             self._expire(self._take(lambda item: self._now_ns() > item.command.deadline_ns))
-            self._injector.look()
+            self._injections.look()
             self._output.flush()
             if not self._stopped:
                 queues.wait(seen, self._patience_ns())
@@ -177,7 +177,7 @@ class CommandDesk:
         with self._turn:
             deadlines = [item.command.deadline_ns for item in self._items]
         waits = [max(0, min(deadlines) - self._now_ns()) + 1_000_000] if deadlines else []
-        waits += [wait_ns for wait_ns in (self._injector.patience_ns, self._output.patience_ns) if wait_ns >= 0]
+        waits += [wait_ns for wait_ns in (self._injections.patience_ns, self._output.patience_ns) if wait_ns >= 0]
         return min(waits, default=-1)
 
     def _make_room(self) -> None:
@@ -210,7 +210,7 @@ class CommandDesk:
 
     def _judge(self, command: Command) -> bool:
         """Accept or reject; False if there is no room before the next cycle, and the command is held."""
-        layer = self._injector.toward_device(command)
+        layer = self._injections.toward_device(command)
         write = command.kind is CommandKind.WRITE or layer is not None
         reason = self._refusal(command)
         if not reason and command.kind is CommandKind.NOTE:
@@ -219,9 +219,9 @@ class CommandDesk:
         if not reason and layer is not None:
             reason = uncovered(layer, command.writes)
         if not reason:
-            reason = self._unwritable(command) if write else self._injector.take(command)
+            reason = self._unwritable(command) if write else self._injections.take(command)
         if not reason and write:
-            reason = self._injector.campaign.crowded
+            reason = self._injections.declared.overload
         if reason:
             count = max(1, len(command.writes))
             told = Record(EventKind.REJECTED, reason, command.writer, command.id, 0, count)
@@ -237,9 +237,9 @@ class CommandDesk:
         self._accept(command, layer)
         return True
 
-    def _accept(self, command: Command, layer: Injection | None) -> None:
+    def _accept(self, command: Command, layer: Layer | None) -> None:
         """Let a command meet the injections below ``layer``, and have what they leave of it wait for the cycle."""
-        left, taken = meet(self._output, command, layer)
+        left, taken = divert_command(self._output, command, layer)
         left = [pair for pair in left if not self._made_unfit(pair[0])]
         self._end(taken, [(EventKind.TAKEN, "")] * len(taken))  # now all that injections get of it has been told
         items = [item for item, _ in left]

@@ -29,7 +29,7 @@ class Owner:
     pid: int
 
 
-class Now(NamedTuple):
+class CycleImage(NamedTuple):
     """The image published last: its cycle, the instance's clock of that, and what the device delivered."""
 
     cycle: int
@@ -38,7 +38,7 @@ class Now(NamedTuple):
 
 
 @dataclass
-class Injection:
+class Layer:
     """One layer. ``cover``: an image of the block in which the bits that it stands over are set."""
 
     id: int
@@ -61,11 +61,11 @@ class Injection:
         """Whether it changes what it covers at present."""
         return True
 
-    def show(self, image: Bits, now: Now) -> None:  # noqa: ARG002  what its client gave last holds at any time
+    def show(self, image: Bits, now: CycleImage) -> None:  # noqa: ARG002  what its client gave last holds at any time
         """Put into an image what consumers get for the covered bits of ``/out``."""
         image ^= (image ^ self.values) & self.cover
 
-    def meet(self, write: Write, bits: Bits, now: Now) -> bytes | None:  # noqa: ARG002
+    def transform_write(self, write: Write, bits: Bits, now: CycleImage) -> bytes | None:  # noqa: ARG002
         """What becomes of these bits of a write toward the device: its data, the same object if unchanged.
 
         None: they go no further.
@@ -73,28 +73,28 @@ class Injection:
         return None
 
 
-class Passage(NamedTuple):
+class DivertedWrite(NamedTuple):
     """What became of a write on its way to the device."""
 
-    met: list[tuple[Injection, list[Write]]]
+    met: list[tuple[Layer, list[Write]]]
     """What came to injections that took it, or made something else of it."""
     left: bytes
     """Which of its bits go to the device,"""
     data: bytes
     """with which values,"""
-    by: Injection | None
+    by: Layer | None
     """and the last injection that has changed some of these."""
 
 
 @dataclass
-class Injections:
+class LayerStack:
     """All injections of one block of ``size`` bytes; the innermost first."""
 
     size: int
-    layers: list[Injection] = field(default_factory=list)
-    now: Now = field(default_factory=lambda: Now(-1, 0, b""))
+    layers: list[Layer] = field(default_factory=list)
+    now: CycleImage = field(default_factory=lambda: CycleImage(-1, 0, b""))
 
-    def lay(self, injection: Injection) -> str:
+    def lay(self, injection: Layer) -> str:
         """Add a layer; why not, or empty."""
         if any(layer.id == injection.id for layer in self.layers):
             return f"there is an injection {injection.id} already"
@@ -104,11 +104,11 @@ class Injections:
         self.layers.insert(place, injection)
         return ""
 
-    def find(self, number: int) -> Injection | None:
+    def find(self, number: int) -> Layer | None:
         """The layer of this number."""
         return next((layer for layer in self.layers if layer.id == number), None)
 
-    def lift(self, which: Callable[[Injection], bool]) -> list[Injection]:
+    def lift(self, which: Callable[[Layer], bool]) -> list[Layer]:
         """Remove layers; those that there were."""
         lifted = [layer for layer in self.layers if which(layer)]
         self.layers = [layer for layer in self.layers if not which(layer)]
@@ -119,29 +119,29 @@ class Injections:
         layers = [layer for layer in self.layers if layer.direction is Direction.OUT and layer.active]
         return self.seen(raw, layers).tobytes() if layers else None
 
-    def seen(self, raw: bytes, inner: Iterable[Injection]) -> Bits:
+    def seen(self, raw: bytes, inner: Iterable[Layer]) -> Bits:
         """What these layers over ``/out`` make of an image."""
         image = np.frombuffer(raw, np.uint8).copy()
         for layer in inner:
             layer.show(image, self.now)
         return image
 
-    def before(self, raw: bytes, layer: Injection) -> Bits:
+    def before(self, raw: bytes, layer: Layer) -> Bits:
         """What consumers would see of an image without a layer and those further out."""
         return self.seen(raw, self.inner(layer))
 
-    def inner(self, layer: Injection) -> list[Injection]:
+    def inner(self, layer: Layer) -> list[Layer]:
         """The layers over ``/out`` that are further in than one of them, and change what they cover."""
         inner = self.layers[: self.layers.index(layer)]
         return [other for other in inner if other.direction is Direction.OUT and other.active]
 
-    def outer(self, layer: Injection) -> list[Injection]:
+    def outer(self, layer: Layer) -> list[Layer]:
         """Those that are further out and that clients give values to; of one over ``/in`` none."""
         if layer.direction is Direction.IN:
             return []
         return [other for other in self.layers[self.layers.index(layer) + 1 :] if other.given]
 
-    def beneath(self, raw: bytes, layer: Injection) -> list[Write]:
+    def inner_values(self, raw: bytes, layer: Layer) -> list[Write]:
         """What a layer over ``/out`` gets from those further in; the rest of its bits come from the device."""
         inner = self.inner(layer)
         bits = np.zeros(self.size, np.uint8)
@@ -149,12 +149,12 @@ class Injections:
             bits |= other.cover & layer.cover
         return merge(self.seen(raw, inner).tobytes(), bits.tobytes(), [(0, self.size)] if inner else [])
 
-    def onward(self, raw: bytes, layer: Injection, write: Write) -> list[tuple[Injection, list[Write]]]:
+    def onward(self, raw: bytes, layer: Layer, write: Write) -> list[tuple[Layer, list[Write]]]:
         """What of the values that a layer over ``/out`` gives goes to clients' further out, instead of to consumers.
 
         It is what those in between make of it.
         """
-        taken: list[tuple[Injection, list[Write]]] = []
+        taken: list[tuple[Layer, list[Write]]] = []
         bits = np.full(len(write.data), write.mask or 0xFF, np.uint8)
         for other in self.outer(layer):
             span = slice(write.offset, write.offset + len(write.data))
@@ -165,12 +165,12 @@ class Injections:
                 bits &= ~hit
         return taken
 
-    def divert(self, write: Write, above: Injection | None) -> Passage:
+    def divert(self, write: Write, above: Layer | None) -> DivertedWrite:
         """Let a write meet the injections on its way to the device.
 
         ``above``: the injection whose values these are; only what stands below it, if it still does, is on their way.
         """
-        met: list[tuple[Injection, list[Write]]] = []
+        met: list[tuple[Layer, list[Write]]] = []
         by = None
         span = slice(write.offset, write.offset + len(write.data))
         bits = np.full(len(write.data), write.mask or 0xFF, np.uint8)
@@ -181,7 +181,7 @@ class Injections:
             hit = bits & layer.cover[span]
             if not hit.any():
                 continue
-            data = layer.meet(write, hit, self.now)
+            data = layer.transform_write(write, hit, self.now)
             if data is write.data:
                 continue
             met.append((layer, parts_of(write, hit)))
@@ -189,10 +189,10 @@ class Injections:
                 bits &= ~hit
             else:
                 write, by = write._replace(data=data), layer
-        return Passage(met, bits.tobytes(), write.data, by)
+        return DivertedWrite(met, bits.tobytes(), write.data, by)
 
 
-def shadow(injection: Injection, writes: Sequence[Write]) -> str:
+def shadow(injection: Layer, writes: Sequence[Write]) -> str:
     """Give consumers other values for bits that an injection covers; why not, or empty."""
     if reason := uncovered(injection, writes):
         return reason
@@ -201,7 +201,7 @@ def shadow(injection: Injection, writes: Sequence[Write]) -> str:
     return ""
 
 
-def uncovered(injection: Injection, writes: Iterable[Write]) -> str:
+def uncovered(injection: Layer, writes: Iterable[Write]) -> str:
     """Why values are not an injection's to give; empty if they are."""
     for write in writes:
         cover = injection.cover[write.offset : write.offset + len(write.data)]

@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 
-from shmio.connectors.injection.campaign import Blocks, Campaign
-from shmio.connectors.injection.declared import Declared
-from shmio.connectors.injection.layers import Bits, Injection, Injections, Owner, covering, shadow
-from shmio.connectors.injection.published import Chain, about, pieces
+from shmio.connectors.injection.declared_injections import Blocks, DeclaredInjections
+from shmio.connectors.injection.declared_layer import DeclaredLayer
+from shmio.connectors.injection.layers import Bits, Layer, LayerStack, Owner, covering, shadow
+from shmio.connectors.injection.published import LayerPublisher, layer_event, pieces
 from shmio.connectors.output import Output
 from shmio.layout.values.write import Write, apply
 from shmio.segment import Command, CommandKind, Direction, EventKind
@@ -25,7 +25,7 @@ OwnerOf = Callable[[int], Owner | None]
 """The process that has a command queue at present; None: nobody."""
 
 
-class Injector:
+class InjectionProcessor:
     """Lays, feeds and lifts the injections of one source."""
 
     def __init__(self, output: Output, writable: bytes, refuse_in: str, owner_of: OwnerOf, blocks: Blocks) -> None:
@@ -34,27 +34,27 @@ class Injector:
         self._writer = output.writer
         self._owner_of = owner_of
         self._look_ns = 0  # of CLOCK_MONOTONIC, whatever clock the source has: clients live by that
-        self._chain = Chain(output, writable, refuse_in)
-        self.campaign = Campaign(self._chain, blocks)
+        self._publisher = LayerPublisher(output, writable, refuse_in)
+        self.declared = DeclaredInjections(self._publisher, blocks)
         self._resume()
-        self.campaign.follow()
+        self.declared.follow()
 
     @property
-    def injections(self) -> Injections:
+    def injections(self) -> LayerStack:
         """All there are."""
         return self._output.injections
 
     @property
     def patience_ns(self) -> int:
         """How long until :meth:`look` has something to do; negative: there is nothing to look after."""
-        if all(layer.keep for layer in self.injections.layers) and not self.campaign.looks_elsewhere:
+        if all(layer.keep for layer in self.injections.layers) and not self.declared.reads_other_sources:
             return -1
         return max(0, self._look_ns - time.monotonic_ns())
 
-    def toward_device(self, command: Command) -> Injection | None:
+    def toward_device(self, command: Command) -> Layer | None:
         """The injection over ``/in`` whose values a command carries; None: it carries no such values."""
         layer = self.injections.find(command.injection) if command.kind is CommandKind.SHADOW else None
-        if layer is None or layer.direction is not Direction.IN or isinstance(layer, Declared):
+        if layer is None or layer.direction is not Direction.IN or isinstance(layer, DeclaredLayer):
             return None
         return layer
 
@@ -65,17 +65,17 @@ class Injector:
             if owner is None:
                 return "nobody has the command queue that it came by"
             if command.kind is CommandKind.DECLARE:
-                return self.campaign.declare(command, owner)
+                return self.declared.declare(command, owner)
             return self._lay(command, owner)
         layer = self.injections.find(command.injection)
         if layer is None:
             return f"there is no injection {command.injection}; it may have been lifted"
         if command.kind is not CommandKind.LIFT:
             return self._shadow(layer, command)
-        if isinstance(layer, Declared) and layer.configured:
-            return self.campaign.lift(layer, command)
-        self._chain.lift(lambda other: other is layer, "lifted", command)
-        self.campaign.settle()
+        if isinstance(layer, DeclaredLayer) and layer.configured:
+            return self.declared.lift(layer, command)
+        self._publisher.lift(lambda other: other is layer, "lifted", command)
+        self.declared.settle()
         return ""
 
     def look(self) -> None:
@@ -83,19 +83,19 @@ class Injector:
 
         Lift what nobody keeps and whose client is gone; find anew what conditions read in sources that have changed.
         """
-        self.campaign.follow()
+        self.declared.follow()
         if self.patience_ns != 0:
             return
         self._look_ns = time.monotonic_ns() + LOOK_NS
-        self.campaign.rebind()
+        self.declared.rebind()
         gone = {
             layer.id
             for layer in self.injections.layers
             if not layer.keep and self._owner_of(layer.owner.writer) != layer.owner
         }
         if gone:
-            self._chain.lift(lambda layer: layer.id in gone, "its client is gone")
-            self.campaign.settle()
+            self._publisher.lift(lambda layer: layer.id in gone, "its client is gone")
+            self.declared.settle()
 
     def _lay(self, command: Command, owner: Owner) -> str:
         try:
@@ -103,19 +103,19 @@ class Injector:
         except ValueError as error:
             return str(error)
         with self._output.turn:
-            layer = Injection(
+            layer = Layer(
                 command.id, command.direction, command.priority, command.keep, command.name, owner, cover, cover
             )
-            if reason := self._chain.lay(layer):
+            if reason := self._publisher.lay(layer):
                 return reason
             layer.values = self.injections.before(self._output.base, layer)
             above = [layer, *self.injections.outer(layer)] if layer.direction is Direction.OUT else []
-            end = about(EventKind.INJECTED, layer, command.name)
-            self._output.show([*self._chain.beneath(above, end), *self._chain.laid(layer, end)])
+            end = layer_event(EventKind.INJECTED, layer, command.name)
+            self._output.show([*self._publisher.inner_values(above, end), *self._publisher.laid(layer, end)])
         return ""
 
-    def _shadow(self, layer: Injection, command: Command) -> str:
-        if isinstance(layer, Declared):
+    def _shadow(self, layer: Layer, command: Command) -> str:
+        if isinstance(layer, DeclaredLayer):
             return f"the injection {layer.name} is declared: it takes no values from others"
         with self._output.turn:
             if reason := shadow(layer, command.writes):
@@ -141,17 +141,17 @@ class Injector:
         raw, image = (last.raw, last.image) if last else (bytes(block.layout.size),) * 2
         seen = np.frombuffer(image, np.uint8)
         if last is not None:
-            self.campaign.seen(last)
+            self.declared.seen(last)
         standing = block.standing.read()
         covers = [_cover(one, block.layout.size) for one in standing]
         for place, one in enumerate(standing):
             if one.running is not None:
-                self.campaign.resume(one, one.running, seen)
+                self.declared.resume(one, one.running, seen)
                 continue
             direction = Direction.IN if one.direction == "in" else Direction.OUT
             owner = Owner(one.writer, one.pid)
-            layer = Injection(one.id, direction, one.priority, one.keep, one.name, owner, covers[place], seen.copy())
-            self._chain.restore(layer)
+            layer = Layer(one.id, direction, one.priority, one.keep, one.name, owner, covers[place], seen.copy())
+            self._publisher.restore(layer)
             hidden = np.zeros(block.layout.size, np.uint8)
             for outer, cover in zip(standing[place + 1 :], covers[place + 1 :], strict=True):
                 if outer.direction == "out" and outer.active:
@@ -159,7 +159,7 @@ class Injector:
             if direction is Direction.OUT and hidden.any():
                 layer.values ^= (layer.values ^ self._given(layer, raw)) & hidden
 
-    def _given(self, layer: Injection, raw: bytes) -> Bits:
+    def _given(self, layer: Layer, raw: bytes) -> Bits:
         """The values that a client has given, where consumers see what injections further out make of them.
 
         The events know them, as far as the ring goes back.

@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 
 from shmio.connectors.commands.batch import Item
-from shmio.connectors.injection.declared import Declared
-from shmio.connectors.injection.layers import Injection, Injections
+from shmio.connectors.injection.declared_layer import DeclaredLayer
+from shmio.connectors.injection.layers import Layer, LayerStack
 from shmio.connectors.output import Output
 from shmio.layout.values.write import Write
 from shmio.segment import NO_WRITER, Command, Direction, EventKind, Record
@@ -21,7 +21,7 @@ GROWTH: Final = 64
 """What an injection may take in the segment beyond what it did when it was laid: its numbers grow."""
 
 
-class Chain:
+class LayerPublisher:
     """Lays and lifts, whoever asks for it."""
 
     def __init__(self, output: Output, writable: bytes, refuse_in: str) -> None:
@@ -34,11 +34,11 @@ class Chain:
         self._computed: dict[int, list[Write]] = {}  # by number: what was told last of what declared ones give it
 
     @property
-    def injections(self) -> Injections:
+    def injections(self) -> LayerStack:
         """All there are."""
         return self.output.injections
 
-    def lay(self, layer: Injection) -> str:
+    def lay(self, layer: Layer) -> str:
         """Add a layer, with the output's ``turn`` held; why not, or empty."""
         if layer.direction is Direction.IN:
             if self._refuse_in:
@@ -49,23 +49,23 @@ class Chain:
             return reason
         self._ranges[layer.id] = ranges_of(layer.cover.tobytes())
         try:
-            self.tell(growth=GROWTH * len(self.injections.layers))
+            self.publish(growth=GROWTH * len(self.injections.layers))
         except ValueError as error:
             self.injections.lift(lambda other: other is layer)
             return str(error)
         return ""
 
-    def restore(self, layer: Injection) -> None:
+    def restore(self, layer: Layer) -> None:
         """Go on with a layer of the process before this one, of which everybody knows."""
         self._ranges[layer.id] = ranges_of(layer.cover.tobytes())
         self.injections.lay(layer)
 
-    def lift(self, which: Callable[[Injection], bool], reason: str, command: Command | None = None) -> None:
+    def lift(self, which: Callable[[Layer], bool], reason: str, command: Command | None = None) -> None:
         """Remove layers and tell why."""
         with self.output.turn:
             self.output.show(self.removed(which, reason, command))
 
-    def removed(self, which: Callable[[Injection], bool], reason: str, command: Command | None = None) -> list[Record]:
+    def removed(self, which: Callable[[Layer], bool], reason: str, command: Command | None = None) -> list[Record]:
         """Remove layers, with the output's ``turn`` held; the events that tell why."""
         gone = [layer for layer in self.injections.layers if which(layer)]
         above = {other.id for layer in gone for other in self.injections.outer(layer)}
@@ -74,20 +74,20 @@ class Chain:
             self._shown.pop(layer.id, None)
             self._ranges.pop(layer.id, None)
             self._computed.pop(layer.id, None)
-        self.tell()
-        ends = [about(EventKind.LIFTED, layer, reason, command) for layer in gone]
-        held = [record for layer in gone if isinstance(layer, Declared) for record in lost(layer, reason)]
+        self.publish()
+        ends = [layer_event(EventKind.LIFTED, layer, reason, command) for layer in gone]
+        held = [record for layer in gone if isinstance(layer, DeclaredLayer) for record in lost(layer, reason)]
         left = [layer for layer in self.injections.layers if layer.id in above]
-        return [*held, *self.beneath(left, ends[0]), *ends] if ends else []
+        return [*held, *self.inner_values(left, ends[0]), *ends] if ends else []
 
-    def beneath(self, layers: Iterable[Injection], end: Record) -> Iterator[Record]:
+    def inner_values(self, layers: Iterable[Layer], end: Record) -> Iterator[Record]:
         """What clients' layers over ``/out`` get by now from those further in.
 
         It is told before ``end``, which is why it changed.
         """
         for layer in layers:
             told = Record(EventKind.DIVERTED, layer.name, end.writer, end.command, injection=layer.id)
-            yield from _parts(told, self.injections.beneath(self.output.base, layer))
+            yield from _parts(told, self.injections.inner_values(self.output.base, layer))
 
     def computed(self, base: bytes) -> Iterator[Record]:
         """What clients' layers over ``/out`` get by now from declared ones further in, if it has changed.
@@ -96,16 +96,16 @@ class Chain:
         """
         for layer in self.injections.layers:
             inner = self.injections.inner(layer) if layer.given else []
-            if not any(isinstance(one, Declared) and (one.cover & layer.cover).any() for one in inner):
+            if not any(isinstance(one, DeclaredLayer) and (one.cover & layer.cover).any() for one in inner):
                 self._computed.pop(layer.id, None)
                 continue
-            writes = self.injections.beneath(base, layer)
+            writes = self.injections.inner_values(base, layer)
             if writes != self._computed.get(layer.id):
                 self._computed[layer.id] = writes
                 parts = list(_parts(Record(EventKind.DIVERTED, layer.name, injection=layer.id), writes))
                 yield from (part._replace(item=item, items=len(parts)) for item, part in enumerate(parts))
 
-    def laid(self, layer: Injection, end: Record) -> Iterator[Record]:
+    def laid(self, layer: Layer, end: Record) -> Iterator[Record]:
         """The events that a client's layer was laid: which way, over what, for how long."""
         how = {
             "direction": layer.direction.name.lower(),
@@ -115,7 +115,7 @@ class Chain:
         }
         return in_parts(end, msgspec.json.encode(how))
 
-    def tell(self, growth: int = 0) -> None:
+    def publish(self, growth: int = 0) -> None:
         """Say in the segment what stands, with the output's ``turn`` held.
 
         ValueError: it is too much, or would be with so many bytes more.
@@ -123,8 +123,8 @@ class Chain:
         items = (self._item(layer) for layer in self.injections.layers)
         self.output.writer.block.standing.write(encode(items, growth))
 
-    def _item(self, layer: Injection) -> bytes:
-        running = layer.running if isinstance(layer, Declared) else None
+    def _item(self, layer: Layer) -> bytes:
+        running = layer.running if isinstance(layer, DeclaredLayer) else None
         shown = self._shown.get(layer.id)
         if shown is None or shown[0] != running:
             standing = Standing(
@@ -135,15 +135,15 @@ class Chain:
         return shown[1]
 
 
-def meet(
-    output: Output, command: Command, above: Injection | None
-) -> tuple[list[tuple[Item, Injection | None]], list[Item]]:
+def divert_command(
+    output: Output, command: Command, above: Layer | None
+) -> tuple[list[tuple[Item, Layer | None]], list[Item]]:
     """Let a command's items meet the injections below ``above``, and tell of what these get.
 
     What is left for the device, each with the injection whose values these are by now, if one's; and the items of which
     nothing is left.
     """
-    left: list[tuple[Item, Injection | None]] = []
+    left: list[tuple[Item, Layer | None]] = []
     taken: list[Item] = []
     for place, write in enumerate(command.writes):
         if not output.injections.layers:
@@ -164,7 +164,7 @@ def meet(
     return left, taken
 
 
-def lost(layer: Declared, reason: str) -> Iterator[Record]:
+def lost(layer: DeclaredLayer, reason: str) -> Iterator[Record]:
     """The events of what a delay held and will not send."""
     reason = f"a delay held it: {reason}"
     while layer.held:
@@ -173,7 +173,7 @@ def lost(layer: Declared, reason: str) -> Iterator[Record]:
 
 
 def pieces(
-    kind: EventKind, command: Command, place: int, writes: Iterable[Write], layer: Injection | None
+    kind: EventKind, command: Command, place: int, writes: Iterable[Write], layer: Layer | None
 ) -> Iterator[Record]:
     """Events that tell of parts of an item with their data; several if these are long."""
     name, number = (layer.name, layer.id) if layer else ("", 0)
@@ -192,7 +192,7 @@ def in_parts(told: Record, document: bytes) -> Iterator[Record]:
     yield from _parts(told, [Write(0, 0, document)])
 
 
-def about(kind: EventKind, layer: Injection, text: str, command: Command | None = None) -> Record:
+def layer_event(kind: EventKind, layer: Layer, text: str, command: Command | None = None) -> Record:
     """An event about an injection; with the command that asked for it, if it was not the injection's own."""
     writer, number = (layer.owner.writer, layer.id) if command is None else (command.writer, command.id)
     return Record(kind, text, writer, number, 0, 1, injection=layer.id)

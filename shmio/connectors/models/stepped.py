@@ -6,14 +6,14 @@ import time
 from collections.abc import Iterable, Sequence
 from typing import Final, Protocol
 
-from shmio.connectors.commands.processor import CommandDesk
-from shmio.connectors.injection.campaign import Blocks
+from shmio.connectors.commands.processor import CommandProcessor
+from shmio.connectors.injection.declared_injections import Blocks
 from shmio.connectors.injection.processor import OwnerOf
 from shmio.connectors.models.computed import Computed
 from shmio.connectors.models.inputs import Inputs
 from shmio.connectors.output import Image, Output
 from shmio.connectors.schedule import Schedule
-from shmio.connectors.source_status import Condition, Counters
+from shmio.connectors.source_status import Counters, QualityLog
 from shmio.errors import ShmioError
 from shmio.layout.values.write import Write
 from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
@@ -97,11 +97,11 @@ class SteppedLoop:
         self._inputs = inputs
         self._output = Output(writer, clock.now_ns)
         # Whatever is injected here reaches no plant, so that no arming is needed.
-        self.desk = CommandDesk(
+        self.commands = CommandProcessor(
             self._output, writable, clock.now_ns, allow_nonfinite=allow_nonfinite, armed=True, owner_of=owner_of,
             blocks=blocks, accepted=clock.nudge,
         )  # fmt: skip
-        self._condition = Condition(writer)
+        self._condition = QualityLog(writer)
         self._handled = 0  # the last step computed, or passed over
         self._time_ns: int | None = None  # the instance's clock at what was computed last
         self._published = False
@@ -119,9 +119,9 @@ class SteppedLoop:
             while not (self._live() if self._page.read().virtual else self._free_run()):
                 pass
         finally:
-            self.desk.stop()
+            self.commands.stop()
             reason = "the source was stopped"
-            self.desk.close(reason)
+            self.commands.close(reason)
             self._fail(self._writer.cycle, reason)
             self._writer.event(Record(EventKind.STOPPED))
 
@@ -130,7 +130,7 @@ class SteppedLoop:
         last = self._writer.block.latest()
         if self._output.source_ns:
             self._source.resume(self._output.raw)
-        self.desk.open()
+        self.commands.open()
         self.counters.connects += 1
         state = self._page.read()
         if not state.virtual:
@@ -159,7 +159,7 @@ class SteppedLoop:
         self.counters.overruns += due.skipped
         while (now_ns := self._clock.now_ns()) < due.due_ns:
             wait_ns = due.due_ns - now_ns
-            if self._source.prompt and self.desk.waiting:
+            if self._source.prompt and self.commands.waiting:
                 if now_ns >= self._output.next_ns:
                     self._writer.cycle = max(0, due.cycle - 1)
                     self._carry_out()
@@ -203,7 +203,7 @@ class SteppedLoop:
             if self._source.news():
                 self._show(state.step)
         wait_ns = None
-        if self.desk.waiting:
+        if self.commands.waiting:
             wait_ns = max(0, self._output.next_ns - self._clock.now_ns()) if self._source.prompt else 0
             if not wait_ns:
                 self._carry_out()
@@ -215,7 +215,7 @@ class SteppedLoop:
         """One cycle, or one step."""
         self._writer.cycle, self._time_ns = cycle, time_ns
         self._published = False
-        self.desk.release(cycle)
+        self.commands.release(cycle)
         self._carry_out()
         if self._published:
             return  # a source that shows at once what is written has no more to say
@@ -249,9 +249,9 @@ class SteppedLoop:
 
     def _carry_out(self) -> None:
         """Hand over all that was accepted."""
-        self.desk.settle()
-        if self.desk.waiting:
-            self.desk.carry_out(self._write)
+        self.commands.settle()
+        if self.commands.waiting:
+            self.commands.carry_out(self._write)
 
     def _write(self, writes: Sequence[Write]) -> list[str]:
         """Hand over what is to be written; of a prompt source the frame that shows it comes before the outcomes."""

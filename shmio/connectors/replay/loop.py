@@ -7,16 +7,16 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final
 
-from shmio.connectors.commands.processor import CommandDesk
-from shmio.connectors.injection.campaign import Blocks
+from shmio.connectors.commands.processor import CommandProcessor
+from shmio.connectors.injection.declared_injections import Blocks
 from shmio.connectors.injection.processor import OwnerOf
 from shmio.connectors.models.stepped import StepClock
 from shmio.connectors.output import Output
-from shmio.connectors.replay.beginning import Beginning, as_others, stamp
-from shmio.connectors.replay.player import OVER, STOPPED, Player, is_told
+from shmio.connectors.replay.player import OVER, STOPPED, Player, is_replayed
+from shmio.connectors.replay.recorded_source import Entry, RecordedSource
 from shmio.connectors.replay.recording import MAX_NS
 from shmio.connectors.replay.source import Replay
-from shmio.connectors.replay.tape import Entry, Tape
+from shmio.connectors.replay.start import ReplayStart, as_others, stamp
 from shmio.connectors.source_status import Counters
 from shmio.errors import PathError, SegmentError, ValueRangeError
 from shmio.layout.topic import find, shorten
@@ -71,11 +71,13 @@ SEARCH_PIECE = 256
 class Search:
     """A search under way, in pieces, so that what plays meanwhile goes on."""
 
-    def __init__(self, tape: Tape, find: Find, end_ns: int, *, keep: bool) -> None:
+    def __init__(self, recorded: RecordedSource, find: Find, end_ns: int, *, keep: bool) -> None:
         """Up to before ``end_ns``. ``keep``: as consumers see the recording. PathError: no such register or kind."""
         self._end_ns = end_ns
-        self._matches = _happened(find.event, keep=keep) if find.event else _changed(tape, find, keep=keep)
-        self._entries: Iterator[Entry] = tape.entries(find.after_ns + 1)
+        self._matches = (
+            _event_matcher(find.event, keep=keep) if find.event else _change_matcher(recorded, find, keep=keep)
+        )
+        self._entries: Iterator[Entry] = recorded.entries(find.after_ns + 1)
         self._what = f"event {find.event}" if find.event else f"change of {find.path}"
 
     def go_on(self) -> Found | None:
@@ -89,17 +91,17 @@ class Search:
         return None
 
 
-def _happened(name: str, *, keep: bool) -> Callable[[Entry], bool]:
+def _event_matcher(name: str, *, keep: bool) -> Callable[[Entry], bool]:
     kinds = {str(kind): kind for kind in EventKind}
     if name == ANY:
-        return lambda entry: isinstance(entry.item, Event) and is_told(entry.item, keep=keep)
+        return lambda entry: isinstance(entry.item, Event) and is_replayed(entry.item, keep=keep)
     if name not in kinds:
         raise PathError(f"event {shorten(name, 16)!r} is none of {', '.join(kinds)}, {ANY}")
     return lambda entry: isinstance(entry.item, Event) and entry.item.kind == kinds[name]
 
 
-def _changed(tape: Tape, wanted: Find, *, keep: bool) -> Callable[[Entry], bool]:
-    register = find(tape.block.layout, wanted.path)
+def _change_matcher(recorded: RecordedSource, wanted: Find, *, keep: bool) -> Callable[[Entry], bool]:
+    register = find(recorded.block.layout, wanted.path)
     span = slice(register.offset, register.offset + register.size)
     bits = bits_of(register)
 
@@ -107,7 +109,7 @@ def _changed(tape: Tape, wanted: Find, *, keep: bool) -> Callable[[Entry], bool]
         data = (frame.image if keep else frame.raw)[span]
         return bytes(byte & mask for byte, mask in zip(data, bits, strict=True))
 
-    entry = tape.newest(wanted.after_ns)
+    entry = recorded.newest(wanted.after_ns)
     last = value(entry.item) if entry is not None and isinstance(entry.item, Frame) else None
 
     def matches(entry: Entry) -> bool:
@@ -141,7 +143,7 @@ class ReplayLoop:
         self,
         source: Replay,
         writer: BlockWriter,
-        beginning: Beginning,
+        beginning: ReplayStart,
         clock: StepClock,
         writable: Iterable[str] = (),
         *,
@@ -161,11 +163,11 @@ class ReplayLoop:
         self._clock = clock
         self._output = Output(writer, clock.now_ns)
         # Whatever is injected here reaches no plant, so that no arming is needed.
-        self.desk = CommandDesk(
+        self.commands = CommandProcessor(
             self._output, writable, clock.now_ns, allow_nonfinite=allow_nonfinite, armed=True, owner_of=owner_of,
             blocks=blocks, accepted=clock.nudge,
         )  # fmt: skip
-        self._player = Player(source.tape, self._output, keep=source.keep)
+        self._player = Player(source.recorded, self._output, keep=source.keep)
         self._search: tuple[int, Search] | None = None
         self._play, self._done_ns = beginning
         self._round_before: Play | None = None
@@ -183,8 +185,8 @@ class ReplayLoop:
             while not self._turn():
                 pass
         finally:
-            self.desk.stop()
-            self.desk.close(STOPPED)
+            self.commands.stop()
+            self.commands.close(STOPPED)
             self._player.end(STOPPED, self._stamp_now())
             self._writer.event(Record(EventKind.STOPPED))
 
@@ -200,7 +202,7 @@ class ReplayLoop:
             self._player.begin(play.at_ns(since_ns), self._stamp)
             if play.over:
                 self._end()
-        self.desk.open()
+        self.commands.open()
         self.counters.connects += 1
 
     # ---- the loop ------------------------------------------------------------------------------------------------
@@ -223,9 +225,9 @@ class ReplayLoop:
             self._keep(self._play._replace(step=state.step))
             self._writer.block.ring.wake()
         waits = state.stepping and self._head.asks(self._play.asked) is not None
-        if self.desk.waiting:
-            self.desk.settle()
-            self.desk.carry_out(self._refuse)
+        if self.commands.waiting:
+            self.commands.settle()
+            self.commands.carry_out(self._refuse)
         self.counters.polls = self._player.published
         return self._clock.wait_ns(0 if more else ASK_TURN_NS if waits else self._patience_ns(virtual=state.virtual))
 
@@ -247,7 +249,7 @@ class ReplayLoop:
         if self._player.play(target_ns, self._stamp, PIECE):
             return True
         if self._player.published != before:
-            self.desk.release(self._writer.cycle)
+            self.commands.release(self._writer.cycle)
         settled = play.settled(clock_ns)
         if settled is play:
             if self._player.stopped and not play.over and (play.paused or self._writer.at_ns is not None):
@@ -262,7 +264,7 @@ class ReplayLoop:
             return False
         self._round_before = play
         self._keep(play.next_round())
-        self._player.again(play.begin_ns, self._source.tape.block.stale_ns, self._stamp)
+        self._player.again(play.begin_ns, self._source.recorded.block.stale_ns, self._stamp)
         return True
 
     def _end(self) -> None:
@@ -281,7 +283,7 @@ class ReplayLoop:
         too_late = late_ns > LATE_NS
         if not too_late and not (play.wraps and behind_ns >= play.end_ns - play.begin_ns):
             return
-        left_out = behind_ns // self._source.tape.block.period_ns
+        left_out = behind_ns // self._source.recorded.block.period_ns
         self.counters.overruns += left_out
         if too_late:  # else it is too fast, and would be told all the time
             log.warning("%d frames were left out: this process was held up for %.1f s", left_out, late_ns / 1e9)
@@ -347,7 +349,7 @@ class ReplayLoop:
     def _find(self, number: int, ask: Find) -> bool:
         if self._search is None or self._search[0] != number:
             try:
-                self._search = number, Search(self._source.tape, ask, self._play.end_ns, keep=self._source.keep)
+                self._search = number, Search(self._source.recorded, ask, self._play.end_ns, keep=self._source.keep)
             except PathError as error:
                 self._answer(number, Found(str(error)))
                 return True
@@ -369,7 +371,7 @@ class ReplayLoop:
         self._keep(play)
         if position_ns is not None:
             self._show(position_ns)
-        elif behind or was_ns - play.at_ns(clock_ns) > self._source.tape.block.stale_ns:
+        elif behind or was_ns - play.at_ns(clock_ns) > self._source.recorded.block.stale_ns:
             self._show(play.at_ns(clock_ns))  # or it is asked late to be where it was long ago
         return Found()
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from typing import Final, cast
 
 from shmio.connectors.output import Image, Output
-from shmio.connectors.replay.tape import Entry, Tape
+from shmio.connectors.replay.recorded_source import Entry, RecordedSource
 from shmio.segment import NO_WRITER, BlockWriter, Event, EventKind, Frame, Provenance, Quality, Record, Stamp
 from shmio.segment.commands import MAX_WRITES
 from shmio.segment.playhead import OWN_WORDS
@@ -36,7 +36,7 @@ StampOf = Callable[[int, int], Stamp]
 log = logging.getLogger("shmio.source")
 
 
-def is_told(event: Event, *, keep: bool) -> bool:
+def is_replayed(event: Event, *, keep: bool) -> bool:
     """Whether a recorded event is told again; ``keep``: whether the injections of the recording are seen."""
     return event.kind not in _OF_PROCESSES and (keep or not (event.kind in _OF_INJECTIONS or event.injection))
 
@@ -44,9 +44,9 @@ def is_told(event: Event, *, keep: bool) -> bool:
 class Player:
     """The place in a recording, and what is published there; for one thread."""
 
-    def __init__(self, tape: Tape, output: Output, *, keep: bool) -> None:
+    def __init__(self, recorded: RecordedSource, output: Output, *, keep: bool) -> None:
         """``keep``: whether the injections of the recording are seen."""
-        self._tape = tape
+        self._recorded = recorded
         self._output = output
         self._writer: BlockWriter = output.writer
         self._keep = keep
@@ -67,7 +67,7 @@ class Player:
 
     def go(self, position_ns: int | None) -> None:
         """Have what comes at or behind a position be the next; None: all there is."""
-        self._entries = self._tape.entries(position_ns)
+        self._entries = self._recorded.entries(position_ns)
         self._next = next(self._entries, None)
 
     def begin(self, position_ns: int, stamp: StampOf) -> None:
@@ -75,21 +75,21 @@ class Player:
 
         Where no frame is, that are the events before the first one.
         """
-        entry = self._tape.newest(position_ns - 1)
+        entry = self._recorded.newest(position_ns - 1)
         if entry is not None:
             self._publish(entry, stamp)
         self.go(None if entry is None else position_ns)
 
     def again(self, position_ns: int, stale_ns: int, stamp: StampOf) -> None:
         """Go on at the begin of a loop; where nothing comes soon, what stood at its end stands no longer."""
-        if self._tape.newest(position_ns + stale_ns) is None:
+        if self._recorded.newest(position_ns + stale_ns) is None:
             self.end(NOTHING, stamp(position_ns, position_ns))
         self.go(position_ns)
 
     def resume(self, position_ns: int) -> None:
         """Go on behind a position, up to which the process before this one has published."""
         self.go(position_ns + 1)
-        entry = self._tape.newest(position_ns)
+        entry = self._recorded.newest(position_ns)
         if entry is not None and isinstance(entry.item, Frame):
             self._output.resume(self._image(entry.item, None))
             self._bad = entry.item.quality is Quality.BAD
@@ -102,7 +102,7 @@ class Player:
 
         What lies before it is not read.
         """
-        entry = self._tape.newest(position_ns)
+        entry = self._recorded.newest(position_ns)
         if entry is None:
             self.fail(NOTHING, stamp(position_ns, position_ns))
         else:
@@ -167,7 +167,7 @@ class Player:
 
     def _happen(self, event: Event, at: Stamp) -> None:
         """Tell a recorded event again: nobody's, so that no client of now takes it for its own."""
-        if not is_told(event, keep=self._keep):
+        if not is_replayed(event, keep=self._keep):
             return
         record = Record(
             cast(EventKind, event.kind),  # or a number that this version does not know

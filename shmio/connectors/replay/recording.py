@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from shmio.connectors.replay.tape import Tape
+from shmio.connectors.replay.recorded_source import RecordedSource
 from shmio.errors import RecordingError
 from shmio.local.recording_times import date_ns
 from shmio.recording.dump import open_dump
@@ -124,7 +124,7 @@ class Recording:
                 f"{key}: {text!r} is neither a time such as 2026-11-21T08:30:00 nor seconds of the recording"
             ) from None
 
-    def tape(self, source: str, span: Span) -> Tape:
+    def recorded(self, source: str, span: Span) -> RecordedSource:
         """What there is of a source. RecordingError: nothing, or its layout changes within what is played."""
         if source not in self.sources:
             raise RecordingError(
@@ -140,7 +140,7 @@ class Recording:
                 f"source {source}: its layout was changed within what is to be played, at {at_s:.3f} s: end before "
                 "that, or start there"
             )
-        return Tape(self._dump, self._damage, last, self.utc_ns)
+        return RecordedSource(self._dump, self._damage, last, self.utc_ns)
 
     def close(self) -> None:
         """Close the files."""

@@ -8,9 +8,9 @@ from typing import Annotated
 import msgspec
 
 from shmio.config.model import ReplayedInjections
+from shmio.connectors.replay.recorded_source import RecordedSource
 from shmio.connectors.replay.recording import Recording, Span
 from shmio.connectors.replay.replayed import Replayed
-from shmio.connectors.replay.tape import Tape
 from shmio.errors import ConfigError, RecordingError
 from shmio.layout.model import Layout
 from shmio.segment.playhead import MAX_SPEED, MIN_SPEED
@@ -42,7 +42,7 @@ class Replay(Replayed):
         except RecordingError as error:
             raise ConfigError(f"file: {error}") from None
         try:
-            self.span, self.tape = chosen(self.recording, options, name)
+            self.span, self.recorded = chosen(self.recording, options, name)
         except ConfigError:
             self.recording.close()
             raise
@@ -50,7 +50,7 @@ class Replay(Replayed):
     @property
     def layout(self) -> Layout:
         """Of the frames."""
-        return self.tape.block.layout
+        return self.recorded.block.layout
 
     @property
     def keep(self) -> bool:
@@ -67,13 +67,13 @@ def files(options: Replay.Options) -> Sequence[str]:
     return [options.file] if isinstance(options.file, str) else options.file
 
 
-def chosen(recording: Recording, options: Replay.Options, name: str) -> tuple[Span, Tape]:
+def chosen(recording: Recording, options: Replay.Options, name: str) -> tuple[Span, RecordedSource]:
     """What is played of a recording for the source of this name. ConfigError, beginning with the key."""
     try:
         span = recording.span(options.start, options.end)
     except RecordingError as error:
         raise ConfigError(str(error)) from None
     try:
-        return span, recording.tape(options.source or name, span)
+        return span, recording.recorded(options.source or name, span)
     except RecordingError as error:
         raise ConfigError(f"source: {error}") from None

@@ -16,9 +16,9 @@ from shmio.connectors.s7.block_read import BlockRead
 from shmio.connectors.s7.block_size import SizeProbe
 from shmio.connectors.s7.block_write import BlockWrite, ends, waves
 from shmio.connectors.s7.explain import OUT_OF_RANGE, RefusedError, explain_size
-from shmio.connectors.s7.mode import ModeQuestion
+from shmio.connectors.s7.mode import ModeQuery
 from shmio.connectors.s7.options import S7Options
-from shmio.connectors.s7.transport import DroppingOnError, Transport
+from shmio.connectors.s7.transport import CloseOnError, Transport
 from shmio.connectors.s7.window import Operation, Window
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.values.write import Write
@@ -50,8 +50,8 @@ class S7Client:
         self._window = Window(0, 0)
         self._under_way: deque[BlockRead] = deque()
         self._idle: list[BlockRead] = []
-        self._mode = ModeQuestion()
-        self._dropping_on_error = DroppingOnError(self.close, options)
+        self._mode = ModeQuery()
+        self._close_on_error = CloseOnError(self.close, options)
 
     @property
     def connected(self) -> bool:
@@ -84,7 +84,7 @@ class S7Client:
         ConnectorError: nobody there, not an S7 controller, session refused.
         """
         self.close()
-        with DroppingOnError(self.close, self.options, opening=True):
+        with CloseOnError(self.close, self.options, opening=True):
             self._transport = transport = Transport(self.options.host, self.options.port, self._timeout_ns)
             deadline_ns = transport.deadline_ns
             transport.send(pdu.connect_request(self.options.rack, self.options.cpu_slot), deadline_ns)
@@ -97,7 +97,7 @@ class S7Client:
             if transport.left:
                 raise ConnectorError("unexpected bytes after the session was set up")
             self._use(granted, transport)
-        with self._dropping_on_error:
+        with self._close_on_error:
             self._ask_mode()
             self._flush()
             self._finish(self._mode, deadline_ns)
@@ -122,7 +122,7 @@ class S7Client:
             raise ConnectorError("not connected")
         if not self._idle:
             raise RuntimeError(f"no more than {self.depth} reads may be under way")
-        with self._dropping_on_error:
+        with self._close_on_error:
             read = self._idle.pop()
             read.begin(time.monotonic_ns() + self._timeout_ns)
             self._under_way.append(read)
@@ -141,7 +141,7 @@ class S7Client:
         if not self._under_way:
             raise RuntimeError("no read is under way")
         read = self._under_way[0]
-        with self._dropping_on_error:
+        with self._close_on_error:
             if not self._advance(read, min(until_ns, read.deadline_ns)):
                 if time.monotonic_ns() >= read.deadline_ns:
                     raise TimeoutError
@@ -164,7 +164,7 @@ class S7Client:
         outcomes = [""] * len(writes)
         begun: list[BlockWrite] = []
         try:
-            with self._dropping_on_error:
+            with self._close_on_error:
                 begun_ns = time.monotonic_ns()
                 end_ns = begun_ns + max(self._timeout_ns, LONGEST_WRITE_S * 1_000_000_000)
                 for wave in waves(self.db_number, self.pdu_size, writes, outcomes):

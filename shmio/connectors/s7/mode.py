@@ -37,7 +37,7 @@ _MODES = {
 log = logging.getLogger("shmio.source")
 
 
-class ModeQuestion:
+class ModeQuery:
     """Asks for the operating mode, and remembers the answer."""
 
     count = 1

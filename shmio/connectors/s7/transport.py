@@ -131,7 +131,7 @@ def named(error: BaseException, options: S7Options, *, opening: bool = False) ->
     return None
 
 
-class DroppingOnError:
+class CloseOnError:
     """Closes a connection on any way out of a ``with`` block but the good one, and names the error for people."""
 
     def __init__(self, close: Callable[[], None], options: S7Options, *, opening: bool = False) -> None:

@@ -21,7 +21,7 @@ from shmio.endpoints.grpc.streams.feeds import Feeds
 from shmio.endpoints.grpc.streams.wakeups import Bells
 from shmio.endpoints.grpc.time.virtual_time import Hold
 from shmio.errors import SegmentError, ShmioError
-from shmio.log_rate_limit import Ration
+from shmio.log_rate_limit import LogRateLimit
 from shmio.logs import fields
 from shmio.worker import BEAT_S, Worker
 
@@ -33,7 +33,7 @@ FOREIGN_LOGGERS: Final = ("asyncio", "grpc._cython.cygrpc")
 def run(worker: Worker) -> None:
     """Serve until told to stop."""
     memory.limit_arenas()
-    rations = {name: Ration(one_kind=name != "shmio.grpc") for name in ("shmio.grpc", *FOREIGN_LOGGERS)}
+    rations = {name: LogRateLimit(one_kind=name != "shmio.grpc") for name in ("shmio.grpc", *FOREIGN_LOGGERS)}
     for name, ration in rations.items():
         logging.getLogger(name).addFilter(ration)
     try:

@@ -11,7 +11,7 @@ from shmio import worker
 from shmio.config import Mqtt
 from shmio.endpoints.mqtt.bridge import Bridge
 from shmio.endpoints.mqtt.broker import process
-from shmio.log_rate_limit import Ration
+from shmio.log_rate_limit import LogRateLimit
 from shmio.worker import BEAT_S, Worker
 
 BROKER = "broker"
@@ -20,7 +20,7 @@ BROKER = "broker"
 
 def run(worker: Worker) -> None:
     """Be the one that the name says, until told to stop."""
-    log, ration = logging.getLogger("shmio.mqtt"), Ration()
+    log, ration = logging.getLogger("shmio.mqtt"), LogRateLimit()
     log.addFilter(ration)
     try:
         if worker.name == BROKER:

@@ -17,7 +17,7 @@ import pytest
 import shmio
 from shmio.cli.set import read_value
 from shmio.cli.user import main
-from shmio.connectors.commands.processor import CommandDesk
+from shmio.connectors.commands.processor import CommandProcessor
 from shmio.connectors.output import Output
 from shmio.errors import ConnectorError, ValueRangeError
 from shmio.layout.model import Layout, Register
@@ -52,33 +52,33 @@ class Device:
         self.idle = False
         self.taken = threading.Event()
         self._writer = writer
-        self._desk = CommandDesk(Output(writer), WRITABLE, time.monotonic_ns, allow_nonfinite=["speed"])
+        self._processor = CommandProcessor(Output(writer), WRITABLE, time.monotonic_ns, allow_nonfinite=["speed"])
         self._stop = threading.Event()
-        self._threads = [threading.Thread(target=self._desk.run), threading.Thread(target=self._cycles)]
-        self.desk.open()
+        self._threads = [threading.Thread(target=self._processor.run), threading.Thread(target=self._cycles)]
+        self.processor.open()
         for thread in self._threads:
             thread.start()
 
     @property
-    def desk(self) -> CommandDesk:
-        return self._desk
+    def processor(self) -> CommandProcessor:
+        return self._processor
 
     def stop(self) -> None:
         self._stop.set()
-        self._desk.stop()
+        self._processor.stop()
         for thread in self._threads:
             thread.join(20)
 
     def _cycles(self) -> None:
         while not self._stop.wait(0.001):
-            if not self._desk.waiting:
+            if not self._processor.waiting:
                 continue
             self.taken.set()
             if not self.idle:
                 try:
-                    self._desk.carry_out(self._write)
+                    self._processor.carry_out(self._write)
                 except ConnectorError as error:
-                    self._desk.close(str(error))
+                    self._processor.close(str(error))
 
     def _write(self, writes: Any) -> list[str]:
         if self.lost:
@@ -239,7 +239,7 @@ def test_what_cannot_be_sent_is_one_line_and_nothing_is_written(
 
 
 def test_a_source_without_its_device_says_so(device: Device, capsys: pytest.CaptureFixture[str]) -> None:
-    device.desk.close("no answer from 10.0.0.1")
+    device.processor.close("no answer from 10.0.0.1")
     assert main(["set", "cell/count", "1", "cell/run", "true"]) == 1
     out, err = capsys.readouterr()
     assert out.splitlines() == ["cell/count  rejected", "cell/run    rejected"]

@@ -393,7 +393,7 @@ def test_a_write_is_done_before_the_read_so_that_the_frame_shows_it(segment: Seg
     def command_before_read_4(hook: str, reads: int) -> None:
         if hook == "read" and reads == 3:
             sender.submit([Write(0, 0, (1000).to_bytes(4, "big"))], 10**18)
-            loop.desk._take_one(4)  # what the commands' thread does
+            loop.commands._take_one(4)  # what the commands' thread does
 
     clock = VirtualClock(8 * PERIOD_NS)
     loop = SourceLoop(Writing(command_before_read_4), segment.writer("cell"), Schedule(0, PERIOD_NS), clock, ["count"])
@@ -420,7 +420,7 @@ def test_a_write_lost_with_the_connection_is_unknown_and_never_repeated(segment:
     def trouble(hook: str, reads: int) -> None:
         if hook == "read" and reads == 3:
             sender.submit([Write(0, 0, bytes(4))], 10**18)
-            loop.desk._take_one(4)
+            loop.commands._take_one(4)
         if hook == "write":
             raise ConnectorError("cut")
 
@@ -491,9 +491,9 @@ def test_no_frame_behind_the_end_of_a_write_is_older_than_it(segment: Segment) -
             return int(self.answers.pop(0)).to_bytes(4, "big")
 
         def command(self) -> None:
-            if not self.value and not loop.desk.waiting:
+            if not self.value and not loop.commands.waiting:
                 sender.submit([Write(0, 0, (77).to_bytes(4, "big"))], 10**18)
-                loop.desk._take_one(4)
+                loop.commands._take_one(4)
 
         def write(self, writes: Sequence[Write]) -> list[str]:
             assert not self.asked_ns, "reads under way"

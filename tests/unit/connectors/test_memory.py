@@ -48,7 +48,7 @@ def running(segment: Segment) -> Iterator[Commander]:
     schedule = Schedule(segment.header.started_ns, PERIOD_NS)
     cursor = segment.blocks["cell"].cursor()
     loop = SteppedLoop(memory, segment.writer("cell"), schedule, clock, WRITABLE)
-    threads = [threading.Thread(target=run) for run in (loop.run, loop.desk.run)]
+    threads = [threading.Thread(target=run) for run in (loop.run, loop.commands.run)]
     for thread in threads:
         thread.start()
     try:

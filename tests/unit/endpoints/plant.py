@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Sequence
 
-from shmio.connectors.commands.processor import CommandDesk
+from shmio.connectors.commands.processor import CommandProcessor
 from shmio.connectors.injection.layers import Owner
 from shmio.connectors.output import Image, Output
 from shmio.errors import ConnectorError
@@ -18,7 +18,7 @@ GUEST = 0
 
 
 class Plant:
-    """A desk in its thread, and a device that does what it is told unless ``refusal`` says why not."""
+    """A command processor in its thread, and a device that does what it is told unless ``refusal`` says why not."""
 
     def __init__(self, writer: BlockWriter, *, armed: bool = True) -> None:
         self.writer = writer
@@ -29,23 +29,23 @@ class Plant:
         self.owners: dict[int, Owner] = {WRITER: Owner(WRITER, 1), GUEST: Owner(GUEST, 2)}
         self.quality = Quality.GOOD
         self.output = Output(writer)
-        self.desk = CommandDesk(
+        self.commands = CommandProcessor(
             self.output, writer.block.attributes.writable, time.monotonic_ns,
             allow_nonfinite=["axis/position"], armed=armed, owner_of=self.owners.get,
         )  # fmt: skip
-        self.desk.open()
+        self.commands.open()
         self._cycles = 0
         self._stop = threading.Event()
-        self._threads = [threading.Thread(target=self.desk.run)]
+        self._threads = [threading.Thread(target=self.commands.run)]
         self._threads[0].start()
 
     def cycle(self) -> None:
         """Carry out what waits, then publish the memory as it is."""
         try:
-            if self.desk.waiting:
-                self.desk.carry_out(self._write)
+            if self.commands.waiting:
+                self.commands.carry_out(self._write)
         except ConnectorError as error:
-            self.desk.close(str(error))
+            self.commands.close(str(error))
         self._cycles += 1
         image = bytes(self.memory)
         self.output.publish(Image(image, self._cycles, time.time_ns(), self.quality, Provenance.LIVE, ""))
@@ -63,7 +63,7 @@ class Plant:
 
     def stop(self) -> None:
         self._stop.set()
-        self.desk.stop()
+        self.commands.stop()
         for thread in self._threads:
             thread.join(20)
             assert not thread.is_alive()

@@ -9,7 +9,7 @@ import time
 from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager
 
-from shmio.connectors.commands.processor import CommandDesk
+from shmio.connectors.commands.processor import CommandProcessor
 from shmio.connectors.injection.layers import Owner
 from shmio.connectors.output import Image, Output
 from shmio.layout.model import Layout, Register
@@ -43,7 +43,7 @@ class Model:
         self.failure = ""
         self.writer = segment.writer(source)
         self.output = Output(self.writer)
-        self.desk = CommandDesk(
+        self.processor = CommandProcessor(
             self.output, ["goal"], time.monotonic_ns, armed=True, owner_of=lambda writer: Owner(writer, 1)
         )
         self._clock = segment.clock
@@ -51,8 +51,8 @@ class Model:
         self._stopping = False
         self._done = self._clock.read().step
         self.publish(self._done)
-        self.desk.open()
-        self._threads = [threading.Thread(target=run) for run in (self.desk.run, self._run)]
+        self.processor.open()
+        self._threads = [threading.Thread(target=run) for run in (self.processor.run, self._run)]
         for thread in self._threads:
             thread.start()
 
@@ -70,7 +70,7 @@ class Model:
 
     def stop(self) -> None:
         self._stopping = True
-        self.desk.stop()
+        self.processor.stop()
         self._bell.ring()
         for thread in self._threads:
             thread.join(20)
@@ -88,8 +88,8 @@ class Model:
 
     def _step(self, number: int) -> None:
         before = _NUMBERS.unpack_from(self.image)
-        if self.desk.waiting:
-            self.desk.carry_out(self._write)
+        if self.processor.waiting:
+            self.processor.carry_out(self._write)
         count, goal = before[0] + 1, _NUMBERS.unpack_from(self.image)[2]
         _NUMBERS.pack_into(self.image, 0, count, 2 * count, goal, before[2])
         struct.pack_into(">100i", self.image, 16, *range(count, count + 100))

@@ -7,20 +7,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.injection.draw import FEW, Draw, Purpose
+from shmio.injection.draw import FEW, Purpose, SeededRandom
 
 places = st.integers(0, 2**40)
 
 
 def test_the_numbers_are_these_for_ever() -> None:
     """A campaign recorded with one version repeats with the next."""
-    words = Draw(7, "drift").words(1, 12, Purpose.VALUE, 3)
+    words = SeededRandom(7, "drift").words(1, 12, Purpose.VALUE, 3)
     assert [f"{word:016x}" for word in words.tolist()] == ["c5b32a2bd6d0f3ce", "20657407695298c2", "a78378d3780506af"]
 
 
 @given(st.integers(0, 2**63 - 1), places, places)
 def test_the_same_place_has_the_same_numbers_in_any_order(seed: int, run: int, place: int) -> None:
-    one, other = Draw(seed, "a"), Draw(seed, "a")
+    one, other = SeededRandom(seed, "a"), SeededRandom(seed, "a")
     later = other.uniform(run, place + 1, 4)
     assert one.uniform(run, place, 8).tolist() == other.uniform(run, place, 8).tolist()
     assert one.uniform(run, place, 8)[:3].tolist() == other.uniform(run, place, 3).tolist()
@@ -29,7 +29,7 @@ def test_the_same_place_has_the_same_numbers_in_any_order(seed: int, run: int, p
 
 def test_seed_name_activation_place_and_purpose_tell_numbers_apart() -> None:
     found = [
-        Draw(seed, name).words(run, place, purpose, 1)[0]
+        SeededRandom(seed, name).words(run, place, purpose, 1)[0]
         for seed in (0, 1) for name in ("a", "b") for run in (1, 2) for place in (0, 1) for purpose in Purpose
     ]  # fmt: skip
     assert len(set(found)) == len(found)
@@ -37,7 +37,7 @@ def test_seed_name_activation_place_and_purpose_tell_numbers_apart() -> None:
 
 @given(st.integers(0, 2**32), places)
 def test_ranges(seed: int, place: int) -> None:
-    draw = Draw(seed, "x")
+    draw = SeededRandom(seed, "x")
     uniform = draw.uniform(1, place, 50)
     assert ((uniform >= 0) & (uniform < 1)).all()
     assert np.isfinite(draw.gaussian(1, place, 50)).all()
@@ -47,7 +47,7 @@ def test_ranges(seed: int, place: int) -> None:
 
 
 def test_distributions_are_as_they_are_called() -> None:
-    draw = Draw(1, "x")
+    draw = SeededRandom(1, "x")
     uniform = np.concatenate([draw.uniform(1, place, 100) for place in range(1000)])
     assert uniform.mean() == pytest.approx(0.5, abs=0.005)
     assert uniform.var() == pytest.approx(1 / 12, abs=0.002)
@@ -63,7 +63,7 @@ def test_distributions_are_as_they_are_called() -> None:
 
 @given(st.integers(0, 2**32), places)
 def test_few_numbers_are_the_first_of_many(seed: int, place: int) -> None:
-    draw = Draw(seed, "x")
+    draw = SeededRandom(seed, "x")
     for purpose in Purpose:
         assert draw.words(3, place, purpose, FEW).tolist() == draw.words(3, place, purpose, FEW + 1)[:FEW].tolist()
     assert draw.uniform(3, place, FEW).tolist() == draw.uniform(3, place, FEW + 1)[:FEW].tolist()

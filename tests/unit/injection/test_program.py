@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from shmio.config import Declaration
 from shmio.errors import ConfigError
 from shmio.injection import Program, compile_program
-from shmio.injection.draw import Draw
-from shmio.injection.operations import Moment, Operation
+from shmio.injection.draw import SeededRandom
+from shmio.injection.operations import Operation, OperationContext
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.model import Layout
 from shmio.layout.values.codec import Value, codec
@@ -37,7 +37,7 @@ name = "STRING[6]"
 day = "DATE"
 """
 LAYOUT = compile_sources([Source("t.toml", TABLE)]).layouts[0]
-DRAW = Draw(1, "x")
+DRAW = SeededRandom(1, "x")
 
 
 def program(target: str | list[str], operation: str, **keys: Any) -> Program:
@@ -61,7 +61,7 @@ def becomes(path: str, value: Value, operation: str, place: int = 0, /, **keys: 
     found = program(path, operation, **keys)
     image = image_of({path: value})
     before = image.copy()
-    found.operate(DRAW).apply(image, Moment(1, place, place, 0))
+    found.operate(DRAW).apply(image, OperationContext(1, place, place, 0))
     image = before ^ (before ^ image) & found.cover
     return value_of(path, image)
 
@@ -165,12 +165,12 @@ def walk(operation: Operation, steps: list[int]) -> list[tuple[int, int]]:
     for number, step in enumerate(steps):
         cycle += step
         image = image_of({"uint": cycle})
-        operation.apply(image, Moment(1, cycle, cycle, cycle * 10))
+        operation.apply(image, OperationContext(1, cycle, cycle, cycle * 10))
         shown = value_of("uint", image)
         assert isinstance(shown, int)
         seen.append((cycle, shown))
         again = image_of({"uint": cycle})
-        operation.apply(again, Moment(1, cycle, cycle, cycle * 10))
+        operation.apply(again, OperationContext(1, cycle, cycle, cycle * 10))
         assert value_of("uint", again) == shown, f"image {number}: looking twice changed something"
     return seen
 
@@ -281,7 +281,7 @@ def test_whatever_is_not_refused_runs_over_any_bytes(
         cycle += step
         image = np.frombuffer(data, np.uint8).copy()
         if step % 2:
-            running.passed(image, Moment(1, cycle, cycle, cycle * 10_000_000))
-        running.apply(image, Moment(1, cycle, cycle, cycle * 10_000_000))
+            running.passed(image, OperationContext(1, cycle, cycle, cycle * 10_000_000))
+        running.apply(image, OperationContext(1, cycle, cycle, cycle * 10_000_000))
         assert image.shape == (LAYOUT.size,)
         assert image.dtype == np.uint8

@@ -17,7 +17,7 @@ from shmio.plan.processes import Job, Plan
 from shmio.segment import BlockSpec, State
 from shmio.supervisor.main import Supervisor
 from shmio.supervisor.policy import Limits
-from shmio.supervisor.process import Child
+from shmio.supervisor.process import ChildProcess
 
 instance, folder, jobs, limits = sys.argv[1], Path(sys.argv[2]), json.loads(sys.argv[3]), json.loads(sys.argv[4])
 LAYOUTS = {
@@ -64,7 +64,7 @@ def replan() -> Plan:
         raise ConfigError("plan.json: no JSON") from None
 
 
-def kill(child: Child, end: Callable[[Child], None] = Child.kill) -> None:
+def kill(child: ChildProcess, end: Callable[[ChildProcess], None] = ChildProcess.kill) -> None:
     """As a process takes it that waits in the kernel, as long as there is the file."""
     if not (folder / "held").exists():
         end(child)
@@ -76,7 +76,7 @@ def send(pidfd: int, sign: int, really: Callable[[int, int], None] = signal.pidf
         really(pidfd, sign)
 
 
-Child.kill = kill  # type: ignore[method-assign,assignment]
+ChildProcess.kill = kill  # type: ignore[method-assign,assignment]
 signal.pidfd_send_signal = send  # type: ignore[assignment]
 logs.setup(folder / "supervisor.log", "supervisor")
 modules = dict.fromkeys(("source", "emulator", "grpc"), "fake_worker")

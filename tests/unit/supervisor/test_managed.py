@@ -11,7 +11,7 @@ import pytest
 from shmio.plan.processes import Job
 from shmio.segment import Activity, ProcessSpec, Report, Segment
 from shmio.supervisor import policy
-from shmio.supervisor.managed import Managed
+from shmio.supervisor.managed import ManagedProcess
 
 
 def test_the_log_tells_what_a_recorder_lost_while_it_was_in_trouble(
@@ -20,7 +20,7 @@ def test_the_log_tells_what_a_recorder_lost_while_it_was_in_trouble(
     caplog.set_level(logging.INFO, "shmio.supervisor")
     with Segment.create(instance, [], [ProcessSpec("recorder", "recorder")]) as segment:
         slot = segment.processes.find("recorder")
-        managed = Managed(slot)
+        managed = ManagedProcess(slot)
         managed.life = policy.adopted(0, 0)
         for missed, note, complaint in (
             (7, "to a.mem", ""),
@@ -61,7 +61,7 @@ def test_a_process_that_is_kept_is_told_of_rules(
     instance: str, tmp_path: Path, before: Any, rules: Any, told: bool, known: bool
 ) -> None:
     with Segment.create(instance, [], [ProcessSpec("grpc", "grpc")]) as segment:
-        managed, child = Managed(segment.processes.find("grpc")), Told()
+        managed, child = ManagedProcess(segment.processes.find("grpc")), Told()
         managed.child = child  # type: ignore[assignment]
         jobs = [Job("grpc", "grpc", tmp_path / "log", {}, given) for given in (before, rules)]
         if not isinstance(before, str):

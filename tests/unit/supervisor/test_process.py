@@ -9,12 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from shmio.supervisor.process import Child, describe_end
+from shmio.supervisor.process import ChildProcess, describe_end
 
 
-def run(module: str, folder: Path, monkeypatch: pytest.MonkeyPatch, description: bytes = b"{}") -> tuple[Child, int]:
+def run(
+    module: str, folder: Path, monkeypatch: pytest.MonkeyPatch, description: bytes = b"{}"
+) -> tuple[ChildProcess, int]:
     monkeypatch.setenv("PYTHONPATH", str(folder))
-    child = Child.spawn(module, description, folder / "a.log")
+    child = ChildProcess.spawn(module, description, folder / "a.log")
     assert select.select([child.pidfd], [], [], 30)[0], "its end rings"
     return child, child.reap()
 

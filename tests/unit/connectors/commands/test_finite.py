@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.connectors.commands.finite import Finite
+from shmio.connectors.commands.finite import FiniteCheck
 from shmio.layout.model import ByteOrder, Layout, Register
 from shmio.layout.values.write import Write, apply, encode
 
@@ -31,7 +31,7 @@ def layout(order: ByteOrder = "big") -> Layout:
 @pytest.mark.parametrize("order", ["big", "little"])
 def test_they_are_refused_by_name(value: float, order: ByteOrder) -> None:
     block = layout(order)
-    finite = Finite(block, ["free/2"])
+    finite = FiniteCheck(block, ["free/2"])
     speed, _, way, free = REGISTERS
     for register, new, path in (
         (speed, value, "speed"),
@@ -43,13 +43,13 @@ def test_they_are_refused_by_name(value: float, order: ByteOrder) -> None:
         assert reason.startswith(f"{path}: NaN and infinities are not written")
         assert "`allow_nonfinite`" in reason
     assert not finite.refusal(encode(free, [1.0, value], order))
-    assert not Finite(block, ["**"]).refusal(encode(way, [[value, value], [value, value]], order))
+    assert not FiniteCheck(block, ["**"]).refusal(encode(way, [[value, value], [value, value]], order))
 
 
 @given(LITTLE_OR_BIG, st.floats(allow_nan=False, allow_infinity=False, width=32))
 def test_every_number_is_taken(order: ByteOrder, value: float) -> None:
     block = layout(order)
-    finite = Finite(block, [])
+    finite = FiniteCheck(block, [])
     assert not finite.refusal(encode(REGISTERS[0], value, order))
     assert not finite.refusal(encode(REGISTERS[2], [[value, -value], [0.0, 1.0]], order))
     assert not finite.refusal([Write(6, 0, b"\xff\xff"), Write(0, 0, b"\xff\xff")]), "no number is there"
@@ -65,7 +65,7 @@ WRITES = st.one_of(
 
 @given(LITTLE_OR_BIG, st.lists(WRITES, max_size=40))
 def test_no_sequence_of_writes_makes_one_of_parts(order: ByteOrder, writes: list[Write]) -> None:
-    finite = Finite(layout(order), ["free"])
+    finite = FiniteCheck(layout(order), ["free"])
     image = bytearray(48)
     for write in writes:
         if not finite.refusal([write]):

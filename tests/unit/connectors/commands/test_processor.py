@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from shmio.connectors.base import Lost, WriteLostError
 from shmio.connectors.commands.batch import Item, coalesce
-from shmio.connectors.commands.processor import MAX_WAITING, CommandDesk
+from shmio.connectors.commands.processor import MAX_WAITING, CommandProcessor
 from shmio.connectors.output import Output
 from shmio.errors import ConnectorError
 from shmio.layout.model import Layout, Register
@@ -48,14 +48,14 @@ FAR = 10**18
 
 
 class Bench:
-    """A desk with its thread, a sender, and the events."""
+    """A command processor with its thread, a sender, and the events."""
 
     def __init__(self, writer: BlockWriter, writable: Sequence[str] | None = WRITABLE) -> None:
         self.now_ns = 0
-        self.desk = CommandDesk(Output(writer), writable, lambda: self.now_ns)
+        self.processor = CommandProcessor(Output(writer), writable, lambda: self.now_ns)
         self.sender = CommandSender(writer.block, 4)
         self._events: Cursor[Event] = writer.block.events.cursor()
-        self._thread = threading.Thread(target=self.desk.run)
+        self._thread = threading.Thread(target=self.processor.run)
         self._thread.start()
 
     def send(self, *writes: Write, deadline_ns: int = FAR) -> int:
@@ -78,7 +78,7 @@ class Bench:
         return number
 
     def stop(self) -> None:
-        self.desk.stop()
+        self.processor.stop()
         self._thread.join(20)
         assert not self._thread.is_alive()
 
@@ -94,7 +94,7 @@ def writer(instance: str) -> Iterator[BlockWriter]:
 @pytest.fixture
 def bench(writer: BlockWriter) -> Iterator[Bench]:
     bench = Bench(writer)
-    bench.desk.open()
+    bench.processor.open()
     yield bench
     bench.stop()
 
@@ -109,17 +109,17 @@ def confirm(device: list[Write]) -> Callable[[Sequence[Write]], list[str]]:
 
 def test_a_command_is_accepted_carried_out_and_confirmed(bench: Bench) -> None:
     number = bench.accepted(Write(0, 0, b"\1\2"), Write(2, 2, b"\2"))
-    assert bench.desk.waiting
+    assert bench.processor.waiting
     device: list[Write] = []
-    bench.desk.carry_out(confirm(device))
+    bench.processor.carry_out(confirm(device))
     assert device == [Write(0, 0, b"\1\2"), Write(2, 2, b"\2")]
     done = bench.event()
     assert (done.kind, done.command, done.writer, done.item, done.items) == (EventKind.WRITTEN, number, 4, 0, 2)
-    assert not bench.desk.waiting
+    assert not bench.processor.waiting
 
 
 def test_a_note_is_an_event_whatever_the_device_does(bench: Bench) -> None:
-    bench.desk.close("cable out")
+    bench.processor.close("cable out")
     number = bench.sender.submit([], FAR, CommandKind.NOTE, name="Greifer getauscht")
     event = bench.event()
     assert (event.kind, event.text, event.writer, event.command) == (EventKind.NOTED, "Greifer getauscht", 4, number)
@@ -136,7 +136,7 @@ def test_of_one_cycle_the_last_value_wins_and_is_written_once(bench: Bench) -> N
     first = bench.accepted(Write(0, 0, b"\0\1"), Write(2, 1, b"\1"))
     second = bench.accepted(Write(0, 0, b"\0\2"))
     device: list[Write] = []
-    bench.desk.carry_out(confirm(device))
+    bench.processor.carry_out(confirm(device))
     assert device == [Write(2, 1, b"\1"), Write(0, 0, b"\0\2")], "in the order of what counts"
     ends = [bench.event() for _ in range(3)]
     assert [(end.command, end.item, end.kind, end.text) for end in ends] == [
@@ -153,7 +153,7 @@ def test_neighbouring_bits_of_two_writers_both_arrive(bench: Bench, writer: Bloc
     bench.send(Write(4, 0, b"\0\0"))
     bench.event()
     device: list[Write] = []
-    bench.desk.carry_out(confirm(device))
+    bench.processor.carry_out(confirm(device))
     assert [(write.offset, write.mask, write.data[0] & write.mask) for write in device] == [(2, 1, 1), (2, 2, 0)]
 
 
@@ -172,7 +172,7 @@ def test_what_must_not_be_written_is_rejected_as_a_whole(bench: Bench, write: Wr
     event = bench.event()
     assert (event.kind, event.command, event.items) == (EventKind.REJECTED, number, 2)
     assert reason in event.text
-    assert not bench.desk.waiting
+    assert not bench.processor.waiting
 
 
 def test_a_command_for_the_process_before_is_rejected(writer: BlockWriter, instance: str) -> None:
@@ -181,7 +181,7 @@ def test_a_command_for_the_process_before_is_rejected(writer: BlockWriter, insta
     with Segment.open(instance, writable=True) as segment:
         successor = segment.writer("cell")
         bench = Bench(successor)
-        bench.desk.open()
+        bench.processor.open()
         try:
             assert bench.event().kind == EventKind.REJECTED
         finally:
@@ -202,7 +202,7 @@ def test_what_no_cycle_carried_out_in_time_expires(bench: Bench) -> None:
     number = bench.accepted(Write(0, 0, b"\0\0"), deadline_ns=1_000)
     bench.now_ns = 2_000
     device: list[Write] = []
-    bench.desk.carry_out(confirm(device))
+    bench.processor.carry_out(confirm(device))
     event = bench.event()
     assert (event.kind, event.command) == (EventKind.EXPIRED, number)
     assert device == []
@@ -212,7 +212,7 @@ def test_at_its_very_deadline_a_command_is_carried_out(bench: Bench) -> None:
     bench.now_ns = 1_000
     number = bench.accepted(Write(0, 0, b"\1\2"), deadline_ns=1_000)
     device: list[Write] = []
-    bench.desk.carry_out(confirm(device))
+    bench.processor.carry_out(confirm(device))
     event = bench.event()
     assert (event.kind, event.command) == (EventKind.WRITTEN, number)
     assert device == [Write(0, 0, b"\1\2")]
@@ -220,14 +220,14 @@ def test_at_its_very_deadline_a_command_is_carried_out(bench: Bench) -> None:
 
 def test_nothing_is_accepted_while_the_device_is_away_and_nothing_done_when_it_is_back(bench: Bench) -> None:
     number = bench.accepted(Write(0, 0, b"\0\0"))
-    bench.desk.close("cable out")
+    bench.processor.close("cable out")
     event = bench.event()
     assert (event.kind, event.command, event.text) == (EventKind.EXPIRED, number, "cable out")
     bench.send(Write(0, 0, b"\0\0"))
     event = bench.event()
     assert (event.kind, event.text) == (EventKind.REJECTED, "the source is not connected: cable out")
-    bench.desk.open()
-    assert not bench.desk.waiting
+    bench.processor.open()
+    assert not bench.processor.waiting
     bench.accepted(Write(0, 0, b"\0\0"))
 
 
@@ -238,7 +238,7 @@ def test_a_lost_connection_leaves_the_end_unknown(bench: Bench) -> None:
         raise ConnectorError("cut")
 
     with pytest.raises(ConnectorError):
-        bench.desk.carry_out(lost)
+        bench.processor.carry_out(lost)
     event = bench.event()
     assert (event.kind, event.text) == (EventKind.UNKNOWN, "sent, but not confirmed: cut")
 
@@ -253,7 +253,7 @@ def test_of_a_lost_batch_each_item_has_the_end_that_is_known(bench: Bench) -> No
         raise WriteLostError("cut", ["", "no", Lost.UNKNOWN, Lost.UNSENT, Lost.UNSENT, Lost.UNSENT])
 
     with pytest.raises(ConnectorError):
-        bench.desk.carry_out(lost)
+        bench.processor.carry_out(lost)
     ends = [bench.event() for _ in range(5)]
     assert [(end.command, end.item, end.items, end.kind, end.text) for end in ends] == [
         (first, 0, 1, EventKind.WRITTEN, ""),
@@ -274,7 +274,7 @@ def test_an_item_of_which_a_part_was_done_is_not_expired(bench: Bench) -> None:
         raise WriteLostError("", ["", Lost.UNSENT])
 
     with pytest.raises(ConnectorError):
-        bench.desk.carry_out(lost)
+        bench.processor.carry_out(lost)
     assert [bench.event().kind for _ in range(2)] == [EventKind.UNKNOWN, EventKind.EXPIRED]
 
 
@@ -290,14 +290,14 @@ def test_of_a_connector_that_tells_too_little_nothing_is_known(bench: Bench, los
         return [""]
 
     with pytest.raises(ConnectorError, match="1 outcomes of 2 writes"):
-        bench.desk.carry_out(write)
+        bench.processor.carry_out(write)
     end = bench.event()
     assert (end.command, end.item, end.items, end.kind) == (number, 0, 2, EventKind.UNKNOWN)
 
 
 def test_the_refusal_of_one_item_is_told_of_that_item(bench: Bench) -> None:
     bench.accepted(Write(0, 0, b"\0\0"), Write(2, 1, b"\1"), Write(2, 2, b"\2"), Write(6, 0, b"\0"))
-    bench.desk.carry_out(lambda writes: ["access denied" if write.mask == 2 else "" for write in writes])
+    bench.processor.carry_out(lambda writes: ["access denied" if write.mask == 2 else "" for write in writes])
     ends = [bench.event() for _ in range(3)]
     assert [(end.kind, end.item, end.items, end.text) for end in ends] == [
         (EventKind.WRITTEN, 0, 2, ""),
@@ -325,12 +325,12 @@ def test_what_waits_has_a_bound_and_the_rest_its_turn(bench: Bench) -> None:
             seen.append((event.command, EventKind(event.kind)))
 
     until(2)
-    assert len(bench.desk._items) <= MAX_WAITING
+    assert len(bench.processor._items) <= MAX_WAITING
     for commands in (2, 4, 5):
         until(commands)
-        while not bench.desk.waiting:  # accepted is told before it waits
+        while not bench.processor.waiting:  # accepted is told before it waits
             pass
-        bench.desk.carry_out(confirm(device))
+        bench.processor.carry_out(confirm(device))
     accepted = [command for command, kind in seen if kind is EventKind.ACCEPTED]
     assert accepted == [number for number in numbers for _ in range(100)]
 
@@ -354,7 +354,7 @@ def test_what_waits_has_a_bound_in_bytes(bench: Bench, writer: BlockWriter, monk
         commands.wake()
         assert looked.acquire(timeout=20)
     assert bench._events.next(0) is None
-    bench.desk.carry_out(confirm([]))
+    bench.processor.carry_out(confirm([]))
     after = [bench.event() for _ in range(7)]
     assert [event.command for event in after if event.kind == EventKind.WRITTEN] == numbers[:5]
     assert [event.command for event in after if event.kind == EventKind.ACCEPTED] == numbers[5:] * 2
@@ -369,7 +369,7 @@ def test_a_connection_lost_while_a_command_is_being_accepted(
     def told(record: Record) -> int:
         number = tell(record)
         if record.kind is EventKind.ACCEPTED:
-            bench.desk.close("cable out")
+            bench.processor.close("cable out")
         return number
 
     monkeypatch.setattr(writer, "event", told)
@@ -379,14 +379,14 @@ def test_a_connection_lost_while_a_command_is_being_accepted(
         (number, EventKind.ACCEPTED, ""),
         (number, EventKind.EXPIRED, "the source is not connected: cable out"),
     ]
-    bench.desk.open()
-    bench.desk.settle()
-    assert not bench.desk.waiting
+    bench.processor.open()
+    bench.processor.settle()
+    assert not bench.processor.waiting
 
 
 def test_a_superseded_value_is_not_written_when_what_took_its_place_was_refused(bench: Bench) -> None:
     first, second = bench.accepted(Write(0, 0, b"\0\1")), bench.accepted(Write(0, 0, b"\0\2"))
-    bench.desk.carry_out(lambda writes: ["no"] * len(writes))
+    bench.processor.carry_out(lambda writes: ["no"] * len(writes))
     ends = [bench.event() for _ in range(2)]
     assert [(end.command, end.kind, end.text) for end in ends] == [
         (first, EventKind.REFUSED, "no"),
@@ -400,17 +400,17 @@ def test_commands_go_in_the_order_in_which_they_were_accepted(bench: Bench) -> N
     bench.accepted(Write(2, 1, b"\1"))
     bench.accepted(Write(104, 0, b"MORE"))
     device: list[Write] = []
-    bench.desk.carry_out(confirm(device))
+    bench.processor.carry_out(confirm(device))
     assert device == [Write(100, 0, b"DATA"), Write(2, 1, b"\1"), Write(104, 0, b"MORE")]
 
 
 def test_what_waits_expires_at_its_deadline_though_no_cycle_comes(bench: Bench) -> None:
     number = bench.accepted(Write(0, 0, b"\0\0"), deadline_ns=1_000)
     bench.now_ns = 2_000
-    bench.desk._writer.block.commands.wake()
+    bench.processor._writer.block.commands.wake()
     event = bench.event()
     assert (event.kind, event.command) == (EventKind.EXPIRED, number)
-    assert not bench.desk.waiting
+    assert not bench.processor.waiting
 
 
 def test_whatever_a_write_raises_the_end_is_told(bench: Bench) -> None:
@@ -420,7 +420,7 @@ def test_whatever_a_write_raises_the_end_is_told(bench: Bench) -> None:
         raise ZeroDivisionError("a defect")
 
     with pytest.raises(ZeroDivisionError):
-        bench.desk.carry_out(defect)
+        bench.processor.carry_out(defect)
     assert bench.event().kind == EventKind.UNKNOWN
 
 
@@ -442,7 +442,7 @@ def test_what_is_no_command_is_told_and_passed_over(bench: Bench, writer: BlockW
 
 def test_a_source_that_cannot_write_says_so(writer: BlockWriter) -> None:
     bench = Bench(writer, None)
-    bench.desk.open()
+    bench.processor.open()
     try:
         bench.send(Write(0, 0, b"\0\0"))
         assert "connector cannot write" in bench.event().text
@@ -483,7 +483,7 @@ def test_a_command_keeps_its_place_in_its_queue(writer: BlockWriter) -> None:
     sender = CommandSender(writer.block, 0)
     numbers = [sender.submit([Write(0, 0, bytes([0, n]))], FAR) for n in range(50)]
     bench = Bench(writer)
-    bench.desk.open()
+    bench.processor.open()
     try:
         seen = [bench.event().command for _ in range(50)]
     finally:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.connectors.injection.layers import MAX_INJECTIONS, Injection, Injections, Owner, covering, shadow
+from shmio.connectors.injection.layers import MAX_INJECTIONS, Layer, LayerStack, Owner, covering, shadow
 from shmio.layout.values.write import Write
 from shmio.segment import Direction
 
@@ -17,11 +17,9 @@ OWNER = Owner(4, 100)
 
 def layer(
     number: int, *bits: Write, direction: Direction = Direction.OUT, priority: int = 0, values: bytes = bytes(SIZE)
-) -> Injection:
+) -> Layer:
     cover = covering(SIZE, bits)
-    return Injection(
-        number, direction, priority, False, f"s{number}", OWNER, cover, np.frombuffer(values, np.uint8).copy()
-    )
+    return Layer(number, direction, priority, False, f"s{number}", OWNER, cover, np.frombuffer(values, np.uint8).copy())
 
 
 def whole(offset: int, size: int) -> Write:
@@ -32,8 +30,8 @@ def bit(offset: int, number: int) -> Write:
     return Write(offset, 1 << number, bytes([1 << number]))
 
 
-def laid(*layers: Injection) -> Injections:
-    injections = Injections(SIZE)
+def laid(*layers: Layer) -> LayerStack:
+    injections = LayerStack(SIZE)
     for one in layers:
         assert injections.lay(one) == ""
     return injections

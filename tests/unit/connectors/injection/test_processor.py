@@ -101,7 +101,7 @@ class Rig:
         loop = SourceLoop(
             self.device, writer, schedule, self._clock, WRITABLE, armed=self.armed, owner_of=self._owner_of
         )
-        self._threads = [threading.Thread(target=run) for run in (loop.run, loop.desk.run)]
+        self._threads = [threading.Thread(target=run) for run in (loop.run, loop.commands.run)]
         for thread in self._threads:
             thread.start()
         self.until(lambda frame: frame.quality is Quality.GOOD)

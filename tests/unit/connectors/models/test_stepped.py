@@ -147,7 +147,7 @@ class Running:
         self.loop = SteppedLoop(
             source, writer, schedule, self.clock, writable, inputs=inputs, blocks=lambda: own.blocks
         )
-        self._threads = [threading.Thread(target=run) for run in (self.loop.run, self.loop.desk.run)]
+        self._threads = [threading.Thread(target=run) for run in (self.loop.run, self.loop.commands.run)]
         for thread in self._threads:
             thread.start()
 

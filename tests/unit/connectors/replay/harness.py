@@ -13,9 +13,9 @@ from typing import Any
 
 from shmio.connectors.injection.layers import Owner
 from shmio.connectors.models.stepped import PageClock
-from shmio.connectors.replay.beginning import begin
 from shmio.connectors.replay.loop import ReplayLoop
 from shmio.connectors.replay.source import Replay
+from shmio.connectors.replay.start import begin
 from shmio.layout.model import Layout, Register
 from shmio.segment import (
     Attributes,
@@ -133,7 +133,7 @@ class Playing:
             owner_of=lambda writer: Owner(writer, os.getpid()),
             blocks=lambda: own.blocks,
         )
-        self._threads = [threading.Thread(target=run) for run in (self.loop.run, self.loop.desk.run)]
+        self._threads = [threading.Thread(target=run) for run in (self.loop.run, self.loop.commands.run)]
         for thread in self._threads:
             thread.start()
 

@@ -12,9 +12,9 @@ import pytest
 
 from shmio.connectors.replay.loop import Search
 from shmio.connectors.replay.player import NOTHING, Player
+from shmio.connectors.replay.recorded_source import Entry, RecordedSource
 from shmio.connectors.replay.recording import Recording
 from shmio.connectors.replay.source import Replay
-from shmio.connectors.replay.tape import Entry, Tape
 from shmio.errors import CommandError, ConfigError, RecordingError
 from shmio.local.attach import attach
 from shmio.local.replays import Wanted
@@ -157,14 +157,14 @@ def test_what_a_process_that_was_held_up_leaves_out_is_not_read(
                 cell.take()
     [file] = tmp_path.glob("*.mem")
     read = []
-    entries = Tape.entries
+    entries = RecordedSource.entries
 
-    def counted(tape: Tape, from_ns: int | None) -> Iterator[Entry]:
-        for entry in entries(tape, from_ns):
+    def counted(recorded: RecordedSource, from_ns: int | None) -> Iterator[Entry]:
+        for entry in entries(recorded, from_ns):
             read.append(entry)
             yield entry
 
-    monkeypatch.setattr(Tape, "entries", counted)
+    monkeypatch.setattr(RecordedSource, "entries", counted)
     with built(instance, stepped=False) as segment, Playing(segment, file, paused=True) as playing:
         playing.next()
         head = playing.block.playhead

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shmio.connectors.s7.mode import INTERVAL_NS, ModeQuestion, parse_mode_answer
+from shmio.connectors.s7.mode import INTERVAL_NS, ModeQuery, parse_mode_answer
 from shmio.errors import ConnectorError
 from tests.unit.connectors.s7 import noise as frames
 
@@ -26,7 +26,7 @@ def answer(mode: int = 0x48, *, code: int = 0xFF, szl: int = 0x0424, records: in
 
 
 def test_the_request() -> None:
-    question = ModeQuestion()
+    question = ModeQuery()
     question.begin(0, 10)
     wanted = "03000021 02f080 32 07 0000 0102 0008 0008 00 01 12 04 11 44 01 00 ff 09 0004 0424 0000"
     assert question.take(1, 0x0102) == bytes.fromhex(wanted)
@@ -47,7 +47,7 @@ def test_the_request() -> None:
     ],
 )
 def test_what_is_said_of_each_mode(mode: int, doubt: str) -> None:
-    question = ModeQuestion()
+    question = ModeQuery()
     question.begin(0, 10)
     question.accept(0, answer(mode))
     assert question.complete
@@ -55,7 +55,7 @@ def test_what_is_said_of_each_mode(mode: int, doubt: str) -> None:
 
 
 def test_is_asked_once_an_interval_and_is_due_in_time() -> None:
-    question = ModeQuestion()
+    question = ModeQuery()
     assert question.due(5)
     question.begin(5, 100)
     assert not question.due(5 + INTERVAL_NS)  # while it is open
@@ -80,7 +80,7 @@ def test_is_asked_once_an_interval_and_is_due_in_time() -> None:
 def test_a_controller_that_does_not_know_it(unknown: memoryview, caplog: pytest.LogCaptureFixture) -> None:
     """It is said once, to those who look for it, and not asked again."""
     caplog.set_level(logging.DEBUG, "shmio.source")
-    question = ModeQuestion()
+    question = ModeQuery()
     question.begin(0, 10)
     question.accept(0, unknown)
     assert question.doubt == ""
@@ -90,7 +90,7 @@ def test_a_controller_that_does_not_know_it(unknown: memoryview, caplog: pytest.
 
 
 def test_a_controller_that_ends_the_connection_when_asked() -> None:
-    question = ModeQuestion()
+    question = ModeQuery()
     for attempt in range(2):
         assert question.due(0), attempt
         question.begin(0, 10)
@@ -99,7 +99,7 @@ def test_a_controller_that_ends_the_connection_when_asked() -> None:
 
 
 def test_lost_connections_are_no_reason_to_stop_asking_who_has_answered() -> None:
-    question = ModeQuestion()
+    question = ModeQuery()
     question.begin(0, 10)
     question.accept(0, answer(0x84))
     assert question.doubt

@@ -203,7 +203,7 @@ def test_the_answer_comes_when_the_device_has_everything_and_not_before(segment:
 async def waiting(served: Endpoint, device: Plant, items: int) -> None:
     async def reached() -> bool:
         await asyncio.sleep(0)
-        return len(device.desk._items) == items
+        return len(device.commands._items) == items
 
     await served.until(reached)
 

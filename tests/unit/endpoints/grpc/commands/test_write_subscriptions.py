@@ -234,9 +234,9 @@ def test_several_writes_of_a_part_in_one_command_are_one_value(segment: Segment)
 def test_what_is_rejected_is_not_shown(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         (stream,) = await joined(served, "cell/step/in")
-        device.desk.close("away")
+        device.commands.close("away")
         await publish(served, [message("cell/step", "1")])
-        device.desk.open()
+        device.commands.open()
         await publish(served, [message("cell/step", "2")])
         assert await value(stream) == "2"
         stream.cancel()

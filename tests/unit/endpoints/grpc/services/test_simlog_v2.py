@@ -234,7 +234,7 @@ def test_what_the_device_refuses_after_that_is_in_the_log(segment: Segment, capl
 
 def test_a_source_that_is_not_connected_refuses_a_write_at_once(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
-        device.desk.close("cable out")
+        device.commands.close("cable out")
         status, text = await refusal(served.v2.Write(request("cell/step", 1), timeout=TIMEOUT_S))
         assert status is Status.FAILED_PRECONDITION
         assert text == "cell/step: rejected: the source is not connected: cable out"

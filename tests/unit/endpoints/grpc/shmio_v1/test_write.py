@@ -75,7 +75,7 @@ def test_what_the_device_refuses_is_told_with_its_reason(segment: Segment) -> No
 
 def test_what_the_source_rejects_is_not_done_at_all(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
-        device.desk.close("not connected")
+        device.commands.close("not connected")
         answer = await write(served, {"cell/step": 1, "cell/axis/position": 2})
         assert [(one.kind, one.reason) for one in answer.outcomes] == [
             (KINDS.KIND_REJECTED, "the source is not connected: not connected")

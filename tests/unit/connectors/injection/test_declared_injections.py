@@ -12,12 +12,12 @@ import msgspec
 import pytest
 
 from shmio.config import Declaration
-from shmio.connectors.commands.processor import CommandDesk
-from shmio.connectors.injection.declared import MAX_HELD
+from shmio.connectors.commands.processor import CommandProcessor
+from shmio.connectors.injection.declared_layer import MAX_HELD
 from shmio.connectors.injection.layers import Owner
 from shmio.connectors.output import Image, Output
 from shmio.errors import CommandError
-from shmio.injection.draw import Draw
+from shmio.injection.draw import SeededRandom
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.values.codec import Value, codec
 from shmio.local.reading import reading
@@ -70,19 +70,19 @@ class Rig:
         self.events = self.block.events.cursor()
         self.writer = segment.writer(source)
         self.output = Output(self.writer)
-        self.desk = CommandDesk(
+        self.processor = CommandProcessor(
             self.output, ["**"], lambda: 0, armed=True, owner_of=self.owners.get, blocks=lambda: segment.blocks,
             **options,
         )  # fmt: skip
-        self.desk.open()
+        self.processor.open()
         self.cycle = 0
         self.image = bytearray(LAYOUT.size)
         self.written: list[Write] = []
-        self._thread = threading.Thread(target=self.desk.run)
+        self._thread = threading.Thread(target=self.processor.run)
         self._thread.start()
 
     def close(self) -> None:
-        self.desk.stop()
+        self.processor.stop()
         self._thread.join(20)
         assert not self._thread.is_alive()
 
@@ -96,9 +96,9 @@ class Rig:
         self.give(values or {})
         self.cycle += 1
         self.writer.cycle = self.cycle
-        self.desk.release(self.cycle)
-        if self.desk.waiting:
-            self.desk.carry_out(self._write)
+        self.processor.release(self.cycle)
+        if self.processor.waiting:
+            self.processor.carry_out(self._write)
         self.output.publish(Image(bytes(self.image), self.cycle, 1, quality, Provenance.LIVE, ""))
         frame = self.block.latest()
         assert frame is not None
@@ -407,8 +407,8 @@ def test_what_a_delay_held_is_not_sent_when_it_is_lifted_or_the_device_is_gone(
     if by == "lift":
         rig.other.lift(number)
     else:
-        rig.desk.close("cable out")
-        rig.desk.open()
+        rig.processor.close("cable out")
+        rig.processor.open()
     (lost,) = rig.told(EventKind.EXPIRED)
     assert lost.injection == number
     assert lost.text == f"a delay held it: {'lifted' if by == 'lift' else 'cable out'}"
@@ -478,7 +478,7 @@ def test_a_process_goes_on_where_the_one_before_it_ended(make: Callable[..., Rig
     )
     rig.poll({"lamps": FIRST, "speed": 3})
     seeds = {one.name: one.running.seed for one in rig.block.standing.read() if one.running}
-    draw = Draw(seeds["noise"], "noise")
+    draw = SeededRandom(seeds["noise"], "noise")
     expected = [float(5 * (2 * draw.uniform(1, place, 1)[0] - 1)) for place in range(4)]
     rig.close()
     again = Rig(rig.segment)

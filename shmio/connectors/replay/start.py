@@ -11,7 +11,7 @@ from shmio.segment import NO_WRITER, Block, Stamp
 from shmio.segment.playhead import Play, Playhead
 
 
-class Beginning(NamedTuple):
+class ReplayStart(NamedTuple):
     """How a source plays from now on; ``done_ns``: the position up to which the process before has published it.
 
     None: there was none that played the same recording.
@@ -28,7 +28,7 @@ class Beginning(NamedTuple):
         return stamp(play, position_ns, position_ns)
 
 
-def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]) -> Beginning:
+def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]) -> ReplayStart:
     """Set the playhead of a block, unless it is. ``started_ns``: of the segment; ``blocks``: all there are.
 
     SegmentError: the block is none for a replay.
@@ -38,7 +38,7 @@ def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]
         raise SegmentError(f"the block of source {block.source} has no playhead")
     own = block.playhead.read()
     if own is not None and _is_of(source, own):  # without the lock: who holds it may wait for this process
-        return Beginning(own, _done_ns(block, own))
+        return ReplayStart(own, _done_ns(block, own))
     with heads[0].held():  # sources that begin at the same time begin together
         others = as_others(source, heads)
         play = _as_configured(source, block, started_ns) if others is None else others
@@ -46,7 +46,7 @@ def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]
             step=0, asked=block.playhead.asked(), answer=""
         )  # what was asked before was not asked of it
         block.playhead.write(play)
-        return Beginning(play, None)
+        return ReplayStart(play, None)
 
 
 def _done_ns(block: Block, play: Play) -> int | None:

@@ -16,9 +16,9 @@ import msgspec
 
 from shmio.config import Declaration
 from shmio.config.declaration import complaints
-from shmio.connectors.injection.declared import MAX_HELD, Declared, declared, resumed
-from shmio.connectors.injection.layers import Bits, Now, Owner
-from shmio.connectors.injection.published import Chain, about, in_parts, lost
+from shmio.connectors.injection.declared_layer import MAX_HELD, DeclaredLayer, declared, resumed
+from shmio.connectors.injection.layers import Bits, CycleImage, Owner
+from shmio.connectors.injection.published import LayerPublisher, in_parts, layer_event, lost
 from shmio.connectors.output import Image
 from shmio.errors import ConfigError, SegmentError
 from shmio.injection import Program, compile_program
@@ -30,7 +30,7 @@ from shmio.segment import NO_WRITER, Block, Command, EventKind, Frame, Quality, 
 from shmio.segment.standing_injections import Running, Standing
 
 
-class Readings:
+class ConditionValues:
     """Images of sources as of one cycle; each is fetched once, and only if a condition asks for it.
 
     All are what the sources delivered, before any injection, so that none feeds back upon itself. Nothing is known of
@@ -91,33 +91,33 @@ _DECODER: Final = msgspec.json.Decoder(Declaration)
 log = logging.getLogger("shmio.source")
 
 
-class Campaign:
+class DeclaredInjections:
     """What is declared for one source. :meth:`release` and :meth:`forget` are for the loop's thread."""
 
-    def __init__(self, chain: Chain, blocks: Blocks) -> None:
-        self._chain = chain
-        self._output = chain.output
-        self._own = chain.output.writer.block
+    def __init__(self, publisher: LayerPublisher, blocks: Blocks) -> None:
+        self._publisher = publisher
+        self._output = publisher.output
+        self._own = publisher.output.writer.block
         self._blocks_of = blocks
         self._blocks = dict(blocks())
         self._configuration: int | None = None
-        self._layers: list[Declared] = []
+        self._layers: list[DeclaredLayer] = []
 
     @property
-    def crowded(self) -> str:
+    def overload(self) -> str:
         """Why no write can be taken at present; empty if one can."""
-        full = next((layer for layer in self._layers if layer.crowded), None)
+        full = next((layer for layer in self._layers if layer.full), None)
         return f"the delay of injection {full.name} holds {MAX_HELD} values already" if full else ""
 
     @property
-    def looks_elsewhere(self) -> bool:
+    def reads_other_sources(self) -> bool:
         """Whether a condition reads other sources, which a reload may change."""
         return any(layer.program.foreign for layer in self._layers)
 
     def seen(self, frame: Frame) -> None:
         """The last frame of the process before this one."""
         time_ns = self._time_ns(frame.cycle) if self._own.playhead is None else frame.clock_ns
-        self._chain.injections.now = Now(frame.cycle, time_ns, frame.raw)
+        self._publisher.injections.now = CycleImage(frame.cycle, time_ns, frame.raw)
 
     def resume(self, standing: Standing, running: Running, seen: Bits) -> None:
         """Go on with one of the process before this one; ``seen``: the image that consumers saw last."""
@@ -128,7 +128,7 @@ class Campaign:
         except (ConfigError, ValueError) as error:
             log.warning("injection %s is not gone on with: %s", standing.name, error)
             return
-        self._chain.restore(layer)
+        self._publisher.restore(layer)
         self._settle()
 
     def declare(self, command: Command, owner: Owner) -> str:
@@ -143,15 +143,15 @@ class Campaign:
         layer = declared(command.id, program, owner, _seed(declaration), keep=command.keep)
         return self._lay(layer, command)
 
-    def lift(self, layer: Declared, command: Command) -> str:
+    def lift(self, layer: DeclaredLayer, command: Command) -> str:
         """Lift one of the configuration's, until that changes; why not, or empty."""
         if layer.activation.state is State.LIFTED:
             return f"the injection {layer.name} was lifted already"
         with self._output.turn:
             layer.activation.state = State.LIFTED
-            self._chain.tell()
+            self._publisher.publish()
             held = list(lost(layer, "the injection was lifted"))
-            self._output.show([*held, about(EventKind.LIFTED, layer, "lifted", command)])
+            self._output.show([*held, layer_event(EventKind.LIFTED, layer, "lifted", command)])
         return ""
 
     def follow(self) -> None:
@@ -163,7 +163,7 @@ class Campaign:
         wanted = {declaration.name: declaration for declaration in self._own.declared.read()}
         stale = {x.id for x in self._layers if x.configured and wanted.get(x.name) != x.program.declaration}
         if stale:
-            self._chain.lift(lambda layer: layer.id in stale, "the configuration has it no more, or otherwise")
+            self._publisher.lift(lambda layer: layer.id in stale, "the configuration has it no more, or otherwise")
             self.settle()
         there = {layer.name for layer in self._layers if layer.configured}
         for declaration in wanted.values():
@@ -176,7 +176,7 @@ class Campaign:
             self._settle()
 
     def _settle(self) -> None:
-        self._layers = [layer for layer in self._chain.injections.layers if isinstance(layer, Declared)]
+        self._layers = [layer for layer in self._publisher.injections.layers if isinstance(layer, DeclaredLayer)]
         self._output.advance = self._advance if self._layers else None
 
     def _lay_configured(self, declaration: Declaration) -> None:
@@ -191,15 +191,17 @@ class Campaign:
         if reason := self._lay(layer, None):
             log.warning("injection %s: %s", declaration.name, reason)
 
-    def _lay(self, layer: Declared, command: Command | None) -> str:
+    def _lay(self, layer: DeclaredLayer, command: Command | None) -> str:
         with self._output.turn:
-            if reason := self._chain.lay(layer):
+            if reason := self._publisher.lay(layer):
                 return reason
             if self._output.advance is None:  # it is looked at from the next cycle on
-                injections = self._chain.injections
+                injections = self._publisher.injections
                 injections.now = injections.now._replace(cycle=self._output.cycle)
             self._settle()
-            for record in _told(layer, command):  # it changes nothing yet, so there is no frame to be shown before
+            for record in _injected_events(
+                layer, command
+            ):  # it changes nothing yet, so there is no frame to be shown before
                 self._output.writer.event(record)
         return ""
 
@@ -215,7 +217,7 @@ class Campaign:
 
     def rebind(self) -> None:
         """Find the registers of conditions anew in sources that a reload has changed."""
-        if not self.looks_elsewhere:
+        if not self.reads_other_sources:
             return
         blocks = dict(self._blocks_of())
         before, self._blocks = self._blocks, blocks
@@ -239,35 +241,35 @@ class Campaign:
 
         Of several in one cycle the first is looked at: how many there are depends on how fast their writers were.
         """
-        looked = self._chain.injections.now.cycle
+        looked = self._publisher.injections.now.cycle
         time_ns = image.at.clock_ns if image.at else self._time_ns(image.cycle)
-        now = self._chain.injections.now = Now(image.cycle, time_ns, image.raw)
+        now = self._publisher.injections.now = CycleImage(image.cycle, time_ns, image.raw)
         if image.cycle == looked:
             return []
         state = self._own.clock.read()
         step = state.step if self._own.attributes.stepped and state.virtual else None
-        readings = Readings(self._own.source, image, self._blocks, step)
+        readings = ConditionValues(self._own.source, image, self._blocks, step)
         before = {layer.id: layer.active for layer in self._layers}
         changed = [layer for layer in self._layers if layer.advance(now, readings.of(layer.program))]
         if changed:
-            self._chain.tell()
-        turned = [_turned(layer) for layer in changed if layer.active is not before[layer.id]]
-        return [*self._chain.computed(image.base), *turned, *self._lift_finished()]
+            self._publisher.publish()
+        turned = [_activation_event(layer) for layer in changed if layer.active is not before[layer.id]]
+        return [*self._publisher.computed(image.base), *turned, *self._lift_finished()]
 
     def _lift_finished(self) -> list[Record]:
         """Lift what is over, in the cycle in which it comes to that: nobody sees anything else by it."""
         over = {layer.id for layer in self._layers if _finished(layer)}
         if not over:
             return []
-        told = self._chain.removed(lambda layer: layer.id in over, "over")
+        told = self._publisher.removed(lambda layer: layer.id in over, "over")
         self._settle()
         return told
 
-    def release(self, cycle: int) -> list[tuple[Declared, Write]]:
+    def release(self, cycle: int) -> list[tuple[DeclaredLayer, Write]]:
         """What delays over ``/in`` have held long enough, for the cycle that is about to write."""
         if not any(layer.held for layer in self._layers):
             return []
-        now = Now(cycle, self._time_ns(cycle), b"")
+        now = CycleImage(cycle, self._time_ns(cycle), b"")
         with self._output.turn:
             return [(layer, write) for layer in self._layers for write in layer.due(now)]
 
@@ -294,17 +296,17 @@ def _seed(declaration: Declaration) -> int:
     return secrets.randbits(SEED_BITS) if declaration.seed is None else declaration.seed
 
 
-def _finished(layer: Declared) -> bool:
+def _finished(layer: DeclaredLayer) -> bool:
     """Whether it can be lifted: those of the configuration stay in the list."""
     return layer.activation.state is State.OVER and not layer.configured and not layer.held
 
 
-def _turned(layer: Declared) -> Record:
+def _activation_event(layer: DeclaredLayer) -> Record:
     kind = EventKind.ACTIVATED if layer.active else EventKind.DEACTIVATED
-    return about(kind, layer, layer.name)._replace(item=layer.activation.runs)
+    return layer_event(kind, layer, layer.name)._replace(item=layer.activation.runs)
 
 
-def _told(layer: Declared, command: Command | None) -> Iterator[Record]:
+def _injected_events(layer: DeclaredLayer, command: Command | None) -> Iterator[Record]:
     """The events of one that is laid: its declaration with its seed, in parts."""
     document = msgspec.json.encode(msgspec.structs.replace(layer.program.declaration, seed=layer.seed))
-    return in_parts(about(EventKind.INJECTED, layer, layer.name, command), document)
+    return in_parts(layer_event(EventKind.INJECTED, layer, layer.name, command), document)

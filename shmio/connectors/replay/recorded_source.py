@@ -15,7 +15,7 @@ from shmio.segment import Event, Frame
 log = logging.getLogger("shmio.source")
 
 
-class Hole(NamedTuple):
+class MissingFrames(NamedTuple):
     """Frames that are not in the recording."""
 
     reason: str
@@ -25,10 +25,10 @@ class Entry(NamedTuple):
     """A frame, an event, or where frames are missing."""
 
     position_ns: int
-    item: Frame | Event | Hole
+    item: Frame | Event | MissingFrames
 
 
-class Tape:
+class RecordedSource:
     """One source of a recording. Several of its iterators may be under way; for one thread."""
 
     def __init__(self, dump: Dump, damage: list[Damage], block: DumpBlock, utc_ns: int) -> None:
@@ -83,7 +83,7 @@ class Tape:
         if gap.before_ns:
             position_ns = min(position_ns, gap.before_ns - self._utc_ns)
         count = f"{gap.count} frame{'s' * (gap.count != 1)}"
-        return Entry(position_ns, Hole(f"not in the recording: {count} ({gap.reason})"))
+        return Entry(position_ns, MissingFrames(f"not in the recording: {count} ({gap.reason})"))
 
 
-_DAMAGED = Hole("not in the recording: it is damaged here")
+_DAMAGED = MissingFrames("not in the recording: it is damaged here")

@@ -9,12 +9,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from shmio.connectors.injection.layers import Bits, Injection, Now, Owner, parts_of
+from shmio.connectors.injection.layers import Bits, CycleImage, Layer, Owner, parts_of
 from shmio.injection import Program
 from shmio.injection.activation import Activation, State
-from shmio.injection.draw import Draw
+from shmio.injection.draw import SeededRandom
 from shmio.injection.expression import Memory, Number
-from shmio.injection.operations import Delay, Drop, Moment, Operation
+from shmio.injection.operations import Delay, Drop, Operation, OperationContext
 from shmio.layout.values.write import Write
 from shmio.segment import NO_WRITER, Direction
 from shmio.segment.standing_injections import Running
@@ -23,7 +23,7 @@ MAX_HELD: Final = 256
 """Values that a delay over ``/in`` holds before writes are rejected."""
 
 
-class Held(NamedTuple):
+class DelayedWrite(NamedTuple):
     """A write that a delay holds, and when it came."""
 
     write: Write
@@ -32,17 +32,17 @@ class Held(NamedTuple):
 
 
 @dataclass(kw_only=True)
-class Declared(Injection):
+class DeclaredLayer(Layer):
     """The layer. ``writes`` counts those that have met it, over ``/in``, since it became active."""
 
     program: Program
     seed: int
     activation: Activation
-    draw: Draw
+    draw: SeededRandom
     operation: Operation
     memory: Memory = field(default_factory=Memory)
     writes: int = 0
-    held: deque[Held] = field(default_factory=deque)
+    held: deque[DelayedWrite] = field(default_factory=deque)
 
     @property
     def given(self) -> bool:
@@ -60,7 +60,7 @@ class Declared(Injection):
         return self.owner.writer == NO_WRITER
 
     @property
-    def crowded(self) -> bool:
+    def full(self) -> bool:
         """Whether it holds as much as it can."""
         return len(self.held) >= MAX_HELD
 
@@ -71,7 +71,7 @@ class Declared(Injection):
         declaration = self.program.declaration
         return Running(declaration, now.state.value, self.seed, now.runs, now.cycle, now.time_ns)
 
-    def advance(self, now: Now, values: Sequence[Number | None]) -> bool:
+    def advance(self, now: CycleImage, values: Sequence[Number | None]) -> bool:
         """Look at the next image, with the values that its condition reads; whether its state has changed."""
         condition = self.program.condition
         holds = condition is None or condition.expression.holds(values, self.memory)
@@ -82,7 +82,7 @@ class Declared(Injection):
             self.writes = 0
         return changed
 
-    def show(self, image: Bits, now: Now) -> None:
+    def show(self, image: Bits, now: CycleImage) -> None:
         """Put into an image what the operation makes of the covered bits."""
         at = self._moment(now.cycle - self.activation.cycle, now)
         if not self._happens(at):
@@ -92,7 +92,7 @@ class Declared(Injection):
         self.operation.apply(changed, at)
         image ^= (image ^ changed) & self.cover
 
-    def meet(self, write: Write, bits: Bits, now: Now) -> bytes | None:
+    def transform_write(self, write: Write, bits: Bits, now: CycleImage) -> bytes | None:
         """What becomes of these bits of a write toward the device: changed, lost, or held to be sent later."""
         at = self._moment(self.writes, now)
         self.writes += 1
@@ -101,7 +101,7 @@ class Declared(Injection):
         if isinstance(self.operation, Drop):
             return None
         if isinstance(self.operation, Delay):
-            self.held += (Held(part, now.cycle, now.time_ns) for part in parts_of(write, bits))
+            self.held += (DelayedWrite(part, now.cycle, now.time_ns) for part in parts_of(write, bits))
             return None
         span = slice(write.offset, write.offset + len(write.data))
         image = np.frombuffer(now.raw, np.uint8).copy()
@@ -110,7 +110,7 @@ class Declared(Injection):
         self.operation.apply(image, at)
         return bytes(old ^ (old ^ image[span]) & bits)
 
-    def due(self, now: Now) -> list[Write]:
+    def due(self, now: CycleImage) -> list[Write]:
         """What it has held long enough; ``now`` is the cycle that is about to write."""
         due: list[Write] = []
         if not isinstance(self.operation, Delay):
@@ -125,19 +125,19 @@ class Declared(Injection):
             self.held.popleft()
         return due
 
-    def _moment(self, place: int, now: Now) -> Moment:
-        return Moment(self.activation.runs, place, now.cycle, now.time_ns)
+    def _moment(self, place: int, now: CycleImage) -> OperationContext:
+        return OperationContext(self.activation.runs, place, now.cycle, now.time_ns)
 
-    def _happens(self, at: Moment) -> bool:
+    def _happens(self, at: OperationContext) -> bool:
         probability = self.program.declaration.probability
         return probability is None or self.draw.happens(probability, at.run, at.place)
 
 
-def declared(number: int, program: Program, owner: Owner, seed: int, *, keep: bool) -> Declared:
+def declared(number: int, program: Program, owner: Owner, seed: int, *, keep: bool) -> DeclaredLayer:
     """A layer that nobody has seen yet."""
     declaration = program.declaration
-    draw = Draw(seed, declaration.name)
-    return Declared(
+    draw = SeededRandom(seed, declaration.name)
+    return DeclaredLayer(
         number,
         Direction.IN if program.direction == "in" else Direction.OUT,
         declaration.priority,
@@ -154,7 +154,7 @@ def declared(number: int, program: Program, owner: Owner, seed: int, *, keep: bo
     )
 
 
-def resumed(layer: Declared, running: Running, seen: Bits) -> Declared:
+def resumed(layer: DeclaredLayer, running: Running, seen: Bits) -> DeclaredLayer:
     """The layer as the process before this one had it; ``seen``: the image that consumers saw last."""
     state = State(running.state)
     layer.activation = Activation(layer.program.window, state, running.runs, running.cycle, running.time_ns)
