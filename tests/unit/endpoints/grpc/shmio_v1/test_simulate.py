@@ -20,6 +20,7 @@ from shmio.errors import CommandError, ConflictError, LostError, PathError, Remo
 from shmio.messages import value_to_wire
 from shmio.segment import Quality, Segment
 from shmio.wire import shmio_v1_pb2 as wire
+from tests.unit.client.both import BOTH, Connect
 from tests.unit.connectors.models.test_stepped import Running
 from tests.unit.endpoints import http2
 from tests.unit.endpoints.grpc.shmio_v1.harness import stub, values
@@ -519,54 +520,65 @@ def test_what_its_code_raises_is_the_reason_with_the_line(instance: str) -> None
     with_client(instance, test)
 
 
-def test_steps_one_by_one(instance: str) -> None:
-    def test(cell: Client, drive: Running) -> None:
-        stepper = connect(cell.target.address)
-        thread = threading.Thread(target=stepper.step, args=(0.5,))
-        with stepper, cell.simulation("drive") as simulation:
+@BOTH
+def test_steps_one_by_one(instance: str, connects: Connect) -> None:
+    async def test(served: Endpoint, drive: Running) -> None:
+        async with connects(f"127.0.0.1:{served.port}") as cell, await cell.simulation("drive") as simulation:
             with pytest.raises(RemoteError, match="no step is to be answered"):
-                simulation.done({})
-            thread.start()
-            work = next(simulation)
+                await simulation.done({})
+            task = asyncio.create_task(cell.step(0.5))
+            work = await anext(simulation)
             assert (work.step, work.time_ns, work.dt_ns) == (1, 500_000_000, 500_000_000)
             assert (work.time_s, work.dt_s, work.doubt) == (0.5, 0.5, "")
-            with pytest.raises(PathError):
-                simulation.done({"nothing": 1})
-            simulation.done({"axis/count": work.step})
-            thread.join()
-            assert cell["drive/axis/count"] == 1
-            errors: list[Exception] = []
-
-            def fails() -> None:
-                try:
-                    stepper.step()
-                except CommandError as error:
-                    errors.append(error)
-
-            thread = threading.Thread(target=fails)
-            thread.start()
-            next(simulation)
-            simulation.fail("no solution")
-            thread.join()
-            assert "no solution" in str(errors[0])
+            for wrong, error in (({"nothing": 1}, PathError), ({"axis/count": 1.5}, ValueRangeError)):
+                with pytest.raises(error):
+                    await simulation.done(wrong)
+            await simulation.done({"axis/count": work.step})
+            await task
+            assert await cell["drive/axis/count"] == 1
+            task = asyncio.create_task(cell.step())
+            await anext(simulation)
+            await simulation.fail("no solution")
+            with pytest.raises(CommandError, match="no solution"):
+                await task
+            with pytest.raises(RemoteError, match="no step is to be answered"):
+                await simulation.fail("twice")
             simulation.close()
-            assert list(simulation) == []
+            assert [work async for work in simulation] == []
+            async with await cell.simulation("drive") as again:
+                assert (again.computed, again.outputs["axis/count"]) == (True, 1)
 
-    with_client(instance, test)
+    serve_remote(instance, test)
 
 
-def test_joining_what_cannot_be_joined(instance: str) -> None:
-    def test(cell: Client, drive: Running) -> None:
-        with pytest.raises(PathError, match="no source 'x'"):
-            cell.simulate("x", lambda *_: None)
-        with pytest.raises(CommandError, match="no model can join it"):
-            cell.simulate("cell", lambda *_: None)
-        with cell.simulation("drive", "first"), pytest.raises(ConflictError, match="model 'first'"):
-            cell.simulate("drive", lambda *_: None)
-        with pytest.raises(ValueRangeError, match="name: at most 103 bytes"):
-            cell.simulation("drive", "x" * 200)
+@BOTH
+def test_joining_what_cannot_be_joined(instance: str, connects: Connect) -> None:
+    async def test(served: Endpoint, drive: Running) -> None:
+        async with connects(f"127.0.0.1:{served.port}") as cell:
+            with pytest.raises(PathError, match="no source 'x'"):
+                await cell.simulate("x", lambda *_: None)
+            with pytest.raises(CommandError, match="no model can join it"):
+                await cell.simulate("cell", lambda *_: None)
+            async with await cell.simulation("drive", "first"):
+                with pytest.raises(ConflictError, match="model 'first'"):
+                    await cell.simulate("drive", lambda *_: None)
+            with pytest.raises(ValueRangeError, match="name: at most 103 bytes"):
+                await cell.simulation("drive", "x" * 200)
 
-    with_client(instance, test)
+    serve_remote(instance, test)
+
+
+@BOTH
+def test_it_is_computed_until_its_client_is_closed(instance: str, connects: Connect) -> None:
+    async def test(served: Endpoint, drive: Running) -> None:
+        joined = threading.Event()
+        async with connects(f"127.0.0.1:{served.port}") as cell:
+            task = asyncio.create_task(cell.simulate("drive", lambda *_: None, start=lambda _: joined.set()))
+            assert await asyncio.to_thread(joined.wait, TIMEOUT_S)
+        await task
+        await shown(drive, Quality.BAD)
+
+    serve_remote(instance, test)
 
 
 def test_an_instance_that_is_not_there_is_waited_for_so_long() -> None:
@@ -606,7 +618,7 @@ def test_it_joins_again_when_the_endpoint_is_started_anew_and_tells_all_it_knows
             serving.close()
 
 
-def test_the_same_with_asyncio(instance: str) -> None:
+def test_a_coroutine_function_computes_a_source_until_it_is_cancelled(instance: str) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         async def step(time_s: float, dt_s: float, inputs: Values) -> dict[str, object]:
             await asyncio.sleep(0)
@@ -622,30 +634,10 @@ def test_the_same_with_asyncio(instance: str) -> None:
             assert (await cell.read("drive"))["drive/axis/count"] == 50
             with pytest.raises(CommandError, match=r"model 'aio': ValueError: too far \(test_simulate.py, line "):
                 await cell.step(2.0)
-            with pytest.raises(ConflictError, match="model 'aio'"):
-                await cell.simulate("drive", step)
             task.cancel()
             with pytest.raises(asyncio.CancelledError):
                 await task
             await shown(drive, Quality.BAD)
-
-            async with await cell.simulation("drive") as simulation:
-                assert (simulation.computed, simulation.outputs["axis/count"]) == (True, 50)
-                stepped = asyncio.create_task(cell.step(0.5))
-                work = await anext(simulation)
-                with pytest.raises(ValueRangeError):
-                    await simulation.done({"axis/count": 1.5})
-                await simulation.done({"axis/count": work.step})
-                await stepped
-                stepped = asyncio.create_task(cell.step(0.5))
-                await anext(simulation)
-                await simulation.fail("no solution")
-                with pytest.raises(CommandError, match="no solution"):
-                    await stepped
-                with pytest.raises(RemoteError, match="no step is to be answered"):
-                    await simulation.fail("twice")
-            with pytest.raises(PathError):
-                await cell.simulation("x")
 
     serve_remote(instance, test)
 
