@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import grpc
 import pytest
 
-from shmio.client import Client, calls, connect, connect_aio
+from shmio.client import calls
 from shmio.errors import RemoteError
+from tests.unit.client.both import BOTH, Connect
 
 
 @pytest.fixture
@@ -36,6 +37,7 @@ def silent(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     server.stop(None).wait()
 
 
+@BOTH
 @pytest.mark.parametrize(
     "ask",
     [
@@ -46,17 +48,12 @@ def silent(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     ],
     ids=["layouts", "read", "inject", "declare"],
 )
-def test_a_call_that_is_not_answered_ends(silent: str, ask: Callable[[Client], object]) -> None:
-    with connect(silent, timeout_s=0.1) as client, pytest.raises(RemoteError):
-        ask(client)
+def test_a_call_that_is_not_answered_ends(
+    silent: str, connects: Connect, ask: Callable[[Any], Awaitable[object]]
+) -> None:
+    async def test() -> None:
+        async with connects(silent, timeout_s=0.1) as client:
+            with pytest.raises(RemoteError, match="answer"):
+                await ask(client)
 
-
-def test_the_same_with_asyncio(silent: str) -> None:
-    async def ask() -> None:
-        async with connect_aio(silent, timeout_s=0.1) as client:
-            with pytest.raises(RemoteError, match="has not answered within"):
-                await client.inject("cell/a")
-            with pytest.raises(RemoteError, match="has not answered within"):
-                await client.declare([])
-
-    asyncio.run(ask())
+    asyncio.run(test())
