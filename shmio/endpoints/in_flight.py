@@ -31,21 +31,21 @@ def in_words(end: End) -> str:
     return f"{kind}: {reason}"
 
 
-class Cost(NamedTuple):
+class CommandCost(NamedTuple):
     """At most so many bytes in the queue, and events until its end, has a command."""
 
     record_bytes: int
     events: int
 
     @classmethod
-    def of(cls, sizes: Collection[int], name: str = "") -> Cost:
+    def of(cls, sizes: Collection[int], name: str = "") -> CommandCost:
         """That of one with items of so many bytes."""
         events = sum(2 + size // EVENT_DATA_SIZE for size in sizes)
         return cls(64 + 4 * len(name) + sum(24 + size for size in sizes), events)
 
 
 @dataclass(slots=True)
-class Pending:
+class InFlightCommand:
     """``values``: the items of each of its values; ``accepted``: called once, if the source accepts it.
 
     ``until_accepted``: to be accepted is the end.
@@ -53,7 +53,7 @@ class Pending:
 
     incarnation: int
     until_ns: int
-    cost: Cost
+    cost: CommandCost
     values: Sequence[range]
     done: Done
     accepted: Callable[[], None] | None = None
@@ -89,7 +89,7 @@ class Pending:
         self.done([worst([self._ends.get(item, unknown) for item in items]) for items in self.values])
 
 
-class Pendings:
+class InFlightTable:
     """Those of one writer, by their numbers."""
 
     def __init__(self, writer: int) -> None:
@@ -98,7 +98,7 @@ class Pendings:
         self.untaken_bytes = 0
         """Of records that may still lie in the queue."""
         self._writer = writer
-        self._by_number: dict[int, Pending] = {}
+        self._by_number: dict[int, InFlightCommand] = {}
 
     def __len__(self) -> int:
         return len(self._by_number)
@@ -111,14 +111,14 @@ class Pendings:
     def add(
         self,
         ticket: Ticket,
-        cost: Cost,
+        cost: CommandCost,
         done: Done,
         accepted: Callable[[], None] | None = None,
         *,
         until_accepted: bool = False,
     ) -> None:
         """Follow one that was sent."""
-        self._by_number[ticket.number] = Pending(
+        self._by_number[ticket.number] = InFlightCommand(
             ticket.incarnation, ticket.until_ns, cost, [items for _, items in ticket.values], done, accepted,
             until_accepted, open_events=cost.events,
         )  # fmt: skip
@@ -167,7 +167,7 @@ class Pendings:
                 self._end(number, RESTARTED)
         self._hurry(pending for _, pending in before if not pending.taken)
 
-    def _hurry(self, some: Iterable[Pending]) -> None:
+    def _hurry(self, some: Iterable[InFlightCommand]) -> None:
         soon_ns = time.monotonic_ns() + round(PATIENCE_S * 1e9)
         for pending in some:
             pending.until_ns = min(pending.until_ns, soon_ns)

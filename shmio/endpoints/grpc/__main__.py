@@ -14,12 +14,12 @@ import msgspec
 from shmio import worker
 from shmio.config import Address, Grpc, load
 from shmio.endpoints.grpc.server import memory
-from shmio.endpoints.grpc.server.listeners import Doors
+from shmio.endpoints.grpc.server.listeners import Listeners
 from shmio.endpoints.grpc.server.server import Server
 from shmio.endpoints.grpc.services.services import Services
 from shmio.endpoints.grpc.streams.feeds import Feeds
-from shmio.endpoints.grpc.streams.wakeups import Bells
-from shmio.endpoints.grpc.time.virtual_time import Hold
+from shmio.endpoints.grpc.streams.wakeups import WakeUps
+from shmio.endpoints.grpc.time.virtual_time import VirtualTime
 from shmio.errors import SegmentError, ShmioError
 from shmio.log_rate_limit import LogRateLimit
 from shmio.logs import fields
@@ -49,7 +49,7 @@ async def _serve(worker: Worker) -> None:
     rereading = asyncio.Lock()
     worker.on_stop(lambda: loop.call_soon_threadsafe(stopping.set))
     config, place = _settings(worker)
-    doors = Doors(config)
+    listeners = Listeners(config)
     tasks: set[asyncio.Task[None]] = set()
     good_ones: set[str] = set()
     writer = worker.slot.writer
@@ -65,20 +65,20 @@ async def _serve(worker: Worker) -> None:
         task.add_done_callback(tasks.discard)
 
     def reread(file: Path) -> None:
-        task = loop.create_task(_take_anew(worker, file, doors, server, rereading))
+        task = loop.create_task(_take_anew(worker, file, listeners, server, rereading))
         tasks.add(task)
         task.add_done_callback(tasks.discard)
 
     trimmer = memory.Trimmer()
-    hold = Hold()
-    bells = Bells()
-    feeds = Feeds(worker.segment, writer, bells, on_quality, hold)
-    services = Services(worker.segment, worker.slot, hold, bells, feeds, config.default_source)
+    virtual_time = VirtualTime()
+    wake_ups = WakeUps()
+    feeds = Feeds(worker.segment, writer, wake_ups, on_quality, virtual_time)
+    services = Services(worker.segment, worker.slot, virtual_time, wake_ups, feeds, config.default_source)
     server = Server(services)
     feeds.start()
     await services.stepper.start(worker.before.pid)
-    ports = await server.start(doors.listeners, config.tls, place.gid)
-    addresses = [listener.address for listener in doors.listeners]
+    ports = await server.start(listeners.listeners, config.tls, place.gid)
+    addresses = [listener.address for listener in listeners.listeners]
     served = [
         str(Address(address.host, port) if isinstance(address, Address) else address)
         for address, port in zip(addresses, ports, strict=True)
@@ -116,7 +116,7 @@ async def _serve(worker: Worker) -> None:
     await services.stepper.stop()
     await server.stop()
     await _calls_end()
-    bells.close()
+    wake_ups.close()
 
 
 def _end_now(worker: Worker) -> NoReturn:
@@ -146,14 +146,14 @@ def _settings(worker: Worker) -> tuple[Grpc, _Place]:
     return msgspec.convert(config, Grpc), place
 
 
-async def _take_anew(worker: Worker, file: Path, doors: Doors, server: Server, turn: asyncio.Lock) -> None:
+async def _take_anew(worker: Worker, file: Path, listeners: Listeners, server: Server, turn: asyncio.Lock) -> None:
     """Take tokens and roles as the configuration has them by now; calls that these do not allow end."""
     async with turn:  # of two, the one that has read later must be the last
         try:
             config = await asyncio.to_thread(load, file)
             if config.grpc is None:
                 return  # the supervisor is about to stop this process
-            doors.take(config.grpc)
+            listeners.take(config.grpc)
         except ShmioError as error:
             worker.log.error("tokens and roles stay as they were: %s", error)
             return

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from shmio.endpoints.in_flight import MAX_OPEN, Cost, End, Pendings, worst
+from shmio.endpoints.in_flight import MAX_OPEN, CommandCost, End, InFlightTable, worst
 from shmio.errors import CommandError
 from shmio.layout.model import Register
 from shmio.layout.values.write import sizes
@@ -24,7 +24,7 @@ class Inlet:
         self.block = block
         self._commander = Commander(block, writer)
         self._commander.prepare()
-        self._pending = Pendings(writer)
+        self._pending = InFlightTable(writer)
         self._events = block.events.cursor()
 
     def check(self, register: Register) -> None:
@@ -33,7 +33,7 @@ class Inlet:
 
     def send(self, register: Register, value: object, done: Done) -> None:
         """Send a value of a register, an array or an element. CommandError, ValueRangeError: it was not sent."""
-        cost = Cost.of(sizes(register))
+        cost = CommandCost.of(sizes(register))
         if self._pending and self._pending.open_events + cost.events > MAX_OPEN:
             raise CommandError(f"{self.block.source}: too many commands are under way; wait for their results")
         if self.block.retired:

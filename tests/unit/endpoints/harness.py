@@ -15,14 +15,14 @@ from google.protobuf.struct_pb2 import Value
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from shmio.config import Address
-from shmio.endpoints.grpc.server.access import Door, Keys
-from shmio.endpoints.grpc.server.call_guard import Calls, Limits
+from shmio.endpoints.grpc.server.access import Keys, ListenerAccess
+from shmio.endpoints.grpc.server.call_guard import CallLimits, OpenCalls
 from shmio.endpoints.grpc.server.listeners import Listener
 from shmio.endpoints.grpc.server.server import Server
 from shmio.endpoints.grpc.services.services import Services
 from shmio.endpoints.grpc.streams.feed import Feed
-from shmio.endpoints.grpc.streams.wakeups import Bells
-from shmio.endpoints.grpc.time.virtual_time import Hold
+from shmio.endpoints.grpc.streams.wakeups import WakeUps
+from shmio.endpoints.grpc.time.virtual_time import VirtualTime
 from shmio.layout.model import Layout, Register
 from shmio.segment import BlockWriter, Quality, Segment
 from shmio.wire import simlog_v1_pb2 as wire
@@ -58,7 +58,7 @@ TIMEOUT_S = 60
 LOOK_S = 0.001
 
 
-LOOPBACK = Listener(Address("127.0.0.1", 0), Door(Keys()))
+LOOPBACK = Listener(Address("127.0.0.1", 0), ListenerAccess(Keys()))
 """Open to all of this host."""
 
 
@@ -72,10 +72,10 @@ class Endpoint:
     """A served segment, and a client of it."""
 
     def __init__(
-        self, segment: Segment, bells: Bells, feeds: dict[str, Feed], service: Services, server: Server, port: int
+        self, segment: Segment, wake_ups: WakeUps, feeds: dict[str, Feed], service: Services, server: Server, port: int
     ) -> None:
         self.segment = segment
-        self.bells = bells
+        self.wake_ups = wake_ups
         self.feeds = feeds
         self.service = service
         self.server = server
@@ -123,7 +123,7 @@ class Endpoint:
 
 @asynccontextmanager
 async def endpoint(
-    segment: Segment, limits: Limits | None = None, before: int = 0, port: int = 0
+    segment: Segment, limits: CallLimits | None = None, before: int = 0, port: int = 0
 ) -> AsyncIterator[Endpoint]:
     """``before``: pid of the process that was the endpoint before; ``port``: where it was."""
     tasks: set[asyncio.Task[None]] = set()
@@ -131,18 +131,18 @@ async def endpoint(
     def on_quality(source: str, good: bool) -> None:
         tasks.add(asyncio.get_running_loop().create_task(server.set_source(source, good)))
 
-    hold = Hold()
-    bells = Bells()
-    feeds = {name: Feed(block, WRITER, bells, on_quality, hold) for name, block in segment.blocks.items()}
-    service = Services(segment, segment.processes.find("grpc"), hold, bells, feeds, next(iter(feeds)))
-    server = Server(service, Calls(limits))
+    virtual_time = VirtualTime()
+    wake_ups = WakeUps()
+    feeds = {name: Feed(block, WRITER, wake_ups, on_quality, virtual_time) for name, block in segment.blocks.items()}
+    service = Services(segment, segment.processes.find("grpc"), virtual_time, wake_ups, feeds, next(iter(feeds)))
+    server = Server(service, OpenCalls(limits))
     for source in feeds:
         await server.set_source(source, False)
     ports = await server.start([LOOPBACK._replace(address=Address("127.0.0.1", port))])
     for feed in feeds.values():
         feed.start()
     await service.stepper.start(before)
-    served = Endpoint(segment, bells, feeds, service, server, ports[0])
+    served = Endpoint(segment, wake_ups, feeds, service, server, ports[0])
     try:
         yield served
     finally:
@@ -152,10 +152,10 @@ async def endpoint(
         await service.stepper.stop()
         await server.stop()
         await asyncio.gather(*tasks)
-        bells.close()
+        wake_ups.close()
 
 
-def serve(segment: Segment, test: Callable[[Endpoint], Awaitable[None]], limits: Limits | None = None) -> None:
+def serve(segment: Segment, test: Callable[[Endpoint], Awaitable[None]], limits: CallLimits | None = None) -> None:
     async def run() -> None:
         async with endpoint(segment, limits) as served:
             await test(served)

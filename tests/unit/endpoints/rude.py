@@ -151,9 +151,9 @@ class Polite:
             await asyncio.sleep(0)
             topics = {subject.path for subject in feed._channels} - {"inputs"}
             return (len(served.server.calls), served.service.counters[0], topics) == (2, 2, {"step"}) and not (
-                feed.inlet.echo.busy
-                or feed.inlet.followers.busy
-                or feed.inlet._pending
+                feed.commands.write_subscriptions.busy
+                or feed.commands.followers.busy
+                or feed.commands._in_flight
                 or served.service.waiting_bytes
                 or any(not (connected and one.name.startswith("SIMLOG")) for one in feed.block.standing.read())
             )

@@ -1,26 +1,265 @@
-"""Commands to one block, and their ends waited for; for the event loop's thread."""
+"""Sends commands to one block's source and reports what became of each; for the event loop's thread."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Generator, Mapping, Sequence
+import time
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, Final, Unpack
 
+import msgspec
+
 from shmio.config import Declaration
-from shmio.endpoints.grpc.commands.block_commands import Inlet
-from shmio.endpoints.grpc.commands.followers import Follower
-from shmio.endpoints.in_flight import Done, End
+from shmio.endpoints.grpc.commands.event_follower import EventFollower
+from shmio.endpoints.grpc.commands.followers import InjectionFollower, InjectionFollowers
+from shmio.endpoints.grpc.commands.write_subscriptions import WriteSubscriptions
+from shmio.endpoints.grpc.streams.wakeups import WakeUps
+from shmio.endpoints.in_flight import MAX_OPEN, CommandCost, Done, End, InFlightTable
 from shmio.errors import CommandError
-from shmio.layout.values.write import Write
-from shmio.local.writer import RETIRED
-from shmio.segment import EventKind
+from shmio.layout.model import Register
+from shmio.layout.topic import find
+from shmio.layout.values.write import Write, merge, sizes
+from shmio.local.writer import RETIRED, Commander, Ticket
+from shmio.segment import Block, Event, EventKind
 from shmio.segment.commands import Laid
 
 RETRY_S: Final = 0.25
-"""How soon a source that has not lifted an injection is told again."""
+"""Pause before a source that has not lifted an injection is asked again."""
 
 log = logging.getLogger("shmio.grpc")
+
+
+class CommandClient:
+    """Sends commands to a block's source, in order, and keeps no more under way than it can hear the end of.
+
+    For the event loop's thread.
+    """
+
+    def __init__(
+        self,
+        block: Block,
+        writer: int,
+        wake_ups: WakeUps,
+        stamp: Callable[[Event], tuple[int, int]],
+    ) -> None:
+        """``writer``: the command queue of this process. ``stamp``: see :class:`WriteSubscriptions`."""
+        self.block = block
+        self.stamp = stamp
+        self.write_subscriptions = WriteSubscriptions(block, stamp)
+        self.followers = InjectionFollowers()
+        self._loop = asyncio.get_running_loop()
+        self._commander = Commander(block, writer)
+        self._prepared = False
+        self._preparing = asyncio.Lock()
+        self._in_flight = InFlightTable(writer)
+        self._silent = False
+        self._turn = asyncio.Lock()  # who waits for room is served in order
+        self._freed: asyncio.Future[None] | None = None
+        self._timer: asyncio.TimerHandle | None = None
+        self._event_follower = EventFollower(
+            block,
+            wake_ups,
+            on_event=self._on_event,
+            on_batch_end=self._free,
+            missed=self._missed,
+            retired=self._retired,
+        )
+
+    @property
+    def alive(self) -> bool:
+        """Whether the block's events are being followed, as long as there are any."""
+        return self._event_follower.alive or self.block.retired
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing is left of it: it follows no events, and has no value under way and no stream."""
+        return not (
+            self._event_follower.alive
+            or self._in_flight
+            or self._turn.locked()
+            or self.write_subscriptions.busy
+            or self.followers.busy
+        )
+
+    def start(self) -> None:
+        """Begin to follow the events."""
+        self._event_follower.start()
+
+    def stop(self) -> None:
+        """Follow them no more."""
+        self._event_follower.stop()
+        if self._timer is not None:
+            self._timer.cancel()
+
+    def catch_up(self) -> None:
+        """Deliver what has been told so far, to those who listen to what is written too."""
+        self._event_follower.catch_up()
+
+    def ready(self, values: Mapping[str, object]) -> bool:
+        """Whether :meth:`send`, or :meth:`give`, would not have to wait."""
+        return self._prepared and not self._turn.locked() and self._has_room(self._cost(values))
+
+    async def writable(self, registers: Iterable[Register]) -> bool:
+        """Whether the configuration lets all of them be written."""
+        await self._prepare()
+        return all(map(self._commander.is_writable, registers))
+
+    async def send(
+        self,
+        values: Mapping[str, object],
+        done: Done,
+        accepted: Callable[[], None] | None = None,
+        *,
+        timeout_s: float | None = None,
+        until_accepted: bool = False,
+    ) -> None:
+        """Send values of registers, by path, as one command as soon as there is room.
+
+        ``done`` is called once, when the end of all is known, a bounded time later; ``accepted`` before, if the source
+        accepts them. CommandError: one is not writable, or the source is silent; ValueRangeError: neither is called.
+        """
+        submit = partial(self._commander.submit, values, timeout_s)
+        await self._send(submit, self._cost(values), done, accepted, until_accepted=until_accepted)
+
+    async def give(
+        self,
+        injection: int,
+        values: Mapping[str, object],
+        done: Done,
+        accepted: Callable[[], None] | None = None,
+        *,
+        raw: Sequence[Write] = (),
+    ) -> None:
+        """The same for values, and ``raw`` bytes, as an injection's; items are not values.
+
+        ``accepted`` is called of one over ``/in`` only.
+        """
+        writes = self._commander.joined(values, raw)
+        cost = CommandCost.of([len(write.data) for write in writes])
+        await self._send(partial(self._commander.give, injection, writes), cost, done, accepted)
+
+    def lay(self, bits: bytes, follower: InjectionFollower, done: Done, **laid: Unpack[Laid]) -> int:
+        """Have an injection laid over these bits; its number. Never waits. CommandError: not sent."""
+        writes = merge(bits, bits, [(0, len(bits))])
+        cost = CommandCost.of([len(write.data) for write in writes], laid.get("name", ""))
+        return self._lay(self._commander.lay(writes, **laid), cost, follower, done)
+
+    def declare(self, declaration: Declaration, follower: InjectionFollower, done: Done, *, keep: bool) -> int:
+        """Have an injection laid that the source runs by itself; its number. Never waits. CommandError: not sent."""
+        cost = CommandCost.of([len(msgspec.json.encode(declaration))], declaration.name)
+        return self._lay(self._commander.ask_to_declare(declaration, keep=keep), cost, follower, done)
+
+    def _lay(self, ticket: Ticket, cost: CommandCost, follower: InjectionFollower, done: Done) -> int:
+        self._follow_up(ticket, cost, done)
+        self.followers.add(ticket.number, follower)
+        return ticket.number
+
+    def lift(self, injection: int, done: Done) -> None:
+        """Have an injection lifted. Never waits. CommandError: not sent."""
+        self._follow_up(self._commander.ask_to_lift(injection), CommandCost.of(()), done)
+
+    async def _send(
+        self,
+        submit: Callable[[], Ticket],
+        cost: CommandCost,
+        done: Done,
+        accepted: Callable[[], None] | None,
+        *,
+        until_accepted: bool = False,
+    ) -> None:
+        async with self._turn:
+            await self._prepare()
+            while not self._has_room(cost):
+                self._freed = self._loop.create_future()
+                await self._freed
+            if self.block.retired:
+                raise CommandError(RETIRED)
+            if self._silent and self._in_flight:  # one at a time asks whether it is back
+                raise CommandError(
+                    f"source {self.block.source} does not answer; shmio-supervisor status says how it fares"
+                )
+            self._follow_up(submit(), cost, done, accepted, until_accepted=until_accepted)
+
+    def _follow_up(
+        self,
+        ticket: Ticket,
+        cost: CommandCost,
+        done: Done,
+        accepted: Callable[[], None] | None = None,
+        *,
+        until_accepted: bool = False,
+    ) -> None:
+        self._in_flight.add(ticket, cost, done, accepted, until_accepted=until_accepted)
+        if self._timer is None:
+            self._set_timer()
+
+    async def _prepare(self) -> None:
+        if not self._prepared:
+            async with self._preparing:  # not on the loop: for a big layout it takes seconds
+                await asyncio.to_thread(self._commander.prepare)
+                self._prepared = True
+
+    def _cost(self, values: Collection[str]) -> CommandCost:
+        """What a command with these costs; PathError."""
+        return CommandCost.of([size for path in values for size in sizes(find(self.block.layout, path))])
+
+    def _has_room(self, cost: CommandCost) -> bool:
+        pending = self._in_flight
+        fits = pending.untaken_bytes + cost.record_bytes <= self.block.commands.capacity
+        return self._silent or not pending or (fits and pending.open_events + cost.events <= MAX_OPEN)
+
+    # ---- what the source says --------------------------------------------------------------------------------
+
+    def _on_event(self, event: Event) -> None:
+        for channel, message in self.write_subscriptions.follow(event):
+            for listener in channel.listeners:
+                listener.deliver(message)
+        for item in self.followers.gather(event):
+            self.followers.tell(item)
+        if self._in_flight.hear(event):
+            self._silent = False
+            if event.kind == EventKind.STARTED:
+                self._set_timer()
+
+    def _missed(self, count: int) -> None:
+        """Ends of commands may be among it, too: these are not waited for longer than it takes to come."""
+        reason = f"{count} events of source {self.block.source} were missed"
+        self.write_subscriptions.skip()
+        self.followers.skip()
+        self.write_subscriptions.fail(reason)
+        self.followers.fail(reason)
+        self._in_flight.hurry()
+        self._set_timer()
+
+    def _retired(self) -> None:
+        self._in_flight.end(RETIRED)
+        self.followers.end(RETIRED)
+        self._free()
+
+    def _free(self) -> None:
+        if self._freed is not None and not self._freed.done():
+            self._freed.set_result(None)
+
+    # ---- and what it does not say ----------------------------------------------------------------------------
+
+    def _set_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        due_ns = self._in_flight.due_ns
+        if due_ns is not None:
+            self._timer = self._loop.call_later(max(0.0, (due_ns - time.monotonic_ns()) / 1e9), self._expire)
+
+    def _expire(self) -> None:
+        self._timer = None
+        self._silent |= self._in_flight.expire()
+        self._free()
+        self._set_timer()
+
+
+# ---- commands awaited ----------------------------------------------------------------------------------------------
 
 
 class Answer:
@@ -39,80 +278,86 @@ class Answer:
 
 
 async def write(
-    inlet: Inlet, values: Mapping[str, object], timeout_s: float | None = None, *, until_accepted: bool = False
+    commands: CommandClient,
+    values: Mapping[str, object],
+    timeout_s: float | None = None,
+    *,
+    until_accepted: bool = False,
 ) -> Sequence[End]:
     """Write values by path, as one command; what became of each.
 
     PathError, ValueRangeError; CommandError: not writable, or the source takes nothing. Nothing has been sent then.
     """
     answer = Answer()
-    await inlet.send(values, answer.done, timeout_s=timeout_s, until_accepted=until_accepted)
+    await commands.send(values, answer.done, timeout_s=timeout_s, until_accepted=until_accepted)
     return await answer
 
 
-async def give(inlet: Inlet, injection: int, values: Mapping[str, object], raw: Sequence[Write] = ()) -> Sequence[End]:
+async def give(
+    commands: CommandClient, injection: int, values: Mapping[str, object], raw: Sequence[Write] = ()
+) -> Sequence[End]:
     """Give values by path, and raw bytes, as an injection's; what became of them, of neighbours in one."""
     answer = Answer()
-    await inlet.give(injection, values, answer.done, raw=raw)
+    await commands.give(injection, values, answer.done, raw=raw)
     return await answer
 
 
-async def lay(inlet: Inlet, bits: bytes, follower: Follower, **laid: Unpack[Laid]) -> int:
+async def lay(commands: CommandClient, bits: bytes, follower: InjectionFollower, **laid: Unpack[Laid]) -> int:
     """Lay an injection; its number. CommandError: the source refuses it, or does not answer."""
-    return await _laid(inlet, lambda done: inlet.lay(bits, follower, done, **laid))
+    return await _laid(commands, lambda done: commands.lay(bits, follower, done, **laid))
 
 
-async def declare(inlet: Inlet, declaration: Declaration, follower: Follower, *, keep: bool) -> int:
+async def declare(commands: CommandClient, declaration: Declaration, follower: InjectionFollower, *, keep: bool) -> int:
     """Lay one that the source runs by itself; its number. CommandError: as of :func:`lay`."""
-    return await _laid(inlet, lambda done: inlet.declare(declaration, follower, done, keep=keep))
+    return await _laid(commands, lambda done: commands.declare(declaration, follower, done, keep=keep))
 
 
-async def _laid(inlet: Inlet, send: Callable[[Done], int]) -> int:
-    _check(inlet)
+async def _laid(commands: CommandClient, send: Callable[[Done], int]) -> int:
+    _check(commands)
     answer = Answer()
     number = send(answer.done)
     try:
         ((kind, reason),) = await answer
     except asyncio.CancelledError:
-        inlet.followers.remove(number)
+        commands.followers.remove(number)
         raise
     if kind is EventKind.INJECTED:
         return number
-    inlet.followers.remove(number)
+    commands.followers.remove(number)
     if kind is EventKind.UNKNOWN:  # it may stand
-        await lift(inlet, number)
-    raise CommandError(f"{inlet.block.source}: {reason}")
+        await lift(commands, number)
+    raise CommandError(f"{commands.block.source}: {reason}")
 
 
-async def lift(inlet: Inlet, injection: int) -> str:
+async def lift(commands: CommandClient, injection: int) -> str:
     """Lift an injection; why it still stands, or empty."""
     try:
-        _check(inlet)
+        _check(commands)
         answer = Answer()
-        inlet.lift(injection, answer.done)
+        commands.lift(injection, answer.done)
         ((_, reason),) = await answer
     except CommandError as error:
         reason = str(error)
-    return (reason or "the source has not lifted it yet") if stands(inlet, injection) else ""
+    return (reason or "the source has not lifted it yet") if stands(commands, injection) else ""
 
 
-async def have_lifted(inlet: Inlet, injection: int, name: str) -> None:
+async def have_lifted(commands: CommandClient, injection: int, name: str) -> None:
     """Have the source lift one of ours, for as long as that takes: nobody else will while this process lives.
 
     Its follower is told nothing more. ``name``: what it is called in the log.
     """
-    inlet.followers.remove(injection)
-    while stands(inlet, injection) and (reason := await lift(inlet, injection)):
+    commands.followers.remove(injection)
+    while stands(commands, injection) and (reason := await lift(commands, injection)):
         log.warning("%s: an injection is not lifted yet: %s", name, reason)
         await asyncio.sleep(RETRY_S)
 
 
-def stands(inlet: Inlet, injection: int) -> bool:
+def stands(commands: CommandClient, injection: int) -> bool:
     """Whether it still does."""
-    standing = inlet.block.standing.read()
-    return not inlet.block.retired and any(one.id == injection and not one.lifted for one in standing)
+    standing = commands.block.standing.read()
+    return not commands.block.retired and any(one.id == injection and not one.lifted for one in standing)
 
 
-def _check(inlet: Inlet) -> None:
-    if inlet.block.retired:
+def _check(commands: CommandClient) -> None:
+    if commands.block.retired:
         raise CommandError(RETIRED)

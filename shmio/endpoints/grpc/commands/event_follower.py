@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable
 from typing import Final
 
-from shmio.endpoints.grpc.streams.wakeups import Bells
+from shmio.endpoints.grpc.streams.wakeups import WakeUps
 from shmio.segment import Block, Event
 
 log = logging.getLogger("shmio.grpc")
@@ -16,16 +16,16 @@ BATCH: Final = 32
 """Most events that are looked at at once, so that streams get their turn in between."""
 
 
-class Ear:
+class EventFollower:
     """Listens to one block's bell. For the event loop's thread."""
 
     def __init__(
         self,
         block: Block,
-        bells: Bells,
+        wake_ups: WakeUps,
         *,
-        heed: Callable[[Event], None],
-        heeded: Callable[[], None],
+        on_event: Callable[[Event], None],
+        on_batch_end: Callable[[], None],
         missed: Callable[[int], None],
         retired: Callable[[], None],
     ) -> None:
@@ -34,8 +34,8 @@ class Ear:
         ``missed``: with how many were overwritten before they were read; ``retired``: when the block's last was heeded.
         """
         self._block = block
-        self._bells = bells
-        self._heed, self._heeded, self._missing, self._retired = heed, heeded, missed, retired
+        self._wake_ups = wake_ups
+        self._on_event, self._on_batch_end, self._on_missed, self._retired = on_event, on_batch_end, missed, retired
         self._loop = asyncio.get_running_loop()
         self._cursor = block.events.cursor()
         self._missed = 0  # events, as last told
@@ -46,13 +46,13 @@ class Ear:
     def start(self) -> None:
         """Begin to listen."""
         self.alive = True
-        self._bells.join(self._block, self._look, patient=True)
+        self._wake_ups.join(self._block, self._look, patient=True)
 
     def stop(self) -> None:
         """Listen no more."""
         if self.alive:
             self.alive = False
-            self._bells.leave(self._block, self._look)
+            self._wake_ups.leave(self._block, self._look)
 
     def catch_up(self) -> None:
         """Hand over what has been told so far."""
@@ -79,17 +79,17 @@ class Ear:
             event = self._cursor.poll()
             if (missed := self._cursor.missed - self._missed) > 0:
                 self._missed += missed
-                self._missing(missed)
+                self._on_missed(missed)
             if event is not None:
-                self._heed(event)
+                self._on_event(event)
                 continue
             if count:
-                self._heeded()
+                self._on_batch_end()
             if retired:
                 self.stop()
                 self._retired()
             return
-        self._heeded()
+        self._on_batch_end()
         if not self._again:
             self._again = True
             self._loop.call_soon(self._look_again)

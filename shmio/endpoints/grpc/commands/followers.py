@@ -10,7 +10,7 @@ from shmio.segment.pending_commands import Diverted, Gatherer
 _STACKED: Final = frozenset({EventKind.INJECTED, EventKind.LIFTED, EventKind.ACTIVATED, EventKind.DEACTIVATED})
 
 
-class Follower:
+class InjectionFollower:
     """Who has laid an injection, and overrides what concerns him; called in the event loop's thread."""
 
     def happened(self, event: Event) -> None:
@@ -29,7 +29,7 @@ class Follower:
         """What comes next is not all there was."""
 
 
-class Listener(Protocol):
+class WriteListener(Protocol):
     """Who listens to what is written; called in the event loop's thread."""
 
     def accept(self, event: Event) -> None:
@@ -39,30 +39,30 @@ class Listener(Protocol):
         """What comes next is not all there was."""
 
 
-News = Diverted | Event
+InjectionChange = Diverted | Event
 """What was diverted, or happened to injections; what was accepted, if somebody listens."""
 
 
-class Followers:
+class InjectionFollowers:
     """By the number of their injection."""
 
     def __init__(self) -> None:
-        self._followers: dict[int, Follower] = {}
-        self._listeners: dict[Listener, None] = {}  # in the order in which they came
+        self._followers: dict[int, InjectionFollower] = {}
+        self._listeners: dict[WriteListener, None] = {}  # in the order in which they came
         self._gatherer = Gatherer()
 
-    def gather(self, event: Event) -> list[News]:
+    def gather(self, event: Event) -> list[InjectionChange]:
         """What is to be told by this event."""
-        news: list[News] = [*self._gatherer.follow(event)]
+        change: list[InjectionChange] = [*self._gatherer.follow(event)]
         if (event.kind in _STACKED and not event.offset) or (event.kind == EventKind.ACCEPTED and self._listeners):
-            news.append(event)  # of a long declaration's parts the first
-        return news
+            change.append(event)  # of a long declaration's parts the first
+        return change
 
     def skip(self) -> None:
         """Events were missed."""
         self._gatherer = Gatherer()
 
-    def add(self, injection: int, follower: Follower) -> None:
+    def add(self, injection: int, follower: InjectionFollower) -> None:
         """Tell it from now on; before any of its events can have come."""
         self._followers[injection] = follower
 
@@ -70,11 +70,11 @@ class Followers:
         """Tell it nothing more."""
         self._followers.pop(injection, None)
 
-    def listen(self, listener: Listener) -> None:
+    def listen(self, listener: WriteListener) -> None:
         """Tell it what is accepted from now on."""
         self._listeners[listener] = None
 
-    def leave(self, listener: Listener) -> None:
+    def leave(self, listener: WriteListener) -> None:
         """Tell it nothing more."""
         self._listeners.pop(listener, None)
 
@@ -83,22 +83,22 @@ class Followers:
         """Whether anybody listens to what is written."""
         return bool(self._listeners)
 
-    def tell(self, news: News) -> None:
+    def tell(self, change: InjectionChange) -> None:
         """Tell those whom it concerns."""
-        if isinstance(news, Diverted):
-            if follower := self._followers.get(news.injection):
-                follower.divert(news)
+        if isinstance(change, Diverted):
+            if follower := self._followers.get(change.injection):
+                follower.divert(change)
             return
-        if news.kind == EventKind.ACCEPTED:
+        if change.kind == EventKind.ACCEPTED:
             for listener in list(self._listeners):
-                listener.accept(news)
+                listener.accept(change)
             return
-        if follower := self._followers.get(news.injection):
-            follower.happened(news)
-            if news.kind == EventKind.LIFTED:
-                del self._followers[news.injection]
-                follower.lifted(news.text)
-        if news.kind in _STACKED:
+        if follower := self._followers.get(change.injection):
+            follower.happened(change)
+            if change.kind == EventKind.LIFTED:
+                del self._followers[change.injection]
+                follower.lifted(change.text)
+        if change.kind in _STACKED:
             for follower in list(self._followers.values()):
                 follower.restack()
 

@@ -7,7 +7,7 @@ from shmio.segment import Block, Event
 from shmio.segment.pending_commands import apply
 
 
-class Underway:
+class PendingImage:
     """``image``: a frame, and what was accepted behind it. ``mask``: the bits that the present command has written."""
 
     def __init__(self, block: Block) -> None:

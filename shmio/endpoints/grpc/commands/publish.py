@@ -14,7 +14,7 @@ from google.protobuf.message import DecodeError
 
 from shmio.endpoints.grpc.commands.path_kind import Shape, shape
 from shmio.endpoints.grpc.commands.topics import Topics
-from shmio.endpoints.grpc.injection.injections import Shadows, Way
+from shmio.endpoints.grpc.injection.injections import ShadowKind, Shadows
 from shmio.endpoints.grpc.server.rejected_calls import Refusals
 from shmio.endpoints.in_flight import Done, End, in_words, worst
 from shmio.errors import CommandError, ShmioError, ValueRangeError
@@ -25,7 +25,7 @@ TURNS: Final = 3
 """One of gRPC's threads may be held up by the machine with what it has received, while others go on."""
 
 
-class Arrivals:
+class ReceiveBarrier:
     """A turn of the queue through which all that gRPC has received goes to the event loop.
 
     What a handler is waiting for and has come lies in that queue; so does, behind it, the end of an operation that has
@@ -56,8 +56,8 @@ LARGE_ELEMENTS: Final = 1024
 """An array of as many takes noticeable time to read."""
 
 
-class _Way(NamedTuple):
-    """Where a value goes. ``send``: as :meth:`Inlet.send`; ``ready``: whether that would not have to wait."""
+class _Destination(NamedTuple):
+    """Where a value goes. ``send``: as :meth:`CommandClient.send`; ``ready``: whether that would not have to wait."""
 
     send: Callable[[Done, Callable[[], None]], Coroutine[None, None, None]]
     ready: bool
@@ -74,48 +74,48 @@ Parse = Callable[[bytes], Request]
 """What a message asks for; DecodeError: it is none."""
 
 
-class _Stream:
+class _PublishCall:
     """One Publish call: how many of its values are under way, and who waits for them."""
 
     def __init__(self) -> None:
         self.received = 0
         self.open = 0
         self.settled: asyncio.Future[None] | None = None
-        self.unheard = 0  # values that their source has neither accepted nor refused
-        self._heard: asyncio.Future[None] | None = None
+        self.unanswered = 0  # values that their source has neither accepted nor refused
+        self._answered: asyncio.Future[None] | None = None
 
-    async def heard(self) -> None:
+    async def answered(self) -> None:
         """Wait until sources have answered all that has been received."""
-        while self.unheard:
-            self._heard = self._heard or asyncio.get_running_loop().create_future()
-            await asyncio.shield(self._heard)
+        while self.unanswered:
+            self._answered = self._answered or asyncio.get_running_loop().create_future()
+            await asyncio.shield(self._answered)
 
-    def hear(self) -> None:
+    def answer(self) -> None:
         """One is answered."""
-        self.unheard -= 1
-        if not self.unheard and self._heard is not None:
-            self._heard.set_result(None)
-            self._heard = None
+        self.unanswered -= 1
+        if not self.unanswered and self._answered is not None:
+            self._answered.set_result(None)
+            self._answered = None
 
 
-class _Value:
+class _PublishedValue:
     """One value of a stream."""
 
-    def __init__(self, stream: _Stream) -> None:
+    def __init__(self, stream: _PublishCall) -> None:
         self._stream = stream
-        self._heard = False
+        self._answered = False
         stream.open += 1
-        stream.unheard += 1
+        stream.unanswered += 1
 
-    def hear(self) -> None:
+    def answer(self) -> None:
         """Its source has accepted or refused it."""
-        if not self._heard:
-            self._heard = True
-            self._stream.hear()
+        if not self._answered:
+            self._answered = True
+            self._stream.answer()
 
     def end(self) -> None:
         """It has its end."""
-        self.hear()
+        self.answer()
         stream = self._stream
         stream.open -= 1
         if stream.open == 0 and stream.settled is not None and not stream.settled.done():
@@ -141,8 +141,8 @@ class Publisher:
         self._shadows = shadows
         self._refusals = Refusals()
         self._waiting: set[asyncio.Task[None]] = set()
-        self._streams: dict[str, set[_Stream]] = {}  # of each peer
-        self._arrivals = Arrivals()
+        self._streams: dict[str, set[_PublishCall]] = {}  # of each peer
+        self._arrivals = ReceiveBarrier()
 
     @property
     def refused(self) -> int:
@@ -154,7 +154,7 @@ class Publisher:
 
         What was taken is carried out even if the client is gone meanwhile.
         """
-        stream = _Stream()
+        stream = _PublishCall()
         streams = self._streams.setdefault(peer, set())
         streams.add(stream)
         try:
@@ -170,12 +170,12 @@ class Publisher:
                 self._streams.pop(peer, None)
         return Empty()
 
-    async def _take(self, stream: _Stream, message: bytes, parse: Parse, peer: str) -> None:
-        path, value = "", _Value(stream)
+    async def _take(self, stream: _PublishCall, message: bytes, parse: Parse, peer: str) -> None:
+        path, value = "", _PublishedValue(stream)
         try:
             request = parse(message)
             path = request.path
-            way = await self._way(request)
+            destination = await self._resolve(request)
         except DecodeError:
             self._refusals.add(f"{len(message)} bytes are no PubRequest", path, peer)
             value.end()
@@ -187,8 +187,8 @@ class Publisher:
         except BaseException:  # its call ends
             value.end()
             raise
-        sending = self._send(way, partial(self._ended, value, path, peer), value.hear)
-        if way.ready:
+        sending = self._send(destination, partial(self._ended, value, path, peer), value.answer)
+        if destination.ready:
             await sending
         else:  # meanwhile nothing is read: the client is slowed down by the flow control of its stream
             await asyncio.shield(self._keep(sending))
@@ -200,12 +200,12 @@ class Publisher:
         """
         if peer not in self._streams:
             return
-        before: dict[_Stream, int] = {}
+        before: dict[_PublishCall, int] = {}
         with suppress(TimeoutError):
             async with asyncio.timeout(SETTLE_S):
                 while (now := {stream: stream.received for stream in self._streams.get(peer, ())}) != before:
                     for stream in now:
-                        await stream.heard()
+                        await stream.answered()
                     before = now
                     await self._arrivals.handled()
 
@@ -233,21 +233,21 @@ class Publisher:
                 answer.set_result((end[0], in_words(end)))
 
         try:
-            way = await self._way(request)
-            await way.send(ended, accepted)
+            destination = await self._resolve(request)
+            await destination.send(ended, accepted)
         except ShmioError:
             self._refusals.count += 1
             raise
         return await answer
 
-    async def _way(self, request: Request) -> _Way:
+    async def _resolve(self, request: Request) -> _Destination:
         """What is to be written where; PathError, ValueRangeError, CommandError."""
         if shadow := self._shadows.find(request.path):
-            if shadow.way is Way.ORIGINALS:
+            if shadow.kind is ShadowKind.ORIGINALS:
                 raise CommandError(f"{shorten(request.path)}: originals come from here; values go to the shadow's /in")
             injection = shadow.injection
             values = await _read(request, injection.shape)
-            return _Way(partial(injection.give, values), injection.ready(values))
+            return _Destination(partial(injection.give, values), injection.ready(values))
         topic = self._topics.topic(request.path)
         found = shape(self._topics.layout(topic), topic)
         if topic.direction == "out":
@@ -257,12 +257,12 @@ class Publisher:
             raise ValueRangeError(
                 f"{shorten(request.path)}: {len(values)} registers are too many at once, at most {MAX_VALUES}"
             )
-        inlet = self._topics.feed(topic.source).inlet
-        return _Way(partial(inlet.send, values), inlet.ready(values))
+        commands = self._topics.feed(topic.source).commands
+        return _Destination(partial(commands.send, values), commands.ready(values))
 
-    async def _send(self, way: _Way, done: Done, accepted: Callable[[], None]) -> None:
+    async def _send(self, destination: _Destination, done: Done, accepted: Callable[[], None]) -> None:
         try:
-            await way.send(done, accepted)
+            await destination.send(done, accepted)
         except ShmioError as error:
             done([(EventKind.REJECTED, str(error))])
 
@@ -272,7 +272,7 @@ class Publisher:
         task.add_done_callback(self._waiting.discard)
         return task
 
-    def _ended(self, value: _Value, path: str, peer: str, ends: Sequence[End]) -> None:
+    def _ended(self, value: _PublishedValue, path: str, peer: str, ends: Sequence[End]) -> None:
         end = worst(ends)
         if end[0] in DONE:
             self.published += 1

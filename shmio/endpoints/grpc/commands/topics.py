@@ -12,7 +12,7 @@ from shmio.layout.model import Layout, Register
 from shmio.layout.topic import Topic, look_up, parse_topic, shorten
 
 
-class Mark(Enum):
+class TimeTopic(Enum):
     """A topic of time, which no source has: its path in canonical form."""
 
     STEP = "simlog/step"
@@ -21,7 +21,7 @@ class Mark(Enum):
     """Simulation time."""
 
 
-_MARKS: Final = {mark.value: mark for mark in Mark}
+_TIME_TOPICS: Final = {time_topic.value: time_topic for time_topic in TimeTopic}
 
 
 class Topics:
@@ -36,7 +36,7 @@ class Topics:
         """What a path says; PathError: no source of that name."""
         topic = self._parse(path)
         if topic.source not in self._feeds:
-            if self._mark(topic):
+            if self._time_topic(topic):
                 raise PathError(f"{shorten(path)}: it can be subscribed to, and nothing else")
             raise PathError(
                 f"{shorten(path)}: {topic.source} is reserved; SIMLOG://step, model/clock and shadows that stand are "
@@ -44,12 +44,12 @@ class Topics:
             )
         return topic
 
-    def mark(self, path: str) -> Mark | None:
+    def time_topic(self, path: str) -> TimeTopic | None:
         """The topic of time that a path names; None: another one. PathError as of :meth:`topic`."""
-        return self._mark(self._parse(path))
+        return self._time_topic(self._parse(path))
 
-    def _mark(self, topic: Topic) -> Mark | None:
-        return _MARKS.get(f"{topic.source}/{topic.path}") if topic.direction != "in" else None
+    def _time_topic(self, topic: Topic) -> TimeTopic | None:
+        return _TIME_TOPICS.get(f"{topic.source}/{topic.path}") if topic.direction != "in" else None
 
     def name(self, path: str) -> str:
         """One name for all ways to write a path, also one that names nothing here."""

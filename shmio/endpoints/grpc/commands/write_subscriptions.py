@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sized
 from typing import Final, NamedTuple, Protocol
 
-from shmio.endpoints.grpc.commands.pending_image import Underway
+from shmio.endpoints.grpc.commands.pending_image import PendingImage
 from shmio.endpoints.grpc.streams.subject import Subject
 from shmio.layout.values.write import covering
 from shmio.segment import Block, Event, EventKind
@@ -36,7 +36,7 @@ Message = tuple[InChannel, Sized]
 
 
 class _Written(NamedTuple):
-    """A :class:`Picture` of a block as it will be."""
+    """A :class:`BlockImage` of a block as it will be."""
 
     number: int
     clock_ns: int
@@ -46,7 +46,7 @@ class _Written(NamedTuple):
 _NOBODY: Final = (0, 0, 0)
 
 
-class Echo:
+class WriteSubscriptions:
     """Turns accepted writes of all writers into messages, in the order in which the source accepted them.
 
     A subject is shown when a command has written all of it. One of which only a part is written, as an array's
@@ -60,7 +60,7 @@ class Echo:
         self._stamp = stamp
         self._channels: dict[Subject, InChannel] = {}
         self._table: tuple[InChannel, ...] = ()
-        self._underway = Underway(block)
+        self._pending_image = PendingImage(block)
         self._command = _NOBODY  # the one accepted last; it is not known at first, nor after a gap
         self._whole = False  # whether all of it so far has been put
         self._partly: dict[InChannel, Event] = {}  # channels it has written a part of
@@ -95,7 +95,7 @@ class Echo:
     def skip(self) -> None:
         """Events were missed: what is known of the command they may have belonged to is worth nothing."""
         self._command, self._whole = _NOBODY, False
-        self._underway.forget()
+        self._pending_image.forget()
         self._partly.clear()
 
     def follow(self, event: Event) -> list[Message]:
@@ -111,13 +111,13 @@ class Echo:
             self._whole = bool(table) and (self._command != _NOBODY or self._begins(event))
             self._command = command
             if self._whole:
-                self._underway.begin(event.frame)
+                self._pending_image.begin(event.frame)
         if not table:
             self._whole = False
-            self._underway.forget()
+            self._pending_image.forget()
         if not self._whole:
             return messages
-        self._underway.put(event)
+        self._pending_image.put(event)
         for channel in table:
             if channel.start < event.offset + len(event.data) and event.offset < channel.stop:
                 self._touch(channel, event, messages)
@@ -139,7 +139,7 @@ class Echo:
         shift = 8 * (channel.stop - event.offset - len(event.data))
         if not (bits << shift if shift >= 0 else bits >> -shift) & channel.bits:
             return  # other bits of its bytes
-        if channel.bits & ~int.from_bytes(self._underway.mask[channel.start : channel.stop], "big"):
+        if channel.bits & ~int.from_bytes(self._pending_image.mask[channel.start : channel.stop], "big"):
             self._partly[channel] = event
             return
         self._partly.pop(channel, None)
@@ -154,7 +154,7 @@ class Echo:
         return messages
 
     def _show(self, channel: InChannel, event: Event, messages: list[Message]) -> None:
-        message = channel.encode(_Written(*self._stamp(event), bytes(self._underway.image)))
+        message = channel.encode(_Written(*self._stamp(event), bytes(self._pending_image.image)))
         if message is not None:
             messages.append((channel, message))
 

@@ -8,13 +8,13 @@ from functools import partial
 from typing import NamedTuple, cast
 
 from shmio.endpoints.grpc.commands import command_client
-from shmio.endpoints.grpc.commands.followers import Follower
+from shmio.endpoints.grpc.commands.followers import InjectionFollower
 from shmio.endpoints.grpc.commands.path_kind import Shape
 from shmio.endpoints.grpc.commands.write_subscriptions import Listener
-from shmio.endpoints.grpc.injection.injection_base import Beneath
+from shmio.endpoints.grpc.injection.injection_base import InjectionBase
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outbox import EventLane, Finish, Outbox, StateLane
-from shmio.endpoints.grpc.streams.subject import Encode, Source, Subject
+from shmio.endpoints.grpc.streams.subject import Encode, SourceImage, Subject
 from shmio.endpoints.in_flight import Done, End, worst
 from shmio.errors import CommandError, PathError
 from shmio.layout.topic import Topic, find
@@ -27,7 +27,7 @@ from shmio.segment.pending_commands import Diverted, apply
 Leave = Callable[[], None]
 
 
-class Shown(NamedTuple):
+class ShownImage(NamedTuple):
     """An image as one of an injection's topics shows it."""
 
     number: int
@@ -51,7 +51,7 @@ class _Tap:
     def _leave(self, wire: str, listener: Listener) -> None:
         self._channels[wire][1].discard(listener)
 
-    def show(self, shown: Shown) -> None:
+    def show(self, shown: ShownImage) -> None:
         for to_message, listeners in self._channels.values():
             message = to_message(shown) if listeners else None
             if message is not None:
@@ -64,7 +64,7 @@ class _Tap:
                 listener.fail(reason)
 
 
-class Injection(Follower):
+class Injection(InjectionFollower):
     """One, from being laid until it is lifted, by whomever. For the event loop, but what a feed calls.
 
     It is laid over the registers of ``shape``, which is what ``target`` names in the layout of ``feed``. Its
@@ -83,8 +83,8 @@ class Injection(Follower):
         self.ends: dict[object, Callable[[], object]] = {}
         """What is called when it is over, by whom it is for."""
         frame = feed.block.latest()
-        self._beneath = Beneath(feed.block, frame.image if frame else b"")
-        self._gifts = bytearray(self._beneath.given)
+        self._base = InjectionBase(feed.block, frame.image if frame else b"")
+        self._given_image = bytearray(self._base.given)
         self._scan = ChangeScan(shape.registers)
         self._subjects: dict[Subject, None] = {}
         self._diverted, self._given = _Tap(), _Tap()
@@ -105,7 +105,7 @@ class Injection(Follower):
                 raise CommandError(RETIRED)
             answer = command_client.Answer()
             bits = covering(self.shape.registers, self.feed.block.layout.size)
-            self._beneath.number = self.feed.inlet.lay(bits, self, answer.done, direction=direction, name=name)
+            self._base.number = self.feed.commands.lay(bits, self, answer.done, direction=direction, name=name)
             ((kind, reason),) = await answer
             if kind is not EventKind.INJECTED:
                 raise CommandError(f"{kind}: {reason}")
@@ -124,7 +124,7 @@ class Injection(Follower):
                 self._have_it_lifted()
 
     def _have_it_lifted(self) -> None:
-        lifting = command_client.have_lifted(self.feed.inlet, self._beneath.number, str(self.target))
+        lifting = command_client.have_lifted(self.feed.commands, self._base.number, str(self.target))
         self._lifting = asyncio.get_running_loop().create_task(lifting)
 
     def _finish(self, reason: str) -> None:
@@ -137,10 +137,10 @@ class Injection(Follower):
 
     def ready(self, values: Mapping[str, object]) -> bool:
         """Whether :meth:`give` would not have to wait."""
-        return self._laid.done() and self.feed.inlet.ready(values)
+        return self._laid.done() and self.feed.commands.ready(values)
 
     async def give(self, values: Mapping[str, object], done: Done, accepted: Callable[[], None] | None = None) -> None:
-        """Send values as this injection's; ``done`` and ``accepted`` as of :meth:`Inlet.give`.
+        """Send values as this injection's; ``done`` and ``accepted`` as of :meth:`CommandClient.give`.
 
         PathError: it stands no more; CommandError, ValueRangeError: not sent.
         """
@@ -153,7 +153,7 @@ class Injection(Follower):
             nonlocal shown
             if not shown:
                 shown = True
-                self._show_gifts(values)
+                self._show_given(values)
 
         def on_accepted() -> None:
             show()
@@ -165,16 +165,16 @@ class Injection(Follower):
                 show()
             done(ends)
 
-        await self.feed.inlet.give(self._beneath.number, values, on_done, on_accepted)
+        await self.feed.commands.give(self._base.number, values, on_done, on_accepted)
 
-    def _show_gifts(self, values: Mapping[str, object]) -> None:
+    def _show_given(self, values: Mapping[str, object]) -> None:
         layout = self.feed.block.layout
         for path, value in values.items():
-            apply(self._gifts, encode(find(layout, path), value, layout.byte_order))
+            apply(self._given_image, encode(find(layout, path), value, layout.byte_order))
         if self._given and (now := self.feed.present() or self.feed.block.latest()):
-            self._given.show(Shown(now.number, now.clock_ns, bytes(self._gifts)))
+            self._given.show(ShownImage(now.number, now.clock_ns, bytes(self._given_image)))
 
-    def gifts(self, wire: str, encode: Encode, lane: EventLane) -> Leave:
+    def given_values(self, wire: str, encode: Encode, lane: EventLane) -> Leave:
         """Show what its clients give from now on; how to leave again."""
         return self._given.listen(wire, encode, lane)
 
@@ -188,7 +188,7 @@ class Injection(Follower):
             f"{wire} beneath {id(self)}",
             self.shape.path,
             self.shape.registers,
-            lambda picture: encode(self._original(cast(Source, picture))),
+            lambda picture: encode(self._original(cast(SourceImage, picture))),
             self._changed,
         )
         self._subjects.setdefault(subject)
@@ -196,15 +196,15 @@ class Injection(Follower):
         self.feed.listen(subject, lane)
         return partial(self.feed.leave, subject, lane)
 
-    def present(self) -> Shown | None:
+    def present(self) -> ShownImage | None:
         """The original of ``/out`` as of now, if it is good."""
         frame = None if self.inward else self.feed.present()
         return None if frame is None else self._original(frame)
 
-    def _original(self, frame: Source) -> Shown:
-        return Shown(frame.number, frame.clock_ns, self._beneath.image(frame.raw))
+    def _original(self, frame: SourceImage) -> ShownImage:
+        return ShownImage(frame.number, frame.clock_ns, self._base.image(frame.raw))
 
-    def _changed(self, shown: Source, frame: Source) -> bool:
+    def _changed(self, shown: SourceImage, frame: SourceImage) -> bool:
         return bool(self._scan.changed(self._original(shown).image, self._original(frame).image))
 
     def _tell_again(self) -> None:
@@ -215,16 +215,16 @@ class Injection(Follower):
 
     def divert(self, diverted: Diverted) -> None:
         """A command's values went to it."""
-        self._beneath.divert(diverted.writes)
+        self._base.divert(diverted.writes)
         if self.inward:
-            self._diverted.show(Shown(*self.feed.inlet.stamp(diverted.event), bytes(self._beneath.given)))
+            self._diverted.show(ShownImage(*self.feed.commands.stamp(diverted.event), bytes(self._base.given)))
         else:
-            self._beneath.restack()
+            self._base.restack()
             self._tell_again()
 
     def restack(self) -> None:
         """An injection was laid or lifted, on the same source."""
-        if not self.inward and self._beneath.restack():
+        if not self.inward and self._base.restack():
             self._tell_again()
 
     def lifted(self, reason: str) -> None:

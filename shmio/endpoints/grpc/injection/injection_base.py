@@ -11,7 +11,7 @@ from shmio.segment import Block
 from shmio.segment.pending_commands import apply
 
 
-class Beneath:
+class InjectionBase:
     """The image beneath one injection of a block."""
 
     def __init__(self, block: Block, image: bytes = b"") -> None:

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Final, NamedTuple
 
 from shmio.endpoints.grpc.commands.path_kind import Shape
-from shmio.endpoints.grpc.commands.topics import Mark, Topics
+from shmio.endpoints.grpc.commands.topics import TimeTopic, Topics
 from shmio.endpoints.grpc.injection.injection import Injection
 from shmio.endpoints.grpc.server.connections import Peer, connected, peer_of
 from shmio.errors import ConflictError, EndpointError, ValueRangeError
@@ -29,16 +29,16 @@ LOOK_S: Final = 0.25
 UNSEEN_S: Final = 10.0
 """So long an injection stands without a stream if it cannot be seen whether its client is there."""
 
-_MARKS: Final = frozenset(mark.value for mark in Mark)
+_MARKS: Final = frozenset(mark.value for mark in TimeTopic)
 _SCHEME: Final = re.compile(r"^[^/:]*://")
 
 log = logging.getLogger("shmio.grpc")
 
 
-class Way(Enum):
+class ShadowKind(Enum):
     """What a topic of an injection is."""
 
-    GIFTS = "gifts"
+    GIVEN = "gifts"
     """Clients write to it, and read what all of them have written."""
     ORIGINALS = "originals"
     """Clients read what the injection diverts."""
@@ -48,7 +48,7 @@ class Shadow(NamedTuple):
     """One topic of an injection."""
 
     injection: Injection
-    way: Way
+    kind: ShadowKind
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,9 @@ class Shadows:
         """The topic that a path names, if it is one of an injection."""
         return self._named.get(self._topics.name(path)) if self._named else None
 
-    async def lay(self, target: Topic, shape: Shape, ways: Mapping[str, Way], holder: object, peer: str) -> Injection:
+    async def lay(
+        self, target: Topic, shape: Shape, kinds: Mapping[str, ShadowKind], holder: object, peer: str
+    ) -> Injection:
         """Have an injection with these topics laid, or join the one that there is; the holder holds it.
 
         ValueRangeError: a topic is the target itself; ConflictError: a path is in use for another target;
@@ -80,13 +82,13 @@ class Shadows:
         asks, for the list of all injections.
         """
         target = replace(target, direction=target.direction or "out")
-        injection = self._joined(target, ways)
+        injection = self._joined(target, kinds)
         if injection is None:
             feed = self._topics.feed(target.source)
             if sum(other.feed is feed for other in self._holders) >= MAX_INJECTIONS:
                 raise EndpointError(f"{MAX_INJECTIONS} injections stand on {target.source} already: end one")
-            injection = Injection(target, shape, feed, f"{shorten(next(iter(ways)), 60)} of {shorten(peer, 40)}")
-            self._named |= {self._topics.name(path): Shadow(injection, way) for path, way in ways.items()}
+            injection = Injection(target, shape, feed, f"{shorten(next(iter(kinds)), 60)} of {shorten(peer, 40)}")
+            self._named |= {self._topics.name(path): Shadow(injection, kind) for path, kind in kinds.items()}
             self._holders[injection] = set()
             injection.ends[self] = partial(self._forget, injection)
         self._holders[injection].add(holder)
@@ -97,13 +99,15 @@ class Shadows:
             raise
         return injection
 
-    async def lay_for_client(self, target: Topic, shape: Shape, ways: Mapping[str, Way], peer: str) -> Injection:
+    async def lay_for_client(
+        self, target: Topic, shape: Shape, kinds: Mapping[str, ShadowKind], peer: str
+    ) -> Injection:
         """The same for one who has no stream of it yet: its connection holds it, until a stream does."""
         seen = peer_of(peer)
         if seen not in await asyncio.to_thread(connected):
             seen = None
         client = _Client(seen, time.monotonic() + UNSEEN_S)
-        injection = await self.lay(target, shape, ways, client, peer)
+        injection = await self.lay(target, shape, kinds, client, peer)
         if self._looking is None:
             self._looking = asyncio.get_running_loop().create_task(self._look())
         return injection
@@ -128,15 +132,15 @@ class Shadows:
             if injection.target.source in sources:
                 injection.end(RETIRED)
 
-    def _joined(self, target: Topic, ways: Mapping[str, Way]) -> Injection | None:
+    def _joined(self, target: Topic, kinds: Mapping[str, ShadowKind]) -> Injection | None:
         """The injection that has these topics; ConflictError: they are another one's."""
         found: Injection | None = None
-        for path, way in ways.items():
+        for path, kind in kinds.items():
             name = self._topics.name(path)
             if name == str(target):
                 raise ValueRangeError(f"{shorten(path)} is the target: a shadow needs a path of its own")
             shadow = self._named.get(name)
-            if name in _MARKS or (shadow and (shadow.injection.target != target or shadow.way is not way)):
+            if name in _MARKS or (shadow and (shadow.injection.target != target or shadow.kind is not kind)):
                 use = f"the shadow of {shadow.injection.target}" if shadow else "served by shmio"
                 raise ConflictError(f"{shorten(path)} is {use}: name another path")
             found = shadow.injection if shadow else found

@@ -127,7 +127,7 @@ class Keys:
         )
 
 
-class Door:
+class ListenerAccess:
     """One listening address: who may call what there. ``keys`` may be replaced at any time."""
 
     def __init__(self, keys: Keys, anonymous: Iterable[str] = ROLES, *, takes_tokens: bool = True) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import grpc
 from google.protobuf.message import DecodeError
 
-from shmio.endpoints.grpc.server.access import Credentials, DeniedError, Door, client_of
+from shmio.endpoints.grpc.server.access import Credentials, DeniedError, ListenerAccess, client_of
 from shmio.endpoints.grpc.server.rejected_calls import Refusals
 
 Context = grpc.aio.ServicerContext[Any, Any]
@@ -22,7 +22,7 @@ Decode = Callable[[bytes], Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class CallLimits:
     """Of calls, and connections, that are open at once, on all addresses together.
 
     When fewer than ``reserve`` are free, only a client with fewer than ``share`` gets another: one that opens thousands
@@ -40,11 +40,11 @@ class Limits:
 class _Call:
     """One that is open. ``denial``: why it has to end, if it has to."""
 
-    __slots__ = ("client", "denial", "door", "method", "shown", "task")
+    __slots__ = ("access", "client", "denial", "method", "shown", "task")
 
-    def __init__(self, method: str, door: Door, shown: Credentials, client: str) -> None:
+    def __init__(self, method: str, access: ListenerAccess, shown: Credentials, client: str) -> None:
         self.method = method
-        self.door = door
+        self.access = access
         self.shown = shown
         self.client = client
         self.task = asyncio.current_task()
@@ -57,11 +57,11 @@ class _Call:
             self.task.cancel()
 
 
-class Calls:
+class OpenCalls:
     """All calls that are open, whichever address they came by; for the event loop's thread."""
 
-    def __init__(self, limits: Limits | None = None) -> None:
-        self.limits = limits or Limits()
+    def __init__(self, limits: CallLimits | None = None) -> None:
+        self.limits = limits or CallLimits()
         self.refusals = Refusals("call refused", "call")
         self._open: set[_Call] = set()
         self._by_client: Counter[str] = Counter()
@@ -71,17 +71,17 @@ class Calls:
     def __len__(self) -> int:
         return len(self._open)
 
-    def enter(self, method: str, door: Door, context: Context) -> _Call:
+    def enter(self, method: str, access: ListenerAccess, context: Context) -> _Call:
         """Admit one, or DeniedError. It has to :meth:`leave`."""
         peer = context.peer()
         shown = Credentials.of(context.invocation_metadata() or (), context.auth_context())
         try:
-            client = client_of(peer, door.admit(method, shown))
+            client = client_of(peer, access.admit(method, shown))
             self._check(client)
         except DeniedError as error:
             self.refusals.add(str(error), method, peer)
             raise
-        call = _Call(method, door, shown, client)
+        call = _Call(method, access, shown, client)
         self._open.add(call)
         self._by_client[client] += 1
         return call
@@ -120,7 +120,7 @@ class Calls:
         ended = 0
         for call in self._open:
             try:
-                call.door.admit(call.method, call.shown)
+                call.access.admit(call.method, call.shown)
             except DeniedError as error:
                 call.end(error)
                 ended += 1
@@ -141,15 +141,15 @@ class Calls:
             )
 
 
-class Gate(grpc.aio.ServerInterceptor):
+class CallGuard(grpc.aio.ServerInterceptor):
     """Stands before all calls of one listening address.
 
     To gRPC each call is one with a stream of requests, so that who calls is known, and counted, before the first
     message has come; and bytes that are no message end the call with a word, and nothing in the log.
     """
 
-    def __init__(self, door: Door, calls: Calls) -> None:
-        self._door = door
+    def __init__(self, access: ListenerAccess, calls: OpenCalls) -> None:
+        self._access = access
         self._calls = calls
         self._handlers: dict[str, Handler] = {}
 
@@ -170,7 +170,7 @@ class Gate(grpc.aio.ServerInterceptor):
 
         async def run(messages: AsyncIterator[bytes], context: Context) -> Any:
             try:
-                call = self._calls.enter(method, self._door, context)
+                call = self._calls.enter(method, self._access, context)
             except DeniedError as error:
                 await context.abort(error.code, str(error))
             try:

@@ -6,18 +6,18 @@ from typing import NamedTuple
 
 from shmio.config import Address, Grpc, UnixAddress, parse_address
 from shmio.config.listening import encrypted, takes_tokens
-from shmio.endpoints.grpc.server.access import Door, Keys
+from shmio.endpoints.grpc.server.access import Keys, ListenerAccess
 
 
 class Listener(NamedTuple):
     """An address, and who may do what there."""
 
     address: Address | UnixAddress
-    door: Door
+    access: ListenerAccess
     encrypted: bool = False
 
 
-class Doors:
+class Listeners:
     """All of them, with the same keys."""
 
     def __init__(self, config: Grpc) -> None:
@@ -26,7 +26,7 @@ class Doors:
         self._listeners = {
             key: Listener(
                 parse_address(address.listen),
-                Door(keys, address.roles, takes_tokens=takes_tokens(config, address)),
+                ListenerAccess(keys, address.roles, takes_tokens=takes_tokens(config, address)),
                 encrypted(config, address),
             )
             for key, address in config.listening.items()
@@ -42,5 +42,5 @@ class Doors:
         keys = Keys.of(config)
         for key, address in config.listening.items():
             if key in self._listeners:
-                door = self._listeners[key].door
-                door.keys, door.anonymous = keys, frozenset(address.roles)
+                access = self._listeners[key].access
+                access.keys, access.anonymous = keys, frozenset(address.roles)

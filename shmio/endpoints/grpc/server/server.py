@@ -16,8 +16,8 @@ from shmio.config import Address, Tls, UnixAddress
 from shmio.config.tls import read_tls
 from shmio.config.unix_socket import SocketFile, clear
 from shmio.endpoints.grpc.server.aio_server import CoreServer
-from shmio.endpoints.grpc.server.call_guard import Calls, Gate
-from shmio.endpoints.grpc.server.descriptors import room, shortage
+from shmio.endpoints.grpc.server.call_guard import CallGuard, OpenCalls
+from shmio.endpoints.grpc.server.file_descriptors import room, shortage
 from shmio.endpoints.grpc.server.health import Health
 from shmio.endpoints.grpc.server.listeners import Listener
 from shmio.endpoints.grpc.services.services import Services
@@ -46,8 +46,8 @@ OPTIONS = [
 class Server:
     """All services on each of the addresses, each behind a gate."""
 
-    def __init__(self, services: Services, calls: Calls | None = None) -> None:
-        self.calls = Calls() if calls is None else calls
+    def __init__(self, services: Services, calls: OpenCalls | None = None) -> None:
+        self.calls = OpenCalls() if calls is None else calls
         """Those that are open, on all addresses."""
         self._services = services
         self._health = Health()
@@ -84,7 +84,7 @@ class Server:
         self._connections = max(1, connections // len(listeners))
         ports = []
         for listener in listeners:
-            server = self._server(Gate(listener.door, self.calls))
+            server = self._server(CallGuard(listener.access, self.calls))
             ports.append(self._bind(server, listener, credentials, gid))
             self._servers.append(server)
         for server in self._servers:
@@ -129,7 +129,7 @@ class Server:
             ) from None
         return int(port)
 
-    def _server(self, gate: Gate) -> CoreServer:
+    def _server(self, gate: CallGuard) -> CoreServer:
         # No connection is told to have room for more than all calls. When 1000 wait to be looked at, gRPC breaks off
         # some at random: clients that begin with thousands of subscriptions at once would lose some. Each method has
         # its own queue; that of unknown names may fill up, and then is what a flood of them costs in memory.

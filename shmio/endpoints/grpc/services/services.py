@@ -13,13 +13,13 @@ from shmio.endpoints.grpc.injection.injections import Shadows
 from shmio.endpoints.grpc.services.simlog_v1 import SimlogV1
 from shmio.endpoints.grpc.services.simlog_v2 import SimlogV2
 from shmio.endpoints.grpc.services.simserver import SimServer
-from shmio.endpoints.grpc.shmio_v1.service import NativeService
+from shmio.endpoints.grpc.shmio_v1.service import ShmioV1
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outboxes import Outboxes
-from shmio.endpoints.grpc.streams.wakeups import Bells
-from shmio.endpoints.grpc.time.audience import Audience
+from shmio.endpoints.grpc.streams.wakeups import WakeUps
+from shmio.endpoints.grpc.time.open_streams import OpenStreams
 from shmio.endpoints.grpc.time.stepper import Stepper
-from shmio.endpoints.grpc.time.virtual_time import Hold
+from shmio.endpoints.grpc.time.virtual_time import VirtualTime
 from shmio.segment import ProcessSlot, Segment
 
 
@@ -30,8 +30,8 @@ class Services:
         self,
         segment: Segment,
         slot: ProcessSlot,
-        hold: Hold,
-        bells: Bells,
+        virtual_time: VirtualTime,
+        wake_ups: WakeUps,
         feeds: Mapping[str, Feed],
         default_source: str | None,
     ) -> None:
@@ -40,17 +40,19 @@ class Services:
         ``default_source``: that of paths which name none; default: the only one.
         """
         topics = Topics(feeds, default_source)
-        audience = Audience()
-        self._outboxes = Outboxes(audience)
+        open_streams = OpenStreams()
+        self._outboxes = Outboxes(open_streams)
         self._shadows = Shadows(topics)
         self._publisher = Publisher(topics, self._shadows)
-        self.stepper = Stepper(segment, slot, hold, bells, feeds, self._outboxes, self._publisher, audience)
+        self.stepper = Stepper(
+            segment, slot, virtual_time, wake_ups, feeds, self._outboxes, self._publisher, open_streams
+        )
         """The instance's time."""
-        self._native = NativeService(topics, feeds, bells, segment, self.stepper, audience)
+        self._shmio_v1 = ShmioV1(topics, feeds, wake_ups, segment, self.stepper, open_streams)
         self._services = (
-            self._native,
+            self._shmio_v1,
             SimlogV1(topics, self._publisher, self._outboxes, self._shadows, self.stepper),
-            SimlogV2(topics, self._publisher, self._outboxes, self._shadows, self.stepper.timeline.marks),
+            SimlogV2(topics, self._publisher, self._outboxes, self._shadows, self.stepper.timeline.time_topics),
             SimServer(self.stepper, self._outboxes),
         )
 
@@ -62,13 +64,13 @@ class Services:
     @property
     def counters(self) -> tuple[int, int, int, int]:
         """Streams of subscribers open, messages dropped on slow ones, messages published, and refused."""
-        streams = len(self._outboxes) + self._native.streams
+        streams = len(self._outboxes) + self._shmio_v1.streams
         return streams, self._outboxes.dropped, self._publisher.published, self._publisher.refused
 
     @property
     def updates(self) -> int:
         """Updates of our own service since the start; what feeds have made is counted there."""
-        return self._native.updates
+        return self._shmio_v1.updates
 
     @property
     def waiting_bytes(self) -> int:

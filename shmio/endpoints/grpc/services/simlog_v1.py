@@ -13,9 +13,9 @@ from google.protobuf.empty_pb2 import Empty
 
 from shmio.endpoints.grpc.commands.path_kind import Shape, shape
 from shmio.endpoints.grpc.commands.publish import Publisher, Request
-from shmio.endpoints.grpc.commands.topics import Mark, Topics
+from shmio.endpoints.grpc.commands.topics import TimeTopic, Topics
 from shmio.endpoints.grpc.injection.injection import Injection
-from shmio.endpoints.grpc.injection.injections import Shadows, Way, shadow_path
+from shmio.endpoints.grpc.injection.injections import ShadowKind, Shadows, shadow_path
 from shmio.endpoints.grpc.services.error_status import Context, refuse
 from shmio.endpoints.grpc.services.simlog_v1_values import encoder, message_type, read, time_stamp
 from shmio.endpoints.grpc.streams.outbox import EventLane, Lane, Outbox, StateLane
@@ -29,7 +29,7 @@ from shmio.logs import fields
 from shmio.wire import simlog_v1_pb2 as wire
 
 
-class Injecting:
+class InjectCalls:
     """The part of version 1 that is about injections."""
 
     def __init__(
@@ -66,8 +66,8 @@ class Injecting:
         topic, found = await self._resolve(request.target.path, context)
         with self._outboxes.opened() as outbox:
             try:
-                ways = {shadow_path(request.injected.path): Way.GIFTS}
-                injection = await self._shadows.lay(topic, found, ways, outbox, context.peer())
+                kinds = {shadow_path(request.injected.path): ShadowKind.GIVEN}
+                injection = await self._shadows.lay(topic, found, kinds, outbox, context.peer())
             except ShmioError as error:
                 await refuse(context, error)
             release = partial(self._shadows.release, injection, outbox)
@@ -75,22 +75,22 @@ class Injecting:
             try:
                 encode = encoder(injection.shape, injection.feed.block.layout)
                 leave = injection.originals("v1", encode, outbox, shorten(request.target.path))
-                async for message in self._told(injection, outbox, leave, context):
+                async for message in self._messages(injection, outbox, leave, context):
                     yield message
             finally:
                 release()
             await context.abort(grpc.StatusCode.ABORTED, f"{shorten(request.target.path)}: {injection.over}")
 
-    async def gifts(self, injection: Injection, path: str, context: Context) -> AsyncIterator[bytes]:
+    async def given_values(self, injection: Injection, path: str, context: Context) -> AsyncIterator[bytes]:
         """Stream what is published to a shadow, as long as that stands."""
         with self._outboxes.opened() as outbox:
             encode = encoder(injection.shape, injection.feed.block.layout)
-            leave = injection.gifts("v1", encode, EventLane(outbox, shorten(path)))
-            async for message in self._told(injection, outbox, leave, context):
+            leave = injection.given_values("v1", encode, EventLane(outbox, shorten(path)))
+            async for message in self._messages(injection, outbox, leave, context):
                 yield message
             await context.abort(grpc.StatusCode.NOT_FOUND, f"{shorten(path)}: {injection.over}")
 
-    async def _told(
+    async def _messages(
         self, injection: Injection, outbox: Outbox, leave: Callable[[], None], context: Context
     ) -> AsyncIterator[bytes]:
         """What comes for a stream of an injection until that is over; RESOURCE_EXHAUSTED: it is not read."""
@@ -110,7 +110,7 @@ class Injecting:
 
 SERVICE: Final = wire.DESCRIPTOR.services_by_name["SimlogAPI"].full_name
 
-_MARK_TYPES: Final = {Mark.STEP: "int", Mark.CLOCK: "time"}
+_TIME_TOPIC_TYPES: Final = {TimeTopic.STEP: "int", TimeTopic.CLOCK: "time"}
 
 log = logging.getLogger("shmio.grpc")
 
@@ -126,7 +126,7 @@ class SimlogV1:
         self._topics = topics
         self._publisher = publisher
         self._outboxes = outboxes
-        self._injecting = Injecting(outboxes, shadows, self._resolve)
+        self._injecting = InjectCalls(outboxes, shadows, self._resolve)
         self._stepper = stepper
         self._streams: dict[Outbox, str] = {}  # and their source
 
@@ -173,8 +173,8 @@ class SimlogV1:
         """Tell a topic's type; NOT_FOUND, INVALID_ARGUMENT for a structure that there is no message for."""
         if injection := await self._injecting.find(request.path, context):
             return wire.TopicDescriptor(path=request.path, msgType=message_type(injection.shape))
-        if mark := await self._mark(request.path, context):
-            return wire.TopicDescriptor(path=request.path, msgType=_MARK_TYPES[mark])
+        if time_topic := await self._time_topic(request.path, context):
+            return wire.TopicDescriptor(path=request.path, msgType=_TIME_TOPIC_TYPES[time_topic])
         _, found = await self._resolve(request.path, context)
         return wire.TopicDescriptor(path=request.path, msgType=message_type(found))
 
@@ -187,11 +187,11 @@ class SimlogV1:
         else it ends with NOT_FOUND.
         """
         if injection := await self._injecting.find(request.path, context):
-            async for gift in self._injecting.gifts(injection, request.path, context):
+            async for gift in self._injecting.given_values(injection, request.path, context):
                 yield gift
             return
-        if mark := await self._mark(request.path, context):
-            async for moment in self._follow(mark, context):
+        if time_topic := await self._time_topic(request.path, context):
+            async for moment in self._stream_time_topic(time_topic, context):
                 yield moment
             return
         topic, found = await self._resolve(request.path, context)
@@ -222,10 +222,10 @@ class SimlogV1:
             finally:
                 del self._streams[outbox]
 
-    async def _follow(self, mark: Mark, context: Context) -> AsyncIterator[bytes]:
+    async def _stream_time_topic(self, time_topic: TimeTopic, context: Context) -> AsyncIterator[bytes]:
         """Stream a topic of time."""
         with self._outboxes.opened() as outbox, ExitStack() as listening:
-            listening.callback(self._stepper.timeline.marks.listen(mark, _marked, StateLane(outbox)))
+            listening.callback(self._stepper.timeline.time_topics.listen(time_topic, _time_message, StateLane(outbox)))
             outbox.on_failure = listening.close
             await context.send_initial_metadata(())
             while (message := await outbox.pop()) is not None:
@@ -258,10 +258,10 @@ class SimlogV1:
         """Write the values of a stream, in its order, and answer when it has ended and all of them have."""
         return await self._publisher.publish(messages, _parse, context.peer())
 
-    async def _mark(self, path: str, context: Context) -> Mark | None:
+    async def _time_topic(self, path: str, context: Context) -> TimeTopic | None:
         """The topic of time that a path names; NOT_FOUND."""
         try:
-            return self._topics.mark(path)
+            return self._topics.time_topic(path)
         except PathError as error:
             await refuse(context, error)
 
@@ -278,7 +278,7 @@ def _parse(message: bytes) -> Request:
     return Request(request.topic.path, partial(read, request.data))
 
 
-def _marked(mark: Mark, moment: Moment) -> bytes:
+def _time_message(time_topic: TimeTopic, moment: Moment) -> bytes:
     """The message of a topic of time; the clock has it where a client looks for it, and no value."""
-    value = str(moment.number) if mark is Mark.STEP else ""
-    return wire.ROSMessage(type=_MARK_TYPES[mark], value=value).SerializeToString() + time_stamp(*moment)
+    value = str(moment.number) if time_topic is TimeTopic.STEP else ""
+    return wire.ROSMessage(type=_TIME_TOPIC_TYPES[time_topic], value=value).SerializeToString() + time_stamp(*moment)

@@ -14,7 +14,7 @@ from google.protobuf.message import Message
 
 from shmio.endpoints.grpc.commands.path_kind import Shape
 from shmio.endpoints.grpc.streams.encoding import delimited, varint
-from shmio.endpoints.grpc.streams.subject import Encode, Picture
+from shmio.endpoints.grpc.streams.subject import BlockImage, Encode
 from shmio.errors import ValueRangeError
 from shmio.layout.model import Layout, Register
 from shmio.layout.structures import CONTENTS, Found, recognise
@@ -71,7 +71,7 @@ def _text(register: Register, layout: Layout) -> Encode:
     kind = wire.ROSMessage(type=wire_type(register)).SerializeToString()
     decode = codec(register, layout.byte_order).decode
 
-    def encode(frame: Picture) -> bytes | None:
+    def encode(frame: BlockImage) -> bytes | None:
         value = decode(frame.image)
         if value is None:
             return None
@@ -94,7 +94,7 @@ def _structure(found: Shape, layout: Layout) -> Encode:
     kind = wire.ROSMessage(type=shape).SerializeToString()
     fill = _filler(members, layout)
 
-    def encode(frame: Picture) -> bytes:
+    def encode(frame: BlockImage) -> bytes:
         message = wire.ROSMessage()
         content = getattr(message, CONTENTS[shape])
         content.SetInParent()  # it is there, even if all of it is zero

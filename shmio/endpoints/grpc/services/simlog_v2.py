@@ -15,28 +15,28 @@ from google.protobuf.empty_pb2 import Empty
 
 from shmio.endpoints.grpc.commands.path_kind import Shape, shape
 from shmio.endpoints.grpc.commands.publish import Publisher, Request
-from shmio.endpoints.grpc.commands.topics import Mark, Topics
-from shmio.endpoints.grpc.injection.injections import Shadow, Shadows, Way, shadow_paths
+from shmio.endpoints.grpc.commands.topics import TimeTopic, Topics
+from shmio.endpoints.grpc.injection.injections import Shadow, ShadowKind, Shadows, shadow_paths
 from shmio.endpoints.grpc.server.access import holder_of
-from shmio.endpoints.grpc.server.turns import turns
+from shmio.endpoints.grpc.server.time_slices import time_sliced
 from shmio.endpoints.grpc.services.error_status import refuse
 from shmio.endpoints.grpc.services.simlog_v2_values import (
     MAX_ELEMENTS,
     MAX_MEMBERS,
-    Encoded,
+    EncodedMessage,
     encoder,
     from_wire,
-    marked,
     nothing,
     path_field,
     repeated,
     subject,
+    time_message,
     time_stamp,
     value_type,
 )
 from shmio.endpoints.grpc.streams.outbox import EventLane, Finish, Lane, Outbox, StateLane
 from shmio.endpoints.grpc.streams.outboxes import Outboxes
-from shmio.endpoints.grpc.time.time_topics import Marks
+from shmio.endpoints.grpc.time.time_topics import TimeTopics
 from shmio.errors import ConflictError, EndpointError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import Topic, shorten
 from shmio.logs import fields
@@ -60,7 +60,7 @@ log = logging.getLogger("shmio.grpc")
 class _Subscription:
     """``topic``: None of an injection's. ``leave``: None while no source has such a topic."""
 
-    topic: Topic | Mark | None
+    topic: Topic | TimeTopic | None
     lane: Lane | None
     leave: Callable[[], None] | None = None
 
@@ -69,7 +69,7 @@ class Subscriber:
     """One CreateSubscriber call."""
 
     def __init__(
-        self, topics: Topics, shadows: Shadows, marks: Marks, name: str, outbox: Outbox, holder: object
+        self, topics: Topics, shadows: Shadows, time_topics: TimeTopics, name: str, outbox: Outbox, holder: object
     ) -> None:
         """``holder``: whose it is."""
         self.name = name
@@ -79,7 +79,7 @@ class Subscriber:
         """Whether another one of its uuid has taken its place."""
         self._topics = topics
         self._shadows = shadows
-        self._marks = marks
+        self._time_topics = time_topics
         self._subscriptions: dict[str, _Subscription] = {}
 
     def __len__(self) -> int:
@@ -89,11 +89,11 @@ class Subscriber:
         """Subscribe to a topic; again, if it is already: nothing. PathError, ValueRangeError, EndpointError."""
         if path in self._subscriptions:
             return
-        finish = partial(Encoded.under, path=path_field(path))
+        finish = partial(EncodedMessage.under, path=path_field(path))
         if shadow := self._shadows.find(path):
             self._subscriptions[path] = _Subscription(None, None, self._join_shadow(path, shadow, finish))
             return
-        topic = self._topics.mark(path) or self._topics.topic(path)
+        topic = self._topics.time_topic(path) or self._topics.topic(path)
         lane: Lane = StateLane(self.outbox, finish)
         if isinstance(topic, Topic) and topic.direction == "in":
             lane = EventLane(self.outbox, shorten(path), finish)
@@ -121,11 +121,11 @@ class Subscriber:
         """Listen to a topic of an injection, which a listener to originals holds; how to leave again."""
         injection, key = shadow.injection, object()
         to_message = encoder(injection.shape, injection.feed.block.layout)
-        if shadow.way is Way.ORIGINALS:
+        if shadow.kind is ShadowKind.ORIGINALS:
             leave = injection.originals("v2", to_message, self.outbox, shorten(path), finish)
             self._shadows.hold(injection, key)
         else:
-            leave = injection.gifts("v2", to_message, EventLane(self.outbox, shorten(path), finish))
+            leave = injection.given_values("v2", to_message, EventLane(self.outbox, shorten(path), finish))
 
         def over() -> None:
             log.info("a subscribed topic is gone: %s", injection.over, extra=fields(topic=shorten(path)))
@@ -143,8 +143,8 @@ class Subscriber:
         topic, lane = subscription.topic, subscription.lane
         if topic is None or lane is None:
             return
-        if isinstance(topic, Mark):
-            subscription.leave = self._marks.listen(topic, marked, lane)
+        if isinstance(topic, TimeTopic):
+            subscription.leave = self._time_topics.listen(topic, time_message, lane)
             return
         feed = self._topics.feed(topic.source)
         layout = feed.block.layout
@@ -159,10 +159,10 @@ class Subscriber:
 class Subscribers:
     """Those whose stream is open, by their uuid."""
 
-    def __init__(self, topics: Topics, shadows: Shadows, marks: Marks) -> None:
+    def __init__(self, topics: Topics, shadows: Shadows, time_topics: TimeTopics) -> None:
         self._topics = topics
         self._shadows = shadows
-        self._marks = marks
+        self._time_topics = time_topics
         self._open: dict[str, Subscriber] = {}
         self._arrived = asyncio.Event()
 
@@ -187,7 +187,7 @@ class Subscribers:
             log.info("subscriber %s came again; its stream before ends", shorten(name), extra=fields(uuid=uuid))
         elif len(self._open) >= MAX_SUBSCRIBERS:
             raise EndpointError(f"there are {MAX_SUBSCRIBERS} subscribers already; one stream serves many topics")
-        subscriber = self._open[uuid] = Subscriber(self._topics, self._shadows, self._marks, name, outbox, holder)
+        subscriber = self._open[uuid] = Subscriber(self._topics, self._shadows, self._time_topics, name, outbox, holder)
         self._arrived.set()
         self._arrived = asyncio.Event()
         return subscriber
@@ -236,13 +236,13 @@ class SimlogV2:
     name = SERVICE
 
     def __init__(
-        self, topics: Topics, publisher: Publisher, outboxes: Outboxes, shadows: Shadows, marks: Marks
+        self, topics: Topics, publisher: Publisher, outboxes: Outboxes, shadows: Shadows, time_topics: TimeTopics
     ) -> None:
         self._topics = topics
         self._publisher = publisher
         self._outboxes = outboxes
         self._shadows = shadows
-        self._subscribers = Subscribers(topics, shadows, marks)
+        self._subscribers = Subscribers(topics, shadows, time_topics)
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
         """The service's calls, for a server. Values are serialised where they are made, and once."""
@@ -269,10 +269,10 @@ class SimlogV2:
         """Tell what a topic is; ``exists`` is false, and no more said, for what does not exist."""
         if shadow := self._shadows.find(request.path):
             kind = value_type(shadow.injection.shape)
-            direction = wire.OUT if shadow.way is Way.ORIGINALS else wire.IN
+            direction = wire.OUT if shadow.kind is ShadowKind.ORIGINALS else wire.IN
             return wire.TopicInfo(path=request.path, type=kind, direction=direction, exists=True)
         try:
-            if self._topics.mark(request.path):
+            if self._topics.time_topic(request.path):
                 return wire.TopicInfo(path=request.path, type=wire.NUMBER, direction=wire.OUT, exists=True)
             topic, found = self._find(request.path)
             direction = await self._direction(topic, found)
@@ -326,8 +326,8 @@ class SimlogV2:
             topic, found = self._find(request.targetPath)
             encoder(found, self._topics.layout(topic))
             path_in, path_out = shadow_paths(request.shadowPathPrefix, topic)
-            ways = {path_in: Way.GIFTS, path_out: Way.ORIGINALS}
-            await self._shadows.lay_for_client(topic, found, ways, context.peer())
+            kinds = {path_in: ShadowKind.GIVEN, path_out: ShadowKind.ORIGINALS}
+            await self._shadows.lay_for_client(topic, found, kinds, context.peer())
         except ShmioError as error:
             await refuse(context, error)
         return wire.InjectResponse(shadowPathIn=path_in, shadowPathOut=path_out)
@@ -374,14 +374,14 @@ class SimlogV2:
     async def _direction(self, topic: Topic, found: Shape) -> wire.DirectionType:
         if topic.direction is not None:
             return wire.IN if topic.direction == "in" else wire.OUT
-        inlet = self._topics.feed(topic.source).inlet
-        return wire.INOUT if await inlet.writable(found.registers) else wire.OUT
+        commands = self._topics.feed(topic.source).commands
+        return wire.INOUT if await commands.writable(found.registers) else wire.OUT
 
     async def _read(self, paths: Iterable[str]) -> list[bytes]:
         """Serialised messages, made in turns; PathError, ValueRangeError."""
         wanted: list[tuple[str, str | Shadow, Shape]] = []
         members = elements = 0
-        async for path in turns(paths):
+        async for path in time_sliced(paths):
             shadow = self._shadows.find(path)
             topic, found = (shadow.injection.target, shadow.injection.shape) if shadow else self._find(path)
             members, elements = members + len(found.registers), elements + found.elements
@@ -394,10 +394,10 @@ class SimlogV2:
         sources = {source for _, source, _ in wanted if isinstance(source, str)}
         frames = {source: self._topics.feed(source).block.latest() for source in sources}
         return [
-            _shadowed(path, source)
+            _shadow_message(path, source)
             if isinstance(source, Shadow)
             else self._message(path, source, found, frames[source])
-            async for path, source, found in turns(wanted)
+            async for path, source, found in time_sliced(wanted)
         ]
 
     def _message(self, path: str, source: str, found: Shape, frame: Frame | None) -> bytes:
@@ -415,10 +415,10 @@ def _holder(context: Context) -> object:
     return holder_of(context.peer(), context.invocation_metadata() or (), context.auth_context())
 
 
-def _shadowed(path: str, shadow: Shadow) -> bytes:
+def _shadow_message(path: str, shadow: Shadow) -> bytes:
     """The message of an injection's topic: the original of ``/out`` as of now; of what is written there is none."""
     injection = shadow.injection
-    shown = injection.present() if shadow.way is Way.ORIGINALS else None
+    shown = injection.present() if shadow.kind is ShadowKind.ORIGINALS else None
     message = None if shown is None else encoder(injection.shape, injection.feed.block.layout)(shown)
     return (message or nothing(b"")).under(path_field(path))
 

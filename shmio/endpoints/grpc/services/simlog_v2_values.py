@@ -15,9 +15,9 @@ from google.protobuf.struct_pb2 import NULL_VALUE, ListValue
 from google.protobuf.struct_pb2 import Value as WireValue
 
 from shmio.endpoints.grpc.commands.path_kind import Shape
-from shmio.endpoints.grpc.commands.topics import Mark
+from shmio.endpoints.grpc.commands.topics import TimeTopic
 from shmio.endpoints.grpc.streams.encoding import delimited, varint
-from shmio.endpoints.grpc.streams.subject import Picture, Subject
+from shmio.endpoints.grpc.streams.subject import BlockImage, Subject
 from shmio.endpoints.grpc.time.virtual_time import Moment
 from shmio.errors import ValueRangeError
 from shmio.layout.model import Layout, Register
@@ -38,7 +38,7 @@ _DOUBLE: Final = struct.Struct("<Bd")
 _TYPES: Final = {"bool": wire.BOOL, "double": wire.NUMBER, "int": wire.NUMBER, "string": wire.STRING}
 
 
-class Encoded:
+class EncodedMessage:
     """A SimlogMessage without its path: the time stamp of its header, and the fields after that."""
 
     __slots__ = ("_last", "rest", "stamp")
@@ -74,7 +74,7 @@ def subject(found: Shape, layout: Layout) -> Subject:
     return Subject("v2", found.path, found.registers, encoder(found, layout))
 
 
-def encoder(found: Shape, layout: Layout) -> Callable[[Picture], Encoded | None]:
+def encoder(found: Shape, layout: Layout) -> Callable[[BlockImage], EncodedMessage | None]:
     """A function from a frame to the message; None where the bytes hold no value.
 
     ValueRangeError: it is too large, or too deep, for a message.
@@ -88,9 +88,9 @@ def encoder(found: Shape, layout: Layout) -> Callable[[Picture], Encoded | None]
     head = wire.SimlogMessage(type=value_type(found)).SerializeToString() + b"\x1a"
     serialise = _whole(found.registers[0], layout) if found.whole else _structure(found, layout)
 
-    def encode(picture: Picture) -> Encoded | None:
+    def encode(picture: BlockImage) -> EncodedMessage | None:
         value = serialise(picture.image)
-        return None if value is None else Encoded(time_stamp(picture.clock_ns), head + delimited(value))
+        return None if value is None else EncodedMessage(time_stamp(picture.clock_ns), head + delimited(value))
 
     return encode
 
@@ -108,16 +108,16 @@ def time_stamp(clock_ns: int) -> bytes:
     return b"\x0a" + delimited(whole + b"\x10" + varint(nanos) if nanos else whole)
 
 
-def nothing(stamp: bytes) -> Encoded:
+def nothing(stamp: bytes) -> EncodedMessage:
     """The message of a value that there is none of."""
-    return Encoded(stamp, wire.SimlogMessage(type=wire.NULL, value=to_wire(None)).SerializeToString())
+    return EncodedMessage(stamp, wire.SimlogMessage(type=wire.NULL, value=to_wire(None)).SerializeToString())
 
 
-def marked(mark: Mark, moment: Moment) -> Encoded:
+def time_message(topic: TimeTopic, moment: Moment) -> EncodedMessage:
     """The message of a topic of time: a step's number, or seconds."""
-    value = moment.number if mark is Mark.STEP else moment.clock_ns / 1e9
+    value = moment.number if topic is TimeTopic.STEP else moment.clock_ns / 1e9
     message = wire.SimlogMessage(type=wire.NUMBER, value=to_wire(value))
-    return Encoded(time_stamp(moment.clock_ns), message.SerializeToString())
+    return EncodedMessage(time_stamp(moment.clock_ns), message.SerializeToString())
 
 
 def repeated(messages: Iterable[bytes]) -> bytes:

@@ -13,7 +13,7 @@ from shmio.endpoints.grpc.services.error_status import Context, refuse
 from shmio.endpoints.grpc.streams.outbox import StateLane
 from shmio.endpoints.grpc.streams.outboxes import Outboxes
 from shmio.endpoints.grpc.time.stepper import Stepper
-from shmio.endpoints.grpc.time.virtual_time import Status
+from shmio.endpoints.grpc.time.virtual_time import TimeStatus
 from shmio.errors import ShmioError
 from shmio.wire import simserver_pb2 as wire
 
@@ -86,13 +86,13 @@ class SimServer:
                 self._lanes.pop(lane, None)
             await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, outbox.failure)
 
-    async def _answer(self, call: Awaitable[Status], context: Context) -> wire.SimStatus:
+    async def _answer(self, call: Awaitable[TimeStatus], context: Context) -> wire.SimStatus:
         try:
             return _wire(await call)
         except ShmioError as error:
             await refuse(context, error)
 
-    def _tell(self, status: Status) -> None:
+    def _tell(self, status: TimeStatus) -> None:
         if self._lanes:
             message = _wire(status).SerializeToString()
             for lane in self._lanes:
@@ -103,7 +103,7 @@ def _ns(delta_ms: int) -> int | None:
     return delta_ms * _MS or None
 
 
-def _wire(status: Status) -> wire.SimStatus:
+def _wire(status: TimeStatus) -> wire.SimStatus:
     return wire.SimStatus(
         clock=status.clock_ns // _MS, deltaTime=status.dt_ns // _MS, alive=status.alive, playing=status.playing
     )

@@ -12,7 +12,7 @@ import grpc
 from shmio.endpoints.grpc.services.error_status import Context, refuse
 from shmio.endpoints.grpc.streams.encoding import field
 from shmio.endpoints.grpc.time.stepper import Stepper
-from shmio.endpoints.grpc.time.virtual_time import Status
+from shmio.endpoints.grpc.time.virtual_time import TimeStatus
 from shmio.errors import EndpointError, ShmioError, ValueRangeError
 from shmio.segment import Segment
 from shmio.segment.clock import ClockState
@@ -24,7 +24,7 @@ MAX_ANSWERS: Final = 1024
 STEPS: Final = wire.StepsResponse.DESCRIPTOR.fields_by_name["steps"].number
 
 
-class Steps:
+class StepsCall:
     """One call of Steps."""
 
     def __init__(self, stepper: Stepper, peer: str) -> None:
@@ -32,7 +32,7 @@ class Steps:
         self._stepper = stepper
         self._peer = peer
         self._answers: list[bytes] = []
-        self._news = asyncio.Event()  # there is an answer, or there will be no more
+        self._wake = asyncio.Event()  # there is an answer, or there will be no more
         self._room = asyncio.Event()
 
     async def messages(self, requests: AsyncIterator[wire.StepsRequest]) -> AsyncIterator[bytes]:
@@ -41,12 +41,12 @@ class Steps:
         TimeError: a step has failed, after the answers to those before it; ValueRangeError.
         """
         working = asyncio.get_running_loop().create_task(self._work(requests))
-        working.add_done_callback(lambda _: self._news.set())
+        working.add_done_callback(lambda _: self._wake.set())
         try:
             while self._answers or not working.done():
                 if not self._answers:
-                    self._news.clear()
-                    await self._news.wait()
+                    self._wake.clear()
+                    await self._wake.wait()
                     continue
                 answers, self._answers = self._answers, []
                 self._room.set()
@@ -64,14 +64,14 @@ class Steps:
                 step = await self._stepper.step(request.dt_ns or None, self._peer)
                 answer = wire.Step(number=step.number, time_ns=step.time_ns)
                 self._answers.append(field(STEPS, answer.SerializeToString()))
-                self._news.set()
+                self._wake.set()
 
 
 MAX_WATCHERS = 256
 """WatchClock calls that may be open at once."""
 
 
-class Clocks:
+class TimeCalls:
     """A part of the service."""
 
     def __init__(self, segment: Segment, stepper: Stepper) -> None:
@@ -85,7 +85,7 @@ class Clocks:
         unary, clock = grpc.unary_unary_rpc_method_handler, wire.Clock.SerializeToString
         return {
             "Step": unary(self.step, wire.StepRequest.FromString, clock),
-            "Steps": grpc.stream_stream_rpc_method_handler(self.steps, wire.StepsRequest.FromString),
+            "StepsCall": grpc.stream_stream_rpc_method_handler(self.steps, wire.StepsRequest.FromString),
             "SetStepSize": unary(self.set_step_size, wire.SetStepSizeRequest.FromString, clock),
             "Play": unary(self.play, wire.PlayRequest.FromString, clock),
             "Pause": unary(self.pause, wire.PauseRequest.FromString, clock),
@@ -109,7 +109,7 @@ class Clocks:
     async def steps(self, requests: AsyncIterator[wire.StepsRequest], context: Context) -> AsyncIterator[bytes]:
         """The same, without a call for each; the first that fails ends it. Errors as of :meth:`step`."""
         try:
-            async for message in Steps(self._stepper, context.peer()).messages(requests):
+            async for message in StepsCall(self._stepper, context.peer()).messages(requests):
                 yield message
         except ShmioError as error:
             await refuse(context, error)
@@ -157,7 +157,7 @@ class Clocks:
             await refuse(context, error)
         return clock(self._segment.clock.read())
 
-    def _tell(self, _: Status) -> None:
+    def _tell(self, _: TimeStatus) -> None:
         for news in self._watchers:
             news.set()
 

@@ -59,7 +59,7 @@ def column_of(element: ElementType) -> Column:
     return _BY_BASE.get(element.base) or _COLUMNS.get(scalar_codec(element).plain, Column.TEXT)
 
 
-class Decoded(NamedTuple):
+class DecodedImage(NamedTuple):
     """All elements of an image. ``invalid``: places of the registers of which some bytes are no value."""
 
     arrays: Mapping[Column, Array]
@@ -68,7 +68,7 @@ class Decoded(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class _Numbers:
+class _NumberGroup:
     """Elements of one type: ``bytes`` says, by element, where its bytes are, the least significant first."""
 
     slots: slice
@@ -77,7 +77,7 @@ class _Numbers:
 
 
 @dataclass(frozen=True, slots=True)
-class _Other:
+class _SingleElement:
     """An element that is not just a number; ``register``: its place."""
 
     column: Column
@@ -88,7 +88,7 @@ class _Other:
     size: int
 
 
-class _Rest(NamedTuple):
+class _SingleValues(NamedTuple):
     """Elements that are not just numbers. ``invalid``: those that are no value, of the registers at ``places``."""
 
     numbers: Mapping[Column, Mapping[int, Any]]
@@ -105,8 +105,8 @@ class Columns:
         """Column and first slot of each register."""
         self.sizes = dict.fromkeys(Column, 0)
         """Slots of each column."""
-        self._numbers: list[tuple[Column, _Numbers]] = []
-        self._others: list[_Other] = []
+        self._numbers: list[tuple[Column, _NumberGroup]] = []
+        self._others: list[_SingleElement] = []
         groups: dict[tuple[Column, str], list[int]] = {}
         for place, register in enumerate(registers):
             column = column_of(register.element)
@@ -130,15 +130,17 @@ class Columns:
         before = np.repeat(np.cumsum([0, *sizes[:-1]]), sizes) if sizes else np.zeros(0, np.intp)
         self._watched = starts + np.arange(len(starts)) - before
         self._owners = np.repeat(np.arange(len(sizes)), sizes)  # whose each of the watched bytes is
-        self._seen: tuple[Array, _Rest] | None = None
+        self._seen: tuple[Array, _SingleValues] | None = None
 
-    def _others_of(self, members: Sequence[int], registers: Sequence[Register], order: ByteOrder) -> Iterable[_Other]:
+    def _others_of(
+        self, members: Sequence[int], registers: Sequence[Register], order: ByteOrder
+    ) -> Iterable[_SingleElement]:
         for place, register in zip(members, registers, strict=True):
             column, first = self.places[place]
             decode = scalar_codec(register.element, order).decode
             for flat in range(register.count):
                 at = register.offset + flat * register.element.stride
-                yield _Other(column, first + flat, place, decode, at, register.element.size)
+                yield _SingleElement(column, first + flat, place, decode, at, register.element.size)
 
     def place(self, column: Column, slot: int) -> int | None:
         """Place of the register that has a slot; None: there is no such slot."""
@@ -194,22 +196,25 @@ class Columns:
             left &= ~mine
         return np.flatnonzero(left)
 
-    def decode(self, image: bytes) -> Decoded:
+    def decode(self, image: bytes) -> DecodedImage:
         """All elements of an image of the block."""
         arrays = self.decode_numbers(image)
         if not self._others:
-            return Decoded(arrays, (), ())
+            return DecodedImage(arrays, (), ())
         rest = self._rest(image, np.frombuffer(image, np.uint8))
         for column, found in rest.numbers.items():
             for slot, value in found.items():
                 arrays[column][slot] = value
-        return Decoded(arrays, rest.texts, rest.places)
+        return DecodedImage(arrays, rest.texts, rest.places)
 
-    def _rest(self, image: bytes, data: Array) -> _Rest:
+    def _rest(self, image: bytes, data: Array) -> _SingleValues:
         """What is decoded one by one; not again while its bytes stay the same."""
         watched = data[self._watched]
         if self._seen is None:
-            changed, before = range(len(self._others)), _Rest({}, ("",) * self.sizes[Column.TEXT], frozenset(), ())
+            changed, before = (
+                range(len(self._others)),
+                _SingleValues({}, ("",) * self.sizes[Column.TEXT], frozenset(), ()),
+            )
         else:
             seen, before = self._seen
             changed = np.unique(self._owners[watched != seen]).tolist()
@@ -226,11 +231,11 @@ class Columns:
             else:
                 numbers.setdefault(other.column, {})[other.slot] = 0 if value is None else value
         places = tuple(sorted({self._others[index].register for index in invalid}))
-        self._seen = watched, _Rest(numbers, tuple(texts), frozenset(invalid), places)
+        self._seen = watched, _SingleValues(numbers, tuple(texts), frozenset(invalid), places)
         return self._seen[1]
 
 
-def pack(new: Decoded, old: Decoded | None = None, deadband: float = 0.0) -> bytes:
+def pack(new: DecodedImage, old: DecodedImage | None = None, deadband: float = 0.0) -> bytes:
     """A serialised ``Values`` of what differs, by its bits; of all without an ``old``; empty: nothing does.
 
     ``deadband``: numbers that differ by no more are left out.
@@ -256,7 +261,7 @@ def pack(new: Decoded, old: Decoded | None = None, deadband: float = 0.0) -> byt
     return b"".join(parts)
 
 
-def pack_slots(values: Decoded, chosen: Mapping[Column, Array]) -> bytes:
+def pack_slots(values: DecodedImage, chosen: Mapping[Column, Array]) -> bytes:
     """A serialised ``Values`` of these slots."""
     parts = []
     for column, slots in chosen.items():
@@ -268,14 +273,14 @@ def pack_slots(values: Decoded, chosen: Mapping[Column, Array]) -> bytes:
     return b"".join(parts)
 
 
-def merge(new: Decoded, old: Decoded, deadband: float) -> Decoded:
+def merge(new: DecodedImage, old: DecodedImage, deadband: float) -> DecodedImage:
     """What somebody has after :func:`pack`: of a number that was left out, the old one."""
     arrays = {}
     for column, values in new.arrays.items():
         slots = _differing(column, old.arrays[column], values, deadband)
         arrays[column] = old.arrays[column].copy()
         arrays[column][slots] = values[slots]
-    return Decoded(arrays, new.texts, new.invalid)
+    return DecodedImage(arrays, new.texts, new.invalid)
 
 
 def _differing(column: Column, old: Array, new: Array, deadband: float) -> Array:
@@ -292,12 +297,12 @@ def _texts(texts: Iterable[str]) -> bytes:
     return b"".join(field(2, text.encode()) for text in texts)
 
 
-def _numbers(registers: Sequence[Register], code: str, order: ByteOrder, slots: slice) -> _Numbers:
+def _numbers(registers: Sequence[Register], code: str, order: ByteOrder, slots: slice) -> _NumberGroup:
     kind = np.dtype(f"<{code}")
     starts = [register.offset + np.arange(register.count) * register.element.stride for register in registers]
     within = np.arange(kind.itemsize)
     where = np.concatenate(starts)[:, None] + (within[::-1] if order == "big" else within)
-    return _Numbers(slots, where.astype(np.intp), kind)
+    return _NumberGroup(slots, where.astype(np.intp), kind)
 
 
 def _bits(registers: Sequence[Register]) -> tuple[Array, Array]:

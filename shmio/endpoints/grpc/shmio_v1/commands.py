@@ -12,12 +12,12 @@ from shmio.endpoints.grpc.commands import command_client
 from shmio.endpoints.grpc.commands.topics import Topics
 from shmio.endpoints.grpc.services.error_status import Context, refuse
 from shmio.endpoints.grpc.shmio_v1 import describe
-from shmio.endpoints.grpc.shmio_v1.declare import Campaign
-from shmio.endpoints.grpc.shmio_v1.inject import Injection
+from shmio.endpoints.grpc.shmio_v1.declare import DeclareCall
+from shmio.endpoints.grpc.shmio_v1.inject import InjectCall
 from shmio.endpoints.grpc.shmio_v1.selection import Selections
 from shmio.endpoints.grpc.shmio_v1.values import assigned, outcome
 from shmio.endpoints.grpc.streams.feed import Feed
-from shmio.endpoints.grpc.streams.wakeups import Bells
+from shmio.endpoints.grpc.streams.wakeups import WakeUps
 from shmio.errors import CommandError, EndpointError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import shorten
 from shmio.segment import Block
@@ -29,15 +29,15 @@ MAX_INJECTIONS: Final = 256
 MAX_TIMEOUT_MS: Final = 86_400_000
 
 
-class Orders:
+class CommandCalls:
     """A part of the service."""
 
-    def __init__(self, topics: Topics, feeds: Mapping[str, Feed], selections: Selections, bells: Bells) -> None:
+    def __init__(self, topics: Topics, feeds: Mapping[str, Feed], selections: Selections, wake_ups: WakeUps) -> None:
         self._topics = topics
         self._feeds = feeds
         self._selections = selections
-        self._bells = bells
-        self._open: set[Injection | Campaign] = set()
+        self._wake_ups = wake_ups
+        self._open: set[InjectCall | DeclareCall] = set()
         self._turn = asyncio.Lock()
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -68,8 +68,8 @@ class Orders:
                 raise ValueRangeError(f"timeout_ms: at most {MAX_TIMEOUT_MS}, a day")
             source, values = await assigned(request.values, self._topics)
             timeout_s = request.timeout_ms / 1000 or None
-            inlet = self._topics.feed(source).inlet
-            ends = await command_client.write(inlet, values, timeout_s, until_accepted=request.until_accepted)
+            commands = self._topics.feed(source).commands
+            ends = await command_client.write(commands, values, timeout_s, until_accepted=request.until_accepted)
             return wire.WriteResponse(outcomes=[outcome(*end) for end in ends])
         except ShmioError as error:
             await refuse(context, error)
@@ -106,12 +106,12 @@ class Orders:
         if injection.over:
             await context.abort(grpc.StatusCode.ABORTED, f"{injection.source}: {injection.over}")
 
-    async def _injection(self, requests: AsyncIterator[wire.InjectRequest]) -> Injection:
+    async def _injection(self, requests: AsyncIterator[wire.InjectRequest]) -> InjectCall:
         """What the first message asks for. PathError, ValueRangeError, EndpointError."""
         self._check_room()
         async for request in requests:
             if request.WhichOneof("what") == "lay":
-                injection = Injection(self._topics, self._selections, self._bells, request.lay)
+                injection = InjectCall(self._topics, self._selections, self._wake_ups, request.lay)
                 self._open.add(injection)
                 return injection
             break
@@ -122,7 +122,7 @@ class Orders:
         if len(self._open) >= MAX_INJECTIONS:
             raise EndpointError(f"{MAX_INJECTIONS} calls of Inject and Declare are open, the most there may be")
 
-    async def _close(self, one: Injection | Campaign, opening: asyncio.Task[bytes]) -> None:
+    async def _close(self, one: InjectCall | DeclareCall, opening: asyncio.Task[bytes]) -> None:
         try:
             await asyncio.wait((opening,))
             if not opening.cancelled() and opening.exception() is None:
@@ -139,7 +139,7 @@ class Orders:
         opening: asyncio.Task[bytes] | None = None
         try:
             self._check_room()
-            campaign = Campaign(self._feeds, request, self._turn)
+            campaign = DeclareCall(self._feeds, request, self._turn)
             self._open.add(campaign)
             opening = asyncio.get_running_loop().create_task(campaign.open())
             yield await asyncio.shield(opening)
@@ -191,7 +191,7 @@ class Orders:
         return wire.LiftResponse(lifted=lifted)
 
     async def _lift(self, block: Block, one: Standing) -> wire.Lifted:
-        failure = await command_client.lift(self._feeds[block.source].inlet, one.id)
+        failure = await command_client.lift(self._feeds[block.source].commands, one.id)
         return wire.Lifted(source=block.source, number=one.id, name=one.name, failure=failure)
 
     def blocks(self, sources: Collection[str]) -> list[Block]:

@@ -13,9 +13,9 @@ from shmio.config import Declaration
 from shmio.config.campaign import parse_campaign
 from shmio.config.declaration import MAX_DECLARATIONS
 from shmio.endpoints.grpc.commands import command_client
-from shmio.endpoints.grpc.commands.block_commands import Inlet
-from shmio.endpoints.grpc.commands.followers import Follower
-from shmio.endpoints.grpc.shmio_v1.waiting import Waiting
+from shmio.endpoints.grpc.commands.command_client import CommandClient
+from shmio.endpoints.grpc.commands.followers import InjectionFollower
+from shmio.endpoints.grpc.shmio_v1.send_queue import SendQueue
 from shmio.endpoints.grpc.streams.encoding import field
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.errors import CommandError, ValueRangeError
@@ -42,7 +42,7 @@ _KINDS: Final = {
 }
 
 
-class Campaign:
+class DeclareCall:
     """One call of Declare."""
 
     def __init__(self, feeds: Mapping[str, Feed], request: wire.DeclareRequest, turn: asyncio.Lock) -> None:
@@ -61,9 +61,9 @@ class Campaign:
         self._feeds = feeds
         self._turn = turn
         self._keep = request.keep
-        self._members: list[Member] = []
-        self._waiting = Waiting()  # serialised fields of a DeclareResponse
-        self._news = asyncio.Event()
+        self._members: list[DeclaredInjection] = []
+        self._waiting = SendQueue()  # serialised fields of a DeclareResponse
+        self._wake = asyncio.Event()
         self._laid = False
         self._abandoned = False
         self._lifting: asyncio.Task[None] | None = None
@@ -87,11 +87,11 @@ class Campaign:
         try:
             for program in programs:
                 declaration = program.declaration
-                member = Member(self, program.source, feeds[program.source].inlet)
+                member = DeclaredInjection(self, program.source, feeds[program.source].commands)
                 if self._abandoned:
                     raise CommandError("the client is gone")
                 try:
-                    member.number = await command_client.declare(member.inlet, declaration, member, keep=self._keep)
+                    member.number = await command_client.declare(member.commands, declaration, member, keep=self._keep)
                 except CommandError as error:
                     raise CommandError(f'{error} (injection "{declaration.name}")') from None
                 self._members.append(member)
@@ -115,23 +115,23 @@ class Campaign:
         elif not self._keep:
             await self._lift()
         for member in self._members:
-            member.inlet.followers.remove(member.number)
+            member.commands.followers.remove(member.number)
 
     async def _lift(self) -> None:
         await asyncio.gather(
-            *(command_client.have_lifted(one.inlet, one.number, one.source) for one in self._members if not one.gone)
+            *(command_client.have_lifted(one.commands, one.number, one.source) for one in self._members if not one.gone)
         )
 
     async def messages(self) -> AsyncIterator[bytes]:
         """Serialised DeclareResponses, until nothing of it stands."""
         while True:
-            self._news.clear()  # before looking
+            self._wake.clear()  # before looking
             if self._waiting:
                 yield self._waiting.all()
             elif self.over or all(member.gone for member in self._members):
                 return
             else:
-                await self._news.wait()
+                await self._wake.wait()
 
     def tell(self, happening: wire.Happening) -> None:
         """Something was done with one of them."""
@@ -139,14 +139,14 @@ class Campaign:
             return
         if reason := self._waiting.add(field(_HAPPENINGS, happening.SerializeToString())):
             self.end(reason)
-        self._news.set()
+        self._wake.set()
 
     def end(self, reason: str) -> None:
         """What comes next is not all there was. A client that does not read would hold up the stream's end."""
         self.over = self.over or reason
         if self._laid and not self._keep and self._lifting is None:
             self._lifting = asyncio.get_running_loop().create_task(self._lift())
-        self._news.set()
+        self._wake.set()
 
 
 def _check(
@@ -169,12 +169,12 @@ def _check(
     return check(declarations, blocks, wanted)
 
 
-class Member(Follower):
+class DeclaredInjection(InjectionFollower):
     """One injection of a campaign."""
 
-    def __init__(self, campaign: Campaign, source: str, inlet: Inlet) -> None:
+    def __init__(self, campaign: DeclareCall, source: str, commands: CommandClient) -> None:
         self.source = source
-        self.inlet = inlet
+        self.commands = commands
         self.number = 0
         self.gone = False
         """Whether it stands no more."""
@@ -203,7 +203,7 @@ class Member(Follower):
         """It was lifted, or its source is gone."""
         if not self.gone:
             self.gone = True
-            now_ns = self.inlet.block.clock.read().present_ns
+            now_ns = self.commands.block.clock.read().present_ns
             lifted = wire.Happening.KIND_LIFTED
             self._campaign.tell(
                 wire.Happening(source=self.source, number=self.number, kind=lifted, clock_ns=now_ns, text=reason)

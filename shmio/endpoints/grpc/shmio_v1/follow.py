@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Protocol
 
-from shmio.endpoints.grpc.shmio_v1.columns import Decoded
-from shmio.endpoints.grpc.shmio_v1.views import MISSED, QUALITY, REASON, Message, Selection, View, head
+from shmio.endpoints.grpc.shmio_v1.columns import DecodedImage
+from shmio.endpoints.grpc.shmio_v1.views import MISSED, QUALITY, REASON, Selection, UpdateMessage, View, head
 from shmio.endpoints.grpc.streams.encoding import field, number
 from shmio.errors import SegmentError
 from shmio.segment import Block, Frame, Quality
@@ -14,7 +14,7 @@ from shmio.segment import Block, Frame, Quality
 _QUALITY_BAD = number(QUALITY, 0)  # said last it holds, also where the frame was good when it was published
 
 
-class Follower(Protocol):
+class BlockFollower(Protocol):
     """A subscriber's place in a block."""
 
     view: View
@@ -39,7 +39,7 @@ class EveryFrame:
         self._cursor = view.block.cursor(after=max(0, view.block.ring.head() - 1))
         self._missed = 0
         self._shown: Frame | None = None
-        self._age = _Age(view)
+        self._age = _AgeWatch(view)
 
     @property
     def begun(self) -> bool:
@@ -59,7 +59,7 @@ class EveryFrame:
         return update + self._age.of(frame, newest=not self._cursor.behind)
 
 
-class Latest:
+class LatestFrame:
     """The newest frame whenever there is one that shows something else; not more often than wanted."""
 
     def __init__(self, view: View, interval_s: float, deadband: float) -> None:
@@ -69,8 +69,8 @@ class Latest:
         self._deadband = deadband
         self._last_s = -math.inf
         self._shown: Frame | None = None
-        self._sent: Decoded | None = None  # with a dead-band
-        self._age = _Age(view)
+        self._sent: DecodedImage | None = None  # with a dead-band
+        self._age = _AgeWatch(view)
 
     @property
     def begun(self) -> bool:
@@ -101,7 +101,7 @@ class Latest:
         self._last_s = now_s
         return b"".join(update) + added
 
-    def _update(self, frame: Frame, shown: Frame | None) -> Message:
+    def _update(self, frame: Frame, shown: Frame | None) -> UpdateMessage:
         if not (self._deadband and isinstance(self.view, Selection)):
             return self.view.update(frame, shown)
         if shown is None or self._sent is None or not shown.source_ns:
@@ -111,7 +111,7 @@ class Latest:
         return update
 
 
-class _Age:
+class _AgeWatch:
     """Says once that what was shown last has become too old."""
 
     def __init__(self, view: View) -> None:

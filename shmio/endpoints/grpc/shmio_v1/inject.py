@@ -9,17 +9,17 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from shmio.endpoints.grpc.commands import command_client
-from shmio.endpoints.grpc.commands.followers import Follower
+from shmio.endpoints.grpc.commands.followers import InjectionFollower
 from shmio.endpoints.grpc.commands.topics import Topics
-from shmio.endpoints.grpc.injection.injection_base import Beneath
+from shmio.endpoints.grpc.injection.injection_base import InjectionBase
 from shmio.endpoints.grpc.shmio_v1.columns import Array, pack, pack_slots
-from shmio.endpoints.grpc.shmio_v1.selection import MAX_PATTERNS, Place, Selections
+from shmio.endpoints.grpc.shmio_v1.selection import MAX_PATTERNS, Selections, SourceDirection
+from shmio.endpoints.grpc.shmio_v1.send_queue import SendQueue
 from shmio.endpoints.grpc.shmio_v1.values import MAX_VALUES, assigned, outcome, packed
 from shmio.endpoints.grpc.shmio_v1.views import VALUES, head
-from shmio.endpoints.grpc.shmio_v1.waiting import Waiting
-from shmio.endpoints.grpc.shmio_v1.written import head_of
+from shmio.endpoints.grpc.shmio_v1.write_updates import head_of
 from shmio.endpoints.grpc.streams.encoding import field
-from shmio.endpoints.grpc.streams.wakeups import Bells
+from shmio.endpoints.grpc.streams.wakeups import WakeUps
 from shmio.endpoints.in_flight import End, worst
 from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import Topic, shorten
@@ -33,15 +33,15 @@ _RANGES: Final = wire.Table.DESCRIPTOR.fields_by_name["ranges"].number
 _PIECES: Final = wire.Update.DESCRIPTOR.fields_by_name["pieces"].number
 
 
-class Target(NamedTuple):
+class InjectTarget(NamedTuple):
     """A place, the topics that patterns name in it, and ranges."""
 
-    place: Place
+    place: SourceDirection
     topics: tuple[Topic, ...]
     ranges: tuple[wire.Range, ...]
 
 
-def target_of(topics: Topics, lay: wire.Lay) -> Target:
+def target_of(topics: Topics, lay: wire.Lay) -> InjectTarget:
     """What it is to stand over. PathError, ValueRangeError."""
     if not (lay.patterns or lay.ranges):
         raise ValueRangeError("no pattern is given, and no range: an injection stands over something")
@@ -49,7 +49,7 @@ def target_of(topics: Topics, lay: wire.Lay) -> Target:
         if given > MAX_PATTERNS:
             raise ValueRangeError(f"{given} {name}, {MAX_PATTERNS} are the most: use stars, or structures")
     found = tuple(dict.fromkeys(topics.topic(pattern) for pattern in lay.patterns))
-    places = {Place(topic.source, topic.direction == "in") for topic in found}
+    places = {SourceDirection(topic.source, topic.direction == "in") for topic in found}
     if len({place.source for place in places}) > 1:
         raise PathError("one injection is over one source: lay one for each, with a stream each")
     if len(places) > 1:
@@ -60,13 +60,13 @@ def target_of(topics: Topics, lay: wire.Lay) -> Target:
         topic = topics.topic(lay.source)
         if topic.path or topic.direction:
             raise PathError(f"source: {shorten(lay.source)} is not a source's name")
-        places.add(Place(topic.source, places.pop().inward if places else lay.direction == wire.DIRECTION_IN))
+        places.add(SourceDirection(topic.source, places.pop().inward if places else lay.direction == wire.DIRECTION_IN))
     if len(places) != 1:
         raise PathError("source: ranges without a pattern need to be told whose bytes they are")
-    return Target(places.pop(), found, tuple(lay.ranges))
+    return InjectTarget(places.pop(), found, tuple(lay.ranges))
 
 
-class Ranges:
+class ByteRanges:
     """The bytes and bits that an injection is over besides registers."""
 
     def __init__(self, ranges: Iterable[wire.Range], size: int) -> None:
@@ -147,23 +147,23 @@ MAX_LIFETIME_MS: Final = 86_400_000
 _ORIGINALS, _ANSWERS = (wire.InjectResponse.DESCRIPTOR.fields_by_name[name].number for name in ("originals", "answers"))
 
 
-class Injection(Follower):
+class InjectCall(InjectionFollower):
     """One call of Inject."""
 
-    def __init__(self, topics: Topics, selections: Selections, bells: Bells, lay: wire.Lay) -> None:
+    def __init__(self, topics: Topics, selections: Selections, wake_ups: WakeUps, lay: wire.Lay) -> None:
         """PathError, ValueRangeError: as of the request."""
         _check(lay)
         self._topics = topics
         self._selections = selections
-        self._bells = bells
+        self._wake_ups = wake_ups
         self._lay = lay
         self.over = ""
         """Why it has to end, if it was somebody else who lifted it, or nobody reads what it stands over."""
         self._lifted = self._ended = False
         self._lifting: asyncio.Task[None] | None = None
         self._target = target_of(topics, lay)
-        self._news = asyncio.Event()
-        self._waiting = Waiting()  # serialised fields of an InjectResponse
+        self._wake = asyncio.Event()
+        self._waiting = SendQueue()  # serialised fields of an InjectResponse
         self.failure: ShmioError | None = None
         """What is wrong with what the client sends."""
         self._giving: set[asyncio.Task[None]] = set()
@@ -186,16 +186,16 @@ class Injection(Follower):
         """Lay it; the first message. PathError, ValueRangeError, CommandError, EndpointError."""
         self._view = view = await self._selections.registers({self._target.place: self._target.topics})
         size = view.block.layout.size
-        self._ranges = Ranges(self._target.ranges, size)
+        self._ranges = ByteRanges(self._target.ranges, size)
         registers = covering(view.registers, size)
         self._bits = bytes(a | b for a, b in zip(registers, self._ranges.bits, strict=True))
-        self._beneath = Beneath(view.block)
-        self._inlet = self._selections.inlet(self.source)
-        if self._inlet.block is not view.block:
+        self._base = InjectionBase(view.block)
+        self._commands = self._selections.commands(self.source)
+        if self._commands.block is not view.block:
             raise CommandError(f"{self.source}: it was changed by a reload in this very moment; try again")
         lay = self._lay
-        self._beneath.number = await command_client.lay(
-            self._inlet,
+        self._base.number = await command_client.lay(
+            self._commands,
             self._bits,
             self,
             direction=Direction.IN if self._inward else Direction.OUT,
@@ -207,8 +207,8 @@ class Injection(Follower):
         if lay.lifetime_ms:
             self._timer = asyncio.get_running_loop().call_later(lay.lifetime_ms / 1000, self._end)
         if self._originals:
-            self._bells.join(view.block, self._news.set)
-        laid = wire.Laid(number=self._beneath.number).SerializeToString()
+            self._wake_ups.join(view.block, self._wake.set)
+        laid = wire.Laid(number=self._base.number).SerializeToString()
         return field(1, laid + field(2, view.table + self._ranges.table))
 
     @property
@@ -223,10 +223,10 @@ class Injection(Follower):
         if self._timer is not None:
             self._timer.cancel()
         if self._originals:
-            self._bells.leave(self._view.block, self._news.set)
-        number = self._beneath.number
+            self._wake_ups.leave(self._view.block, self._wake.set)
+        number = self._base.number
         if self._lay.keep or self._lifted:
-            self._inlet.followers.remove(number)
+            self._commands.followers.remove(number)
         else:
             self._lifting = self._lifting or self._lift()
             await self._lifting
@@ -234,17 +234,17 @@ class Injection(Follower):
     def _lift(self) -> asyncio.Task[None]:
         name = f"{self.source}: {self._lay.name}"
         return asyncio.get_running_loop().create_task(
-            command_client.have_lifted(self._inlet, self._beneath.number, name)
+            command_client.have_lifted(self._commands, self._base.number, name)
         )
 
     def _end(self) -> None:
         self._ended = True
-        self._news.set()
+        self._wake.set()
 
     async def messages(self) -> AsyncIterator[bytes]:
         """Serialised InjectResponses, until it is over or its time is."""
         while True:
-            self._news.clear()  # before looking
+            self._wake.clear()  # before looking
             if self._waiting:
                 yield self._waiting.all()
             elif original := self._original():
@@ -252,7 +252,7 @@ class Injection(Follower):
             elif self._ended or self.over:
                 return
             else:
-                await self._news.wait()
+                await self._wake.wait()
 
     # ---- up: what the client gives -----------------------------------------------------------------------------
 
@@ -283,7 +283,7 @@ class Injection(Follower):
         try:
             async with self._in_order:  # a large message takes turns, in which those behind it must not pass
                 values, raw = await self._values(shadow)
-            ends: Sequence[End] = await command_client.give(self._inlet, self._beneath.number, values, raw)
+            ends: Sequence[End] = await command_client.give(self._commands, self._base.number, values, raw)
         except ShmioError as error:
             if not shadow.sequence:
                 raise
@@ -318,7 +318,7 @@ class Injection(Follower):
         frame = block.latest() if shown is None or block.ring.head() != shown.number else shown
         if frame is None:
             return None
-        image = self._beneath.image(frame.raw)
+        image = self._base.image(frame.raw)
         if shown is not None and image == self._shown_image and frame.quality == shown.quality:
             self._shown = frame
             return None
@@ -334,13 +334,13 @@ class Injection(Follower):
 
     def divert(self, diverted: Diverted) -> None:
         """A command's values went to it: over ``/in`` what was written, over ``/out`` what others further in give."""
-        self._beneath.divert(diverted.writes)
+        self._base.divert(diverted.writes)
         if not self._inward:
             self.restack()
         elif not self._lay.quiet:
             mask = bytearray(len(self._bits))
             apply(mask, (write._replace(data=b"\xff" * len(write.data)) for write in diverted.writes))
-            image, touched = bytes(self._beneath.given), bytes(mask)
+            image, touched = bytes(self._base.given), bytes(mask)
             columns = self._view.columns
             values = pack_slots(columns.decode(image), columns.touched(touched))
             body = (field(VALUES, values) if values else b"") + self._ranges.touched(image, touched)
@@ -349,26 +349,26 @@ class Injection(Follower):
     def _tell(self, message: bytes) -> None:
         if not self.over and (reason := self._waiting.add(message)):
             self._give_up(reason)
-        self._news.set()
+        self._wake.set()
 
     def _give_up(self, reason: str) -> None:
         """Have it lifted at once: a client that does not read holds up the stream's end."""
         self.over = self.over or reason
-        if self._beneath.number and not (self._lay.keep or self._lifted):
+        if self._base.number and not (self._lay.keep or self._lifted):
             self._lifting = self._lifting or self._lift()
-        self._news.set()
+        self._wake.set()
 
     def restack(self) -> None:
         """An injection was laid or lifted, on the same source."""
         if not self._inward:
-            self._beneath.restack()
-            self._news.set()
+            self._base.restack()
+            self._wake.set()
 
     def lifted(self, reason: str) -> None:
         """It was lifted, and not by this stream."""
         self._lifted = True
         self.over = f"it was lifted: {reason}" if reason != "lifted" else "somebody has lifted it"
-        self._news.set()
+        self._wake.set()
 
     def fail(self, reason: str) -> None:
         """What comes next is not all there was: over ``/out`` frames have it."""

@@ -20,7 +20,7 @@ MAX_TEXT: Final = 4096
 MAX_SOURCES: Final = 256
 
 
-class Moves:
+class ReplayCalls:
     """A part of the service."""
 
     def __init__(self, segment: Segment) -> None:

@@ -9,9 +9,9 @@ from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 from weakref import WeakValueDictionary
 
-from shmio.endpoints.grpc.commands.block_commands import Inlet
+from shmio.endpoints.grpc.commands.command_client import CommandClient
 from shmio.endpoints.grpc.commands.topics import Topics
-from shmio.endpoints.grpc.shmio_v1.views import Frames, Selection, View
+from shmio.endpoints.grpc.shmio_v1.views import RawFrames, Selection, View
 from shmio.errors import EndpointError, PathError, ValueRangeError
 from shmio.layout.glob import named
 from shmio.layout.model import Register
@@ -30,14 +30,14 @@ KEPT: Final = 16
 """Views that are kept though nobody has them, for who reads the same again and again."""
 
 
-class Place(NamedTuple):
+class SourceDirection(NamedTuple):
     """A source, and which way: ``inward``, what is written to it."""
 
     source: str
     inward: bool = False
 
 
-Wanted = Mapping[Place, Sequence[Topic]]
+TopicsBySource = Mapping[SourceDirection, Sequence[Topic]]
 
 _Key = tuple[int, bool, tuple[str, ...]]
 
@@ -52,25 +52,25 @@ class Selections:
         self._kept: OrderedDict[_Key, View] = OrderedDict()
         self._turn = asyncio.Lock()
 
-    def resolve(self, patterns: Sequence[str], *, inward: bool = False) -> Wanted:
+    def resolve(self, patterns: Sequence[str], *, inward: bool = False) -> TopicsBySource:
         """What a call's patterns say; ``inward``: whether ``/in`` may be among them. PathError, ValueRangeError."""
         if not patterns:
             raise ValueRangeError("no pattern is given: a path, structure, glob, or a source's name for all it has")
         if len(patterns) > MAX_PATTERNS:
             raise ValueRangeError(f"{len(patterns)} patterns, {MAX_PATTERNS} are the most: use stars, or structures")
-        wanted: dict[Place, dict[Topic, None]] = {}
+        wanted: dict[SourceDirection, dict[Topic, None]] = {}
         for pattern in patterns:
             topic = self._topics.topic(pattern)
             if topic.direction == "in" and not inward:
                 raise PathError(f"{shorten(pattern)}: what goes into a source is not read here; leave out /in")
-            wanted.setdefault(Place(topic.source, topic.direction == "in"), {})[topic] = None
+            wanted.setdefault(SourceDirection(topic.source, topic.direction == "in"), {})[topic] = None
         return {place: tuple(topics) for place, topics in wanted.items()}
 
-    def inlet(self, source: str) -> Inlet:
+    def commands(self, source: str) -> CommandClient:
         """The way into a source as of now; PathError: a reload has removed it."""
-        return self._topics.feed(source).inlet
+        return self._topics.feed(source).commands
 
-    async def select(self, wanted: Wanted, *, frames: bool = False) -> list[View]:
+    async def select(self, wanted: TopicsBySource, *, frames: bool = False) -> list[View]:
         """One for each place, in this order; ``frames``: raw ones.
 
         PathError: no such register; ValueRangeError: too much for one call; EndpointError: for all clients together.
@@ -82,7 +82,7 @@ class Selections:
             budget.take(view)
         return views
 
-    async def registers(self, wanted: Wanted) -> Selection:
+    async def registers(self, wanted: TopicsBySource) -> Selection:
         """That of the one place there is; of no registers, if no topic is named."""
         ((place, topics),) = wanted.items()
         if not topics:
@@ -93,7 +93,7 @@ class Selections:
             raise PathError(f"{place.source}: no register is named")
         return view
 
-    async def _view(self, place: Place, topics: Sequence[Topic], budget: _Budget) -> View:
+    async def _view(self, place: SourceDirection, topics: Sequence[Topic], budget: _Budget) -> View:
         """``topics``: none for raw frames."""
         block = self._topics.feed(place.source).block
         key = block.section, place.inward, tuple(topic.path for topic in topics)
@@ -111,7 +111,7 @@ class Selections:
     async def _make(self, block: Block, topics: Sequence[Topic], budget: _Budget, *, inward: bool) -> View:
         number = next(self._numbers)
         if not topics:
-            return Frames(number, block)
+            return RawFrames(number, block)
         view = await asyncio.to_thread(_select, number, block, topics, budget, inward=inward)
         if self._elements + view.elements > MAX_ALL_ELEMENTS:
             self._kept.clear()

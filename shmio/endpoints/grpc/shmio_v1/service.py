@@ -11,19 +11,19 @@ import grpc
 from shmio.endpoints.grpc.commands.topics import Topics
 from shmio.endpoints.grpc.services.error_status import Context, refuse
 from shmio.endpoints.grpc.shmio_v1 import describe
-from shmio.endpoints.grpc.shmio_v1.clock import Clocks
-from shmio.endpoints.grpc.shmio_v1.commands import Orders
+from shmio.endpoints.grpc.shmio_v1.clock import TimeCalls
+from shmio.endpoints.grpc.shmio_v1.commands import CommandCalls
 from shmio.endpoints.grpc.shmio_v1.follow import aged
-from shmio.endpoints.grpc.shmio_v1.replay import Moves
+from shmio.endpoints.grpc.shmio_v1.replay import ReplayCalls
 from shmio.endpoints.grpc.shmio_v1.selection import Selections
-from shmio.endpoints.grpc.shmio_v1.simulate import Simulations
-from shmio.endpoints.grpc.shmio_v1.subscribe import Subscription
+from shmio.endpoints.grpc.shmio_v1.simulate import SimulateCalls
+from shmio.endpoints.grpc.shmio_v1.subscribe import SubscribeCall
 from shmio.endpoints.grpc.shmio_v1.views import AGE_NS, ORIGINALS, Selection, View
 from shmio.endpoints.grpc.streams.encoding import field, number
 from shmio.endpoints.grpc.streams.feed import Feed
-from shmio.endpoints.grpc.streams.wakeups import Bells
-from shmio.endpoints.grpc.time.audience import Audience
+from shmio.endpoints.grpc.streams.wakeups import WakeUps
 from shmio.endpoints.grpc.time.delivery import PATIENCE_S
+from shmio.endpoints.grpc.time.open_streams import OpenStreams
 from shmio.endpoints.grpc.time.stepper import Stepper
 from shmio.errors import EndpointError, ShmioError
 from shmio.local.time_control import Step
@@ -35,7 +35,7 @@ MAX_STREAMS: Final = 256
 """Subscribe calls that may be open at once."""
 
 
-class NativeService:
+class ShmioV1:
     """Serves the registers of all sources typed and packed."""
 
     name = SERVICE
@@ -44,24 +44,24 @@ class NativeService:
         self,
         topics: Topics,
         feeds: Mapping[str, Feed],
-        bells: Bells,
+        wake_ups: WakeUps,
         segment: Segment,
         stepper: Stepper,
-        audience: Audience,
+        open_streams: OpenStreams,
     ) -> None:
         """``audience``: what its streams are a part of."""
         self._feeds = feeds
         self._segment = segment
         self._selections = Selections(topics)
-        self._bells = bells
-        self._clocks = Clocks(segment, stepper)
-        self._hold = stepper.timeline.hold
-        self._audience = audience
-        stepper.timeline.also(self)
-        self._orders = Orders(topics, feeds, self._selections, self._bells)
-        self._simulations = Simulations(feeds, segment)
-        self._moves = Moves(segment)
-        self._open: set[Subscription] = set()
+        self._wake_ups = wake_ups
+        self._time_calls = TimeCalls(segment, stepper)
+        self._virtual_time = stepper.timeline.virtual_time
+        self._open_streams = open_streams
+        stepper.timeline.add_receiver(self)
+        self._command_calls = CommandCalls(topics, feeds, self._selections, self._wake_ups)
+        self._simulate_calls = SimulateCalls(feeds, segment)
+        self._replay_calls = ReplayCalls(segment)
+        self._open: set[SubscribeCall] = set()
         self._ended_updates = 0
 
     @property
@@ -85,14 +85,14 @@ class NativeService:
             "Read": unary(self.read, wire.ReadRequest.FromString),
             "Subscribe": streaming(self.subscribe, wire.SubscribeRequest.FromString),
         }
-        for part in (self._orders, self._simulations, self._clocks, self._moves):
+        for part in (self._command_calls, self._simulate_calls, self._time_calls, self._replay_calls):
             calls |= part.handlers()
         return calls
 
     async def get_layouts(self, request: wire.GetLayoutsRequest, context: Context) -> AsyncIterator[wire.LayoutPart]:
         """The layouts of these sources, or of all. NOT_FOUND: no such source."""
         try:
-            blocks = self._orders.blocks(request.sources)
+            blocks = self._command_calls.blocks(request.sources)
         except ShmioError as error:
             await refuse(context, error)
         for block in blocks:
@@ -127,12 +127,12 @@ class NativeService:
                 raise EndpointError(
                     f"{MAX_STREAMS} calls of Subscribe are open, the most there may be: one takes many patterns"
                 )
-            subscription = Subscription(self._selections, self._bells, self._hold, request)
+            subscription = SubscribeCall(self._selections, self._wake_ups, self._virtual_time, request)
         except ShmioError as error:
             await refuse(context, error)
         self._open.add(subscription)
         try:
-            with self._audience.joined():
+            with self._open_streams.joined():
                 yield await subscription.open()
                 async for message in subscription.messages():
                     yield message
@@ -158,7 +158,7 @@ class NativeService:
 
     def move(self, sources: Collection[str]) -> None:
         """Have the streams of these sources go over to the blocks that there are by now."""
-        self._simulations.move()
+        self._simulate_calls.move()
         for subscription in self._open:
             subscription.move(sources)
 

@@ -11,16 +11,16 @@ from typing import Any
 import grpc
 import numpy as np
 
-from shmio.endpoints.grpc.server.turns import turns
+from shmio.endpoints.grpc.server.time_slices import time_sliced
 from shmio.endpoints.grpc.services.error_status import Context, refuse
 from shmio.endpoints.grpc.shmio_v1.clock import clock
-from shmio.endpoints.grpc.shmio_v1.columns import KINDS, Column, Decoded, pack
+from shmio.endpoints.grpc.shmio_v1.columns import KINDS, Column, DecodedImage, pack
 from shmio.endpoints.grpc.shmio_v1.selection import MAX_ELEMENTS, MAX_REGISTERS
 from shmio.endpoints.grpc.shmio_v1.values import FIELDS, MAX_VALUES, index_of, plain
 from shmio.endpoints.grpc.shmio_v1.views import Selection
 from shmio.endpoints.grpc.streams.encoding import field
 from shmio.endpoints.grpc.streams.feed import Feed
-from shmio.endpoints.grpc.streams.wakeups import Bell
+from shmio.endpoints.grpc.streams.wakeups import WakeUp
 from shmio.errors import CommandError, ConflictError, PathError, SegmentError, ShmioError, ValueRangeError
 from shmio.layout.image import initial_frame
 from shmio.layout.model import Register
@@ -32,7 +32,7 @@ from shmio.segment.model_channel import MAX_NAME_BYTES, Ask, Link, ends_of
 from shmio.wire import shmio_v1_pb2 as wire
 
 
-class Fill:
+class OutputEncoder:
     """Those of one table. What was found out about a slot or a path is kept."""
 
     def __init__(self, selection: Selection) -> None:
@@ -59,7 +59,7 @@ class Fill:
             left = np.arange(len(slots))
             if column in KINDS:
                 left = columns.encode(column, slots, np.fromiter(part.values, KINDS[column]), image)
-            async for at in turns(left.tolist()):
+            async for at in time_sliced(left.tolist()):
                 self._put(*self._at(column, int(slots[at])), part.values[at], image)
 
     async def assigned(self, assignments: Any, image: bytearray) -> None:
@@ -71,7 +71,7 @@ class Fill:
                 f"assignments: {len(assignments)} values, {MAX_VALUES} are the most by path: give them by slots"
             )
         order = self._selection.block.layout.byte_order
-        async for assignment in turns(assignments):
+        async for assignment in time_sliced(assignments):
             register = self._paths.get(assignment.path)
             if register is None:
                 register = self._find(assignment.path)
@@ -118,13 +118,13 @@ _INPUTS, _OUTPUTS, _PRESENT = (
 _VALUES, _INVALID = (wire.Do.DESCRIPTOR.fields_by_name[name].number for name in ("values", "invalid"))
 
 
-class Simulations:
+class SimulateCalls:
     """A part of the service: the models that are connected, one for a source at most."""
 
     def __init__(self, feeds: Mapping[str, Feed], segment: Segment) -> None:
         self._feeds = feeds
         self._segment = segment
-        self._open: dict[int, Simulation] = {}  # by the section of their block
+        self._open: dict[int, SimulateCall] = {}  # by the section of their block
         for block in segment.blocks.values():
             if block.link is not None:  # the process before this one may have died with its model
                 self._ring(block)
@@ -141,7 +141,7 @@ class Simulations:
         INVALID_ARGUMENT: it does not join, or answers what was not asked; UNAVAILABLE: a reload has changed the source.
         """
         taking: asyncio.Task[None] | None = None
-        simulation: Simulation | None = None
+        simulation: SimulateCall | None = None
         try:
             simulation = await self._joining(requests, context.peer())
             first = await simulation.join()
@@ -162,7 +162,7 @@ class Simulations:
         if simulation.failure is not None:
             await refuse(context, simulation.failure)
 
-    async def _joining(self, requests: AsyncIterator[wire.SimulateRequest], peer: str) -> Simulation:
+    async def _joining(self, requests: AsyncIterator[wire.SimulateRequest], peer: str) -> SimulateCall:
         """What the first message asks for. PathError, CommandError, ConflictError, ValueRangeError."""
         async for request in requests:
             if request.WhichOneof("what") == "join":
@@ -171,7 +171,7 @@ class Simulations:
                     raise ValueRangeError(f"name: at most {MAX_NAME_BYTES} bytes")
                 if before := self._open.get(block.section):
                     raise ConflictError(_taken(block, before.name, before.peer))
-                simulation = self._open[block.section] = Simulation(block, self._segment, printable(name), peer)
+                simulation = self._open[block.section] = SimulateCall(block, self._segment, printable(name), peer)
                 return simulation
             break
         raise ValueRangeError("the first message of Simulate joins, all others answer steps")
@@ -188,7 +188,7 @@ class Simulations:
             )
         return block
 
-    def _release(self, simulation: Simulation, _: object = None) -> None:
+    def _release(self, simulation: SimulateCall, _: object = None) -> None:
         """Have its source free for another one, if it is not yet."""
         if self._open.get(simulation.block.section) is simulation:
             del self._open[simulation.block.section]
@@ -209,7 +209,7 @@ class Simulations:
                 simulation.end(SegmentError(f"{source} was changed or removed by a reload: join again"))
 
 
-class Simulation:
+class SimulateCall:
     """One call of Simulate."""
 
     def __init__(self, block: Block, segment: Segment, name: str, peer: str) -> None:
@@ -221,11 +221,11 @@ class Simulation:
         self._segment = segment
         self._joined = False
         self._over = False
-        self._news = asyncio.Event()
-        self._bell: Bell | None = None  # rings when the source has asked for a step
+        self._wake = asyncio.Event()
+        self._bell: WakeUp | None = None  # rings when the source has asked for a step
         self._handed = 0
         self._asked: Ask | None = None  # what the model has in hand
-        self._given: Decoded | None = None
+        self._given: DecodedImage | None = None
         self._image: bytearray | None = None  # with the outputs as the model has set them
         self._refused = ""
 
@@ -238,7 +238,7 @@ class Simulation:
     async def join(self) -> bytes:
         """Take the link; the first message. ConflictError, ValueRangeError."""
         self._inputs, self._outputs = await asyncio.to_thread(_tables, self.block)  # takes seconds for a large layout
-        self._fill = Fill(self._outputs)
+        self._encoder = OutputEncoder(self._outputs)
         link = self._link
         self._handed = link.asked.head()  # before it is taken: what was asked then is not for this model
         if not link.join(self.name):
@@ -246,8 +246,8 @@ class Simulation:
             name, who = (before.name, f"pid {before.pid}") if before else ("another", "which is leaving")
             raise ConflictError(_taken(self.block, name, who))
         self._joined = True
-        self._bell = Bell(link.asked, f"asked-{self.block.source}")
-        self._bell.listeners[self._news.set] = None
+        self._bell = WakeUp(link.asked, f"asked-{self.block.source}")
+        self._bell.listeners[self._wake.set] = None
         frame = self.block.latest()
         image = frame.raw if frame is not None and frame.source_ns else bytes(initial_frame(self.block.layout)[0])
         joined = wire.Joined(
@@ -272,19 +272,19 @@ class Simulation:
         """Have the stream end."""
         self.failure = self.failure or failure
         self._over = True
-        self._news.set()
+        self._wake.set()
 
     # ---- down: what is to be done ------------------------------------------------------------------------------
 
     async def messages(self) -> AsyncIterator[bytes]:
         """Serialised SimulateResponses, until it is over."""
         while not self._over:
-            self._news.clear()  # before looking
+            self._wake.clear()  # before looking
             if self._asked is None and (ask := self._newest()) is not None:
                 self._asked = ask
                 yield field(_WORK, self._work(ask))
             else:
-                await self._news.wait()
+                await self._wake.wait()
 
     def _newest(self) -> Ask | None:
         """The step that the source waits for, unless it has been handed out."""
@@ -333,8 +333,8 @@ class Simulation:
         failure = " ".join(done.failure.split()) if done.HasField("failure") else None
         if failure is None:
             try:
-                await self._fill.packed(done.values, image)
-                await self._fill.assigned(done.assignments, image)
+                await self._encoder.packed(done.values, image)
+                await self._encoder.assigned(done.assignments, image)
             except (PathError, ValueRangeError) as error:
                 failure = str(error)
                 self._refused = f"step {ask.step}: {failure}"
@@ -346,7 +346,7 @@ class Simulation:
         else:  # not given: a source that looks late, too, might take it still
             self._refused = self._refused or f"step {ask.step}: the answer came {late_ns // 1_000_000} ms too late"
         self._asked = None
-        self._news.set()
+        self._wake.set()
 
 
 def _tables(block: Block) -> tuple[Selection, Selection]:

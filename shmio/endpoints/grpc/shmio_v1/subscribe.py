@@ -9,13 +9,13 @@ from collections.abc import AsyncIterator, Collection
 from functools import partial
 from typing import Final
 
-from shmio.endpoints.grpc.shmio_v1.follow import EveryFrame, Follower, Latest
-from shmio.endpoints.grpc.shmio_v1.selection import Place, Selections
+from shmio.endpoints.grpc.shmio_v1.follow import BlockFollower, EveryFrame, LatestFrame
+from shmio.endpoints.grpc.shmio_v1.selection import Selections, SourceDirection
 from shmio.endpoints.grpc.shmio_v1.views import Selection, View
-from shmio.endpoints.grpc.shmio_v1.written import Inward
+from shmio.endpoints.grpc.shmio_v1.write_updates import WriteFollower
 from shmio.endpoints.grpc.streams.encoding import field
-from shmio.endpoints.grpc.streams.wakeups import Bells, Ring
-from shmio.endpoints.grpc.time.virtual_time import Hold
+from shmio.endpoints.grpc.streams.wakeups import Callback, WakeUps
+from shmio.endpoints.grpc.time.virtual_time import VirtualTime
 from shmio.errors import EndpointError, PathError, ValueRangeError
 from shmio.local.time_control import Step
 from shmio.wire import shmio_v1_pb2 as wire
@@ -49,30 +49,32 @@ def check(request: wire.SubscribeRequest) -> None:
         raise ValueRangeError("deadband is for the format VALUES")
 
 
-class Subscription:
+class SubscribeCall:
     """One call of Subscribe."""
 
-    def __init__(self, selections: Selections, bells: Bells, hold: Hold, request: wire.SubscribeRequest) -> None:
+    def __init__(
+        self, selections: Selections, wake_ups: WakeUps, virtual_time: VirtualTime, request: wire.SubscribeRequest
+    ) -> None:
         """``hold``: virtual time. PathError, ValueRangeError: as of the request."""
         check(request)
         self.updates = 0
         self.late = False
         """Whether a step has waited too long for it; see :meth:`give_up`."""
-        self._hold = hold
+        self._virtual_time = virtual_time
         self._opened = False
-        self._marks: deque[tuple[Step, asyncio.Future[None]]] = deque()
+        self._step_marks: deque[tuple[Step, asyncio.Future[None]]] = deque()
         self._selections = selections
-        self._bells = bells
+        self._wake_ups = wake_ups
         self._request = request
         self._wanted = selections.resolve(request.patterns, inward=True)
         if request.format == wire.FORMAT_FRAMES and any(place.inward for place in self._wanted):
             raise ValueRangeError("what is written has no raw frames: leave out /in, or ask for the format VALUES")
-        self._followers: dict[Place, Follower] = {}
-        self._inward: dict[Place, Inward] = {}
-        self._rings: dict[Place, Ring] = {}  # what their bells call
-        self._moved: dict[Place, None] = {}
+        self._followers: dict[SourceDirection, BlockFollower] = {}
+        self._inward: dict[SourceDirection, WriteFollower] = {}
+        self._rings: dict[SourceDirection, Callback] = {}  # what their bells call
+        self._moved: dict[SourceDirection, None] = {}
         self._turn = 0
-        self._news = asyncio.Event()
+        self._wake = asyncio.Event()
         self._clock = asyncio.get_running_loop().time
 
     async def open(self) -> bytes:
@@ -83,8 +85,8 @@ class Subscription:
 
     def close(self) -> None:
         """Leave them."""
-        while self._marks:
-            _set(self._marks.popleft()[1])
+        while self._step_marks:
+            _set(self._step_marks.popleft()[1])
         for place in self._wanted:
             self._leave(place)
 
@@ -92,16 +94,16 @@ class Subscription:
         """Nothing waits for it any more, and it ends as soon as its client reads again; what it holds goes at once."""
         self.late = True
         self.close()
-        self._news.set()
+        self._wake.set()
 
     def wake(self) -> None:
         """Look for what may be sent by now."""
-        self._news.set()
+        self._wake.set()
 
     def move(self, sources: Collection[str]) -> None:
         """A reload has changed these sources."""
         self._moved |= dict.fromkeys(place for place in self._wanted if place.source in sources)
-        self._news.set()
+        self._wake.set()
 
     def mark(self, step: Step) -> asyncio.Future[None]:
         """Say that a step is over, when all that has changed in it is sent; what is done then, or when this ends.
@@ -112,8 +114,8 @@ class Subscription:
         if self.late or not self._opened:
             sent.set_result(None)
         else:
-            self._marks.append((step, sent))
-            self._news.set()
+            self._step_marks.append((step, sent))
+            self._wake.set()
         return sent
 
     async def messages(self) -> AsyncIterator[bytes]:
@@ -125,10 +127,10 @@ class Subscription:
             for inward in self._inward.values():
                 if inward.failure:
                     raise EndpointError(inward.failure)
-            self._news.clear()  # before looking
+            self._wake.clear()  # before looking
             batch, whole = self._batch()
-            if self._marks and whole and not self._moved:
-                step, sent = self._marks.popleft()
+            if self._step_marks and whole and not self._moved:
+                step, sent = self._step_marks.popleft()
                 try:
                     yield batch + field(STEP, wire.Step(number=step.number, time_ns=step.time_ns).SerializeToString())
                 finally:
@@ -170,28 +172,28 @@ class Subscription:
             parts.append(field(UPDATES, update))
         return b"".join(parts), not (waiting or any(inward.waits for inward in self._inward.values()))
 
-    def _open(self, follower: Follower) -> bool:
+    def _open(self, follower: BlockFollower) -> bool:
         """Whether a block may be shown now: on the instance's clock, in virtual time, only when a step is over."""
-        held = self._hold.on and follower.view.block.attributes.stepped
-        return not held or bool(self._marks) or not follower.begun
+        held = self._virtual_time.on and follower.view.block.attributes.stepped
+        return not held or bool(self._step_marks) or not follower.begun
 
-    def _ring(self, follower: Follower) -> None:
+    def _ring(self, follower: BlockFollower) -> None:
         """Its block has something new."""
         if self._open(follower):
-            self._news.set()
+            self._wake.set()
 
     async def _wait(self) -> None:
         due_s = min((follower.due_s for follower in self._followers.values()), default=math.inf)
         if math.isinf(due_s):
-            await self._news.wait()
+            await self._wake.wait()
             return
-        handle = asyncio.get_running_loop().call_at(due_s, self._news.set)
+        handle = asyncio.get_running_loop().call_at(due_s, self._wake.set)
         try:
-            await self._news.wait()
+            await self._wake.wait()
         finally:
             handle.cancel()
 
-    async def _go_over(self, place: Place) -> bytes:
+    async def _go_over(self, place: SourceDirection) -> bytes:
         """Follow the block that a source has by now, or say that it has none; all of the old one was sent."""
         self._leave(place)
         try:
@@ -204,25 +206,25 @@ class Subscription:
             ended = wire.Ended(source=place.source, reason=str(error), direction=direction)
             return field(ENDED, ended.SerializeToString())
 
-    def _join(self, place: Place, view: View) -> bytes:
+    def _join(self, place: SourceDirection, view: View) -> bytes:
         request = self._request
         if place.inward and isinstance(view, Selection):
-            self._inward[place] = Inward(view.writes, self._selections.inlet(place.source), self._news.set)
+            self._inward[place] = WriteFollower(view.writes, self._selections.commands(place.source), self._wake.set)
             return field(TABLES, view.table)
         if request.mode == wire.MODE_EVERY_FRAME:
-            follower: Follower = EveryFrame(view)
+            follower: BlockFollower = EveryFrame(view)
         else:
-            follower = Latest(view, 1 / request.max_rate_hz if request.max_rate_hz else 0.0, request.deadband)
+            follower = LatestFrame(view, 1 / request.max_rate_hz if request.max_rate_hz else 0.0, request.deadband)
         self._followers[place] = follower
         ring = self._rings[place] = partial(self._ring, follower)
-        self._bells.join(view.block, ring)
+        self._wake_ups.join(view.block, ring)
         return field(TABLES, view.table)
 
-    def _leave(self, place: Place) -> None:
+    def _leave(self, place: SourceDirection) -> None:
         if inward := self._inward.pop(place, None):
             inward.leave()
         if follower := self._followers.pop(place, None):
-            self._bells.leave(follower.view.block, self._rings.pop(place))
+            self._wake_ups.leave(follower.view.block, self._rings.pop(place))
 
 
 def _set(sent: asyncio.Future[None]) -> None:

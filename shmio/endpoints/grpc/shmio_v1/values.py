@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 from shmio.endpoints.grpc.commands.topics import Topics
-from shmio.endpoints.grpc.server.turns import turns
+from shmio.endpoints.grpc.server.time_slices import time_sliced
 from shmio.endpoints.grpc.shmio_v1.columns import Column
 from shmio.endpoints.grpc.shmio_v1.views import Selection
 from shmio.errors import CommandError, ValueRangeError
@@ -45,7 +45,7 @@ async def assigned(assignments: Any, topics: Topics) -> tuple[str, dict[str, obj
         )
     values: dict[str, object] = {}
     sources: dict[str, None] = {}
-    async for assignment in turns(assignments):
+    async for assignment in time_sliced(assignments):
         topic = topics.topic(assignment.path)
         register = topics.register(topic)
         if topic.direction == "out":

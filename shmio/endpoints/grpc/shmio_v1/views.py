@@ -9,8 +9,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from shmio.endpoints.grpc.shmio_v1.columns import Column, Columns, Decoded, column_of, merge, pack
-from shmio.endpoints.grpc.shmio_v1.written import Writes
+from shmio.endpoints.grpc.shmio_v1.columns import Column, Columns, DecodedImage, column_of, merge, pack
+from shmio.endpoints.grpc.shmio_v1.write_updates import WriteUpdates
 from shmio.endpoints.grpc.streams.encoding import field
 from shmio.layout.model import Register
 from shmio.segment import Block, Frame
@@ -24,12 +24,12 @@ VALUES, ORIGINALS, INVALID, INJECTED, IMAGE, ORIGINAL, QUALITY, REASON, MISSED, 
 )  # fmt: skip
 
 _CACHED: Final = 8
-_NO_MARKS: Final = np.zeros(0, "<u4")
+_NO_PLACES: Final = np.zeros(0, "<u4")
 
-Marks = np.ndarray[Any, np.dtype[Any]]
+Places = np.ndarray[Any, np.dtype[Any]]
 
 
-class Message(NamedTuple):
+class UpdateMessage(NamedTuple):
     """A serialised ``Update`` in two parts. ``body``: what has changed; empty, if nothing has."""
 
     head: bytes
@@ -47,14 +47,14 @@ class Selection:
         self.registers = tuple(registers)
         self.elements = sum(register.count for register in registers)
         self.columns = Columns(registers, block.layout.byte_order)
-        self._decoded: OrderedDict[int, Decoded] = OrderedDict()
-        self._updates: OrderedDict[tuple[int, int], Message] = OrderedDict()
-        self._marks: OrderedDict[int, Marks] = OrderedDict()
+        self._decoded: OrderedDict[int, DecodedImage] = OrderedDict()
+        self._updates: OrderedDict[tuple[int, int], UpdateMessage] = OrderedDict()
+        self._injected_places: OrderedDict[int, Places] = OrderedDict()
 
     @cached_property
-    def writes(self) -> Writes:
+    def writes(self) -> WriteUpdates:
         """What becomes of what is written to them."""
-        return Writes(self.number, self.block, self.registers, self.columns)
+        return WriteUpdates(self.number, self.block, self.registers, self.columns)
 
     @cached_property
     def table(self) -> bytes:
@@ -72,7 +72,7 @@ class Selection:
             describe(register, table.registers.add(), column, slot)
         return table.SerializeToString()
 
-    def decode(self, frame: Frame) -> Decoded:
+    def decode(self, frame: Frame) -> DecodedImage:
         """All elements of a frame as consumers see it."""
         found = self._decoded.get(frame.number)
         if found is None:
@@ -80,7 +80,7 @@ class Selection:
             _trim(self._decoded)
         return found
 
-    def update(self, frame: Frame, before: Frame | None = None) -> Message:
+    def update(self, frame: Frame, before: Frame | None = None) -> UpdateMessage:
         """An ``Update``: what differs from the frame before; all of it, if there is none.
 
         Its quality is that which the frame was published with.
@@ -95,14 +95,16 @@ class Selection:
             _trim(self._updates)
         return found
 
-    def update_beyond(self, frame: Frame, before: Frame, sent: Decoded, deadband: float) -> tuple[Message, Decoded]:
+    def update_beyond(
+        self, frame: Frame, before: Frame, sent: DecodedImage, deadband: float
+    ) -> tuple[UpdateMessage, DecodedImage]:
         """The same with a dead-band, for who was sent that much; and what it has then."""
         new = self.decode(frame)
         return self._update(frame, before, new, sent, deadband), merge(new, sent, deadband)
 
     def _update(
-        self, frame: Frame, before: Frame | None, new: Decoded, old: Decoded | None, deadband: float = 0.0
-    ) -> Message:
+        self, frame: Frame, before: Frame | None, new: DecodedImage, old: DecodedImage | None, deadband: float = 0.0
+    ) -> UpdateMessage:
         parts = []
         if frame.source_ns:
             if values := pack(new, old, deadband):
@@ -112,23 +114,23 @@ class Selection:
         now = self.injected(frame)
         if before is None or (now is not (was := self.injected(before)) and not np.array_equal(now, was)):
             parts.append(field(INJECTED, field(1, now.tobytes())))
-        return Message(head(self.number, frame, whole=before is None), b"".join(parts))
+        return UpdateMessage(head(self.number, frame, whole=before is None), b"".join(parts))
 
     def originals(self, frame: Frame) -> bytes:
         """The serialised ``Values`` that the source delivered."""
         return pack(self.columns.decode(frame.raw))
 
-    def injected(self, frame: Frame) -> Marks:
+    def injected(self, frame: Frame) -> Places:
         """Places of the registers that are under an injection over ``/out``, by what stood when it was asked first."""
         if frame.effective is None:
-            return _NO_MARKS
-        found = self._marks.get(frame.event)  # nothing is laid or lifted without an event
+            return _NO_PLACES
+        found = self._injected_places.get(frame.event)  # nothing is laid or lifted without an event
         if found is None:
-            found = self._marks[frame.event] = self._under_injections()
-            _trim(self._marks)
+            found = self._injected_places[frame.event] = self._under_injections()
+            _trim(self._injected_places)
         return found
 
-    def _under_injections(self) -> Marks:
+    def _under_injections(self) -> Places:
         cover = np.zeros(self.block.layout.size, np.uint8)
         for standing in self.block.standing.read():
             if standing.direction == "out" and standing.active:
@@ -140,7 +142,7 @@ class Selection:
         return np.flatnonzero(hit).astype("<u4")
 
     @cached_property
-    def _extents(self) -> tuple[Marks, ...]:
+    def _extents(self) -> tuple[Places, ...]:
         """First byte, the one after the last, and of a single bit its mask, by register."""
         starts = [register.offset for register in self.registers]
         stops = [register.offset + register.size for register in self.registers]
@@ -148,14 +150,14 @@ class Selection:
         return tuple(np.array(numbers, np.intp) for numbers in (starts, stops, masks))
 
 
-class Frames:
+class RawFrames:
     """A block of which somebody wants raw frames; as a :class:`Selection` of no registers."""
 
     def __init__(self, number: int, block: Block) -> None:
         self.number = number
         self.block = block
         self.elements = 0
-        self._updates: OrderedDict[int, Message] = OrderedDict()
+        self._updates: OrderedDict[int, UpdateMessage] = OrderedDict()
 
     @cached_property
     def table(self) -> bytes:
@@ -169,19 +171,19 @@ class Frames:
             size=layout.size,
         ).SerializeToString()
 
-    def update(self, frame: Frame, before: Frame | None = None) -> Message:  # noqa: ARG002  a frame is always whole
+    def update(self, frame: Frame, before: Frame | None = None) -> UpdateMessage:  # noqa: ARG002  a frame is always whole
         """An ``Update`` with both images, if they are two."""
         found = self._updates.get(frame.number)
         if found is None:
             body = field(IMAGE, frame.image) if frame.source_ns else b""
             if frame.source_ns and frame.effective is not None:
                 body += field(ORIGINAL, frame.raw)
-            found = self._updates[frame.number] = Message(head(self.number, frame, whole=True), body)
+            found = self._updates[frame.number] = UpdateMessage(head(self.number, frame, whole=True), body)
             _trim(self._updates)
         return found
 
 
-View = Selection | Frames
+View = Selection | RawFrames
 
 
 def head(table: int, frame: Frame, *, whole: bool = False) -> bytes:

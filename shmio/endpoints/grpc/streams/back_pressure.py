@@ -21,7 +21,7 @@ LATE_S: Final = 0.002
 """What is for one that is far behind waits no longer if there is something newer."""
 
 
-class Pace:
+class LossMonitor:
     """Of one client's stream. Times in s, on any clock."""
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ TOTAL_BYTES: Final = 256 << 20
 """Of all that waits in all streams: when there is more, a stream may hold no more than its equal part of it."""
 
 
-class Total:
+class TotalBacklog:
     """What waits in all streams."""
 
     def __init__(self) -> None:
@@ -67,10 +67,10 @@ class Total:
         return self.size > TOTAL_BYTES and size > TOTAL_BYTES // max(1, self.streams)
 
 
-class Load:
+class Backlog:
     """Messages of one kind that wait."""
 
-    def __init__(self, total: Total) -> None:
+    def __init__(self, total: TotalBacklog) -> None:
         self.count = 0
         self.size = 0
         self._total = total
@@ -108,7 +108,7 @@ LOOK_S: Final = 0.02
 """Now and then what comes is looked at, whoever has something to take: it may be bad news."""
 
 
-class Crowd:
+class BackPressure:
     """Of a feed, which need not read what nobody can take: when one of them can, it is what is newest then."""
 
     def __init__(self, block: Block, refill: Callable[[], object]) -> None:

@@ -62,7 +62,7 @@ class Channel:
         self.entries = b"" if self.changed else entries(subject.registers, slot)
 
 
-class Table(NamedTuple):
+class ChannelTable(NamedTuple):
     """The channels of a block."""
 
     slots: tuple[Channel | None, ...]
@@ -71,7 +71,7 @@ class Table(NamedTuple):
     """Those that the scan does not look at."""
 
     @classmethod
-    def of(cls, channels: Collection[Channel], slots: int) -> Table:
+    def of(cls, channels: Collection[Channel], slots: int) -> ChannelTable:
         """That of these; ``slots``: of places, of which some may be free."""
         places: list[Channel | None] = [None] * slots
         for channel in channels:

@@ -6,12 +6,12 @@ import asyncio
 import logging
 from collections.abc import Callable, Iterable, Sized
 
-from shmio.endpoints.grpc.commands.block_commands import Inlet
-from shmio.endpoints.grpc.streams.back_pressure import Crowd
-from shmio.endpoints.grpc.streams.channel import Channel, Listener, Table
+from shmio.endpoints.grpc.commands.command_client import CommandClient
+from shmio.endpoints.grpc.streams.back_pressure import BackPressure
+from shmio.endpoints.grpc.streams.channel import Channel, ChannelTable, Listener
 from shmio.endpoints.grpc.streams.subject import Subject
-from shmio.endpoints.grpc.streams.wakeups import Bells
-from shmio.endpoints.grpc.time.virtual_time import Hold, Moment, Still
+from shmio.endpoints.grpc.streams.wakeups import WakeUps
+from shmio.endpoints.grpc.time.virtual_time import DeliveredImage, Moment, VirtualTime
 from shmio.segment import Block, Event, Frame, Quality
 
 log = logging.getLogger("shmio.grpc")
@@ -31,27 +31,27 @@ class Feed:
         self,
         block: Block,
         writer: int,
-        bells: Bells,
+        wake_ups: WakeUps,
         on_quality: Callable[[str, bool], None],
-        hold: Hold | None = None,
+        virtual_time: VirtualTime | None = None,
     ) -> None:
         """``writer``: the command queue of this process. ``hold``: virtual time; default: there is none."""
         self.block = block
-        self.inlet = Inlet(block, writer, bells, self._stamp)
+        self.commands = CommandClient(block, writer, wake_ups, self._stamp)
         """The other direction."""
         self.messages = 0
-        self._hold = hold or Hold()
-        self._held = self._hold.on and block.attributes.stepped
+        self._virtual_time = virtual_time or VirtualTime()
+        self._held = self._virtual_time.on and block.attributes.stepped
         self._stepped = False  # since it is held
-        self._shown: Frame | Still | None = None  # what listeners have seen; None while quality is bad
+        self._shown: Frame | DeliveredImage | None = None  # what listeners have seen; None while quality is bad
         self._good = False  # as last told
         self._loop = asyncio.get_running_loop()
-        self._bells = bells
+        self._wake_ups = wake_ups
         self._on_quality = on_quality
         self._channels: dict[Subject, Channel] = {}
-        self._crowd = Crowd(block, self._refill)
+        self._back_pressure = BackPressure(block, self._refill)
         self._free: list[int] = []  # slots
-        self._table = Table.of((), 0)
+        self._table = ChannelTable.of((), 0)
         self._outdated = False
         self._owed: dict[Listener, Channel] = {}  # joined while there was no good value
         _ = block.layout.members("")  # builds what paths are looked up in, before the first client waits for it
@@ -62,12 +62,12 @@ class Feed:
     @property
     def alive(self) -> bool:
         """Whether the block is being followed, as long as there is something to come."""
-        return (self._following or self.block.retired) and self.inlet.alive
+        return (self._following or self.block.retired) and self.commands.alive
 
     @property
     def over(self) -> bool:
         """Whether nothing is left of it: neither does it follow the block, nor has it a stream."""
-        return not (self._following or self._channels) and self.inlet.over
+        return not (self._following or self._channels) and self.commands.over
 
     def start(self) -> None:
         """Begin to follow the block."""
@@ -76,13 +76,13 @@ class Feed:
             self._adopt(newest)
         self._cursor = self.block.cursor(after=newest.number - 1 if newest else 0)
         self._following = True
-        self.inlet.start()  # it hears first: what was written before a frame is told before it
-        self._bells.join(self.block, self._look)
+        self.commands.start()  # it hears first: what was written before a frame is told before it
+        self._wake_ups.join(self.block, self._look)
 
     def stop(self) -> None:
         """Follow it no more."""
         self._end()
-        self.inlet.stop()
+        self.commands.stop()
 
     def listen(self, subject: Subject, listener: Listener) -> None:
         """Join a subject's listeners; the current value is delivered at once, or as soon as it is good."""
@@ -92,7 +92,7 @@ class Feed:
             channel = self._channels[subject] = Channel(subject, slot)
             self._rebuild()
         channel.listeners[listener] = None
-        self._crowd.join(listener.stream)
+        self._back_pressure.join(listener.stream)
         listener.since = 0
         self._owed[listener] = channel
         self._settle()
@@ -102,7 +102,7 @@ class Feed:
         self._owed.pop(listener, None)
         channel = self._channels[subject]
         del channel.listeners[listener]
-        self._crowd.leave(listener.stream)
+        self._back_pressure.leave(listener.stream)
         if not channel.listeners:
             del self._channels[subject]
             self._free.append(channel.slot)
@@ -142,8 +142,8 @@ class Feed:
         if frame is None or frame.quality is Quality.BAD:
             self._shown = None
             return
-        shown, self._shown = self._shown, Still(*self._hold.moment, frame.image, frame.raw)
-        for channel in sorted(self._news(shown, frame), key=lambda channel: channel.order):
+        shown, self._shown = self._shown, DeliveredImage(*self._virtual_time.moment, frame.image, frame.raw)
+        for channel in sorted(self._changes(shown, frame), key=lambda channel: channel.order):
             self._keep(channel.listeners, channel.encode(self._shown))
         self._settle()
 
@@ -157,7 +157,7 @@ class Feed:
     def _adopt(self, frame: Frame | None) -> None:
         """Before the first step the first good image is shown as it is."""
         if self._held and not self._stepped and self._shown is None and frame and frame.quality is not Quality.BAD:
-            self._shown = Still(*self._hold.moment, frame.image, frame.raw)
+            self._shown = DeliveredImage(*self._virtual_time.moment, frame.image, frame.raw)
             self._settle()
 
     def _settle(self) -> None:
@@ -187,7 +187,7 @@ class Feed:
                     listener.since = 0  # it may have lost this very value
 
     def _rebuild(self) -> None:
-        self._table = Table.of(self._channels.values(), len(self._channels) + len(self._free))
+        self._table = ChannelTable.of(self._channels.values(), len(self._channels) + len(self._free))
         self._outdated = False
 
     # ---- what the source publishes -----------------------------------------------------------------------------
@@ -195,14 +195,14 @@ class Feed:
     def _end(self) -> None:
         if self._following:
             self._following = False
-            self._bells.leave(self.block, self._look)
+            self._wake_ups.leave(self.block, self._look)
 
     def _look(self) -> None:
         """Take the frames that have come, a few at a time; if there are none, look at the age of the last one."""
         if not self._following:
             return  # it has left while the bell rang
-        if not self._held and self._crowd.passes():
-            self._bells.rest(self.block, self._look)
+        if not self._held and self._back_pressure.passes():
+            self._wake_ups.rest(self.block, self._look)
         else:
             self._read()
 
@@ -221,13 +221,13 @@ class Feed:
         """A stream that was too slow has asked for more: what is newest, though it may have that of others by now."""
         if self._following:
             self._read()
-            if not self._crowd.passes():
-                self._bells.resume(self.block, self._look)
+            if not self._back_pressure.passes():
+                self._wake_ups.resume(self.block, self._look)
 
     def _follow(self) -> None:
         block = self.block
         if not self._held:  # else nothing that is shown is read here
-            self._cursor = self._crowd.look(self._cursor)
+            self._cursor = self._back_pressure.look(self._cursor)
         retired = block.retired  # before looking: what was published before the end is still shown
         take = self._regard if self._held else self._take
         for count in range(TURN_FRAMES):
@@ -273,9 +273,9 @@ class Feed:
             self._good = good
             self._on_quality(self.block.source, good)
 
-    def _show(self, shown: Frame | Still | None, frame: Frame) -> None:
+    def _show(self, shown: Frame | DeliveredImage | None, frame: Frame) -> None:
         """Give what has changed since the frame shown before, or everything, to all who have not seen the frame yet."""
-        for channel in self._news(shown, frame):
+        for channel in self._changes(shown, frame):
             message = channel.encode(frame)
             if message is None:
                 continue
@@ -287,22 +287,22 @@ class Feed:
         if self._owed:
             self._settle()
 
-    def _news(self, shown: Frame | Still | None, frame: Frame) -> list[Channel]:
+    def _changes(self, shown: Frame | DeliveredImage | None, frame: Frame) -> list[Channel]:
         """The channels whose bytes have changed since then; all, if nothing was shown."""
         slots, scan, apart = self._table
         if shown is None:
             return [channel for channel in slots if channel]
-        news = [channel for slot in scan.changed(shown.image, frame.image) if (channel := slots[slot])]
-        return news + [channel for channel in apart if channel.changed and channel.changed(shown, frame)]
+        changes = [channel for slot in scan.changed(shown.image, frame.image) if (channel := slots[slot])]
+        return changes + [channel for channel in apart if channel.changed and channel.changed(shown, frame)]
 
-    def present(self) -> Frame | Still | None:
+    def present(self) -> Frame | DeliveredImage | None:
         """What would be shown to who listens now; None: nothing good."""
         if self._held:
-            self._hold.look()
+            self._virtual_time.look()
             return self._shown
         frame = self.block.latest()
         return None if frame is None or self.block.assess(frame)[0] is Quality.BAD else frame
 
     def _stamp(self, event: Event) -> tuple[int, int]:
         """Number and time of what is told of an event: the frame before it, in virtual time the step before."""
-        return self._hold.moment if self._held else Moment(event.frame, event.clock_ns)
+        return self._virtual_time.moment if self._held else Moment(event.frame, event.clock_ns)

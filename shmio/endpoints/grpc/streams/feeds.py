@@ -6,8 +6,8 @@ import asyncio
 from collections.abc import Callable, Iterator, Mapping
 
 from shmio.endpoints.grpc.streams.feed import Feed
-from shmio.endpoints.grpc.streams.wakeups import Bells
-from shmio.endpoints.grpc.time.virtual_time import Hold
+from shmio.endpoints.grpc.streams.wakeups import WakeUps
+from shmio.endpoints.grpc.time.virtual_time import VirtualTime
 from shmio.segment import Segment
 
 
@@ -18,9 +18,9 @@ class Feeds(Mapping[str, Feed]):
         self,
         segment: Segment,
         writer: int,
-        bells: Bells,
+        wake_ups: WakeUps,
         on_quality: Callable[[str, bool], None],
-        hold: Hold | None = None,
+        virtual_time: VirtualTime | None = None,
     ) -> None:
         """``writer``: the command queue of this process. ``on_quality``: told whether a source is good by now.
 
@@ -29,9 +29,9 @@ class Feeds(Mapping[str, Feed]):
         self._segment = segment
         self._generation = -1  # of the segment when it was last read
         self._writer = writer
-        self._bells = bells
+        self._wake_ups = wake_ups
         self._on_quality = on_quality
-        self._hold = hold
+        self._virtual_time = virtual_time
         self._feeds: dict[str, Feed] = {}
         self._ended: list[Feed] = []
         self._ended_messages = 0
@@ -59,7 +59,9 @@ class Feeds(Mapping[str, Feed]):
         """Begin to follow all blocks that are not followed yet."""
         for source, block in self._segment.blocks.items():
             if source not in self._feeds:
-                feed = self._feeds[source] = Feed(block, self._writer, self._bells, self._on_quality, self._hold)
+                feed = self._feeds[source] = Feed(
+                    block, self._writer, self._wake_ups, self._on_quality, self._virtual_time
+                )
                 self._on_quality(source, False)
                 feed.start()
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sized
 from functools import partial
 from typing import Any, Final
 
-from shmio.endpoints.grpc.streams.back_pressure import LATE_S, Load, Pace, Total
+from shmio.endpoints.grpc.streams.back_pressure import LATE_S, Backlog, LossMonitor, TotalBacklog
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.subject import Subject
 from shmio.segment.events import EVENT_SLOTS
@@ -31,9 +31,9 @@ Finish = Callable[[Any], bytes]
 class Outbox:
     """Messages of its lanes in the order in which they came; for the event loop's thread alone, with one reader."""
 
-    def __init__(self, total: Total | None = None) -> None:
-        total = total or Total()
-        self.states, self.events = Load(total), Load(total)
+    def __init__(self, total: TotalBacklog | None = None) -> None:
+        total = total or TotalBacklog()
+        self.states, self.events = Backlog(total), Backlog(total)
         self.dropped = 0
         self.failure = ""
         """Why it ended; empty: it did not fail."""
@@ -47,7 +47,7 @@ class Outbox:
         self._taken = 0  # those before this number have left, or were dropped
         self._told: asyncio.Future[None] | None = None
         self._asked = False  # whether the reader waits
-        self.pace = Pace()
+        self.losses = LossMonitor()
         self.refills: dict[Callable[[], object], None] = {}
         """Called, once, as soon as nothing waits: who has more, and waits for that."""
 
@@ -59,12 +59,12 @@ class Outbox:
     @property
     def behind(self) -> bool:
         """Whether that is far less than there could be."""
-        return self.pace.behind
+        return self.losses.behind
 
     def skip(self, frames: int, topics: int) -> None:
         """So many frames of so many topics were not delivered to it, which is too slow for them."""
         self.dropped += frames
-        self.pace.skip(frames * topics)
+        self.losses.skip(frames * topics)
 
     def add(self, lane: _Lane, message: Sized, at_s: float = 0.0) -> int:
         """Take a message; its number. ``at_s``: for :meth:`since`."""
@@ -172,7 +172,7 @@ class Outbox:
 class _Lane:
     """One topic's part of an outbox."""
 
-    def __init__(self, outbox: Outbox, load: Load, finish: Finish) -> None:
+    def __init__(self, outbox: Outbox, load: Backlog, finish: Finish) -> None:
         self.load = load
         self._outbox = outbox
         self._finish = finish
@@ -223,13 +223,13 @@ class StateLane(_Lane):
         waits = len(self._numbers)  # of a client that keeps up nothing does, and this is all
         outbox, numbers, now_s = self._outbox, self._numbers, time.monotonic()
         at_s = now_s if at_s is None else at_s
-        outbox.pace.offer(now_s)
+        outbox.losses.offer(now_s)
         if waits >= TOPIC_BOUND or (self.load.count and self.load.full(message, STATE_BOUND)):
             self.drop()
-        elif waits and outbox.pace.behind:
+        elif waits and outbox.losses.behind:
             while numbers and at_s > outbox.since(numbers[0]) + LATE_S:
                 outbox.drop(numbers.popleft())
-        outbox.pace.lose(waits - len(numbers))
+        outbox.losses.lose(waits - len(numbers))
         self._add(message, at_s)
 
     def lose(self) -> None:
@@ -265,9 +265,9 @@ class EventLane(_Lane):
 
     def join(self, feed: Feed, subject: Subject) -> Callable[[], None]:
         """Listen to what is written to a feed's source; how to leave again."""
-        echo = feed.inlet.echo
-        echo.listen(subject, self)
-        return partial(echo.leave, subject, self)
+        write_subscriptions = feed.commands.write_subscriptions
+        write_subscriptions.listen(subject, self)
+        return partial(write_subscriptions.leave, subject, self)
 
 
 Lane = StateLane | EventLane

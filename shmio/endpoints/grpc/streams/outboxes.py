@@ -6,20 +6,20 @@ import asyncio
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from shmio.endpoints.grpc.streams.back_pressure import Total
+from shmio.endpoints.grpc.streams.back_pressure import TotalBacklog
 from shmio.endpoints.grpc.streams.outbox import Outbox
-from shmio.endpoints.grpc.time.audience import Audience
+from shmio.endpoints.grpc.time.open_streams import OpenStreams
 
 
 class Outboxes:
     """Those of all open streams, counted."""
 
-    def __init__(self, audience: Audience | None = None) -> None:
+    def __init__(self, open_streams: OpenStreams | None = None) -> None:
         """``audience``: what they are a part of."""
-        self._audience = Audience() if audience is None else audience
+        self._open_streams = OpenStreams() if open_streams is None else open_streams
         self._open: set[Outbox] = set()
         self._dropped = 0
-        self._total = Total()
+        self._total = TotalBacklog()
 
     @property
     def waiting_bytes(self) -> int:
@@ -41,7 +41,7 @@ class Outboxes:
         self._open.add(outbox)
         self._total.streams += 1
         try:
-            with self._audience.joined():
+            with self._open_streams.joined():
                 yield outbox
         finally:
             self._open.discard(outbox)

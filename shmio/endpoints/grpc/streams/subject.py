@@ -9,7 +9,7 @@ from typing import Protocol
 from shmio.layout.model import Register
 
 
-class Picture(Protocol):
+class BlockImage(Protocol):
     """An image of a block and its time: a frame, or what is to become one."""
 
     @property
@@ -25,7 +25,7 @@ class Picture(Protocol):
         """The block's bytes."""
 
 
-class Source(Picture, Protocol):
+class SourceImage(BlockImage, Protocol):
     """A frame, with what its source delivered."""
 
     @property
@@ -33,7 +33,7 @@ class Source(Picture, Protocol):
         """That, whatever injections show instead."""
 
 
-Encode = Callable[[Picture], Sized | None]
+Encode = Callable[[BlockImage], Sized | None]
 """The message, whose length is in bytes; None where the bytes hold no value."""
 
 
@@ -49,4 +49,4 @@ class Subject:
     path: str
     registers: tuple[Register, ...] = field(compare=False)
     encode: Encode = field(compare=False)
-    changed: Callable[[Source, Source], bool] | None = field(default=None, compare=False)
+    changed: Callable[[SourceImage, SourceImage], bool] | None = field(default=None, compare=False)

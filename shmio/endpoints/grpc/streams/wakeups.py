@@ -9,19 +9,19 @@ from typing import Final
 from shmio.segment import Block
 from shmio.segment.relay import TURN_NS, Relay, Word
 
-Ring = Callable[[], object]
+Callback = Callable[[], object]
 
 REST_S: Final = 0.005
 """So long a bell is not heard when nobody listens to it but those that have time."""
 
 
-class Bell:
+class WakeUp:
     """Rings for one word in shared memory, at first too, and now and then. For the event loop's thread."""
 
     def __init__(self, word: Word, name: str, turn_ns: int = TURN_NS) -> None:
         """``turn_ns``: it rings after so long without a ring, too."""
-        self.listeners: dict[Ring, None] = {}  # in the order in which they came
-        self.patient: set[Ring] = set()
+        self.listeners: dict[Callback, None] = {}  # in the order in which they came
+        self.patient: set[Callback] = set()
         """Those of them that have time for a while."""
         self._loop = asyncio.get_running_loop()
         self._relay = Relay(word, name, turn_ns)
@@ -76,56 +76,56 @@ class Bell:
             ring()
 
 
-class Bells:
+class WakeUps:
     """Those of all blocks that are followed; for the event loop's thread."""
 
     def __init__(self) -> None:
-        self._bells: dict[int, Bell] = {}
-        self._stopped: list[Bell] = []
+        self._wake_ups: dict[int, WakeUp] = {}
+        self._stopped: list[WakeUp] = []
 
-    def join(self, block: Block, ring: Ring, *, patient: bool = False) -> None:
+    def join(self, block: Block, ring: Callback, *, patient: bool = False) -> None:
         """Have ``ring`` called when there is a frame or an event, and now and then.
 
         ``patient``: if nobody else listens but who :meth:`rest`, it has time, too.
         """
-        bell = self._bells.get(block.section)
+        bell = self._wake_ups.get(block.section)
         if bell is None:
-            bell = Bell(block.ring, f"bell-{block.source}", min(TURN_NS, block.stale_ns))
-            self._bells[block.section] = bell
+            bell = WakeUp(block.ring, f"bell-{block.source}", min(TURN_NS, block.stale_ns))
+            self._wake_ups[block.section] = bell
         bell.listeners[ring] = None
         if patient:
             bell.patient.add(ring)
         else:
             bell.resume()
 
-    def rest(self, block: Block, ring: Ring) -> None:
+    def rest(self, block: Block, ring: Callback) -> None:
         """Have ``ring`` not called for a while; it still is if others listen that have no time."""
-        if bell := self._bells.get(block.section):
+        if bell := self._wake_ups.get(block.section):
             bell.patient.add(ring)
             bell.rest()
 
-    def resume(self, block: Block, ring: Ring) -> None:
+    def resume(self, block: Block, ring: Callback) -> None:
         """Have it called again."""
-        if bell := self._bells.get(block.section):
+        if bell := self._wake_ups.get(block.section):
             bell.patient.discard(ring)
             bell.resume()
 
-    def leave(self, block: Block, ring: Ring) -> None:
+    def leave(self, block: Block, ring: Callback) -> None:
         """The last one takes the bell with it."""
-        bell = self._bells.get(block.section)
+        bell = self._wake_ups.get(block.section)
         if bell is None:
             return  # all are closed
         bell.listeners.pop(ring, None)
         bell.patient.discard(ring)
         if not bell.listeners:
             bell.stop()
-            del self._bells[block.section]
+            del self._wake_ups[block.section]
             self._stopped = [stopped for stopped in self._stopped if stopped.alive] + [bell]
 
     def close(self) -> None:
         """Ring no more, and wait until nothing is left of it."""
-        for bell in self._bells.values():
+        for bell in self._wake_ups.values():
             bell.stop()
-        for bell in (*self._bells.values(), *self._stopped):
+        for bell in (*self._wake_ups.values(), *self._stopped):
             bell.join()
-        self._bells.clear()
+        self._wake_ups.clear()

@@ -9,7 +9,7 @@ from typing import Final, Protocol
 
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outboxes import Outboxes
-from shmio.endpoints.grpc.time.virtual_time import Hold, Moment
+from shmio.endpoints.grpc.time.virtual_time import Moment, VirtualTime
 from shmio.errors import SegmentError
 from shmio.local.time_control import Step
 from shmio.segment.clock import ClockState
@@ -21,7 +21,7 @@ together less than a step's own time-out. A stream that is the only one has so l
 log = logging.getLogger("shmio.grpc")
 
 
-class Other(Protocol):
+class StepReceiver(Protocol):
     """Who has streams of his own."""
 
     @property
@@ -43,30 +43,30 @@ class Delivery:
     order anyhow: nothing is waited for before the marks if there is only one.
     """
 
-    def __init__(self, hold: Hold, feeds: Mapping[str, Feed], outboxes: Outboxes) -> None:
-        self._hold = hold
+    def __init__(self, virtual_time: VirtualTime, feeds: Mapping[str, Feed], outboxes: Outboxes) -> None:
+        self._virtual_time = virtual_time
         self._feeds = feeds
         self._outboxes = outboxes
         self._turn = asyncio.Lock()
-        self.others: list[Other] = []
+        self.receivers: list[StepReceiver] = []
 
     def begin(self, moment: Moment) -> None:
         """Time has become virtual, and this is what was delivered of it."""
-        self._hold.on = True
-        self._hold.moment = moment
+        self._virtual_time.on = True
+        self._virtual_time.moment = moment
         for feed in self._feeds.values():
             feed.hold()
 
     def end(self) -> None:
         """Time is real again; while no step is :attr:`busy`."""
-        self._hold.on = False
+        self._virtual_time.on = False
         for feed in list(self._feeds.values()):
             try:
                 feed.release()
             except SegmentError as error:
                 log.warning("time is real again: %s", str(error))
-        for other in self.others:
-            other.release()
+        for receiver in self.receivers:
+            receiver.release()
 
     async def deliver(self, step: Step, mark: Callable[[], None]) -> bool:
         """Deliver a step, and ``mark`` it; False if it has been already.
@@ -74,13 +74,13 @@ class Delivery:
         The stream of a client that does not read ends ``PATIENCE_S`` later.
         """
         async with self._turn:
-            if step.number <= self._hold.moment.number:
+            if step.number <= self._virtual_time.moment.number:
                 return False
             self._show(step)
-            if len(self._outboxes) + sum(other.streams for other in self.others) > 1:
+            if len(self._outboxes) + sum(receiver.streams for receiver in self.receivers) > 1:
                 await self._outboxes.taken(PATIENCE_S)
-            for other in self.others:
-                await other.deliver(step)
+            for receiver in self.receivers:
+                await receiver.deliver(step)
             mark()
             await self._outboxes.taken(PATIENCE_S)
             return True
@@ -92,15 +92,15 @@ class Delivery:
 
     def pass_over(self, step: Step, mark: Callable[[], None]) -> None:
         """Deliver a step for which there is no stream, unless it has been already; while none is :attr:`busy`."""
-        if step.number > self._hold.moment.number:
+        if step.number > self._virtual_time.moment.number:
             self._show(step)
             mark()
 
     def _show(self, step: Step) -> None:
         for feed in list(self._feeds.values()):
             if feed.block.attributes.stepped:
-                feed.inlet.catch_up()
-        self._hold.moment = Moment(step.number, step.time_ns)
+                feed.commands.catch_up()
+        self._virtual_time.moment = Moment(step.number, step.time_ns)
         for feed in list(self._feeds.values()):
             try:
                 feed.step()

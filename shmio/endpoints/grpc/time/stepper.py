@@ -13,10 +13,10 @@ from typing import Any, Final, TypeVar
 from shmio.endpoints.grpc.commands.publish import Publisher
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outboxes import Outboxes
-from shmio.endpoints.grpc.streams.wakeups import Bell, Bells
-from shmio.endpoints.grpc.time.audience import Audience
+from shmio.endpoints.grpc.streams.wakeups import WakeUp, WakeUps
+from shmio.endpoints.grpc.time.open_streams import OpenStreams
 from shmio.endpoints.grpc.time.timeline import Timeline
-from shmio.endpoints.grpc.time.virtual_time import Hold, Status
+from shmio.endpoints.grpc.time.virtual_time import TimeStatus, VirtualTime
 from shmio.errors import ShmioError, TimeError
 from shmio.local.step_answers import Wait
 from shmio.local.time_control import Coordinator, Step, check_step
@@ -27,14 +27,14 @@ BRIEF_NS: Final = 500_000
 """So long the event loop stands still for sources that answer at once: to be told by a thread takes about as long."""
 
 
-class Driver:
+class StepDriver:
     """What :meth:`Coordinator.step` is to a thread; for the event loop's thread, one step at a time."""
 
-    def __init__(self, coordinator: Coordinator, clock: ClockPage, bells: Bells) -> None:
+    def __init__(self, coordinator: Coordinator, clock: ClockPage, wake_ups: WakeUps) -> None:
         self._coordinator = coordinator
         self._clock = clock
-        self._bells = bells
-        self._delivered: Bell | None = None  # nobody else delivers steps, as a rule
+        self._wake_ups = wake_ups
+        self._delivered: WakeUp | None = None  # nobody else delivers steps, as a rule
 
     async def step(self, dt_ns: int | None) -> Step:
         """Errors as of :meth:`Coordinator.step`; one that is cancelled is broken off."""
@@ -73,9 +73,9 @@ class Driver:
     def _listen(self, wait: Wait, ring: Callable[[], None]) -> Callable[[], object]:
         block = wait.block
         if block is not None:
-            self._bells.join(block, ring)
-            return lambda: self._bells.leave(block, ring)
-        bell = self._delivered = self._delivered or Bell(self._clock.delivered_bell, "delivered")
+            self._wake_ups.join(block, ring)
+            return lambda: self._wake_ups.leave(block, ring)
+        bell = self._delivered = self._delivered or WakeUp(self._clock.delivered_bell, "delivered")
         bell.listeners[ring] = None
         return lambda: bell.listeners.pop(ring)
 
@@ -167,19 +167,19 @@ class Stepper:
         self,
         segment: Segment,
         slot: ProcessSlot,
-        hold: Hold,
-        bells: Bells,
+        virtual_time: VirtualTime,
+        wake_ups: WakeUps,
         feeds: Mapping[str, Feed],
         outboxes: Outboxes,
         publisher: Publisher,
-        audience: Audience,
+        open_streams: OpenStreams,
     ) -> None:
         """Arguments as of :class:`Timeline`."""
         self._segment = segment
         self._publisher = publisher
         self._loop = asyncio.get_running_loop()
         self._coordinator = Coordinator(segment)
-        self._driver = Driver(self._coordinator, segment.clock, bells)
+        self._driver = StepDriver(self._coordinator, segment.clock, wake_ups)
         self._turn = asyncio.Lock()  # one moves time
         self._owns = False
         self._changing = asyncio.Lock()  # one begins to play, or ends
@@ -188,7 +188,7 @@ class Stepper:
         self._rest_s = 0.0  # when time is given up if nobody has moved it by then
         self._player = Player(self._make, lambda: segment.clock.read().step_size_ns)
         self._tasks: set[asyncio.Task[Any]] = set()
-        self.timeline = Timeline(segment, slot, hold, feeds, outboxes, audience, lambda: self._player.dt_ns)
+        self.timeline = Timeline(segment, slot, virtual_time, feeds, outboxes, open_streams, lambda: self._player.dt_ns)
         """How time stands, whoever moves it."""
 
     async def start(self, predecessor: int = 0) -> None:
@@ -225,15 +225,15 @@ class Stepper:
             if task is not self._moving:  # it is over, or others would wait for a step that nobody waits for
                 task.cancel()
 
-    async def play(self, dt_ns: int | None = None, rate: float = 1.0) -> Status:
+    async def play(self, dt_ns: int | None = None, rate: float = 1.0) -> TimeStatus:
         """Step from now on ``rate`` times as fast as real time; how time stands then. TimeError, ValueRangeError."""
         return await self._do(self._begin_play(dt_ns, rate))
 
-    async def pause(self, *, end: bool = False) -> Status:
+    async def pause(self, *, end: bool = False) -> TimeStatus:
         """Step no more by itself; TimeError. ``end``: tell that it is not alive, until somebody moves time."""
         return await self._do(self._end_play(end))
 
-    async def release(self) -> Status:
+    async def release(self) -> TimeStatus:
         """Have time be real again; TimeError: it is not ours to release, or was never real."""
         return await self._do(self._end_virtual())
 
@@ -324,7 +324,7 @@ class Stepper:
 
     # ---- playing ---------------------------------------------------------------------------------------------------
 
-    async def _begin_play(self, dt_ns: int | None, rate: float) -> Status:
+    async def _begin_play(self, dt_ns: int | None, rate: float) -> TimeStatus:
         _check(dt_ns)
         async with self._changing:
             self._player.dt_ns, self._player.rate = dt_ns, rate
@@ -332,7 +332,7 @@ class Stepper:
             self._player.begin()
         return self.timeline.status
 
-    async def _end_virtual(self) -> Status:
+    async def _end_virtual(self) -> TimeStatus:
         self._coordinator.check_release()
         async with self._changing:
             await self._player.end()
@@ -342,7 +342,7 @@ class Stepper:
                 self.timeline.ended = False
             return self.timeline.status
 
-    async def _end_play(self, end: bool) -> Status:
+    async def _end_play(self, end: bool) -> TimeStatus:
         async with self._changing:
             await self._player.end()
             await self._change(partial(self._coordinator.set_playing, False), end=end)

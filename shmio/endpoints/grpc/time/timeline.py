@@ -9,11 +9,11 @@ from typing import Any
 
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outboxes import Outboxes
-from shmio.endpoints.grpc.streams.wakeups import Bell
-from shmio.endpoints.grpc.time.audience import Audience
-from shmio.endpoints.grpc.time.delivery import Delivery, Other, before
-from shmio.endpoints.grpc.time.time_topics import Marks
-from shmio.endpoints.grpc.time.virtual_time import Hold, Moment, Status
+from shmio.endpoints.grpc.streams.wakeups import WakeUp
+from shmio.endpoints.grpc.time.delivery import Delivery, StepReceiver, before
+from shmio.endpoints.grpc.time.open_streams import OpenStreams
+from shmio.endpoints.grpc.time.time_topics import TimeTopics
+from shmio.endpoints.grpc.time.virtual_time import Moment, TimeStatus, VirtualTime
 from shmio.local.time_control import Step
 from shmio.segment import ProcessSlot, Segment
 from shmio.segment.clock import ClockState
@@ -26,19 +26,19 @@ class Timeline:
         self,
         segment: Segment,
         slot: ProcessSlot,
-        hold: Hold,
+        virtual_time: VirtualTime,
         feeds: Mapping[str, Feed],
         outboxes: Outboxes,
-        audience: Audience,
+        open_streams: OpenStreams,
         play_dt_ns: Callable[[], int | None],
     ) -> None:
         """``slot``: this process's in the table. ``audience``: while there is none, no step waits for it.
 
         ``play_dt_ns``: of each step that this process plays; None: the step size.
         """
-        self.marks = Marks(hold, self._now, lambda: self._clock.read().step_size_ns / 1e9)
+        self.time_topics = TimeTopics(virtual_time, self._now, lambda: self._clock.read().step_size_ns / 1e9)
         """Tells steps and time."""
-        self.hold = hold
+        self.virtual_time = virtual_time
         """Whether time is virtual, and what was delivered."""
         self.steered = False
         """Whether this process moves time at present, and has its steps delivered by itself."""
@@ -46,31 +46,31 @@ class Timeline:
         """Whether somebody has said that time goes on no more; until it does."""
         self._clock = segment.clock
         self._slot = slot
-        self._audience = audience
+        self._open_streams = open_streams
         self._play_dt_ns = play_dt_ns
         self._loop = asyncio.get_running_loop()
-        self._delivery = Delivery(hold, feeds, outboxes)
-        self._watchers: list[Callable[[Status], None]] = []
+        self._delivery = Delivery(virtual_time, feeds, outboxes)
+        self._watchers: list[Callable[[TimeStatus], None]] = []
         self._delivering: set[asyncio.Task[Any]] = set()
-        self._page: Bell | None = None  # rings when it is written
+        self._page: WakeUp | None = None  # rings when it is written
         state = self._clock.read()
         if state.virtual:
             self._delivery.begin(Moment(state.done, state.present_ns))
         self._told = self._status(state)[1:]
         self._delivered = state.done
         self._awaited = False  # whether steps wait for this process
-        audience.changed = self._attend
-        hold.look = self.look
+        open_streams.changed = self._attend
+        virtual_time.look = self.look
         self._attend()
 
     def start(self) -> None:
         """Begin to follow time."""
-        self._page = Bell(self._clock.bell, "clock")
+        self._page = WakeUp(self._clock.bell, "clock")
         self._page.listeners[self.look] = None
 
     async def stop(self) -> None:
         """Deliver and tell nothing more."""
-        self.marks.stop()
+        self.time_topics.stop()
         page, self._page = self._page, None  # who moves time may still give it up, and have it ring again
         if page is not None:
             page.stop()
@@ -90,16 +90,16 @@ class Timeline:
         if self._page is not None:
             (self._page.mute if owns else self._page.unmute)()
 
-    def also(self, other: Other) -> None:
+    def add_receiver(self, receiver: StepReceiver) -> None:
         """Have each step delivered to others, too, before it is over."""
-        self._delivery.others.append(other)
+        self._delivery.receivers.append(receiver)
 
-    def watch(self, watcher: Callable[[Status], None]) -> None:
+    def watch(self, watcher: Callable[[TimeStatus], None]) -> None:
         """Have it told of each step and of each change."""
         self._watchers.append(watcher)
 
     @property
-    def status(self) -> Status:
+    def status(self) -> TimeStatus:
         """How time stands."""
         return self._status(self.look())
 
@@ -113,11 +113,11 @@ class Timeline:
     def look(self) -> ClockState:
         """Heed what the page says by now; also called now and then, for the death of who plays rings no bell."""
         state = self._clock.read()
-        if state.virtual and not self.hold.on:
+        if state.virtual and not self.virtual_time.on:
             self._delivery.begin(before(state))
-        elif self.hold.on and not state.virtual and not self._delivery.busy:  # else with the next look
+        elif self.virtual_time.on and not state.virtual and not self._delivery.busy:  # else with the next look
             self._end(state)
-        if state.virtual and state.done > self.hold.moment.number and not self.steered:
+        if state.virtual and state.done > self.virtual_time.moment.number and not self.steered:
             step = Step(state.done, state.present_ns, state.dt_ns)
             if self._awaited or self._delivery.busy:
                 task = self._loop.create_task(self.deliver(step))
@@ -133,12 +133,12 @@ class Timeline:
     def _end(self, state: ClockState) -> None:
         """Time was released: it goes by itself again."""
         self._delivery.end()
-        self.marks.resume()
+        self.time_topics.resume()
         self._tell(self._status(state), state)
 
     def _attend(self) -> None:
         """Have steps wait for this process from now on, or no longer."""
-        if self._audience:
+        if self._open_streams:
             self.look()  # it is shown what is over by now, and waited for from the next step on
             self._awaited = True
             self._clock.deliver(self._slot.index, self._delivered)
@@ -148,18 +148,18 @@ class Timeline:
 
     def _mark(self, step: Step) -> None:
         self.ended = False
-        self.marks.tell()
+        self.time_topics.tell()
         state = self._clock.read()
-        self._tell(Status(step.time_ns, step.dt_ns, True, state.playing), state)
+        self._tell(TimeStatus(step.time_ns, step.dt_ns, True, state.playing), state)
 
-    def _status(self, state: ClockState) -> Status:
+    def _status(self, state: ClockState) -> TimeStatus:
         dt_ns = (self._play_dt_ns() if state.playing else None) or state.step_size_ns
-        return Status(self._now().clock_ns, dt_ns, not self.ended, state.playing)
+        return TimeStatus(self._now().clock_ns, dt_ns, not self.ended, state.playing)
 
-    def _tell(self, status: Status, state: ClockState) -> None:
+    def _tell(self, status: TimeStatus, state: ClockState) -> None:
         self._told = self._status(state)[1:]
         for watcher in self._watchers:
             watcher(status)
 
     def _now(self) -> Moment:
-        return self.hold.moment if self.hold.on else Moment(0, self._clock.read().time_ns)
+        return self.virtual_time.moment if self.virtual_time.on else Moment(0, self._clock.read().time_ns)

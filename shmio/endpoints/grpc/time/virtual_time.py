@@ -13,7 +13,7 @@ class Moment(NamedTuple):
     clock_ns: int
 
 
-class Status(NamedTuple):
+class TimeStatus(NamedTuple):
     """How time stands. ``dt_ns``: of the step that it tells of, or else what a step moves time by at present."""
 
     clock_ns: int
@@ -22,7 +22,7 @@ class Status(NamedTuple):
     playing: bool
 
 
-class Still(NamedTuple):
+class DeliveredImage(NamedTuple):
     """A picture of a block (``streams.subject``) as a step has left it; ``raw`` as of a frame."""
 
     number: int
@@ -31,7 +31,7 @@ class Still(NamedTuple):
     raw: bytes
 
 
-class Hold:
+class VirtualTime:
     """Whether time is virtual, and the step that was delivered last.
 
     While it is, what comes out of blocks on the instance's clock is shown step by step. Written in the event loop's

@@ -10,13 +10,13 @@ import pytest
 from shmio.client import calls
 from shmio.endpoints import in_flight
 from shmio.endpoints.grpc.server import server
-from shmio.endpoints.grpc.server.call_guard import Limits
+from shmio.endpoints.grpc.server.call_guard import CallLimits
 from shmio.endpoints.grpc.services import simlog_v2, simlog_v2_values
 from shmio.endpoints.grpc.streams import back_pressure, outbox
 
 PAGE = Path(__file__).parents[4] / "docs/reference/grpc-access.md"
 ROW = re.compile(r"^\| (.+?) \| (\d+)( MiB| s)? \|", re.MULTILINE)
-LIMITS = Limits()
+LIMITS = CallLimits()
 MIB = 1 << 20
 SILENT_MS = sum(value for name, value in server.OPTIONS if name.startswith("grpc.keepalive_time"))
 

@@ -148,12 +148,12 @@ def test_of_two_reloads_the_later_one_counts(monkeypatch: pytest.MonkeyPatch) ->
 
     async def test() -> None:
         worker: Any = SimpleNamespace(log=logging.getLogger("test"))
-        doors: Any = SimpleNamespace(take=lambda grpc: taken.append(grpc.number))
+        listeners: Any = SimpleNamespace(take=lambda grpc: taken.append(grpc.number))
         server: Any = SimpleNamespace(calls=SimpleNamespace(review=lambda: 0))
         turn = Turn()
-        first = asyncio.create_task(_take_anew(worker, Path("x"), doors, server, turn))
+        first = asyncio.create_task(_take_anew(worker, Path("x"), listeners, server, turn))
         assert await asyncio.to_thread(begun.wait, TIMEOUT_S)
-        second = asyncio.create_task(_take_anew(worker, Path("x"), doors, server, turn))
+        second = asyncio.create_task(_take_anew(worker, Path("x"), listeners, server, turn))
         waits = asyncio.create_task(turn.waited_for.wait())
         await asyncio.wait((second, waits), return_when=asyncio.FIRST_COMPLETED)  # it is over, if it need not wait
         going_on.set()

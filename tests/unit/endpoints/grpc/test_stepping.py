@@ -180,7 +180,7 @@ def test_what_was_written_before_a_step_is_in_it_and_its_echo_before(instance: s
 
 def test_what_a_client_of_version_1_has_published_is_applied_before_its_step(instance: str) -> None:
     async def test(served: Endpoint, models: Models) -> None:
-        goal, echo = await open_v1(served, "sim/goal"), await open_v1(served, "sim/goal/in")
+        goal, write_subscriptions = await open_v1(served, "sim/goal"), await open_v1(served, "sim/goal/in")
         publish: Any = served.stub.Publish(timeout=TIMEOUT_S)
         expected = ["0"]
         for number in range(1, 40):
@@ -191,7 +191,7 @@ def test_what_a_client_of_version_1_has_published_is_applied_before_its_step(ins
             assert await step(served) == 0
             expected.append(last)
         assert await values(goal, len(expected)) == expected
-        first = await asyncio.wait_for(echo.read(), TIMEOUT_S)
+        first = await asyncio.wait_for(write_subscriptions.read(), TIMEOUT_S)
         assert (first.value, first.timeStamp.seq, first.timeStamp.stamp.nsec) == ("100", 0, 0)
         await publish.done_writing()
         await publish
@@ -382,7 +382,7 @@ def test_one_that_takes_nothing_costs_one_step_and_holds_nothing_any_more(
         reader = await served.subscriber("reader", "sim/count")
 
         def given_up() -> bool:
-            streams = served.service._native._open
+            streams = served.service._shmio_v1._open
             return any(outbox.failure for outbox in served.service._outboxes._open) or any(one.late for one in streams)
 
         number = 0
@@ -395,7 +395,7 @@ def test_one_that_takes_nothing_costs_one_step_and_holds_nothing_any_more(
         got = await messages(reader, number + 4)
         assert got == [("sim/count", float(n)) for n in range(number + 4)]
         assert {subject.path for subject in served.feeds["sim"]._channels} == {"count"}
-        assert not any(one._followers for one in served.service._native._open)
+        assert not any(one._followers for one in served.service._shmio_v1._open)
         await connection.drop(reset=True)
 
     simulate(instance, test)

@@ -12,7 +12,7 @@ import grpc
 import pytest
 
 from shmio.config import UnixAddress
-from shmio.endpoints.grpc.server.access import Door, Keys
+from shmio.endpoints.grpc.server.access import Keys, ListenerAccess
 from shmio.endpoints.grpc.server.listeners import Listener
 from shmio.endpoints.grpc.server.server import Server
 from shmio.errors import EndpointError
@@ -25,7 +25,7 @@ from tests.unit.endpoints.harness import TIMEOUT_S, Endpoint, serve
 @pytest.mark.parametrize("name", ["socket", "a name 100 % as # it may ? be"])
 def test_it_serves_there_and_leaves_nothing(segment: Segment, tmp_path: Path, name: str) -> None:
     file = tmp_path / name
-    listener = Listener(UnixAddress(str(file)), Door(Keys()))
+    listener = Listener(UnixAddress(str(file)), ListenerAccess(Keys()))
 
     async def test(served: Endpoint) -> None:
         server = Server(served.service)
@@ -52,7 +52,7 @@ def test_a_group_may_open_it(segment: Segment, tmp_path: Path) -> None:
 
     async def test(served: Endpoint) -> None:
         server = Server(served.service)
-        await server.start([Listener(UnixAddress(str(file)), Door(Keys()))], gid=os.getegid())
+        await server.start([Listener(UnixAddress(str(file)), ListenerAccess(Keys()))], gid=os.getegid())
         assert (stat.S_IMODE(file.stat().st_mode), file.stat().st_gid) == (0o660, os.getegid())
         await server.stop()
 

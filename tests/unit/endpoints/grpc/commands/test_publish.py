@@ -262,10 +262,10 @@ def test_a_client_that_leaves_while_it_is_slowed_down_loses_nothing_that_was_rec
             await call.write(message("cell/step", str(number)).SerializeToString())
 
         async def slowed() -> bool:
-            return not served.feeds["cell"].inlet.ready({"step": 1})
+            return not served.feeds["cell"].commands.ready({"step": 1})
 
         await served.until(slowed)
-        under_way = len(served.feeds["cell"].inlet._pending)
+        under_way = len(served.feeds["cell"].commands._in_flight)
         assert 50 < under_way < 2000
         call.cancel()
         device.run()
@@ -277,7 +277,7 @@ def test_a_client_that_leaves_while_it_is_slowed_down_loses_nothing_that_was_rec
 
 
 async def idle(served: Endpoint) -> bool:
-    return not served.feeds["cell"].inlet._pending and not served.service._publisher._waiting
+    return not served.feeds["cell"].commands._in_flight and not served.service._publisher._waiting
 
 
 def test_what_the_device_refuses_is_refused(segment: Segment, caplog: pytest.LogCaptureFixture) -> None:
@@ -313,7 +313,7 @@ def test_what_was_meant_for_a_source_before_its_restart_is_never_done(
         late = asyncio.ensure_future(publish(served, [message("cell/step", "2"), message("cell/inputs/0", "9")]))
 
         async def sent() -> bool:
-            return len(served.feeds["cell"].inlet._pending) == 3
+            return len(served.feeds["cell"].commands._in_flight) == 3
 
         await served.until(sent)
         served.writer = segment.writer("cell")

@@ -52,7 +52,7 @@ def test_who_listens_to_in_sees_what_is_written_by_whomever(segment: Segment, in
         assert first.msgType == "int"
         stream.cancel()
         await served.until(lambda: listening(served, 0))
-        assert served.feeds["cell"].inlet.echo._channels == {}
+        assert served.feeds["cell"].commands.write_subscriptions._channels == {}
 
     with_plant(segment, test)
 
@@ -127,7 +127,7 @@ def test_a_long_write_is_shown_once_and_whole(segment: Segment) -> None:
 
 def test_who_joins_in_the_middle_of_a_write_is_shown_the_next_one(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
-        events = served.feeds["cell"].inlet._ear._cursor
+        events = served.feeds["cell"].commands._event_follower._cursor
 
         async def heard() -> bool:
             return events.behind == 0

@@ -16,8 +16,8 @@ import trustme
 
 from shmio.config import Address, Grpc, Tls, Token
 from shmio.config.model import Client, Listening
-from shmio.endpoints.grpc.server.access import NEEDS, Door, Keys
-from shmio.endpoints.grpc.server.listeners import Doors, Listener
+from shmio.endpoints.grpc.server.access import NEEDS, Keys, ListenerAccess
+from shmio.endpoints.grpc.server.listeners import Listener, Listeners
 from shmio.endpoints.grpc.server.server import Server
 from shmio.segment import Segment
 from shmio.wire import simlog_v1_pb2 as wire
@@ -67,7 +67,7 @@ def follow(channel: grpc.aio.Channel, secret: str) -> Any:
 def test_a_token_may_what_its_roles_say(segment: Segment, caplog: pytest.LogCaptureFixture) -> None:
     async def test(served: Endpoint) -> None:
         async with (
-            guarded(served, Doors(LOCAL).listeners) as (server, (port,)),
+            guarded(served, Listeners(LOCAL).listeners) as (server, (port,)),
             grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel,
         ):
             assert await call(channel, GET, secret=READER)
@@ -98,7 +98,7 @@ def test_a_token_may_what_its_roles_say(segment: Segment, caplog: pytest.LogCapt
 
 def test_no_call_of_any_service_passes_without_its_role(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
-        nobody = Listener(Address("127.0.0.1", 0), Door(Keys(), ()))
+        nobody = Listener(Address("127.0.0.1", 0), ListenerAccess(Keys(), ()))
         names = ("simulation.", "simlog.", "grpc.health.", "grpc.reflection.")
         async with (
             guarded(served, [nobody]) as (server, (port,)),
@@ -132,26 +132,26 @@ def test_a_call_that_is_not_in_the_table_is_refused(segment: Segment, monkeypatc
 def test_a_reload_ends_the_streams_of_tokens_that_went_and_no_others(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         served.publish(image(step=1))
-        doors = Doors(LOCAL)
+        listeners = Listeners(LOCAL)
         async with (
-            guarded(served, doors.listeners) as (server, (port,)),
+            guarded(served, listeners.listeners) as (server, (port,)),
             grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel,
         ):
             stays, goes = follow(channel, READER), follow(channel, WRITER)
             for stream in (stays, goes):
                 assert wire.ROSMessage.FromString(await stream.read()).value == "1"
             new = "newone-0123456789abcdef"
-            doors.take(Grpc(listen=LOCAL.listen, token=[BOTH[0], token(new, "read")]))
+            listeners.take(Grpc(listen=LOCAL.listen, token=[BOTH[0], token(new, "read")]))
             assert server.calls.review() == 1
             told, message = await refusal(goes.read())
             assert (told, message.startswith("the token is none")) == (UNKNOWN, True)
             assert await call(channel, GET, secret=new)
             served.publish(image(step=2))
             assert wire.ROSMessage.FromString(await stays.read()).value == "2"
-            doors.take(Grpc(listen=LOCAL.listen, token=[token(READER, "write")]))
+            listeners.take(Grpc(listen=LOCAL.listen, token=[token(READER, "write")]))
             assert server.calls.review() == 1
             assert (await refusal(stays.read()))[0] is DENIED
-            doors.take(Grpc(listen=LOCAL.listen))
+            listeners.take(Grpc(listen=LOCAL.listen))
             assert await call(channel, GET), "open, as without tokens"
             stays.cancel()
 
@@ -161,8 +161,8 @@ def test_a_reload_ends_the_streams_of_tokens_that_went_and_no_others(segment: Se
 def test_an_address_gives_its_roles_to_who_shows_nothing(segment: Segment) -> None:
     async def test(served: Endpoint) -> None:
         config = Grpc(listen=[], token=BOTH, address=[Listening(listen="127.0.0.1:0", roles=["read"])])
-        exposed = Listener(Address("127.0.0.1", 0), Door(Keys.of(config), ["read"], takes_tokens=False))
-        async with guarded(served, [*Doors(config).listeners, exposed]) as (_, ports):
+        exposed = Listener(Address("127.0.0.1", 0), ListenerAccess(Keys.of(config), ["read"], takes_tokens=False))
+        async with guarded(served, [*Listeners(config).listeners, exposed]) as (_, ports):
             async with grpc.aio.insecure_channel(f"127.0.0.1:{ports[0]}") as channel:
                 assert await call(channel, GET)
                 told, message = await refusal(call(channel, PUBLISH, b""))
@@ -206,7 +206,7 @@ def test_certificates_have_roles_by_their_names(segment: Segment, tmp_path: Path
 
     async def test(served: Endpoint) -> None:
         nonlocal port
-        async with guarded(served, Doors(config).listeners, tls) as (_, (port,)):
+        async with guarded(served, Listeners(config).listeners, tls) as (_, (port,)):
             async with as_client("dash.lab.example") as channel:
                 assert await call(channel, GET)
                 told, message = await refusal(call(channel, PUBLISH, b""))
@@ -226,7 +226,7 @@ def test_those_who_call_are_told_at_once_however_little_they_send(segment: Segme
 
     async def test(served: Endpoint) -> None:
         async with (
-            guarded(served, Doors(LOCAL).listeners) as (server, (port,)),
+            guarded(served, Listeners(LOCAL).listeners) as (server, (port,)),
             grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel,
         ):
             silent: Any = channel.stream_unary(GET)(timeout=TIMEOUT_S)

@@ -11,7 +11,7 @@ import grpc
 import pytest
 
 from shmio.endpoints.grpc.server.access import NEEDS, client_of
-from shmio.endpoints.grpc.server.call_guard import Limits
+from shmio.endpoints.grpc.server.call_guard import CallLimits
 from shmio.segment import Segment
 from shmio.wire import simlog_v1_pb2 as wire
 from tests.unit.endpoints import http2
@@ -84,7 +84,7 @@ def test_connections_beyond_the_limit_are_closed_and_the_others_go_on(segment: S
         await idle[1].drop(reset=True)
         await polite.close()
 
-    serve(segment, test, Limits(connections=3))
+    serve(segment, test, CallLimits(connections=3))
 
 
 async def until_calls(served: Endpoint, count: int) -> None:
@@ -121,7 +121,7 @@ def test_one_client_cannot_have_all_calls_and_no_more_than_there_are_are_open(se
             await client.close()
         await until_calls(served, 0)
 
-    serve(segment, test, Limits(calls=12, reserve=4, share=2))
+    serve(segment, test, CallLimits(calls=12, reserve=4, share=2))
 
 
 def test_the_limits_hold_as_documented(segment: Segment) -> None:
@@ -170,7 +170,7 @@ def test_a_call_without_its_message_ends(segment: Segment) -> None:
         assert await refusal(closed) == (grpc.StatusCode.INVALID_ARGUMENT, f"{GET}: the call has no message")
         await until_calls(served, 0)
 
-    serve(segment, test, Limits(message_s=0.05))
+    serve(segment, test, CallLimits(message_s=0.05))
 
 
 PUBLISHES = [method for method in NEEDS if method.endswith("/Publish")]

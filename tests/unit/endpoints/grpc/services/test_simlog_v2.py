@@ -268,7 +268,7 @@ def test_writes_whose_clients_left_are_done_or_not_but_harm_nobody(segment: Segm
         await write(served, "cell/step", 77)
 
         async def idle() -> bool:
-            return not served.feeds["cell"].inlet._pending
+            return not served.feeds["cell"].commands._in_flight
 
         await served.until(idle)
         assert device.memory[12:14] == b"\0\x4d"

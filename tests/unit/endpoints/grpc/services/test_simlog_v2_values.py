@@ -12,7 +12,7 @@ from shmio.endpoints.grpc.commands.path_kind import Shape, shape
 from shmio.endpoints.grpc.services.simlog_v1_values import time_stamp as time_stamp_v1
 from shmio.endpoints.grpc.services.simlog_v2_values import (
     MAX_LEVELS,
-    Encoded,
+    EncodedMessage,
     encoder,
     from_wire,
     path_field,
@@ -153,14 +153,14 @@ def test_a_text_has_all_digits_of_a_long_number() -> None:
 @pytest.mark.parametrize("clock_ns", [0, 1, 999_999_999, 1_000_000_000, 3_000_000_007, 2**62])
 def test_times_are_as_protobuf_writes_them(clock_ns: int) -> None:
     seconds, nanos = divmod(clock_ns, 1_000_000_000)
-    header = v2.SimlogMessage.FromString(Encoded(time_stamp(clock_ns), b"").under(b"")).header
+    header = v2.SimlogMessage.FromString(EncodedMessage(time_stamp(clock_ns), b"").under(b"")).header
     assert (header.timestamp.seconds, header.timestamp.nanos) == (seconds, nanos)
     stamp = v1.ROSMessage.FromString(time_stamp_v1(2**32 + 5, clock_ns)).timeStamp
     assert (stamp.seq, stamp.stamp.sec, stamp.stamp.nsec) == (5, seconds, clock_ns)
 
 
 def test_one_value_is_sent_under_each_of_its_paths() -> None:
-    encoded = Encoded(time_stamp(5), b"")
+    encoded = EncodedMessage(time_stamp(5), b"")
     paths = ["cell/a", "CELL://a", "cell/a", ""]
     found = [v2.SimlogMessage.FromString(encoded.under(path_field(path))).header.path for path in paths]
     assert found == paths

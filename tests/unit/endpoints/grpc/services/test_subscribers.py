@@ -51,7 +51,7 @@ async def end(stream: Any) -> tuple[grpc.StatusCode, str]:
 async def left(served: Endpoint) -> bool:
     """Whether nobody is listening any more."""
     feed = served.feeds["cell"]
-    return await listening(served, 0) and not feed._channels and not feed.inlet.echo.busy
+    return await listening(served, 0) and not feed._channels and not feed.commands.write_subscriptions.busy
 
 
 def test_current_values_come_first_then_every_change_of_all_topics_in_the_order_of_frames(segment: Segment) -> None:
@@ -385,7 +385,7 @@ def test_a_reload_moves_topics_and_one_that_is_gone_comes_back_with_its_source(s
         spec = BlockSpec("cell", layout, 10_000_000, STALE_NS, 1 << 20, Attributes("test", WRITABLE[:1]))
         segment.change(retire=["cell"], add=[spec])
         old = served.feeds["cell"]
-        served.feeds["cell"] = type(old)(segment.blocks["cell"], 4, served.bells, lambda *_: None)
+        served.feeds["cell"] = type(old)(segment.blocks["cell"], 4, served.wake_ups, lambda *_: None)
         served.feeds["cell"].start()
         served.service.move(["cell"])
         assert not old._channels

@@ -6,7 +6,7 @@ import asyncio
 
 import pytest
 
-from shmio.endpoints.grpc.shmio_v1.simulate import Fill
+from shmio.endpoints.grpc.shmio_v1.simulate import OutputEncoder
 from shmio.endpoints.grpc.shmio_v1.values import MAX_VALUES
 from shmio.endpoints.grpc.shmio_v1.views import Selection
 from shmio.errors import ValueRangeError
@@ -22,7 +22,7 @@ def test_values_by_path_are_few_for_each_takes_its_time(instance: str) -> None:
     blocks = [BlockSpec("line", ROWS, 20_000_000, 500_000_000, 1 << 20)]
     with Segment.create(instance, blocks, []) as segment:
         try:
-            fill = Fill(Selection(1, segment.blocks["line"], ROWS.registers))
+            fill = OutputEncoder(Selection(1, segment.blocks["line"], ROWS.registers))
             given = [wire.Assignment(path=f"rows/{at}", value=value_to_wire(at, "rows")) for at in range(MAX_VALUES)]
             image = bytearray(ROWS.size)
             asyncio.run(fill.assigned(given, image))

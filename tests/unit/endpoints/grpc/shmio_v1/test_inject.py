@@ -400,7 +400,7 @@ def test_events_that_were_missed_end_what_cannot_be_told_in_full(segment: Segmen
     async def test(served: Endpoint, _: Plant) -> None:
         async with connect_aio(f"127.0.0.1:{served.port}") as cell:
             outward, inward = await cell.inject("cell/axis"), await cell.inject("cell/step/in", originals=True)
-            served.feeds["cell"].inlet.followers.fail("3 events of source cell were missed")
+            served.feeds["cell"].commands.followers.fail("3 events of source cell were missed")
             with pytest.raises(RemoteError, match="3 events of source cell were missed"):
                 await drain_aio(inward)
             (one,) = await cell.injections()

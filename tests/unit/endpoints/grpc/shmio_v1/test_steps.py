@@ -39,7 +39,7 @@ def test_so_many_steps_are_done_and_all_streams_have_each_of_them(instance: str)
             seen = []
             async for step in cell.steps(40, 0.02):
                 seen.append(step)
-                assert served.service.stepper.timeline.hold.moment.number >= step.step
+                assert served.service.stepper.timeline.virtual_time.moment.number >= step.step
             assert seen == done(*range(1, 41), dt_ms=20)
             assert (await cell.clock()).step == 40
         assert [await stream.values() for _ in range(40)] == [{"count": number} for number in range(1, 41)]
@@ -165,7 +165,7 @@ def test_of_who_does_not_read_the_next_steps_wait(monkeypatch: pytest.MonkeyPatc
 
     async def test() -> None:
         stepper: Any = Stepper()
-        messages = clock.Steps(stepper, "peer").messages(requests())
+        messages = clock.StepsCall(stepper, "peer").messages(requests())
         sizes = []
         async for message in messages:
             sizes.append(len(wire.StepsResponse.FromString(message).steps))

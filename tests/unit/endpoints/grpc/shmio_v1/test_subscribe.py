@@ -298,7 +298,7 @@ def reload(served: Endpoint, layout: Layout | None) -> None:
     old = served.feeds.pop("cell")
     old.stop()
     if layout:
-        feed = served.feeds["cell"] = Feed(served.segment.blocks["cell"], WRITER, served.bells, lambda *_: None)
+        feed = served.feeds["cell"] = Feed(served.segment.blocks["cell"], WRITER, served.wake_ups, lambda *_: None)
         feed.start()
         served.writer = served.segment.writer("cell")
     served.service.move(["cell"])

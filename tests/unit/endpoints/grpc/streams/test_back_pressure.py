@@ -9,10 +9,10 @@ from contextlib import closing
 import pytest
 
 from shmio.endpoints.grpc.streams import back_pressure, outbox, wakeups
-from shmio.endpoints.grpc.streams.back_pressure import Pace
+from shmio.endpoints.grpc.streams.back_pressure import LossMonitor
 from shmio.endpoints.grpc.streams.feed import Feed
 from shmio.endpoints.grpc.streams.outbox import Outbox, StateLane
-from shmio.endpoints.grpc.streams.wakeups import Bells
+from shmio.endpoints.grpc.streams.wakeups import WakeUps
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Quality, Segment
 from shmio.segment.block import Stamp
 from tests.unit.endpoints.grpc.test_grpc import STEP
@@ -21,7 +21,7 @@ from tests.unit.endpoints.harness import LAYOUT, SOON_STALE_NS, STALE_NS, TIMEOU
 MANY = 300
 
 
-class Known(Pace):
+class Known(LossMonitor):
     """Says what it is told to."""
 
     def __init__(self, *, behind: bool) -> None:
@@ -36,14 +36,14 @@ class Followed:
 
     def __init__(self, segment: Segment, *behind: bool, source: str = "cell") -> None:
         self.writer = segment.writer(source)
-        self._bells = Bells()
+        self._wake_ups = WakeUps()
         self.told = list[bool]()
-        self.feed = Feed(segment.blocks[source], WRITER, self._bells, lambda _, good: self.told.append(good))
+        self.feed = Feed(segment.blocks[source], WRITER, self._wake_ups, lambda _, good: self.told.append(good))
         self.count = 0
         self.feed.start()
         self.streams = [Outbox() for _ in behind]
         for stream, late in zip(self.streams, behind, strict=True):
-            stream.pace = Known(behind=late)
+            stream.losses = Known(behind=late)
             StateLane(stream).join(self.feed, STEP)
 
     async def begin(self) -> None:
@@ -76,7 +76,7 @@ class Followed:
 
     def stop(self) -> None:
         self.feed.stop()
-        self._bells.close()
+        self._wake_ups.close()
 
 
 def follow(segment: Segment, test: Callable[[Followed], Awaitable[None]], *behind: bool) -> None:
@@ -249,19 +249,19 @@ def test_bad_news_of_a_source_that_says_nothing_more_wait_for_no_ring(
     monkeypatch.setattr(wakeups, "REST_S", 0.001)
 
     async def test(followed: Followed) -> None:
-        passes, heard = followed.feed._crowd.passes, asyncio.Event()
+        passes, heard = followed.feed._back_pressure.passes, asyncio.Event()
 
         def passed() -> bool:
             heard.set()
             return passes()
 
-        monkeypatch.setattr(followed.feed._crowd, "passes", passed)
+        monkeypatch.setattr(followed.feed._back_pressure, "passes", passed)
         await followed.fail()
         async with asyncio.timeout(TIMEOUT_S):
             await heard.wait()
         assert followed.told == [True], "nobody has looked yet"
         monkeypatch.setattr(back_pressure, "LOOK_S", 0.0)
-        followed.feed._crowd._until_s = 0.0
+        followed.feed._back_pressure._until_s = 0.0
         async with asyncio.timeout(TIMEOUT_S):
             while followed.told == [True]:  # noqa: ASYNC110  it has no bell of its own
                 await asyncio.sleep(0)

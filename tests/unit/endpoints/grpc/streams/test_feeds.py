@@ -13,8 +13,8 @@ from shmio.endpoints.grpc.streams import back_pressure
 from shmio.endpoints.grpc.streams import wakeups as ringing
 from shmio.endpoints.grpc.streams.feeds import Feeds
 from shmio.endpoints.grpc.streams.subject import Subject
-from shmio.endpoints.grpc.streams.wakeups import Bells
-from shmio.endpoints.grpc.time.virtual_time import Hold, Moment
+from shmio.endpoints.grpc.streams.wakeups import WakeUps
+from shmio.endpoints.grpc.time.virtual_time import Moment, VirtualTime
 from shmio.segment import Attributes, BlockSpec, Quality, Segment
 from tests.unit.endpoints.grpc.test_grpc import STEP, Recorder
 from tests.unit.endpoints.harness import LAYOUT, STALE_NS, TIMEOUT_S, WRITABLE, WRITER, image
@@ -24,8 +24,8 @@ from tests.unit.endpoints.stepped import stepped_segment
 
 def test_what_a_reload_ended_is_forgotten_when_its_streams_are_gone(segment: Segment, instance: str) -> None:
     async def run(opened: Segment) -> None:
-        bells = Bells()
-        feeds = Feeds(opened, WRITER, bells, lambda source, good: None)
+        wake_ups = WakeUps()
+        feeds = Feeds(opened, WRITER, wake_ups, lambda source, good: None)
         feeds.start()
         old = feeds["cell"]
         stream = Recorder()
@@ -54,7 +54,7 @@ def test_what_a_reload_ended_is_forgotten_when_its_streams_are_gone(segment: Seg
         assert feeds.messages == counted
         assert feeds.alive
         feeds.stop()
-        bells.close()
+        wake_ups.close()
 
     with Segment.open(instance, writable=True) as opened:
         asyncio.run(run(opened))
@@ -64,8 +64,8 @@ def test_the_loop_goes_on_while_a_new_layout_is_read(segment: Segment, instance:
     """Whatever is read of the segment is read by another thread than that of the streams."""
 
     async def run(opened: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-        bells = Bells()
-        feeds = Feeds(opened, WRITER, bells, lambda source, good: None)
+        wake_ups = WakeUps()
+        feeds = Feeds(opened, WRITER, wake_ups, lambda source, good: None)
         feeds.start()
         await feeds.follow()
         going_on, begun, refresh = threading.Event(), asyncio.Event(), opened.refresh
@@ -87,7 +87,7 @@ def test_the_loop_goes_on_while_a_new_layout_is_read(segment: Segment, instance:
             assert await following == ["second"]
         assert list(feeds) == ["cell", "second"]
         feeds.stop()
-        bells.close()
+        wake_ups.close()
 
     with Segment.open(instance, writable=True) as opened, pytest.MonkeyPatch.context() as monkeypatch:
         asyncio.run(run(opened, monkeypatch))
@@ -98,9 +98,9 @@ COUNT = Subject("raw", "count", (MODEL_LAYOUT.registers[0],), lambda picture: by
 
 def test_a_model_that_a_reload_changes_in_virtual_time_is_shown_step_by_step_too(instance: str) -> None:
     async def run(opened: Segment) -> None:
-        bells, hold = Bells(), Hold()
-        hold.on, hold.moment = True, Moment(6, 0)
-        feeds = Feeds(opened, WRITER, bells, lambda source, good: None, hold)
+        wake_ups, virtual_time = WakeUps(), VirtualTime()
+        virtual_time.on, virtual_time.moment = True, Moment(6, 0)
+        feeds = Feeds(opened, WRITER, wake_ups, lambda source, good: None, virtual_time)
         feeds.start()
         attributes = Attributes("simulation", ("goal",), stepped=True)
         spec = BlockSpec("sim", MODEL_LAYOUT, 10_000_000, STALE_NS, 1 << 20, attributes)
@@ -116,12 +116,12 @@ def test_a_model_that_a_reload_changes_in_virtual_time_is_shown_step_by_step_too
                     await asyncio.sleep(0)
         assert stream.got == [bytes((6, 1))], "the first image, and nothing more before a step"
         for number in (7, 8):
-            hold.moment = Moment(number, 0)
+            virtual_time.moment = Moment(number, 0)
             feeds["sim"].step()
         assert stream.got == [bytes((6, 1)), bytes((7, 3))]
         feeds["sim"].leave(COUNT, stream)
         feeds.stop()
-        bells.close()
+        wake_ups.close()
 
     with stepped_segment(instance, "sim") as segment:
         asyncio.run(run(segment))
@@ -133,8 +133,8 @@ def test_a_feed_that_is_held_passes_nothing_over(instance: str, monkeypatch: pyt
     monkeypatch.setattr(ringing, "REST_S", 0.001)
 
     async def run(opened: Segment) -> None:
-        told, bells = list[bool](), Bells()
-        feeds = Feeds(opened, WRITER, bells, lambda _, good: told.append(good))
+        told, wake_ups = list[bool](), WakeUps()
+        feeds = Feeds(opened, WRITER, wake_ups, lambda _, good: told.append(good))
         feeds.start()
         feed, stream, writer = feeds["sim"], Recorder(), opened.writer("sim")
         feed.listen(COUNT, stream)
@@ -151,7 +151,7 @@ def test_a_feed_that_is_held_passes_nothing_over(instance: str, monkeypatch: pyt
         assert stream.stream.dropped == 0
         feed.leave(COUNT, stream)
         feeds.stop()
-        bells.close()
+        wake_ups.close()
 
     with stepped_segment(instance, "sim", virtual=False) as segment:
         asyncio.run(run(segment))

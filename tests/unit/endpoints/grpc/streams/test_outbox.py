@@ -79,14 +79,14 @@ def test_of_values_that_come_at_once_it_is_given_those_that_are_not_older_than_t
         outbox = Outbox()
         lane = StateLane(outbox)
         for behind, left in ((False, [b"a", b"b", b"c"]), (True, [b"b", b"c"])):
-            outbox.pace.behind = behind
+            outbox.losses.behind = behind
             for letter, at_s in (
                 (b"a", 7.0),
                 (b"b", 7.0 + back_pressure.LATE_S),
                 (b"c", 7.0 + 1.5 * back_pressure.LATE_S),
             ):
                 lane.deliver(letter, at_s)
-                outbox.pace.behind = behind
+                outbox.losses.behind = behind
             assert await rest(outbox) == left
 
     asyncio.run(test())

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from shmio.endpoints.grpc.streams.back_pressure import BEHIND_S, WINDOW_S, Pace
+from shmio.endpoints.grpc.streams.back_pressure import BEHIND_S, WINDOW_S, LossMonitor
 
 
-def far_behind(now_s: float) -> Pace:
+def far_behind(now_s: float) -> LossMonitor:
     """One that was found to lose most of what there is."""
-    pace = Pace()
-    pace.offer(now_s - WINDOW_S)
-    pace.lose(1)
-    pace.offer(now_s)
-    assert pace.behind
-    return pace
+    losses = LossMonitor()
+    losses.offer(now_s - WINDOW_S)
+    losses.lose(1)
+    losses.offer(now_s)
+    assert losses.behind
+    return losses
 
 
 def test_all_who_are_far_behind_are_tried_again_together() -> None:
     together_s = 7 * BEHIND_S
     paces = [far_behind(together_s - before_s) for before_s in (0.9 * BEHIND_S, 0.4 * BEHIND_S, 0.001)]
     for now_s, behind in ((together_s - 0.0005, True), (together_s, False)):
-        for pace in paces:
-            pace.offer(now_s)
-        assert [pace.behind for pace in paces] == [behind] * 3
+        for losses in paces:
+            losses.offer(now_s)
+        assert [losses.behind for losses in paces] == [behind] * 3

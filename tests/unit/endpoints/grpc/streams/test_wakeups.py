@@ -6,14 +6,14 @@ import asyncio
 
 import pytest
 
-from shmio.endpoints.grpc.streams.wakeups import Bell, Bells
+from shmio.endpoints.grpc.streams.wakeups import WakeUp, WakeUps
 from shmio.segment import Segment
 from tests.unit.endpoints.harness import TIMEOUT_S, image
 
 
 def test_all_who_listen_to_a_block_hear_of_it_in_the_order_in_which_they_came(segment: Segment) -> None:
     async def test() -> None:
-        block, writer, bells = segment.blocks["cell"], segment.writer("cell"), Bells()
+        block, writer, wake_ups = segment.blocks["cell"], segment.writer("cell"), WakeUps()
         heard = list[tuple[str, int]]()
         reached = asyncio.Event()
 
@@ -25,15 +25,15 @@ def test_all_who_listen_to_a_block_hear_of_it_in_the_order_in_which_they_came(se
             if block.ring.head() == 100:
                 reached.set()
 
-        bells.join(block, first)
-        bells.join(block, second)
+        wake_ups.join(block, first)
+        wake_ups.join(block, second)
         for number in range(100):
             writer.publish(image(step=number), cycle=number)
         async with asyncio.timeout(TIMEOUT_S):
             await reached.wait()
         assert heard[-2:] == [("first", 100), ("second", 100)]
         assert len(heard) < 200, "a loop that has no time is not rung for each frame"
-        bells.leave(block, first)
+        wake_ups.leave(block, first)
         heard.clear()
         reached.clear()
         writer.publish(image(), cycle=100)
@@ -41,24 +41,24 @@ def test_all_who_listen_to_a_block_hear_of_it_in_the_order_in_which_they_came(se
             while ("second", 101) not in heard:  # noqa: ASYNC110  another thread's doing
                 await asyncio.sleep(0)
         assert ("first", 101) not in heard
-        bells.close()
+        wake_ups.close()
 
     asyncio.run(test())
 
 
 def test_who_leaves_while_it_rings_takes_nobody_with_him(segment: Segment) -> None:
     async def test() -> None:
-        block, bells, over = segment.blocks["cell"], Bells(), asyncio.Event()
+        block, wake_ups, over = segment.blocks["cell"], WakeUps(), asyncio.Event()
 
         def leaving() -> None:
-            bells.leave(block, leaving)
+            wake_ups.leave(block, leaving)
 
-        bells.join(block, leaving)
-        bells.join(block, over.set)
+        wake_ups.join(block, leaving)
+        wake_ups.join(block, over.set)
         async with asyncio.timeout(TIMEOUT_S):
             await over.wait()
-        bells.leave(block, over.set)
-        bells.close()
+        wake_ups.leave(block, over.set)
+        wake_ups.close()
 
     asyncio.run(test())
 
@@ -67,7 +67,7 @@ def test_a_bell_rests_while_all_who_listen_have_time(segment: Segment, monkeypat
     monkeypatch.setattr("shmio.endpoints.grpc.streams.wakeups.REST_S", 1000.0)
 
     async def test() -> None:
-        block, writer, bells = segment.blocks["cell"], segment.writer("cell"), Bells()
+        block, writer, wake_ups = segment.blocks["cell"], segment.writer("cell"), WakeUps()
         heard = list[str]()
         rung = asyncio.Event()
 
@@ -81,29 +81,29 @@ def test_a_bell_rests_while_all_who_listen_have_time(segment: Segment, monkeypat
             heard.append("prompt")
             rung.set()
 
-        bells.join(block, busy)
-        bells.join(block, patient, patient=True)
-        bells.rest(block, busy)
+        wake_ups.join(block, busy)
+        wake_ups.join(block, patient, patient=True)
+        wake_ups.rest(block, busy)
         heard.clear()
         for number in range(100):
             writer.publish(image(step=number), cycle=number)
             await asyncio.sleep(0)
         assert not heard
-        bells.join(block, prompt)  # who has no time ends it for all
+        wake_ups.join(block, prompt)  # who has no time ends it for all
         async with asyncio.timeout(TIMEOUT_S):
             await rung.wait()
             assert heard == ["busy", "patient", "prompt"]
-            bells.rest(block, busy)
+            wake_ups.rest(block, busy)
             rung.clear()
             writer.publish(image(), cycle=100)
             await rung.wait()
-            bells.leave(block, prompt)
-            bells.rest(block, busy)
+            wake_ups.leave(block, prompt)
+            wake_ups.rest(block, busy)
             heard.clear()
-            bells.resume(block, busy)
+            wake_ups.resume(block, busy)
             while not heard:  # noqa: ASYNC110  another thread's doing
                 await asyncio.sleep(0)
-        bells.close()
+        wake_ups.close()
 
     asyncio.run(test())
 
@@ -115,7 +115,7 @@ def test_a_bell_that_has_rested_rings_for_what_was_left_and_goes_on(
 
     async def test() -> None:
         writer, heard = segment.writer("cell"), asyncio.Event()
-        bell = Bell(segment.blocks["cell"].ring, "bell", turn_ns=10**15)
+        bell = WakeUp(segment.blocks["cell"].ring, "bell", turn_ns=10**15)
         bell.listeners[heard.set] = None
         bell.patient.add(heard.set)
 

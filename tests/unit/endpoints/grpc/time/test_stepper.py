@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable, Generator
 from typing import Any
 
-from shmio.endpoints.grpc.time.stepper import Driver
+from shmio.endpoints.grpc.time.stepper import StepDriver
 from shmio.local.step_answers import Wait
 from shmio.local.time_control import Step
 
@@ -56,8 +56,8 @@ def test_a_source_that_rings_much_before_it_answers_does_not_hold_up_the_loop() 
             await asyncio.sleep(0)
 
     async def test() -> None:
-        coordinator, clock, bells = Coordinator(), None, Bells()
-        driver = Driver(coordinator, clock, bells)  # type: ignore[arg-type]  # what it needs of them
+        coordinator, clock, wake_ups = Coordinator(), None, Bells()
+        driver = StepDriver(coordinator, clock, wake_ups)  # type: ignore[arg-type]  # what it needs of them
         beside = asyncio.create_task(others())
         assert await driver.step(None) == DONE
         await beside

@@ -13,7 +13,7 @@ HELD_S: Final = 0.005
 T = TypeVar("T")
 
 
-async def turns(items: Iterable[T]) -> AsyncIterator[T]:
+async def time_sliced(items: Iterable[T]) -> AsyncIterator[T]:
     """Each of the items; others get their turn whenever those before have taken ``HELD_S``."""
     begun_s = time.perf_counter()
     for item in items:

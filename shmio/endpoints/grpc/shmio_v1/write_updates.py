@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 
-from shmio.endpoints.grpc.commands.block_commands import Inlet
-from shmio.endpoints.grpc.commands.pending_image import Underway, ones
+from shmio.endpoints.grpc.commands.command_client import CommandClient
+from shmio.endpoints.grpc.commands.pending_image import PendingImage, ones
 from shmio.endpoints.grpc.shmio_v1.columns import Columns, pack_slots
-from shmio.endpoints.grpc.shmio_v1.waiting import Waiting
+from shmio.endpoints.grpc.shmio_v1.send_queue import SendQueue
 from shmio.endpoints.grpc.streams.encoding import field
 from shmio.layout.model import Register
 from shmio.layout.values.write import covering
@@ -36,7 +36,7 @@ def head_of(table: int, event: Event) -> bytes:
     ).SerializeToString()
 
 
-class Writes:
+class WriteUpdates:
     """What is written to a table's registers, each part of a command once for all who listen. For the loop's thread."""
 
     def __init__(self, number: int, block: Block, registers: Sequence[Register], columns: Columns) -> None:
@@ -45,7 +45,7 @@ class Writes:
         self._block = block
         self._columns = columns
         self._cover = np.frombuffer(covering(registers, block.layout.size), np.uint8)
-        self._underway = Underway(block)
+        self._pending_image = PendingImage(block)
         self._command = _NOBODY
         self._event = 0
         self._update = b""
@@ -64,9 +64,9 @@ class Writes:
         command = event.incarnation, event.writer, event.command
         if command != self._command:
             self._command = command
-            self._underway.begin(event.frame)
-        self._underway.put(event)
-        image, mask = self._underway.image, self._underway.mask
+            self._pending_image.begin(event.frame)
+        self._pending_image.put(event)
+        image, mask = self._pending_image.image, self._pending_image.mask
         part = bytearray(len(mask))
         apply(part, (ones(event),))
         if not (np.frombuffer(part, np.uint8) & self._cover).any():
@@ -81,22 +81,22 @@ class Writes:
         return head_of(self._number, event) + field(_VALUES, pack_slots(self._columns.decode(bytes(image)), slots))
 
 
-class Inward:
+class WriteFollower:
     """A subscriber's place in what is written: a queue, for none of it may be left out."""
 
-    def __init__(self, writes: Writes, inlet: Inlet, ring: Callable[[], None]) -> None:
+    def __init__(self, writes: WriteUpdates, commands: CommandClient, ring: Callable[[], None]) -> None:
         """``ring``: called when there is something."""
         self.failure = ""
         """Why what comes next is not all there was; empty: it is."""
         self._writes = writes
-        self._inlet = inlet
+        self._commands = commands
         self._ring = ring
-        self._waiting = Waiting()
-        inlet.followers.listen(self)
+        self._waiting = SendQueue()
+        commands.followers.listen(self)
 
     def leave(self) -> None:
         """Listen no more."""
-        self._inlet.followers.leave(self)
+        self._commands.followers.leave(self)
 
     @property
     def waits(self) -> bool:
@@ -117,6 +117,6 @@ class Inward:
     def fail(self, reason: str) -> None:
         """What comes next is not all there was: what waits is not given either, and nothing more is kept."""
         self.failure = self.failure or reason
-        self._waiting = Waiting()
+        self._waiting = SendQueue()
         self.leave()
         self._ring()

@@ -9,7 +9,7 @@ import grpc
 import pytest
 
 from shmio.client import connect_aio
-from shmio.endpoints.grpc.shmio_v1 import waiting
+from shmio.endpoints.grpc.shmio_v1 import send_queue
 from shmio.layout.model import Layout, Register
 from shmio.segment import Attributes, BlockSpec, EventKind, ProcessSpec, Segment
 from shmio.wire import shmio_v1_pb2 as wire
@@ -133,7 +133,7 @@ def test_a_reload_is_followed(segment: Segment) -> None:
             if isinstance(found := await stream.next(), wire.Ended):
                 ends.append(found)
         assert {(end.source, end.direction) for end in ends} == {("cell", 0), ("cell", 1)}
-        assert not feed.inlet.followers.busy
+        assert not feed.commands.followers.busy
         served.feeds["cell"] = feed
         served.service.move(["cell"])
         while not isinstance(await stream.next(), wire.Table):
@@ -146,7 +146,7 @@ def test_a_reload_is_followed(segment: Segment) -> None:
 
 
 def test_who_does_not_keep_up_is_told_and_left(segment: Segment, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(waiting, "MAX_WAITING", 8)
+    monkeypatch.setattr(send_queue, "MAX_WAITING", 8)
 
     async def test(served: Endpoint, _: Plant) -> None:
         stream = subscribe(served, "cell/step/in")
@@ -157,11 +157,11 @@ def test_who_does_not_keep_up_is_told_and_left(segment: Segment, monkeypatch: py
         head = events.head()
         (accepted,) = (one for at in range(1, head + 1) if (one := events.read(at)) and one.kind == EventKind.ACCEPTED)
         for number in range(head + 1, head + 21):  # within one turn of the loop: nobody reads meanwhile
-            feed.inlet.followers.tell(accepted._replace(number=number))
+            feed.commands.followers.tell(accepted._replace(number=number))
         code, text = await refusal(drain(stream))
         assert code is Status.RESOURCE_EXHAUSTED
         assert "messages wait to be read" in text
-        assert not feed.inlet.followers.busy
+        assert not feed.commands.followers.busy
 
     with_plant(segment, test)
 
@@ -175,7 +175,7 @@ def test_events_that_were_missed_end_it(segment: Segment) -> None:
     async def test(served: Endpoint, _: Plant) -> None:
         stream = subscribe(served, "cell/step/in")
         await joined(stream)
-        served.feeds["cell"].inlet.followers.fail("3 events of source cell were missed")
+        served.feeds["cell"].commands.followers.fail("3 events of source cell were missed")
         assert await refusal(drain(stream)) == (Status.RESOURCE_EXHAUSTED, "3 events of source cell were missed")
 
     with_plant(segment, test)
@@ -187,6 +187,6 @@ def test_what_is_not_served(segment: Segment) -> None:
         assert (await refusal(frames.next()))[0] is Status.INVALID_ARGUMENT
         nothing = subscribe(served, "cell/nothing/in")
         assert (await refusal(nothing.next()))[0] is Status.NOT_FOUND
-        assert not served.feeds["cell"].inlet.followers.busy
+        assert not served.feeds["cell"].commands.followers.busy
 
     with_plant(segment, test)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 
-class Audience:
+class OpenStreams:
     """The open streams, counted; for the event loop's thread."""
 
     def __init__(self) -> None:

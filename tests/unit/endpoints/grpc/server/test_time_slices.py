@@ -5,14 +5,14 @@ from __future__ import annotations
 import asyncio
 import time
 
-from shmio.endpoints.grpc.server.turns import HELD_S, turns
+from shmio.endpoints.grpc.server.time_slices import HELD_S, time_sliced
 
 
 def test_others_get_their_turn_between_items_that_take_long() -> None:
     seen: list[str] = []
 
     async def work() -> None:
-        async for item in turns(range(3)):
+        async for item in time_sliced(range(3)):
             until_s = time.perf_counter() + HELD_S
             while time.perf_counter() <= until_s:
                 pass

@@ -6,7 +6,7 @@ import resource
 
 import pytest
 
-from shmio.endpoints.grpc.server.descriptors import EACH, FEW, OWN, room, shortage
+from shmio.endpoints.grpc.server.file_descriptors import EACH, FEW, OWN, room, shortage
 
 INFINITE = resource.RLIM_INFINITY
 

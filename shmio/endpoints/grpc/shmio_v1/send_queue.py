@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections import deque
 from typing import Final
 
-from shmio.endpoints.grpc.streams.back_pressure import Load, Total
+from shmio.endpoints.grpc.streams.back_pressure import Backlog, TotalBacklog
 
 MAX_WAITING: Final = 4096
 
 
-class Waiting:
+class SendQueue:
     """Up to a number of them, and of bytes."""
 
     def __init__(self) -> None:
         self._messages: deque[bytes] = deque()
-        self._load = Load(Total())
+        self._load = Backlog(TotalBacklog())
 
     def __bool__(self) -> bool:
         return bool(self._messages)
