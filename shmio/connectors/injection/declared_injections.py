@@ -150,8 +150,8 @@ class DeclaredInjections:
         with self._output.turn:
             layer.activation.state = State.LIFTED
             self._publisher.publish()
-            held = list(lost(layer, "the injection was lifted"))
-            self._output.show([*held, layer_event(EventKind.LIFTED, layer, "lifted", command)])
+            told = [*lost(layer, "the injection was lifted"), *self._publisher.computed(self._output.base)]
+            self._output.show([*told, layer_event(EventKind.LIFTED, layer, "lifted", command)])
         return ""
 
     def follow(self) -> None:

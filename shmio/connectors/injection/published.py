@@ -78,6 +78,8 @@ class LayerPublisher:
         ends = [layer_event(EventKind.LIFTED, layer, reason, command) for layer in gone]
         held = [record for layer in gone if isinstance(layer, DeclaredLayer) for record in lost(layer, reason)]
         left = [layer for layer in self.injections.layers if layer.id in above]
+        for layer in left:
+            self._computed.pop(layer.id, None)  # they are told now what they get without those that are gone
         return [*held, *self.inner_values(left, ends[0]), *ends] if ends else []
 
     def inner_values(self, layers: Iterable[Layer], end: Record) -> Iterator[Record]:
@@ -92,16 +94,19 @@ class LayerPublisher:
     def computed(self, base: bytes) -> Iterator[Record]:
         """What clients' layers over ``/out`` get by now from declared ones further in, if it has changed.
 
+        Also when the last of these has become inactive, for then others further in may give them something else.
         No command brings it: its number is 0, and each event is the item-th of so many items.
         """
         for layer in self.injections.layers:
             inner = self.injections.inner(layer) if layer.given else []
-            if not any(isinstance(one, DeclaredLayer) and (one.cover & layer.cover).any() for one in inner):
-                self._computed.pop(layer.id, None)
+            declared = any(isinstance(one, DeclaredLayer) and (one.cover & layer.cover).any() for one in inner)
+            told = self._computed.pop(layer.id, None)
+            if not declared and told is None:
                 continue
             writes = self.injections.inner_values(base, layer)
-            if writes != self._computed.get(layer.id):
+            if declared:
                 self._computed[layer.id] = writes
+            if writes != told:
                 parts = list(_parts(Record(EventKind.DIVERTED, layer.name, injection=layer.id), writes))
                 yield from (part._replace(item=item, items=len(parts)) for item, part in enumerate(parts))
 

@@ -102,6 +102,35 @@ def test_what_a_declared_one_computes_goes_to_the_one_further_out(rig: Rig, loca
         assert any(one.values == {"speed": 7} for one in stream)
 
 
+def test_what_a_declared_one_computes_is_told_again_when_it_is_declared_again(rig: Rig, local: Attachment) -> None:
+    rig.client.write({"speed": 3})
+    rig.sees({"speed": 3})
+    with local.inject("cell/speed", priority=1) as outer:
+        stream = outer.diverted(timeout_s=20)
+        drift = msgspec.convert(
+            {"name": "drift", "target": "cell/speed", "operation": "offset", "value": 100}, Declaration
+        )
+        for _ in range(2):
+            declared = rig.client.declare(drift)
+            assert any(one.values == {"speed": 103} for one in stream)
+            rig.client.lift(declared)
+            rig.event(EventKind.LIFTED)
+
+
+def test_what_others_give_is_told_when_a_declared_one_between_becomes_inactive(rig: Rig, local: Attachment) -> None:
+    drift = {"name": "drift", "target": "cell/speed", "operation": "offset", "value": 100, "when": "cell/axis/1 > 0"}
+    rig.client.declare(msgspec.convert(drift, Declaration))
+    inner = rig.other.inject(["speed"], priority=-1)
+    rig.other.shadow(inner, {"speed": 7})
+    with local.inject("cell/speed", priority=1) as outer:
+        stream = outer.diverted(timeout_s=20)
+        assert next(stream).values == {"speed": 7}
+        rig.client.write({"axis/1": 1})
+        assert next(stream).values == {"speed": 107}
+        rig.client.write({"axis/1": 0})
+        assert next(stream).values == {"speed": 7}
+
+
 def test_a_program_gets_what_others_write_command_by_command(rig: Rig, local: Attachment) -> None:
     with local.inject("cell/speed/in", "cell/axis/in", "cell/lamps/2/in") as shadow:
         lamps = [place in (2, 3) for place in range(10)]
