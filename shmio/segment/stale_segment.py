@@ -187,7 +187,9 @@ def holder(slot: ProcessSlot, shared: SharedObject) -> Worker | None:
         return None
     try:
         fd = os.pidfd_open(pid)
-    except ProcessLookupError:
+    except OSError:
+        # The process has ended. If its number went to another program's thread, Linux says EINVAL,
+        # and from 6.14 on ENOENT; the latter also while the process is being reaped.
         return None
     if _maps(pid, shared.inode) and slot.alive():
         return Worker(slot.name, pid, fd)

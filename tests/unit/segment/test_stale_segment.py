@@ -7,14 +7,15 @@ import pwd
 import signal
 import subprocess
 import sys
+import threading
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from shmio.errors import AlreadyRunningError, NotRunningError, SegmentError
-from shmio.segment import ProcessSpec, Segment, instances
-from shmio.segment.stale_segment import clear, living
+from shmio.segment import ProcessSpec, Report, Segment, instances
+from shmio.segment.stale_segment import clear, holder, living
 
 SUPERVISOR = """
 import subprocess, sys
@@ -46,6 +47,23 @@ def test_a_living_supervisor_is_left_alone(instance: str) -> None:
         with pytest.raises(AlreadyRunningError, match=f"pid {os.getpid()}"):
             clear(instance)
         segment.unlink()
+
+
+def test_a_pid_that_went_to_a_thread_names_no_process(instance: str) -> None:
+    over = threading.Event()
+    thread = threading.Thread(target=over.wait)
+    thread.start()
+    try:
+        with Segment.create(instance, [], [ProcessSpec("cell", "source")]) as segment:
+            slot = segment.processes.find("cell")
+            assert slot.take()
+            assert thread.native_id is not None
+            slot.report = Report(thread.native_id)
+            assert holder(slot, segment.shared) is None
+            segment.unlink()
+    finally:
+        over.set()
+        thread.join()
 
 
 WORKER = """
