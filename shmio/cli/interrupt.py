@@ -12,14 +12,20 @@ from types import FrameType
 
 @contextmanager
 def told_to_stop() -> Iterator[threading.Event]:
-    """An event that is set by the first of these signals; whoever heeded them before does so again afterwards."""
+    """An event that is set by the first of these signals; whoever heeded them before does so again afterwards.
+
+    SIGHUP counts unless it is ignored, as by nohup.
+    """
     stopping = threading.Event()
 
     def stop(_number: int, _frame: FrameType | None) -> None:
         # Not here: the main thread, which is interrupted, may hold the event's lock.
         threading.Thread(target=stopping.set, daemon=True).start()
 
-    old = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    heeded = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+        heeded.remove(signal.SIGHUP)
+    old = {number: signal.signal(number, stop) for number in heeded}
     try:
         yield stopping
     finally:
