@@ -85,7 +85,7 @@ class TimeCalls:
         unary, clock = grpc.unary_unary_rpc_method_handler, wire.Clock.SerializeToString
         return {
             "Step": unary(self.step, wire.StepRequest.FromString, clock),
-            "StepsCall": grpc.stream_stream_rpc_method_handler(self.steps, wire.StepsRequest.FromString),
+            "Steps": grpc.stream_stream_rpc_method_handler(self.steps, wire.StepsRequest.FromString),
             "SetStepSize": unary(self.set_step_size, wire.SetStepSizeRequest.FromString, clock),
             "Play": unary(self.play, wire.PlayRequest.FromString, clock),
             "Pause": unary(self.pause, wire.PauseRequest.FromString, clock),
