@@ -18,9 +18,9 @@ from common import begin, db201, quantiles, table
 
 from shmio.config import Address
 from shmio.local.attach import attach
+from shmio.recorder.instance_follower import FROM_THE_FIRST, InstanceFollower
 from shmio.recorder.output import Output, create
 from shmio.recorder.recorder import Recorder
-from shmio.recorder.tap import FROM_THE_FIRST, Tap
 from shmio.segment import BlockSpec, Origin, Quality, Segment, Stamp
 from shmio.testing.cell import Cell
 
@@ -41,7 +41,9 @@ def record(folder: Path, period_ns: int, frames: int) -> Path:
     with Segment.create(f"bench-{os.getpid()}-recorded", [spec], [], origin=Origin(0, time.time_ns())) as segment:
         try:
             path, fd = create(folder, "bench")
-            recorder = Recorder(Tap(segment, FROM_THE_FIRST), Output(path, fd, limit_bytes=1 << 26), by="benchmark")
+            recorder = Recorder(
+                InstanceFollower(segment, FROM_THE_FIRST), Output(path, fd, limit_bytes=1 << 26), by="benchmark"
+            )
             started_ns = segment.header.started_ns
             writer = segment.writer("cell", Stamp(started_ns + FIRST_NS, FIRST_NS))
             for number in range(frames):

@@ -9,11 +9,11 @@ from typing import NamedTuple, Protocol
 from shmio.config import Declaration
 from shmio.layout.model import Layout, Register
 from shmio.local.reading import Reading
-from shmio.local.replays import Wanted
+from shmio.local.replays import ReplayRequest
 from shmio.local.writer import Outcome
 from shmio.model.replay_status import Playing
 from shmio.segment.clock import ClockState
-from shmio.segment.standing_injections import Standing
+from shmio.segment.standing_injections import StandingInjection
 
 
 class Selected(NamedTuple):
@@ -92,13 +92,13 @@ class Cell(Protocol):
     def declare(self, declarations: Sequence[Declaration], *, keep: bool) -> AbstractContextManager[Campaign]:
         """Lay declared injections, all or none, for the time of a ``with`` block unless they are to be kept."""
 
-    def injections(self) -> dict[str, tuple[Standing, ...]]:
+    def injections(self) -> dict[str, tuple[StandingInjection, ...]]:
         """What stands at present, by source; the innermost first."""
 
     def lift(self, source: str, number: int) -> None:
         """Lift an injection."""
 
-    def lift_all(self) -> list[tuple[str, Standing]]:
+    def lift_all(self) -> list[tuple[str, StandingInjection]]:
         """Lift all."""
 
     @property
@@ -120,5 +120,5 @@ class Cell(Protocol):
     def release(self) -> None:
         """Have it be real again."""
 
-    def replay(self, wanted: Wanted) -> list[Playing]:
+    def replay(self, wanted: ReplayRequest) -> list[Playing]:
         """Move what plays recordings, if anything is wanted; how they play then."""

@@ -16,12 +16,12 @@ from shmio.layout.model import Layout, Register
 from shmio.local.attach import Attachment
 from shmio.local.injection import Shadow
 from shmio.local.reading import Reading, reading
-from shmio.local.replays import Wanted
+from shmio.local.replays import ReplayRequest
 from shmio.local.writer import Outcome
 from shmio.model.replay_status import Playing
 from shmio.segment import Block, Cursor, Event, EventKind, Frame, Quality
 from shmio.segment.clock import ClockState
-from shmio.segment.standing_injections import Standing
+from shmio.segment.standing_injections import StandingInjection
 
 IDLE_S: Final = 0.5
 WAITING_FRAMES: Final = 64
@@ -115,7 +115,7 @@ class Local:
         """Lay declared injections, all or none, for the time of a ``with`` block unless they are to be kept."""
         return LocalCampaign(self.attachment, declarations, keep=keep)
 
-    def injections(self) -> dict[str, tuple[Standing, ...]]:
+    def injections(self) -> dict[str, tuple[StandingInjection, ...]]:
         """What stands at present, by source; the innermost first."""
         return self.attachment.injections()
 
@@ -123,7 +123,7 @@ class Local:
         """Lift an injection."""
         self.attachment.lift(source, number)
 
-    def lift_all(self) -> list[tuple[str, Standing]]:
+    def lift_all(self) -> list[tuple[str, StandingInjection]]:
         """Lift all."""
         return self.attachment.lift_all()
 
@@ -154,7 +154,7 @@ class Local:
         """Have it be real again."""
         self.attachment.release()
 
-    def replay(self, wanted: Wanted) -> list[Playing]:
+    def replay(self, wanted: ReplayRequest) -> list[Playing]:
         """Move what plays recordings, if anything is wanted; how they play then."""
         replay = self.attachment.replay
         return replay.status(wanted.sources) if wanted.nothing else replay.change(wanted)

@@ -26,12 +26,12 @@ from shmio.layout.model import Layout, Register
 from shmio.layout.types import element_type
 from shmio.layout.values.codec import Value
 from shmio.local.reading import Reading
-from shmio.local.replays import Wanted
+from shmio.local.replays import ReplayRequest
 from shmio.local.writer import Outcome as LocalOutcome
 from shmio.model.replay_status import Playing
 from shmio.segment import EventKind, Quality
 from shmio.segment.clock import ClockMode, ClockState
-from shmio.segment.standing_injections import Running, Standing
+from shmio.segment.standing_injections import DeclaredState, StandingInjection
 
 
 @contextmanager
@@ -136,11 +136,11 @@ class Remote:
         with self._client.declare(map(msgspec.to_builtins, declarations), keep=keep) as campaign:
             yield _RemoteCampaign(campaign)
 
-    def injections(self) -> dict[str, tuple[Standing, ...]]:
+    def injections(self) -> dict[str, tuple[StandingInjection, ...]]:
         """What stands at present, by source; the innermost first."""
-        found: dict[str, tuple[Standing, ...]] = {}
+        found: dict[str, tuple[StandingInjection, ...]] = {}
         for one in self._client.injections():
-            standing = Standing(
+            standing = StandingInjection(
                 one.number, one.direction, one.priority, one.keep, one.name, one.writer, one.pid,
                 one.ranges, None if one.running is None else _running(one.running),
             )  # fmt: skip
@@ -151,9 +151,12 @@ class Remote:
         """Lift an injection."""
         self._client.lift(source, number)
 
-    def lift_all(self) -> list[tuple[str, Standing]]:
+    def lift_all(self) -> list[tuple[str, StandingInjection]]:
         """Lift all."""
-        return [(one.source, Standing(one.number, "", 0, False, one.name, 0, 0, ())) for one in self._client.lift_all()]
+        return [
+            (one.source, StandingInjection(one.number, "", 0, False, one.name, 0, 0, ()))
+            for one in self._client.lift_all()
+        ]
 
     @property
     def clock(self) -> ClockState:
@@ -186,7 +189,7 @@ class Remote:
         """Have it be real again."""
         self._client.release()
 
-    def replay(self, wanted: Wanted) -> list[Playing]:
+    def replay(self, wanted: ReplayRequest) -> list[Playing]:
         """Move what plays recordings, if anything is wanted; how they play then."""
         wish = msgspec.to_builtins(wanted)  # what is wanted alone
         return self._client.replay(**wish)
@@ -241,9 +244,9 @@ class _RemoteCampaign:
         return found
 
 
-def _running(found: ClientRunning) -> Running:
+def _running(found: ClientRunning) -> DeclaredState:
     declaration = msgspec.convert(found.declaration, Declaration)
-    return Running(declaration, found.state, found.seed, found.runs, found.cycle, found.time_ns)
+    return DeclaredState(declaration, found.state, found.seed, found.runs, found.cycle, found.time_ns)
 
 
 def _outcomes(found: Sequence[Outcome]) -> list[LocalOutcome]:

@@ -11,7 +11,7 @@ import msgspec
 
 from shmio.cli.cell import Cell
 from shmio.cli.run import dumps
-from shmio.local.replays import Wanted
+from shmio.local.replays import ReplayRequest
 from shmio.logs import printable
 from shmio.model.replay_status import Playing
 
@@ -56,7 +56,7 @@ def execute(cell: Cell, options: argparse.Namespace) -> int:
     return 0
 
 
-def _wanted(options: argparse.Namespace) -> Wanted:
+def _wanted(options: argparse.Namespace) -> ReplayRequest:
     action, value = options.action, options.value
     if (value is None) != (action in _ALONE):
         options.refuse(f"{action} takes no VALUE" if value is not None else f"{action} needs a VALUE: {_VERBS[action]}")
@@ -77,7 +77,7 @@ def _wanted(options: argparse.Namespace) -> Wanted:
     }
     if action == "loop" and value not in ("on", "off"):
         options.refuse(f"loop is on or off, not {value!r}")
-    return Wanted(**wanted[action], sources=tuple(options.source))
+    return ReplayRequest(**wanted[action], sources=tuple(options.source))
 
 
 def _number(options: argparse.Namespace) -> float:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
-from shmio.local.writer import PATIENCE_S, RESTARTED, SILENT, Ticket
+from shmio.local.writer import PATIENCE_S, RESTARTED, SILENT, PendingCommand
 from shmio.segment import DONE, ENDS, Event, EventKind
 from shmio.segment.events import EVENT_DATA_SIZE
 
@@ -110,7 +110,7 @@ class InFlightTable:
 
     def add(
         self,
-        ticket: Ticket,
+        ticket: PendingCommand,
         cost: CommandCost,
         done: Done,
         accepted: Callable[[], None] | None = None,

@@ -25,21 +25,21 @@ from shmio.errors import CommandError, NotRunningError, PathError, QualityError,
 from shmio.layout.model import Register
 from shmio.layout.topic import Topic, look_up, parse_topic
 from shmio.layout.values.codec import Value
-from shmio.local.declared_injections import Laid, declare
+from shmio.local.declared_injections import DeclaredInjection, declare
 from shmio.local.injection import Diversion, Shadow, lift_all, written
 from shmio.local.reading import Reading, View, reading
-from shmio.local.timekeeper import Timed
-from shmio.local.writer import Commander, Outcome
+from shmio.local.timekeeper import TimeMethods
+from shmio.local.writer import Outcome, SourceWriter
 from shmio.segment.block import Block
 from shmio.segment.commands import Direction
 from shmio.segment.cursor import Cursor, Entry
 from shmio.segment.frame import Frame, Quality
 from shmio.segment.processes import Activity, Report
 from shmio.segment.segment import Segment, running_instances
-from shmio.segment.standing_injections import Standing
+from shmio.segment.standing_injections import StandingInjection
 
 
-def take_guest(segment: Segment) -> int:
+def take_guest_slot(segment: Segment) -> int:
     """Take a free guest's place for life; the number of its command queue. SegmentError: none is free."""
     places = segment.processes.guests
     for slot in places:
@@ -69,14 +69,14 @@ TURN_S = 1.0
 """How often a waiting reader looks whether the instance still is."""
 
 
-class Attachment(Timed):
+class Attachment(TimeMethods):
     """A running instance as a local program sees it. Use as a context manager, or :meth:`close`."""
 
     def __init__(self, segment: Segment) -> None:
         super().__init__(segment)
         self._turn = threading.Lock()
         self._guest: int | None = None
-        self._commanders: dict[str, Commander] = {}
+        self._source_writers: dict[str, SourceWriter] = {}
 
     def _blocks(self) -> dict[str, Block]:
         if self._segment.closed:
@@ -213,7 +213,7 @@ class Attachment(Timed):
         for path, topic in zip(values, topics, strict=True):
             if topic.direction == "out":
                 raise PathError(f"{path}: what comes out of a source is not written; leave out /out")
-        return self._commander(block).write(
+        return self._source_writer(block).write(
             {topic.path: value for topic, value in zip(topics, values.values(), strict=True)}, timeout_s
         )
 
@@ -229,12 +229,12 @@ class Attachment(Timed):
         if len(directions) != 1:
             raise PathError("an injection is over /out or over /in, not over both")
         direction = Direction.IN if "in" in directions else Direction.OUT
-        commander = self._commander(block)
+        source_writer = self._source_writer(block)
         events = block.events.cursor()  # from before it is laid: what it diverts at once is not missed
-        number = commander.inject(
+        number = source_writer.inject(
             [topic.path or "**" for topic in topics], direction=direction, priority=priority, keep=keep, name=name
         )
-        return Shadow(commander, number, direction, events, partial(self._next, block), keep=keep)
+        return Shadow(source_writer, number, direction, events, partial(self._next, block), keep=keep)
 
     def written(self, *paths: str, timeout_s: float | None = None) -> Iterator[Diversion]:
         """What is written to registers, structures or patterns of one source from now on, by whomever, in order.
@@ -248,29 +248,29 @@ class Attachment(Timed):
         patterns = [topic.path or "**" for topic in topics]
         return written(block, patterns, block.events.cursor(), partial(self._next, block), timeout_s)
 
-    def declare(self, declarations: Sequence[Declaration], *, keep: bool = False) -> list[Laid]:
+    def declare(self, declarations: Sequence[Declaration], *, keep: bool = False) -> list[DeclaredInjection]:
         """Lay injections that their sources run by themselves, all or none; see docs/reference/injections.md.
 
         Each goes when it is over or lifted, or, unless ``keep``, with this program. The attachment must be
         ``writable``. ConfigError; CommandError: a source refuses, or does not answer.
         """
-        return declare(declarations, self._blocks(), self._commander, keep=keep)
+        return declare(declarations, self._blocks(), self._source_writer, keep=keep)
 
-    def injections(self) -> dict[str, tuple[Standing, ...]]:
+    def injections(self) -> dict[str, tuple[StandingInjection, ...]]:
         """What stands at present, by source; the innermost first."""
         return {source: block.standing.read() for source, block in self._blocks().items()}
 
     def lift(self, source: str, number: int) -> None:
         """Lift an injection, whoever laid it. PathError: no such source; CommandError: no such injection."""
-        self._commander(self.block(source)).lift(number)
+        self._source_writer(self.block(source)).lift(number)
 
-    def lift_all(self) -> list[tuple[str, Standing]]:
+    def lift_all(self) -> list[tuple[str, StandingInjection]]:
         """Lift all injections of all sources, whoever laid them: (source, injection) of each.
 
         All are tried, and at once. CommandError: some still stand, and why.
         """
         standing = [(source, one) for source, ones in self.injections().items() for one in ones if not one.lifted]
-        lift_all([(self._commander(self.block(source)), one.id) for source, one in standing])
+        lift_all([(self._source_writer(self.block(source)), one.id) for source, one in standing])
         return standing
 
     def note(self, text: str, source: str | None = None) -> None:
@@ -279,18 +279,18 @@ class Attachment(Timed):
         The attachment must be ``writable``. PathError; ValueRangeError: too long; CommandError: the source's process
         does not answer.
         """
-        self._commander(self.block(source if source is not None else self.sources[0])).note(text)
+        self._source_writer(self.block(source if source is not None else self.sources[0])).note(text)
 
-    def _commander(self, block: Block) -> Commander:
-        """The commander for a block, in the name of one of the guests' places, kept from the first write on."""
+    def _source_writer(self, block: Block) -> SourceWriter:
+        """The source_writer for a block, in the name of one of the guests' places, kept from the first write on."""
         if not self._segment.shared.writable:
             raise CommandError("this attachment only reads: attach with writable=True")
         with self._turn:
             if self._guest is None:
-                self._guest = take_guest(self._segment)
-            known = self._commanders.get(block.source)
+                self._guest = take_guest_slot(self._segment)
+            known = self._source_writers.get(block.source)
             if known is None or known.block is not block:
-                known = self._commanders[block.source] = Commander(block, self._guest)
+                known = self._source_writers[block.source] = SourceWriter(block, self._guest)
             return known
 
     def close(self) -> None:

@@ -9,21 +9,21 @@ from shmio.config import Declaration
 from shmio.config.declaration import check_declarations
 from shmio.errors import CommandError, ConfigError
 from shmio.injection import Program, compile_program
-from shmio.local.writer import Commander
+from shmio.local.writer import SourceWriter
 from shmio.segment.block import Block
 
 
-class Laid(NamedTuple):
+class DeclaredInjection(NamedTuple):
     """A declared injection as the program that laid it holds it."""
 
-    commander: Commander
+    source_writer: SourceWriter
     number: int
     """By which anybody may lift it."""
     program: Program
 
     def lift(self) -> None:
         """Lift it. CommandError: it is over, was lifted already, or no answer came."""
-        self.commander.lift(self.number)
+        self.source_writer.lift(self.number)
 
 
 def check(
@@ -50,20 +50,35 @@ def check(
 def declare(
     declarations: Sequence[Declaration],
     blocks: Mapping[str, Block],
-    commander: Callable[[Block], Commander],
+    source_writer: Callable[[Block], SourceWriter],
     *,
     keep: bool = False,
-) -> list[Laid]:
-    """Lay all or none; ``commander``: who sends commands to a block. ConfigError; CommandError: a source refuses."""
-    laid: list[Laid] = []
+) -> list[DeclaredInjection]:
+    """Lay all declared injections, or none of them.
+
+    Args:
+        declarations: What to lay.
+        blocks: The instance's blocks, by source.
+        source_writer: Gives the writer that sends commands to a block.
+        keep: Whether the injections stay when this process ends.
+
+    Returns:
+        One object for each declaration, in the same order.
+
+    Raises:
+        ConfigError: A declaration is wrong.
+        CommandError: A source refuses one, or does not answer.
+
+    """
+    laid: list[DeclaredInjection] = []
     try:
         for program in check(declarations, blocks):
-            sender = commander(blocks[program.source])
+            sender = source_writer(blocks[program.source])
             try:
                 number = sender.declare(program.declaration, keep=keep)
             except CommandError as error:
                 raise CommandError(f'{error} (injection "{program.declaration.name}")') from None
-            laid.append(Laid(sender, number, program))
+            laid.append(DeclaredInjection(sender, number, program))
     except BaseException:
         for one in laid:
             one.lift()

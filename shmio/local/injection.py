@@ -12,12 +12,12 @@ from shmio.errors import CommandError, PathError
 from shmio.layout.topic import parse_topic
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import cover, merge
-from shmio.local.writer import Commander, Outcome, Ticket
+from shmio.local.writer import Outcome, PendingCommand, SourceWriter
 from shmio.segment.block import Block
 from shmio.segment.commands import Direction
 from shmio.segment.cursor import Cursor
 from shmio.segment.events import Event, EventKind
-from shmio.segment.pending_commands import Diverted, Gatherer, apply, values
+from shmio.segment.pending_commands import CommandAssembler, CommandWrites, apply, values
 
 Next = Callable[[Cursor[Event], float | None], Event | None]
 """The next event of a cursor, waited for so many s; None: there is none, or will be none. NotRunningError."""
@@ -48,7 +48,7 @@ class Shadow:
 
     def __init__(
         self,
-        commander: Commander,
+        source_writer: SourceWriter,
         number: int,
         direction: Direction,
         events: Cursor[Event],
@@ -57,15 +57,15 @@ class Shadow:
         keep: bool,
     ) -> None:
         """``events``: from before it was laid."""
-        self.source = commander.block.source
+        self.source = source_writer.block.source
         self.number = number
         """By which anybody may lift it, or give values to it."""
         self.direction = direction
-        self._commander = commander
+        self._source_writer = source_writer
         self._events = events
-        self._gathered = Gatherer()
+        self._gathered = CommandAssembler()
         self._missed = 0
-        self._image = bytearray(commander.block.layout.size)  # what was diverted so far
+        self._image = bytearray(source_writer.block.layout.size)  # what was diverted so far
         self._next_event = next_event
         self._keep = keep
 
@@ -76,7 +76,7 @@ class Shadow:
         shadow was lifted. PathError, ValueRangeError, CommandError: nothing has been sent.
         """
         paths = {parse_topic(path, (self.source,), self.source).path: value for path, value in values.items()}
-        return self._commander.shadow(self.number, paths, timeout_s)
+        return self._source_writer.shadow(self.number, paths, timeout_s)
 
     def diverted(self, timeout_s: float | None = None) -> Iterator[Diversion]:
         """What went to this shadow since it was laid: over ``/in`` what others wrote, command by command, in order.
@@ -94,16 +94,16 @@ class Shadow:
             if event.kind == EventKind.LIFTED and event.injection == self.number:
                 return
 
-    def _diversion(self, diverted: Diverted) -> Diversion:
+    def _diversion(self, diverted: CommandWrites) -> Diversion:
         apply(self._image, diverted.writes)
         missed, self._missed = self._events.missed - self._missed, self._events.missed
         event = diverted.event
-        written = values(self._commander.block.layout, bytes(self._image), diverted.writes)
+        written = values(self._source_writer.block.layout, bytes(self._image), diverted.writes)
         return Diversion(written, event.writer, event.command, event.clock_ns, event.utc_ns, missed)
 
     def lift(self) -> None:
         """Lift it; consumers see what the source delivers. CommandError: it was lifted already, or no answer came."""
-        self._commander.lift(self.number)
+        self._source_writer.lift(self.number)
 
     def __enter__(self) -> Self:
         return self
@@ -132,7 +132,7 @@ def written(
 def _written(
     block: Block, bits: bytes, events: Cursor[Event], next_event: Next, timeout_s: float | None
 ) -> Iterator[Diversion]:
-    layout, gatherer = block.layout, Gatherer(EventKind.ACCEPTED)
+    layout, gatherer = block.layout, CommandAssembler(EventKind.ACCEPTED)
     last, missed = block.latest(), 0
     image = bytearray(layout.size if last is None else last.image)
     until_s = _deadline(timeout_s)
@@ -150,24 +150,24 @@ def _written(
                 until_s = _deadline(timeout_s)
 
 
-def lift_all(injections: Iterable[tuple[Commander, int]]) -> None:
+def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
     """Lift all of these; those that are gone by then count as lifted. CommandError: some still stand, and why."""
-    asked: list[tuple[Commander, Ticket]] = []
+    asked: list[tuple[SourceWriter, PendingCommand]] = []
     chosen, reasons = list(injections), dict[str, None]()
-    for commander, number in chosen:
+    for source_writer, number in chosen:
         try:
-            asked.append((commander, commander.ask_to_lift(number)))
+            asked.append((source_writer, source_writer.ask_to_lift(number)))
         except CommandError as error:
             reasons[str(error)] = None
-    for commander, ticket in asked:
+    for source_writer, ticket in asked:
         try:
-            commander.expect_lifted(ticket)
+            source_writer.expect_lifted(ticket)
         except CommandError as error:
             reasons[str(error)] = None
     left = [
         number
-        for commander, number in chosen
-        if any(one.id == number and not one.lifted for one in commander.block.standing.read())
+        for source_writer, number in chosen
+        if any(one.id == number and not one.lifted for one in source_writer.block.standing.read())
     ]
     if left:
         raise CommandError(f"{len(left)} of {len(chosen)} injections still stand: {'; '.join(reasons)}")

@@ -15,7 +15,16 @@ from shmio.layout.topic import look_up, parse_topic
 from shmio.local.recording_times import moment_ns
 from shmio.model.replay_status import Playing
 from shmio.segment.block import Block
-from shmio.segment.playhead import MAX_SPEED, MIN_SPEED, Ask, Find, Found, Move, Play, Playhead
+from shmio.segment.playhead import (
+    MAX_SPEED,
+    MIN_SPEED,
+    FindRequest,
+    MoveRequest,
+    Playhead,
+    PlayheadAnswer,
+    PlayheadRequest,
+    PlayState,
+)
 from shmio.segment.segment import Segment
 
 ANSWER_S: Final = 5.0
@@ -25,7 +34,7 @@ TURN_NS: Final = 500_000_000
 """How often it is looked whether who asks still wants to know."""
 
 
-class Wanted(msgspec.Struct, frozen=True, omit_defaults=True):
+class ReplayRequest(msgspec.Struct, frozen=True, omit_defaults=True):
     """What is to change; None and empty: nothing. It pauses at ``until``, once.
 
     ``seek``, ``until``: seconds from the begin, or a date and time, local unless it says. ``change``: play to the next
@@ -46,7 +55,7 @@ class Wanted(msgspec.Struct, frozen=True, omit_defaults=True):
     @property
     def nothing(self) -> bool:
         """Whether nothing is to change."""
-        return self == Wanted(sources=self.sources)
+        return self == ReplayRequest(sources=self.sources)
 
 
 class Replays:
@@ -62,42 +71,42 @@ class Replays:
         CommandError: none does; PathError: one of them does not.
         """
         now_ns = self._segment.clock.present_ns()
-        plays = self._chosen(Wanted(sources=tuple(sources)))
-        return [_told(source, play, now_ns) for source, play in plays.items()]
+        plays = self._chosen(ReplayRequest(sources=tuple(sources)))
+        return [_replay_status(source, play, now_ns) for source, play in plays.items()]
 
     def pause(self) -> list[Playing]:
         """Have all stand where they are."""
-        return self.change(Wanted(paused=True))
+        return self.change(ReplayRequest(paused=True))
 
     def play(self, speed: float | None = None) -> list[Playing]:
         """Have all go on; what is over begins anew. ValueRangeError: no such speed."""
-        return self.change(Wanted(paused=False, speed=speed))
+        return self.change(ReplayRequest(paused=False, speed=speed))
 
     def speed(self, speed: float) -> list[Playing]:
         """Play ``speed`` times as fast as the instance's clock, 0.01 to 1000. ValueRangeError."""
-        return self.change(Wanted(speed=speed))
+        return self.change(ReplayRequest(speed=speed))
 
     def seek(self, to: float | str) -> list[Playing]:
         """Be at a time: seconds from the begin, or a date and time. ValueRangeError: it is not in the recording."""
-        return self.change(Wanted(seek=str(to)))
+        return self.change(ReplayRequest(seek=str(to)))
 
     def loop(self, on: bool = True) -> list[Playing]:
         """Begin anew at the end, or do not."""
-        return self.change(Wanted(loop=on))
+        return self.change(ReplayRequest(loop=on))
 
     def play_until(self, to: float | str) -> list[Playing]:
         """Play to a time, and pause there."""
-        return self.change(Wanted(paused=False, until=str(to)))
+        return self.change(ReplayRequest(paused=False, until=str(to)))
 
     def to_change(self, path: str, *, jump: bool = False) -> list[Playing]:
         """Play to the next change of a register, and pause there. PathError; CommandError: there is none."""
-        return self.change(Wanted(change=path, jump=jump))
+        return self.change(ReplayRequest(change=path, jump=jump))
 
     def to_event(self, kind: str, *, jump: bool = False) -> list[Playing]:
         """The same with the next event of a kind, such as ``accepted`` or ``noted``, or ``any``, of any source."""
-        return self.change(Wanted(event=kind, jump=jump))
+        return self.change(ReplayRequest(event=kind, jump=jump))
 
-    def change(self, wanted: Wanted, given_up: Callable[[], bool] = lambda: False) -> list[Playing]:
+    def change(self, wanted: ReplayRequest, given_up: Callable[[], bool] = lambda: False) -> list[Playing]:
         """Do what is wanted; how all play then. ``given_up`` is asked now and then while a recording is searched.
 
         ValueRangeError: a speed or a time; PathError: a source or a register; CommandError: there is no replay, or it
@@ -112,7 +121,7 @@ class Replays:
             if wanted.change or wanted.event:
                 self._go_to(wanted, heads, given_up)
             else:
-                self._move(heads, lambda play, clock_ns: _moved(play, wanted, clock_ns))
+                self._move(heads, lambda play, clock_ns: _move_request(play, wanted, clock_ns))
         return self.status(wanted.sources)
 
     # ---- which -----------------------------------------------------------------------------------------------------
@@ -121,8 +130,8 @@ class Replays:
         self._segment.refresh()
         return {name: block for name, block in self._segment.blocks.items() if block.playhead is not None}
 
-    def _plays(self) -> dict[str, Play]:
-        found: dict[str, Play] = {}
+    def _plays(self) -> dict[str, PlayState]:
+        found: dict[str, PlayState] = {}
         for source, block in self._blocks().items():
             play = block.playhead.read() if block.playhead else None
             if play is not None:
@@ -131,7 +140,7 @@ class Replays:
             raise CommandError(f"instance {self._segment.instance!r} plays no recording")
         return found
 
-    def _chosen(self, wanted: Wanted) -> dict[str, Play]:
+    def _chosen(self, wanted: ReplayRequest) -> dict[str, PlayState]:
         """The sources that are meant, and what plays the same recordings."""
         plays = self._plays()
         for source in wanted.sources:
@@ -168,9 +177,9 @@ class Replays:
 
     # ---- what ------------------------------------------------------------------------------------------------------
 
-    def _go_to(self, wanted: Wanted, heads: Mapping[str, Playhead], given_up: Callable[[], bool]) -> None:
+    def _go_to(self, wanted: ReplayRequest, heads: Mapping[str, Playhead], given_up: Callable[[], bool]) -> None:
         """Have them stand, look ahead, and go on to what was found."""
-        self._move(heads, lambda _, clock_ns: Move(clock_ns, paused=True))
+        self._move(heads, lambda _, clock_ns: MoveRequest(clock_ns, paused=True))
         searched = dict(heads)
         path = ""
         if wanted.change:
@@ -179,21 +188,24 @@ class Replays:
         now_ns = self._segment.clock.read().time_ns
         after_ns = {source: play.at_ns(now_ns) for source, play in self._plays().items()}
         answers = self._ask(
-            searched, {source: Find(after_ns[source], path, wanted.event) for source in searched}, SEARCH_S, given_up
+            searched,
+            {source: FindRequest(after_ns[source], path, wanted.event) for source in searched},
+            SEARCH_S,
+            given_up,
         )
         positions_ns = [found.position_ns for found in answers.values() if found.position_ns is not None]
         if not positions_ns:
             raise CommandError(next(iter(answers.values())).error)
         at_ns = min(positions_ns)
         if wanted.jump:
-            self._move(heads, lambda _, clock_ns: Move(clock_ns, paused=True, position_ns=at_ns))
+            self._move(heads, lambda _, clock_ns: MoveRequest(clock_ns, paused=True, position_ns=at_ns))
         else:
-            self._move(heads, lambda _, now: Move(now, paused=False, until_ns=at_ns, speed=wanted.speed))
+            self._move(heads, lambda _, now: MoveRequest(now, paused=False, until_ns=at_ns, speed=wanted.speed))
 
-    def _move(self, heads: Mapping[str, Playhead], move: Callable[[Play, int], Move]) -> None:
+    def _move(self, heads: Mapping[str, Playhead], move: Callable[[PlayState, int], MoveRequest]) -> None:
         """Move all from one moment on."""
         clock_ns = self._segment.clock.read().time_ns  # behind a step that is under way: until then nobody answers
-        asks: dict[str, Ask] = {}
+        asks: dict[str, PlayheadRequest] = {}
         for source, head in heads.items():
             play = head.read()
             if play is not None:
@@ -205,10 +217,10 @@ class Replays:
     def _ask(
         self,
         heads: Mapping[str, Playhead],
-        asks: Mapping[str, Ask],
+        asks: Mapping[str, PlayheadRequest],
         patience_s: float,
         given_up: Callable[[], bool] = lambda: False,
-    ) -> dict[str, Found]:
+    ) -> dict[str, PlayheadAnswer]:
         """Ask all at once; their answers."""
         numbers = {source: heads[source].ask(ask) for source, ask in asks.items()}
         for slot in self._segment.processes:
@@ -220,7 +232,9 @@ class Replays:
             for source, number in numbers.items()
         }
 
-    def _answer(self, source: str, head: Playhead, number: int, until_ns: int, given_up: Callable[[], bool]) -> Found:
+    def _answer(
+        self, source: str, head: Playhead, number: int, until_ns: int, given_up: Callable[[], bool]
+    ) -> PlayheadAnswer:
         ring = self._segment.blocks[source].ring
         while True:
             seen = ring.doorbell()
@@ -241,13 +255,13 @@ class Replays:
         return "its process does not run"
 
 
-def _recording(play: Play) -> tuple[int, int, int]:
+def _recording(play: PlayState) -> tuple[int, int, int]:
     return play.begin_ns, play.end_ns, play.utc_ns
 
 
-def _moved(play: Play, wanted: Wanted, clock_ns: int) -> Move:
+def _move_request(play: PlayState, wanted: ReplayRequest, clock_ns: int) -> MoveRequest:
     """The same request for one source. ValueRangeError: a time that it does not have."""
-    return Move(
+    return MoveRequest(
         clock_ns,
         paused=wanted.paused,
         speed=wanted.speed,
@@ -257,7 +271,7 @@ def _moved(play: Play, wanted: Wanted, clock_ns: int) -> Move:
     )
 
 
-def _position(play: Play, text: str) -> int:
+def _position(play: PlayState, text: str) -> int:
     try:
         position_ns = moment_ns(text, play.utc_ns + play.begin_ns) - play.utc_ns
     except ValueError:
@@ -270,7 +284,7 @@ def _position(play: Play, text: str) -> int:
     return position_ns
 
 
-def _told(source: str, play: Play, clock_ns: int) -> Playing:
+def _replay_status(source: str, play: PlayState, clock_ns: int) -> Playing:
     position_ns = play.at_ns(clock_ns)
     return Playing(
         source,

@@ -15,7 +15,7 @@ _REAL: Final = "; shmio step --release brings real time back"
 _STANDS: Final = f"it stands until it is stepped{_REAL}"
 
 
-class Wait(NamedTuple):
+class StepWait(NamedTuple):
     """What a step waits for: that a bell differs from ``seen``, or for so long.
 
     It is the doorbell of ``block``, which has to answer; if that is None, the bell of those who deliver steps.
@@ -26,7 +26,7 @@ class Wait(NamedTuple):
     rest_ns: int
 
 
-def answer(block: Block, number: int) -> str | None:
+def step_answer(block: Block, number: int) -> str | None:
     """A participant's answer to a step: empty when it is done, why it failed, None as long as there is none."""
     if block.retired:
         return ""  # a reload has ended it
@@ -42,7 +42,7 @@ def answer(block: Block, number: int) -> str | None:
     return frame.reason or "it gave no reason" if frame.quality is Quality.BAD else ""
 
 
-def silence(segment: Segment, block: Block, hard_ns: int) -> str:
+def describe_silence(segment: Segment, block: Block, hard_ns: int) -> str:
     """What is known of a participant that has not answered."""
     what = f"{block.source}: no answer within {hard_ns / 1e9:g} s"
     for slot in segment.processes:
@@ -54,12 +54,12 @@ def silence(segment: Segment, block: Block, hard_ns: int) -> str:
     return what
 
 
-def taken(participants: Sequence[Block]) -> str:
+def take_over_note(participants: Sequence[Block]) -> str:
     """What is told of time that was real until now."""
     return _STANDS if participants else f"{_NOBODY}{_REAL}"
 
 
-def standing(segment: Segment, participants: Sequence[Block]) -> str:
+def unmoved_note(segment: Segment, participants: Sequence[Block]) -> str:
     """What the next step does not move, though who steps may expect it, and the remedy; empty: it moves all."""
     if not participants:
         return _NOBODY if segment.clock.stepped else f"{_NOBODY}{_REAL}"

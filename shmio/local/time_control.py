@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from shmio.errors import TimeError, ValueRangeError
-from shmio.local.step_answers import Wait, answer, silence, standing, taken
+from shmio.local.step_answers import StepWait, describe_silence, step_answer, take_over_note, unmoved_note
 from shmio.segment.block import Block
 from shmio.segment.clock import ClockMode, ClockState, time_lock
 from shmio.segment.processes import ProcessSlot
@@ -91,7 +91,7 @@ class Coordinator:
                 # Who free-runs looks at the page before each cycle: none begins after this write, so that none of
                 # theirs is later than the present one, as it is found once more after it.
                 self._write(self._frozen(state))
-                state = self._frozen(state._replace(note="" if steps else taken(self._participants())))
+                state = self._frozen(state._replace(note="" if steps else take_over_note(self._participants())))
             self._write(state)
             for slot in self._segment.processes:
                 self._segment.clock.slot_bell(slot.index).ring()
@@ -172,7 +172,7 @@ class Coordinator:
                 else:
                     block.ring.wait(seen, rest_ns)
 
-    def stepping(self, dt_ns: int | None = None) -> Generator[Wait, None, Step]:
+    def stepping(self, dt_ns: int | None = None) -> Generator[StepWait, None, Step]:
         """:meth:`step` for an event loop: it yields what to wait for, and looks again when it is asked to go on.
 
         Whoever does not go on to its end has to close it. Nothing else of this coordinator may be called meanwhile.
@@ -183,7 +183,7 @@ class Coordinator:
         check_step(dt_ns)
         step = Step(before.step + 1, before.time_ns + dt_ns, dt_ns)
         participants = self._participants()
-        stands = standing(self._segment, participants)
+        stands = unmoved_note(self._segment, participants)
         asked = before._replace(step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
         problem = "it was broken off"
         try:
@@ -256,7 +256,7 @@ class Coordinator:
 
     def _await_frames(
         self, number: int, participants: Sequence[Block], asked: ClockState
-    ) -> Generator[Wait, None, str]:
+    ) -> Generator[StepWait, None, str]:
         """Wait for the frame of each for this step; who has failed or not answered, and why; empty: nobody."""
         begun_ns = time.monotonic_ns()
         waiting = list(participants)
@@ -265,26 +265,26 @@ class Coordinator:
         while waiting:
             block = waiting[0]
             seen = block.ring.doorbell()  # before looking
-            found = answer(block, number)
+            found = step_answer(block, number)
             if found is not None:
                 waiting.remove(block)
                 problems += [f"{block.source}: {found}"] if found else []
                 continue
             passed_ns = time.monotonic_ns() - begun_ns
             if passed_ns >= self._hard_ns:
-                silent = [block for block in waiting if answer(block, number) is None]
-                problems += [silence(self._segment, block, self._hard_ns) for block in silent]
+                silent = [block for block in waiting if step_answer(block, number) is None]
+                problems += [describe_silence(self._segment, block, self._hard_ns) for block in silent]
                 return "; ".join(problems)
             if passed_ns >= self._soft_ns and not told:
                 told = True
-                names = [block.source for block in waiting if answer(block, number) is None]
+                names = [block.source for block in waiting if step_answer(block, number) is None]
                 note = f"step {number} waits for {', '.join(names)}"
                 log.warning(note)
                 self._write(asked._replace(note=note))
-            yield Wait(block, seen, (self._hard_ns if told else min(self._soft_ns, self._hard_ns)) - passed_ns)
+            yield StepWait(block, seen, (self._hard_ns if told else min(self._soft_ns, self._hard_ns)) - passed_ns)
         return "; ".join(problems)
 
-    def _await_delivery(self, number: int) -> Generator[Wait, None, str]:
+    def _await_delivery(self, number: int) -> Generator[StepWait, None, str]:
         """Wait until the other dispatchers have delivered a step; who has not, or empty."""
         clock, begun_ns, told = self._segment.clock, time.monotonic_ns(), False
         rung = False
@@ -304,7 +304,7 @@ class Coordinator:
                 told = True
                 log.warning("step %d waits for its delivery by %s", number, names)
             # In turns: one that dies rings no bell.
-            yield Wait(None, seen, min(self._soft_ns, self._hard_ns - passed_ns))
+            yield StepWait(None, seen, min(self._soft_ns, self._hard_ns - passed_ns))
 
     def _owes(self, slot: ProcessSlot, number: int) -> bool:
         """Whether another process delivers steps, lives, and has not delivered this one yet."""

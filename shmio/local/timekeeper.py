@@ -96,7 +96,7 @@ class Timekeeper:
             self._paused.wait(max(0, due_ns - now_ns) / 1e9)
 
 
-class Timed:
+class TimeMethods:
     """The part of an attachment that has to do with time."""
 
     def __init__(self, segment: Segment) -> None:

@@ -16,7 +16,7 @@ from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
 from shmio.layout.values.write import Write, apply, bits_of, cover, encode, merge
-from shmio.segment.commands import MAX_NAME_BYTES, CommandKind, CommandSender, Laid
+from shmio.segment.commands import MAX_NAME_BYTES, CommandKind, CommandSender, InjectionOptions
 from shmio.segment.events import DONE, ENDS, Event, EventKind
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class Outcome:
 
 
 @dataclass(slots=True)
-class Ticket:
+class PendingCommand:
     """A command under way: its number, and where in the events its outcome will be looked for."""
 
     number: int
@@ -72,7 +72,7 @@ class Ticket:
         return values
 
 
-class Commander:
+class SourceWriter:
     """Writes registers of one block in the name of one writer. Several threads may use it."""
 
     def __init__(self, block: Block, writer: int) -> None:
@@ -98,7 +98,7 @@ class Commander:
     def _writable(self) -> bytes:
         return cover(self.block.layout, self.block.attributes.writable)
 
-    def submit(self, values: Mapping[str, object], timeout_s: float | None = None) -> Ticket:
+    def submit(self, values: Mapping[str, object], timeout_s: float | None = None) -> PendingCommand:
         """Send values of registers, whole arrays or elements by their paths in the block, as one command.
 
         All or none is accepted by the source. PathError: no such register; CommandError: not writable, or the source
@@ -127,11 +127,11 @@ class Commander:
             ranges.append((write.offset, write.offset + len(write.data)))
         return merge(image, bits, ranges)
 
-    def give(self, injection: int, writes: Sequence[Write], timeout_s: float | None = None) -> Ticket:
+    def give(self, injection: int, writes: Sequence[Write], timeout_s: float | None = None) -> PendingCommand:
         """Send what :meth:`joined` gives as an injection's: items are not values. CommandError: not sent."""
         return self._send(("",) * len(writes), writes, timeout_s, CommandKind.SHADOW, injection)
 
-    def inject(self, patterns: Iterable[str], timeout_s: float | None = None, **laid: Unpack[Laid]) -> int:
+    def inject(self, patterns: Iterable[str], timeout_s: float | None = None, **laid: Unpack[InjectionOptions]) -> int:
         """Lay an injection over all that the patterns name (see :func:`shmio.layout.values.write.cover`); its number.
 
         Consumers see what they saw, until it gives values. PathError: there is no such register; CommandError: the
@@ -144,7 +144,9 @@ class Commander:
         self._expect(ticket, EventKind.INJECTED)
         return ticket.number
 
-    def lay(self, bits: Sequence[Write], timeout_s: float | None = None, **laid: Unpack[Laid]) -> Ticket:
+    def lay(
+        self, bits: Sequence[Write], timeout_s: float | None = None, **laid: Unpack[InjectionOptions]
+    ) -> PendingCommand:
         """Ask for an injection over what these writes would set, whose number is the ticket's. Never waits.
 
         CommandError: not sent.
@@ -160,7 +162,9 @@ class Commander:
         self._expect(ticket, EventKind.INJECTED)
         return ticket.number
 
-    def ask_to_declare(self, declaration: Declaration, timeout_s: float | None = None, *, keep: bool = False) -> Ticket:
+    def ask_to_declare(
+        self, declaration: Declaration, timeout_s: float | None = None, *, keep: bool = False
+    ) -> PendingCommand:
         """The first half of :meth:`declare`; the number will be the ticket's. CommandError: not sent. Never waits."""
         writes = [Write(0, 0, msgspec.json.encode(declaration))]
         return self._send(("",), writes, timeout_s, CommandKind.DECLARE, keep=keep, name=declaration.name)
@@ -179,15 +183,15 @@ class Commander:
         """Lift an injection, whoever laid it. CommandError: there is none, or the source does not answer."""
         self.expect_lifted(self.ask_to_lift(injection, timeout_s))
 
-    def ask_to_lift(self, injection: int, timeout_s: float | None = None) -> Ticket:
+    def ask_to_lift(self, injection: int, timeout_s: float | None = None) -> PendingCommand:
         """The first half of :meth:`lift`. CommandError: not sent. Never waits."""
         return self._send(("",), [], timeout_s, CommandKind.LIFT, injection)
 
-    def expect_lifted(self, ticket: Ticket) -> None:
+    def expect_lifted(self, ticket: PendingCommand) -> None:
         """The second half of :meth:`lift`."""
         self._expect(ticket, EventKind.LIFTED)
 
-    def _expect(self, ticket: Ticket, kind: EventKind) -> None:
+    def _expect(self, ticket: PendingCommand, kind: EventKind) -> None:
         (outcome,) = self.outcomes(ticket)
         if outcome.kind is not kind:
             raise CommandError(f"{self.block.source}: {outcome.text}")
@@ -204,7 +208,7 @@ class Commander:
         timeout_s: float | None,
         kind: CommandKind = CommandKind.WRITE,
         injection: int = 0,
-    ) -> Ticket:
+    ) -> PendingCommand:
         paths, writes = list[str](), list[Write]()
         for path, (register, value) in values.items():
             items = self._encode(register, path, value)
@@ -219,15 +223,15 @@ class Commander:
         timeout_s: float | None,
         kind: CommandKind = CommandKind.WRITE,
         injection: int = 0,
-        **laid: Unpack[Laid],
-    ) -> Ticket:
+        **laid: Unpack[InjectionOptions],
+    ) -> PendingCommand:
         wait_s = self.timeout_s if timeout_s is None else timeout_s
         deadline_ns = time.monotonic_ns() + round(wait_s * 1e9)
         events, incarnation = self.block.events.cursor(), self.block.incarnation
         number = self._sender.submit(writes, deadline_ns, kind, injection, **laid)
-        return Ticket(number, paths, incarnation, deadline_ns + round(PATIENCE_S * 1e9), events)
+        return PendingCommand(number, paths, incarnation, deadline_ns + round(PATIENCE_S * 1e9), events)
 
-    def outcomes(self, ticket: Ticket) -> list[Outcome]:
+    def outcomes(self, ticket: PendingCommand) -> list[Outcome]:
         """Wait until all is over and say what became of each value, in the order they were given."""
         open_items = set(range(len(ticket.paths)))
         ends: dict[int, Event] = {}
@@ -261,7 +265,7 @@ class Commander:
                 remedy += ", unless its model computes it: nobody writes that, and shmio inject shows another value"
             raise CommandError(f"{self.block.source}/{register.path} is not writable; {remedy}")
 
-    def _next(self, ticket: Ticket) -> Event | None:
+    def _next(self, ticket: PendingCommand) -> Event | None:
         """The next event about the command; None when none will come, or not in time."""
         while (rest_ns := ticket.until_ns - time.monotonic_ns()) > 0:
             event = ticket.events.next(rest_ns / 1e9)
@@ -274,13 +278,13 @@ class Commander:
                 ticket.until_ns = min(ticket.until_ns, time.monotonic_ns() + round(PATIENCE_S * 1e9))
         return None
 
-    def _outcome(self, ticket: Ticket, place: int, path: str, ends: Mapping[int, Event]) -> Outcome:
+    def _outcome(self, ticket: PendingCommand, place: int, path: str, ends: Mapping[int, Event]) -> Outcome:
         end = ends.get(place)
         if end is None:
             return Outcome(path, EventKind.UNKNOWN, self._silence(ticket))
         return Outcome(path, EventKind(end.kind), end.text)
 
-    def _silence(self, ticket: Ticket) -> str:
+    def _silence(self, ticket: PendingCommand) -> str:
         if self.block.retired:
             return REPLACED
         if self.block.incarnation != ticket.incarnation:

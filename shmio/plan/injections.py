@@ -13,7 +13,7 @@ from shmio.injection import Program, compile_program
 from shmio.layout.model import Layout
 from shmio.layout.values.write import cover
 from shmio.segment import NO_WRITER
-from shmio.segment.standing_injections import Running, Standing, declared_document, encode, ranges_of
+from shmio.segment.standing_injections import DeclaredState, StandingInjection, declared_document, encode, ranges_of
 
 
 def check_injections(config: Config, layouts: Mapping[str, Layout]) -> tuple[dict[str, bytes], tuple[str, ...]]:
@@ -70,10 +70,10 @@ def _document(source: str, programs: list[Program]) -> bytes:
         raise ConfigError(f"injection: {len(programs)} over source {source!r}: {error}") from None
 
 
-def _standing(program: Program) -> Standing:
+def _standing(program: Program) -> StandingInjection:
     """As its source's process will show it."""
     declaration = program.declaration
-    return Standing(
+    return StandingInjection(
         2**64 - 1, program.direction, declaration.priority, True, declaration.name, NO_WRITER, 0,
-        ranges_of(program.cover.tobytes()), Running(declaration, "waiting", 2**63 - 1),
+        ranges_of(program.cover.tobytes()), DeclaredState(declaration, "waiting", 2**63 - 1),
     )  # fmt: skip

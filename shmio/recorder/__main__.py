@@ -9,13 +9,13 @@ import msgspec
 
 from shmio import worker
 from shmio.config import Recorder as Settings
-from shmio.recorder.attach import ConfigFiles
-from shmio.recorder.keeper import Keeper
-from shmio.recorder.predecessor import interrupted, places
+from shmio.recorder.attached_files import ConfigFiles
+from shmio.recorder.housekeeping import Housekeeper
+from shmio.recorder.instance_follower import InstanceFollower, StartPositions
+from shmio.recorder.predecessor import last_positions, trigger_interrupted
+from shmio.recorder.rotation import RotatingRecorder
 from shmio.recorder.selection import Selection
-from shmio.recorder.series import Series
-from shmio.recorder.tap import Start, Tap
-from shmio.recorder.triggered import Triggered
+from shmio.recorder.triggered import TriggeredRecorder
 from shmio.recording.format.encoding import SUPERVISED, Reason
 from shmio.segment import Report
 from shmio.worker import BEAT_S, Worker
@@ -31,22 +31,22 @@ def run(worker: Worker) -> None:
     directory, segment = Path(settings.directory), worker.segment
     worker.running()  # its search for what its predecessor has may take a while
     segment.clock.abstain(worker.slot.index)  # for which no step waits: the rings have what comes meanwhile
-    known = places(directory, segment, SUPERVISED, worker.slot.beat)
+    known = last_positions(directory, segment, SUPERVISED, worker.slot.beat)
     elsewhere = _elsewhere(worker.before, directory)
-    start = Start(known, reason=Reason.ELSEWHERE if elsewhere else Reason.NOT_RUNNING)
+    start = StartPositions(known, reason=Reason.ELSEWHERE if elsewhere else Reason.NOT_RUNNING)
     selection = Selection(settings.sources or None, settings.registers)
     for missing in selection.nothing({name: block.layout for name, block in segment.blocks.items()}):
         worker.log.warning("recorder.registers: %s", missing)
-    tap, attachments = Tap(segment, start, selection), ConfigFiles(Path(worker.config["config_file"]))
-    series: Series | Triggered
+    tap, attachments = InstanceFollower(segment, start, selection), ConfigFiles(Path(worker.config["config_file"]))
+    series: RotatingRecorder | TriggeredRecorder
     if settings.trigger:
-        going = interrupted(directory, segment, SUPERVISED, worker.slot.beat)
-        series = Triggered(tap, settings, settings.trigger, SUPERVISED, attachments, going=going)
+        going = trigger_interrupted(directory, segment, SUPERVISED, worker.slot.beat)
+        series = TriggeredRecorder(tap, settings, settings.trigger, SUPERVISED, attachments, going=going)
     else:
-        series = Series(tap, settings, SUPERVISED, attachments)
+        series = RotatingRecorder(tap, settings, SUPERVISED, attachments)
     goes_on = ", going on where its predecessor ended" if known else ""
     worker.log.info("recording %s%s%s", _note(series), goes_on, elsewhere)
-    keeper = Keeper(segment.instance, settings, SUPERVISED, series.present)
+    keeper = Housekeeper(segment.instance, settings, SUPERVISED, series.present)
     keeper.start()
     _record(worker, series)
     keeper.stop()
@@ -65,7 +65,7 @@ def _elsewhere(before: Report, directory: Path) -> str:
     return f"; {name} of the recorder before is not in this folder: what the rings no longer hold is there alone"
 
 
-def _record(worker: Worker, series: Series | Triggered) -> None:
+def _record(worker: Worker, series: RotatingRecorder | TriggeredRecorder) -> None:
     """Turn after turn; in virtual time a step is over only when there was one for it, so that none of it is missed."""
     clock, slot = worker.segment.clock, worker.slot.index
     bell = clock.slot_bell(slot)
@@ -89,13 +89,13 @@ def _record(worker: Worker, series: Series | Triggered) -> None:
         _report(worker, series, problem)
 
 
-def _report(worker: Worker, series: Series | Triggered, problem: str) -> None:
+def _report(worker: Worker, series: RotatingRecorder | TriggeredRecorder, problem: str) -> None:
     counters = series.counters
     numbers = (counters.frames, counters.events, counters.missed, series.written)
     worker.report(numbers, note=problem or _note(series))
 
 
-def _note(series: Series | Triggered) -> str:
+def _note(series: RotatingRecorder | TriggeredRecorder) -> str:
     return f"{NOTE}{series.file.name}" if series.file else WAITS
 
 

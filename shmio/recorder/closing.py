@@ -48,14 +48,14 @@ def finalise(file: Path, beat: Callable[[], object] = lambda: None) -> bool:
             before = os.fstat(fd)
             if before.st_size != reader.records.size:
                 return False
-            _write(fd, Ending(reader))
+            _write(fd, RecordingEnd(reader))
             os.utime(fd, ns=(before.st_atime_ns, before.st_mtime_ns))  # nothing was recorded since
         finally:
             os.close(fd)
     return True
 
 
-def _write(fd: int, ending: Ending) -> None:
+def _write(fd: int, ending: RecordingEnd) -> None:
     """Cut off, and append."""
     data = ending.data()
     os.ftruncate(fd, ending.cut)
@@ -87,7 +87,7 @@ class _Chunk:
     counts: dict[int, int] = field(default_factory=dict)
 
 
-class Ending:
+class RecordingEnd:
     """What belongs behind the last record that is whole."""
 
     def __init__(self, reader: Reader) -> None:

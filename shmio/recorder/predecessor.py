@@ -10,7 +10,7 @@ from typing import Final
 
 from shmio.errors import RecordingError
 from shmio.recorder.folder import about_of, own_files
-from shmio.recording.format.encoding import EVENT, FRAME, Place
+from shmio.recording.format.encoding import EVENT, FRAME, BlockPosition
 from shmio.recording.reading.reader import Reader
 from shmio.recording.reading.survey import survey
 from shmio.segment import Block, Segment
@@ -21,18 +21,20 @@ MAX_FILES: Final = 256
 log = logging.getLogger("shmio.recorder")
 
 
-def places(directory: Path, segment: Segment, by: str, beat: Callable[[], object] = lambda: None) -> dict[int, Place]:
+def last_positions(
+    directory: Path, segment: Segment, by: str, beat: Callable[[], object] = lambda: None
+) -> dict[int, BlockPosition]:
     """By section the last frame and event of each block that recorders of this kind (``by``) have of this run.
 
     Blocks that were not recorded are left out. ``beat`` is called now and then.
     """
-    found: dict[int, Place] = {}
+    found: dict[int, BlockPosition] = {}
     blocks = {block.section: block for block in (*segment.ended, *segment.blocks.values())}
     for file in _of_this_run(directory, segment, by, beat):
         beat()
         try:
             with Reader(file, own=True, beat=beat) as reader:
-                found = _places(reader, blocks) | found
+                found = _positions(reader, blocks) | found
         except (OSError, RecordingError) as error:
             log.warning("it is not known where the recording before ended: %s", error)
             continue
@@ -41,7 +43,7 @@ def places(directory: Path, segment: Segment, by: str, beat: Callable[[], object
     return found
 
 
-def interrupted(directory: Path, segment: Segment, by: str, beat: Callable[[], object] = lambda: None) -> bool:
+def trigger_interrupted(directory: Path, segment: Segment, by: str, beat: Callable[[], object] = lambda: None) -> bool:
     """Whether the recorder before died within what a trigger had begun."""
     for file in _of_this_run(directory, segment, by, beat)[:1]:
         with suppress(OSError, RecordingError), Reader(file, own=True, beat=beat) as reader:
@@ -64,10 +66,10 @@ def _of_this_run(directory: Path, segment: Segment, by: str, beat: Callable[[], 
     return [file for _, file in sorted(found, reverse=True)]
 
 
-def _places(reader: Reader, blocks: dict[int, Block]) -> dict[int, Place]:
+def _positions(reader: Reader, blocks: dict[int, Block]) -> dict[int, BlockPosition]:
     """Where a file ends: where it began, if nothing came of a block, or its last chunk is damaged."""
     found = survey(reader)
-    places = {section: place for section, place in reader.places.items() if section in blocks}
+    positions = {section: place for section, place in reader.places.items() if section in blocks}
     for channel in reader.channels.values():
         block = blocks.get(channel.section)
         if block is None or channel.source != block.source or channel.encoding not in (FRAME, EVENT):
@@ -82,14 +84,14 @@ def _places(reader: Reader, blocks: dict[int, Block]) -> dict[int, Place]:
                 log.warning("where the recording before ended is known from its beginning only: %s", error)
                 track = None
         number = max(number, found.missed_to.get((channel.source, channel.block, what), 0))
-        frame, event, log_ns = places.get(channel.section, Place())
+        frame, event, log_ns = positions.get(channel.section, BlockPosition())
         log_ns = max(log_ns, track.last_ns if track else 0)
         if channel.encoding == FRAME:
-            places[channel.section] = Place(number, event, log_ns)
+            positions[channel.section] = BlockPosition(number, event, log_ns)
         else:
-            places[channel.section] = Place(frame, number, log_ns)
+            positions[channel.section] = BlockPosition(frame, number, log_ns)
     return {
         section: place
-        for section, place in places.items()
+        for section, place in positions.items()
         if place.frame <= blocks[section].ring.head() and place.event <= blocks[section].events.head()
     }

@@ -10,17 +10,17 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from shmio import __version__
-from shmio.recorder.attach import Attachment, Attachments, no_attachments
-from shmio.recorder.follower import Aside, Entry, Follower
+from shmio.recorder.attached_files import AttachedFile, AttachedFiles, no_attachments
+from shmio.recorder.block_follower import BlockEntry, BlockFollower, InstanceEntry
+from shmio.recorder.instance_follower import TURN_S, InstanceFollower
 from shmio.recorder.output import Output
-from shmio.recorder.tap import TURN_S, Tap
 from shmio.recorder.writer import JSON, Channels, Writer
-from shmio.recording.format.encoding import Gap, Place, ProcessChange, Reason
+from shmio.recording.format.encoding import BlockPosition, Gap, ProcessChange, Reason
 from shmio.segment import Event, Frame
 
 
 @dataclass(slots=True)
-class _Lost:
+class _LostRange:
     """What could not be taken because there was no room: numbers from, to."""
 
     first: int
@@ -33,22 +33,22 @@ class _Lost:
 
 
 @dataclass(slots=True)
-class Followed:
+class RecordedBlock:
     """A block in one file. ``begin``: where that begins; then the last frame and event that are in it, or in a gap."""
 
-    follower: Follower
-    begin: Place
+    follower: BlockFollower
+    begin: BlockPosition
     frame: int
     event: int
     log_ns: int
     channels: Channels | None = None
-    lost: dict[str, _Lost] = field(default_factory=dict)
+    lost: dict[str, _LostRange] = field(default_factory=dict)
     """By what it is."""
 
     @property
-    def place(self) -> Place:
+    def place(self) -> BlockPosition:
         """Behind what was written last."""
-        return Place(self.frame, self.event, self.log_ns)
+        return BlockPosition(self.frame, self.event, self.log_ns)
 
     @property
     def losses(self) -> int:
@@ -69,7 +69,7 @@ class Followed:
             what, first, last = item.what, item.first, item.last
         else:
             what, first, last = "frames" if isinstance(item, Frame) else "events", item.number, item.number
-        lost = self.lost.setdefault(what, _Lost(first, last, self.log_ns))
+        lost = self.lost.setdefault(what, _LostRange(first, last, self.log_ns))
         lost.last = last
         return last - first + 1
 
@@ -108,14 +108,14 @@ class Recorder:
 
     def __init__(
         self,
-        tap: Tap,
+        tap: InstanceFollower,
         output: Output,
         *,
         by: str,
-        places: Mapping[int, Place] | None = None,
+        places: Mapping[int, BlockPosition] | None = None,
         about: Mapping[str, str] | None = None,
         counters: Counters | None = None,
-        attachments: Attachments = no_attachments,
+        attachments: AttachedFiles = no_attachments,
     ) -> None:
         """``by``: who records. ``about``: what else is to be told of this recording.
 
@@ -127,20 +127,20 @@ class Recorder:
         self.counters = counters or Counters()
         self.places = dict(tap.start.places if places is None else places)
         """Where the recording had come to, by section, when :meth:`settle` was called last."""
-        self.confirmed: Mapping[int, Place] = dict(self.places)
+        self.confirmed: Mapping[int, BlockPosition] = dict(self.places)
         """Where it had come to when what was written last that is on the disk for certain."""
         self._ended = False
         self.empty = True
         """Whether nothing has happened yet."""
         self._attachments = attachments
         self._writer = Writer(output, {**self._about(by), **(about or {})})
-        self._followed: dict[int, Followed] = {}
+        self._followed: dict[int, RecordedBlock] = {}
         self._attached: set[bytes] = set()
         self._config = attachments(None, 0)
         self._attach(self._config)
         self._unaware = True
         """Whether the file does not say how the processes are."""
-        self._to_confirm: tuple[int, dict[int, Place]] | None = None
+        self._to_confirm: tuple[int, dict[int, BlockPosition]] | None = None
         self._writer.places(self.places)
         for follower in tap.followers:
             self._known(follower)
@@ -170,14 +170,14 @@ class Recorder:
         self.put(entries)
         return more
 
-    def put(self, entries: Iterable[Entry | Aside]) -> None:
+    def put(self, entries: Iterable[BlockEntry | InstanceEntry]) -> None:
         """Add what the tap gave; end the chunk if it is time. RecordingError: the file was removed."""
         for follower in self.tap.followers:
             self._known(follower)
         full = self.output.full
         if self._unaware and not full:
             self._unaware = False
-            entries = [*(entry for entry in entries if not of_a_process(entry)), *self.tap.standing()]
+            entries = [*(entry for entry in entries if not is_process_change(entry)), *self.tap.standing()]
         for entry in entries:
             if full:
                 self._lose(entry)
@@ -244,18 +244,18 @@ class Recorder:
 
     # ---- blocks ------------------------------------------------------------------------------------------------------
 
-    def _known(self, follower: Follower) -> Followed:
+    def _known(self, follower: BlockFollower) -> RecordedBlock:
         return self._followed.get(follower.block.section) or self._follow(follower)
 
-    def _follow(self, follower: Follower) -> Followed:
+    def _follow(self, follower: BlockFollower) -> RecordedBlock:
         """Begin with a block: attach what is needed to read it."""
         block = follower.block
         place = self.places.get(block.section, follower.begin)
-        followed = self._followed[block.section] = Followed(follower, place, *place)
+        followed = self._followed[block.section] = RecordedBlock(follower, place, *place)
         layout = follower.part.layout
         if layout.hash not in self._attached:
             self._attached.add(layout.hash)
-            self._attach([Attachment(f"layouts/{layout.hash.hex()}.json", JSON, layout.to_json())])
+            self._attach([AttachedFile(f"layouts/{layout.hash.hex()}.json", JSON, layout.to_json())])
         if not follower.over:  # the files on the disk are of its successor
             self._attach(self._attachments(block.source, follower.number))
         return followed
@@ -267,15 +267,15 @@ class Recorder:
             self._config = now
             self._attach(now)
 
-    def _attach(self, attachments: list[Attachment]) -> None:
+    def _attach(self, attachments: list[AttachedFile]) -> None:
         for name, media_type, data, changed_ns in attachments:
             self._writer.attach(name, media_type, data, self.tap.now(), changed_ns)
 
     # ---- entries -----------------------------------------------------------------------------------------------------
 
-    def _write(self, entry: Entry | Aside) -> None:
-        self.empty = self.empty and of_a_process(entry)
-        if isinstance(entry, Aside):
+    def _write(self, entry: BlockEntry | InstanceEntry) -> None:
+        self.empty = self.empty and is_process_change(entry)
+        if isinstance(entry, InstanceEntry):
             self._aside(entry)
             return
         log_ns, follower, item = entry
@@ -300,19 +300,19 @@ class Recorder:
             self._writer.event(followed.channels, item, log_ns)
             followed.come_to("events", item.number, log_ns)
 
-    def _aside(self, aside: Aside) -> None:
+    def _aside(self, aside: InstanceEntry) -> None:
         if isinstance(aside.item, ProcessChange):
             self._writer.process(aside.item, aside.log_ns)
         else:
             self._writer.step(aside.item, aside.log_ns)
 
-    def _lose(self, entry: Entry | Aside) -> None:
-        if isinstance(entry, Aside):
-            self._unaware |= of_a_process(entry)
+    def _lose(self, entry: BlockEntry | InstanceEntry) -> None:
+        if isinstance(entry, InstanceEntry):
+            self._unaware |= is_process_change(entry)
         else:
             self.counters.missed += self._known(entry.follower).lose(entry.item)
 
-    def _tell_lost(self, followed: Followed, before_ns: int) -> None:
+    def _tell_lost(self, followed: RecordedBlock, before_ns: int) -> None:
         """Put down what there was no room for, before what follows it."""
         for gap in followed.found(before_ns):
             log_ns = before_ns or self.tap.now()
@@ -320,6 +320,6 @@ class Recorder:
             followed.come_to(gap.what, gap.last, log_ns)
 
 
-def of_a_process(entry: Entry | Aside) -> bool:
+def is_process_change(entry: BlockEntry | InstanceEntry) -> bool:
     """Whether it is what has happened to a process."""
     return isinstance(entry.item, ProcessChange)

@@ -15,7 +15,7 @@ from shmio.layout.values.write import chosen, covering
 from shmio.segment import Block, Frame
 
 
-class Part:
+class RecordedRegisters:
     """Registers of a block. ``layout`` has only these, each at its place."""
 
     def __init__(self, layout: Layout, mask: npt.NDArray[np.uint8] | None = None) -> None:
@@ -42,18 +42,18 @@ class Selection:
         self._sources = sources
         self._registers = registers
 
-    def part(self, block: Block, sources: Collection[str]) -> Part | None:
+    def part(self, block: Block, sources: Collection[str]) -> RecordedRegisters | None:
         """What is recorded of a block; None: nothing. ``sources``: all there are."""
         if self._sources is not None and block.source not in self._sources:
             return None
         if not self._registers:
-            return Part(block.layout)
+            return RecordedRegisters(block.layout)
         paths = {path for pattern in self._registers for path in _paths(pattern, block.source, block.layout, sources)}
         registers = tuple(register for register in block.layout.registers if register.path in paths)
         if len(registers) == len(block.layout.registers):
-            return Part(block.layout)
+            return RecordedRegisters(block.layout)
         mask = np.frombuffer(covering(registers, block.layout.size), np.uint8)
-        return Part(replace(block.layout, registers=registers), mask) if registers else None
+        return RecordedRegisters(replace(block.layout, registers=registers), mask) if registers else None
 
     def nothing(self, layouts: Mapping[str, Layout]) -> list[str]:
         """What of it names nothing: sources that are not there, patterns without registers. ``layouts``: by source."""

@@ -15,12 +15,12 @@ from shmio.errors import ConfigError, RecordingError
 from shmio.injection.expression import Memory, Number
 from shmio.injection.program import NEVER, compile_condition
 from shmio.layout.values.codec import RegisterCodec
-from shmio.recorder.attach import Attachments
-from shmio.recorder.follower import Aside, Entry
-from shmio.recorder.recorder import CLOSE_S, Counters, of_a_process
-from shmio.recorder.series import Series
-from shmio.recorder.tap import TURN_S, Tap
-from shmio.recording.format.encoding import Gap, Place, Reason
+from shmio.recorder.attached_files import AttachedFiles
+from shmio.recorder.block_follower import BlockEntry, InstanceEntry
+from shmio.recorder.instance_follower import TURN_S, InstanceFollower
+from shmio.recorder.recorder import CLOSE_S, Counters, is_process_change
+from shmio.recorder.rotation import RotatingRecorder
+from shmio.recording.format.encoding import BlockPosition, Gap, Reason
 from shmio.segment import Block, Frame, Quality
 
 ENTRY_BYTES: Final = 800
@@ -56,9 +56,9 @@ class Trigger:
         self._images: dict[str, bytes | None] = {}
         self._memory = Memory()
 
-    def sees(self, entry: Entry | Aside) -> bool:
+    def sees(self, entry: BlockEntry | InstanceEntry) -> bool:
         """Whether it is true with this entry."""
-        if isinstance(entry, Aside) or not isinstance(entry.item, Frame):
+        if isinstance(entry, InstanceEntry) or not isinstance(entry.item, Frame):
             return False
         source = self._sections.get(entry.follower.block.section, "")
         if source not in self.sources:
@@ -74,20 +74,20 @@ class Trigger:
         return value if isinstance(value, bool | int | float) else None
 
 
-class Backlog:
+class PreTriggerBuffer:
     """What was published in the last seconds, as far as a bound of memory lasts; older entries are let go."""
 
-    def __init__(self, before_s: float, limit_bytes: int, places: Mapping[int, Place]) -> None:
+    def __init__(self, before_s: float, limit_bytes: int, places: Mapping[int, BlockPosition]) -> None:
         """``places``: behind which it begins, by section."""
         self._before_ns = round(before_s * 1e9)
         self._limit = limit_bytes
-        self._entries: deque[Entry | Aside] = deque()
+        self._entries: deque[BlockEntry | InstanceEntry] = deque()
         self._size = 0
         self._told = False
         self.places = dict(places)
         """Behind which it begins now, by section."""
 
-    def add(self, entry: Entry | Aside) -> None:
+    def add(self, entry: BlockEntry | InstanceEntry) -> None:
         """The next one. What was lost before this recorder ran is not missed."""
         item = entry.item
         if isinstance(item, Gap) and item.reason is not Reason.OVERTAKEN:
@@ -105,7 +105,7 @@ class Backlog:
         while self._size > self._limit:
             self._drop()
 
-    def before(self, log_ns: int) -> list[Entry | Aside]:
+    def before(self, log_ns: int) -> list[BlockEntry | InstanceEntry]:
         """What was published in the seconds before this time, the oldest first; :attr:`places` is where it begins."""
         self._trim(log_ns)
         return list(self._entries)
@@ -119,8 +119,8 @@ class Backlog:
         self._size -= _size(entry)
         self._pass(entry)
 
-    def _pass(self, entry: Entry | Aside) -> None:
-        if isinstance(entry, Aside):
+    def _pass(self, entry: BlockEntry | InstanceEntry) -> None:
+        if isinstance(entry, InstanceEntry):
             return
         section, item = entry.follower.block.section, entry.item
         frame, event, _ = self.places.get(section, entry.follower.begin)
@@ -130,19 +130,22 @@ class Backlog:
             frame = item.number
         else:
             event = item.number
-        self.places[section] = Place(frame, event, entry.log_ns)
+        self.places[section] = BlockPosition(frame, event, entry.log_ns)
 
 
-def _size(entry: Entry | Aside) -> int:
+def _size(entry: BlockEntry | InstanceEntry) -> int:
     item = entry.item
     return ENTRY_BYTES + (len(item.raw) + len(item.effective or b"") if isinstance(item, Frame) else 0)
 
 
-class Triggered:
-    """As :class:`~shmio.recorder.series.Series`, but for the time between triggers. One that comes prolongs a file."""
+class TriggeredRecorder:
+    """Records from some seconds before each trigger until some seconds after it, to a file of its own.
+
+    A trigger that comes while a file is being written prolongs that file.
+    """
 
     def __init__(
-        self, tap: Tap, settings: Settings, trigger: TriggerSettings, by: str, attachments: Attachments,
+        self, tap: InstanceFollower, settings: Settings, trigger: TriggerSettings, by: str, attachments: AttachedFiles,
         *, going: bool = False,
     ) -> None:  # fmt: skip
         """``going``: a recorder that died was within such a recording. ConfigError: the condition cannot be."""
@@ -154,8 +157,8 @@ class Triggered:
         tap.watch(self._trigger.sources)
         self._by = by
         self._attachments = attachments
-        self._series: Series | None = None
-        self._ending: list[Series] = []
+        self._series: RotatingRecorder | None = None
+        self._ending: list[RotatingRecorder] = []
         self._backlog = self._anew(tap.start.places)
         self._until_ns = 0
         self._came_s = time.monotonic()
@@ -170,14 +173,14 @@ class Triggered:
         entries, more = self.tap.take()
         if entries:
             self._came_s = time.monotonic()
-        batch: list[Entry | Aside] = []
+        batch: list[BlockEntry | InstanceEntry] = []
         for entry in entries:
-            if self._series and entry.log_ns > self._until_ns and not of_a_process(entry):
+            if self._series and entry.log_ns > self._until_ns and not is_process_change(entry):
                 self._end(batch)
                 batch = []
             if self._trigger.sees(entry):
                 self._begin(entry.log_ns)
-            if isinstance(entry, Entry) and not entry.follower.number:
+            if isinstance(entry, BlockEntry) and not entry.follower.number:
                 continue  # it is only watched
             if self._series:
                 batch.append(entry)
@@ -204,7 +207,7 @@ class Triggered:
         before = self._backlog.before(log_ns)
         about = {"trigger": self._trigger.when, "triggered_ns": str(log_ns)}
         try:
-            series = Series(
+            series = RotatingRecorder(
                 self.tap, self._settings, self._by, self._attachments,
                 places=self._backlog.places, about=about, counters=self.counters,
             )  # fmt: skip
@@ -218,18 +221,18 @@ class Triggered:
         series.put(before)
         log.info("%s: recording to %s", self._trigger.when, series.file)
 
-    def _end(self, last: Sequence[Entry | Aside]) -> None:
+    def _end(self, last: Sequence[BlockEntry | InstanceEntry]) -> None:
         if series := self._series:
             series.put(last)
             self._backlog = self._anew(series.end())
             self._ending.append(series)  # before it is the present one no longer: another thread may look
             self._series = None
 
-    def _anew(self, places: Mapping[int, Place]) -> Backlog:
-        return Backlog(self._times.before_s, round(self._times.before_mb * 1e6), places)
+    def _anew(self, places: Mapping[int, BlockPosition]) -> PreTriggerBuffer:
+        return PreTriggerBuffer(self._times.before_s, round(self._times.before_mb * 1e6), places)
 
     @property
-    def _all(self) -> list[Series]:
+    def _all(self) -> list[RotatingRecorder]:
         present = self._series
         return [*self._ending, *([present] if present else [])]
 

@@ -27,15 +27,15 @@ from shmio.recording.format.encoding import (
     PROFILE,
     STEP_SCHEMA,
     STEPS_TOPIC,
+    BlockPosition,
     Gap,
-    Place,
     ProcessChange,
     StepMark,
     differ,
     encode_event,
     encode_frame,
     encode_json,
-    encode_place,
+    encode_position,
 )
 from shmio.segment import Block, Event, Frame
 
@@ -67,10 +67,10 @@ class Writer:
         self._own: dict[str, int] = {}
         self.flush()
 
-    def places(self, places: Mapping[int, Place]) -> None:
+    def places(self, places: Mapping[int, BlockPosition]) -> None:
         """Tell where the recorder before had come to, by section: it may be all that there is of a block."""
         if places:
-            self._mcap.add_metadata(PLACES, {str(section): encode_place(place) for section, place in places.items()})
+            self._mcap.add_metadata(PLACES, {str(section): encode_position(place) for section, place in places.items()})
 
     def attach(self, name: str, media_type: str, data: bytes, now_ns: int, changed_ns: int = 0) -> None:
         """Attach a file."""

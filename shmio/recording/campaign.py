@@ -17,7 +17,7 @@ NS = 1e9
 
 
 @dataclass(slots=True)
-class _Held:
+class _HeldValue:
     """A value that a client gave, since when."""
 
     place: Place
@@ -25,7 +25,7 @@ class _Held:
 
 
 @dataclass(slots=True)
-class _Laid:
+class _RecordedInjection:
     """An injection from the time when it was laid, the ``place``-th."""
 
     place: int
@@ -34,7 +34,7 @@ class _Laid:
     declaration: Declaration | None
     """None: a client gave it values."""
     priority: int = 0
-    held: dict[str, _Held] = field(default_factory=dict)
+    held: dict[str, _HeldValue] = field(default_factory=dict)
     """By path, what it gave last."""
 
 
@@ -88,7 +88,7 @@ def derive(dump: Dump) -> Derived:
 class _Source:
     def __init__(self, found: Derived) -> None:
         self._found = found
-        self._laid: dict[int, _Laid] = {}
+        self._laid: dict[int, _RecordedInjection] = {}
         self._declared: list[tuple[int, Declaration]] = []
         self._count = 0
         self._unknown: set[int] = set()
@@ -122,7 +122,7 @@ class _Source:
             return
         priority = how.get("priority", 0)
         self._count += 1
-        self._laid[event.injection] = _Laid(
+        self._laid[event.injection] = _RecordedInjection(
             self._count, event.text, event.clock_ns, declaration, priority if isinstance(priority, int) else 0
         )
 
@@ -141,9 +141,9 @@ class _Source:
                 continue
             if before is not None:
                 self._set(laid, before, event.clock_ns)
-            laid.held[place.path] = _Held(place, event.clock_ns)
+            laid.held[place.path] = _HeldValue(place, event.clock_ns)
 
-    def _lift(self, laid: _Laid, event: Event) -> None:
+    def _lift(self, laid: _RecordedInjection, event: Event) -> None:
         for held in laid.held.values():
             self._set(laid, held, event.clock_ns)
         if laid.declaration is not None:
@@ -159,7 +159,7 @@ class _Source:
         self._declared.sort(key=lambda pair: pair[0])
         self._found.declarations += [one for _, one in self._declared]
 
-    def _set(self, laid: _Laid, held: _Held, until_ns: int | None) -> None:
+    def _set(self, laid: _RecordedInjection, held: _HeldValue, until_ns: int | None) -> None:
         place = held.place
         value = place.plain
         if value is None or (isinstance(value, float) and not math.isfinite(value)):
@@ -168,7 +168,9 @@ class _Source:
         one = Declaration(name=name, target=place.path, operation="set", value=value, priority=laid.priority)
         self._declare(laid, one, until_ns, held.since_ns)
 
-    def _declare(self, laid: _Laid, one: Declaration, until_ns: int | None, since_ns: int | None = None) -> None:
+    def _declare(
+        self, laid: _RecordedInjection, one: Declaration, until_ns: int | None, since_ns: int | None = None
+    ) -> None:
         """Within these times, too. A change is seen from the next cycle on: in virtual time that is a later moment."""
         since_s = (max(0, laid.since_ns if since_ns is None else since_ns) + 1) / NS
         if since_s > max(one.start_s or 0.0, 1 / NS):

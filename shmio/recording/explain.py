@@ -15,7 +15,7 @@ from shmio.layout.values.text import json_value, to_text
 from shmio.layout.values.write import Write, bits_of
 from shmio.layout.values.write import apply as write_to
 from shmio.segment.events import NO_WRITER, Event, EventKind
-from shmio.segment.processes import GUESTS, WRITERS
+from shmio.segment.processes import GUEST_SLOTS, WRITERS
 
 MAX_REMEMBERED: Final = 4096
 """Commands under way, and injections, whose beginning is kept in mind."""
@@ -199,4 +199,4 @@ def by(writer: int) -> str:
     """Whose a command queue is."""
     if writer == NO_WRITER:
         return ""
-    return _ROLES.get(writer, f"program {writer + 1}" if writer < GUESTS else f"writer {writer}")
+    return _ROLES.get(writer, f"program {writer + 1}" if writer < GUEST_SLOTS else f"writer {writer}")

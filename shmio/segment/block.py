@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from shmio.segment._atomics import FrameTuple
     from shmio.segment.clock import ClockPage
     from shmio.segment.commands import CommandQueues
-    from shmio.segment.model_channel import Link
+    from shmio.segment.model_channel import ModelChannel
     from shmio.segment.playhead import Playhead
     from shmio.segment.standing_injections import DeclaredCell, StandingCell
 
@@ -106,7 +106,7 @@ class Block:
         retired: Callable[[], bool],
         section: int,
         clock: ClockPage,
-        link: Link | None = None,
+        model_channel: ModelChannel | None = None,
         playhead: Playhead | None = None,
     ) -> None:
         self.source = source
@@ -122,7 +122,7 @@ class Block:
         """Those that the configuration has for it."""
         self.attributes = attributes
         self.clock = clock
-        self.link = link
+        self.model_channel = model_channel
         """Toward the program elsewhere that computes it; None: it is no such block."""
         self.playhead = playhead
         """Of the recording that it plays; None: it plays none."""

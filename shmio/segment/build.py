@@ -20,7 +20,7 @@ from shmio.segment.block import Attributes
 from shmio.segment.clock import ClockPage, page_size
 from shmio.segment.events import EVENT_SIZE, EVENT_SLOTS
 from shmio.segment.header import HEADER_SIZE, SECTION_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
-from shmio.segment.processes import GUESTS, ProcessSpec, ProcessTable, supervisor_beat
+from shmio.segment.processes import GUEST_SLOTS, ProcessSpec, ProcessTable, supervisor_beat
 from shmio.segment.shm import SharedObject
 from shmio.segment.standing_injections import CELL_SIZE
 
@@ -28,7 +28,7 @@ RING_SECONDS = 8
 SECTIONS_PER_BLOCK = 8  # of one that has all
 SPARE_SECTIONS = 40 * SECTIONS_PER_BLOCK
 OWN_SECTIONS = 1  # that are no block's: the clock page
-SPARE_PROCESSES = 16 + GUESTS
+SPARE_PROCESSES = 16 + GUEST_SLOTS
 EVENT_STRIDE = -(-(_atomics.RAW_OFFSET + EVENT_SIZE) // 64) * 64
 
 _RING = struct.Struct("<8Iqq")

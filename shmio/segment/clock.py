@@ -23,7 +23,7 @@ from enum import IntEnum
 from typing import Final, NamedTuple
 
 from shmio.segment import _atomics
-from shmio.segment.double_buffer import TwinCell
+from shmio.segment.double_buffer import DoubleBuffer
 from shmio.segment.header import Header, cut, text
 
 STEP_SIZE_NS: Final = 50_000_000
@@ -98,7 +98,7 @@ class ClockState(NamedTuple):
         return self.step - self.resumed_ns // period_ns
 
 
-class Bell:
+class Doorbell:
     """A futex word in shared memory: who waits is woken when it is rung. Works on a read-only mapping, but to ring."""
 
     def __init__(self, memory: memoryview, offset: int) -> None:
@@ -140,9 +140,9 @@ class ClockPage:
         self._owned = owned
         self._last = b"", ClockState()  # what was read last
         self._started_ns, self._started_utc_ns = head.started_ns, head.started_utc_ns
-        self.bell = Bell(memory, offset + _BELL_AT)
+        self.bell = Doorbell(memory, offset + _BELL_AT)
         """Rung at every change of the page."""
-        self.delivered_bell = Bell(memory, offset + _DELIVERED_BELL_AT)
+        self.delivered_bell = Doorbell(memory, offset + _DELIVERED_BELL_AT)
         """Rung by those who deliver steps."""
 
     @staticmethod
@@ -209,9 +209,9 @@ class ClockPage:
         since_ns = monotonic_ns - self._started_ns
         return (SIMULATED_UTC_NS if self.stepped else self._started_utc_ns) + since_ns
 
-    def slot_bell(self, index: int) -> Bell:
+    def slot_bell(self, index: int) -> Doorbell:
         """The bell of the process in this slot of the table: rung when the page has something for it to do."""
-        return Bell(self._memory, self._entry(index) + 8)
+        return Doorbell(self._memory, self._entry(index) + 8)
 
     def delivered(self, index: int) -> int | None:
         """The last step that the process in this slot has delivered; None: it delivers none."""
@@ -249,10 +249,10 @@ def _word(memory: memoryview, offset: int) -> int:
     return int.from_bytes(memory[offset : offset + 4], "little")
 
 
-def _cell(memory: memoryview, offset: int) -> TwinCell:
+def _cell(memory: memoryview, offset: int) -> DoubleBuffer:
     first, second = _COPIES_AT
     complaint = "the clock page makes no sense: restart the instance: shmio-supervisor down, up"
-    return TwinCell(memory, (offset + first, offset + second), complaint)
+    return DoubleBuffer(memory, (offset + first, offset + second), complaint)
 
 
 def _pack(state: ClockState) -> bytes:

@@ -197,7 +197,7 @@ class CommandQueues:
         return self._offset + SECTION_HEADER_SIZE + writer * self._stride
 
 
-class Laid(TypedDict, total=False):
+class InjectionOptions(TypedDict, total=False):
     """How an injection is laid; see :class:`Command`."""
 
     direction: Direction
@@ -223,7 +223,7 @@ class CommandSender:
         deadline_ns: int,
         kind: CommandKind = CommandKind.WRITE,
         injection: int = 0,
-        **laid: Unpack[Laid],
+        **laid: Unpack[InjectionOptions],
     ) -> int:
         """Send one command; its number. It is for the source's present process only, and for the time until then.
 

@@ -10,7 +10,7 @@ from shmio.segment import _atomics
 _ATTEMPTS: Final = 4
 
 
-class TwinCell:
+class DoubleBuffer:
     """Both of its copies; several threads may read it."""
 
     def __init__(self, memory: memoryview, copies: tuple[int, int], complaint: str) -> None:

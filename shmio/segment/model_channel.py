@@ -30,7 +30,7 @@ _RINGS_AT: Final = 192
 _COMPUTED: Final = 1  # flag: a model has done a step
 
 
-class Ends(NamedTuple):
+class ModelPorts(NamedTuple):
     """The registers of a block whose model is elsewhere. One that is in-out is among both: it has two ends."""
 
     inputs: tuple[Register, ...]
@@ -39,7 +39,7 @@ class Ends(NamedTuple):
     """What it computes."""
 
 
-class Joined(NamedTuple):
+class ConnectedModel(NamedTuple):
     """A model that is connected. ``number``: how many have been before, and this one; ``pid``: who writes for it."""
 
     number: int
@@ -47,7 +47,7 @@ class Joined(NamedTuple):
     name: str
 
 
-class Ask(NamedTuple):
+class ModelRequest(NamedTuple):
     """A step that the source asks for. ``number`` is the ask's own; the step's may be asked for again.
 
     ``time_ns``: of the instance's clock after the step, ``dt_ns`` before which it was that much less. ``until_ns``:
@@ -65,14 +65,14 @@ class Ask(NamedTuple):
     shown: bytes
 
 
-class Answer(NamedTuple):
+class ModelAnswer(NamedTuple):
     """What came of an ask. ``image`` has the outputs; with ``failure`` none of it counts."""
 
     image: bytes
     failure: str | None
 
 
-def ends_of(layout: Layout, outputs: Sequence[str], inouts: Sequence[str]) -> Ends:
+def model_ports(layout: Layout, outputs: Sequence[str], inouts: Sequence[str]) -> ModelPorts:
     """What the patterns of ``outputs`` and ``inouts`` say of a layout's registers.
 
     ConfigError, beginning with the key: a pattern names no register, or one is named in both.
@@ -82,7 +82,7 @@ def ends_of(layout: Layout, outputs: Sequence[str], inouts: Sequence[str]) -> En
         path = layout.registers[twice[0]].path
         raise ConfigError(f"inouts: {path} is among outputs, too: what is both is named here alone")
     registers = list(enumerate(layout.registers))
-    return Ends(
+    return ModelPorts(
         tuple(register for index, register in registers if index not in computed),
         tuple(register for index, register in registers if index in computed | both),
     )
@@ -110,7 +110,7 @@ def section(ring_header: bytes, slot_bytes: int) -> tuple[int, bytes]:
     return _RINGS_AT + 2 * ring_size, begin
 
 
-class Link:
+class ModelChannel:
     """The section of one block."""
 
     def __init__(self, shared: SharedObject, memory: memoryview, offset: int, size: int, lock_byte: int) -> None:
@@ -133,16 +133,16 @@ class Link:
         """Bytes of one image."""
         return self.asked.frame_size
 
-    def model(self) -> Joined | None:
+    def model(self) -> ConnectedModel | None:
         """The model that is connected, as other processes see it; None: there is none, or who had it is dead."""
         return self._read() if self._shared.locked(self._lock_byte) else None
 
-    def _read(self) -> Joined:
+    def _read(self) -> ConnectedModel:
         data = _atomics.cell_read(self._memory, self._offset + _JOINED_AT, _JOINED.size)
         if data is None:
-            return Joined(0, 0, "")
+            return ConnectedModel(0, 0, "")
         pid, _, number, name = _JOINED.unpack(data)
-        return Joined(number, pid, text(name))
+        return ConnectedModel(number, pid, text(name))
 
     def computed(self) -> bool:
         """Whether a model has done a step, this one or one before."""
@@ -151,7 +151,7 @@ class Link:
 
     # ---- the source's part ---------------------------------------------------------------------------------------
 
-    def ask(self, ask: Ask, publish_ns: int) -> int:
+    def ask(self, ask: ModelRequest, publish_ns: int) -> int:
         """Ask for a step; the ask's number, whatever it says. ``publish_ns``: the time of its frame."""
         return self.asked.publish(
             ask.commanded, ask.shown, ask.step, publish_ns, ask.time_ns, ask.until_ns,
@@ -159,13 +159,13 @@ class Link:
             cut(ask.doubt, _atomics.REASON_SIZE),
         )  # fmt: skip
 
-    def answer_to(self, number: int) -> Answer | None:
+    def answer_to(self, number: int) -> ModelAnswer | None:
         """The answer to an ask, if it is the newest one: no late answer is taken for it."""
         fields = self.answered.latest()
         if fields is None or fields[8] != number:
             return None
         failed = fields[6] != Quality.GOOD
-        return Answer(fields[11], fields[10] if failed else None)
+        return ModelAnswer(fields[11], fields[10] if failed else None)
 
     # ---- the part of who writes for the model ----------------------------------------------------------------------
 
@@ -173,11 +173,11 @@ class Link:
         """Take the link; False: another process has it."""
         if not self._shared.try_lock(self._lock_byte):
             return False
-        self._tell(Joined(self._read().number + 1, os.getpid(), name), _COMPUTED if self.computed() else 0)
+        self._tell(ConnectedModel(self._read().number + 1, os.getpid(), name), _COMPUTED if self.computed() else 0)
         self.answered.begin()
         return True
 
-    def _tell(self, joined: Joined, flags: int) -> None:
+    def _tell(self, joined: ConnectedModel, flags: int) -> None:
         data = _JOINED.pack(joined.pid, flags, joined.number, cut(joined.name, MAX_NAME_BYTES))
         _atomics.cell_write(self._memory, self._offset + _JOINED_AT, data)
 
@@ -186,15 +186,17 @@ class Link:
         self._shared.unlock(self._lock_byte)
         self.answered.wake()
 
-    def newest(self) -> Ask | None:
+    def newest(self) -> ModelRequest | None:
         """The step that was asked for last; None: none was yet."""
         fields = self.asked.latest()
         if fields is None:
             return None
         number, step, _, time_ns, until_ns, _, _, _, dt_ns, _, doubt, commanded, shown = fields
-        return Ask(number, step, time_ns, dt_ns, until_ns, doubt, commanded, commanded if shown is None else shown)
+        return ModelRequest(
+            number, step, time_ns, dt_ns, until_ns, doubt, commanded, commanded if shown is None else shown
+        )
 
-    def answer(self, ask: Ask, now_ns: int, image: bytes | bytearray, failure: str | None = None) -> None:
+    def answer(self, ask: ModelRequest, now_ns: int, image: bytes | bytearray, failure: str | None = None) -> None:
         """Answer an ask; ``failure``: why it failed. ``now_ns``: CLOCK_MONOTONIC."""
         if failure is None and not self.computed():
             self._tell(self._read(), _COMPUTED)

@@ -14,7 +14,7 @@ from shmio.layout.values.write import apply as write_to
 from shmio.segment.events import Event, EventKind
 
 
-class Diverted(NamedTuple):
+class CommandWrites(NamedTuple):
     """What one command wrote that went to one injection, or on to the device: in its parts, in the events' order."""
 
     injection: int
@@ -27,7 +27,7 @@ _Key = tuple[int, int, int]
 _NOBODY: Final = (0, 0, 0)
 
 
-class Gatherer:
+class CommandAssembler:
     """Gathers the events about what was diverted, or of another kind with data; give it all of a block's, in order.
 
     A command is whole when it says something else, or when another one is diverted. What is diverted says so at once.
@@ -39,7 +39,7 @@ class Gatherer:
         self._command: _Key = _NOBODY
         self._parts: dict[int, list[Event]] = {}
 
-    def follow(self, event: Event) -> list[Diverted]:
+    def follow(self, event: Event) -> list[CommandWrites]:
         """What is whole by this event."""
         command = event.incarnation, event.writer, event.command
         if event.kind != self._kind:
@@ -51,9 +51,9 @@ class Gatherer:
             whole += self._whole()
         return whole
 
-    def _whole(self) -> list[Diverted]:
+    def _whole(self) -> list[CommandWrites]:
         whole = [
-            Diverted(injection, parts[-1], tuple(Write(part.offset, part.mask, part.data) for part in parts))
+            CommandWrites(injection, parts[-1], tuple(Write(part.offset, part.mask, part.data) for part in parts))
             for injection, parts in self._parts.items()
         ]
         self._command, self._parts = _NOBODY, {}

@@ -20,7 +20,7 @@ import msgspec
 
 from shmio.errors import CommandError
 from shmio.segment import _atomics
-from shmio.segment.double_buffer import TwinCell
+from shmio.segment.double_buffer import DoubleBuffer
 from shmio.segment.header import cut, text
 from shmio.segment.shm import SharedObject
 
@@ -47,7 +47,7 @@ _LOCK_TURN_S: Final = 0.02
 _LOCK_S: Final = 10.0
 
 
-class Play(NamedTuple):
+class PlayState(NamedTuple):
     """How a recording plays. Positions and clocks in ns.
 
     When the instance's clock was ``anchor_ns``, the position was ``position_ns``; it moves at ``speed`` times that
@@ -104,11 +104,11 @@ class Play(NamedTuple):
             clock_ns += 1
         return clock_ns
 
-    def next_round(self) -> Play:
+    def next_round(self) -> PlayState:
         """The same, with this round behind it, of one that wraps."""
         return self._replace(anchor_ns=self.due_ns(self.end_ns), position_ns=self.begin_ns)
 
-    def settled(self, clock_ns: int) -> Play:
+    def settled(self, clock_ns: int) -> PlayState:
         """The same, with the rounds that are over by then behind it, and paused where it was to stop."""
         reach_ns = self.reach_ns(clock_ns)
         if self.paused or reach_ns < self.until_ns:
@@ -119,11 +119,11 @@ class Play(NamedTuple):
             return self._replace(anchor_ns=anchor_ns, position_ns=self.begin_ns)
         return self.anchored(clock_ns)._replace(paused=True, until_ns=self.end_ns)
 
-    def anchored(self, clock_ns: int) -> Play:
+    def anchored(self, clock_ns: int) -> PlayState:
         """The same, told from a time of the instance's clock on."""
         return self._replace(anchor_ns=clock_ns, position_ns=self.at_ns(clock_ns))
 
-    def moved_as(self, other: Play) -> Play:
+    def moved_as(self, other: PlayState) -> PlayState:
         """The same, moved as another that plays the same recording."""
         return self._replace(
             anchor_ns=other.anchor_ns,
@@ -136,7 +136,7 @@ class Play(NamedTuple):
         )
 
 
-class Move(msgspec.Struct, tag="move", forbid_unknown_fields=True, omit_defaults=True):
+class MoveRequest(msgspec.Struct, tag="move", forbid_unknown_fields=True, omit_defaults=True):
     """Ask that it plays otherwise, from ``clock_ns`` of the instance's clock on; what is None stays as it is.
 
     ``until_ns``: where it is to pause, once; with ``position_ns`` None is at the end.
@@ -150,7 +150,7 @@ class Move(msgspec.Struct, tag="move", forbid_unknown_fields=True, omit_defaults
     until_ns: int | None = None
 
 
-class Find(msgspec.Struct, tag="find", forbid_unknown_fields=True, omit_defaults=True):
+class FindRequest(msgspec.Struct, tag="find", forbid_unknown_fields=True, omit_defaults=True):
     """Ask for the first position behind ``after_ns`` at which a register changes, or an event of a kind happened."""
 
     after_ns: int
@@ -158,16 +158,16 @@ class Find(msgspec.Struct, tag="find", forbid_unknown_fields=True, omit_defaults
     event: str = ""
 
 
-class Found(msgspec.Struct, omit_defaults=True):
+class PlayheadAnswer(msgspec.Struct, omit_defaults=True):
     """The answer. ``error``: why it is not done; ``position_ns``: what was to be found; None: it is not there."""
 
     error: str = ""
     position_ns: int | None = None
 
 
-Ask = Move | Find
-_ASKS: Final = msgspec.json.Decoder(Ask)
-_FOUND: Final = msgspec.json.Decoder(Found)
+PlayheadRequest = MoveRequest | FindRequest
+_ASKS: Final = msgspec.json.Decoder(PlayheadRequest)
+_FOUND: Final = msgspec.json.Decoder(PlayheadAnswer)
 
 
 class Playhead:
@@ -183,7 +183,7 @@ class Playhead:
         self._memory = memory
         first, second = _COPIES_AT
         complaint = "a playhead makes no sense: restart its source: shmio-supervisor restart NAME"
-        self._state = TwinCell(memory, (offset + first, offset + second), complaint)
+        self._state = DoubleBuffer(memory, (offset + first, offset + second), complaint)
         self._ask_at = offset + _ASK_AT
         self._lock_byte = lock_byte
         self._clock = clock
@@ -191,7 +191,7 @@ class Playhead:
 
     # ---- for anybody ---------------------------------------------------------------------------------------------
 
-    def read(self) -> Play | None:
+    def read(self) -> PlayState | None:
         """How it plays; None: no process of the source has begun yet. SegmentError: it cannot be read."""
         data = self._state.read(_STATE.size)
         (flags, _, begin, end, anchor, position, until, base, utc, speed, step, asked, answer, begun, newest) = (
@@ -199,7 +199,7 @@ class Playhead:
         )
         if not flags & _VALID or not begin < end or not (math.isfinite(speed) and speed > 0):
             return None
-        return Play(
+        return PlayState(
             begin, end, anchor, position, until, base, utc, speed, bool(flags & _PAUSED), bool(flags & _LOOP),
             bool(flags & _OWN_CLOCK), bool(flags & _OVER), step, asked, text(answer), begun, newest,
         )  # fmt: skip
@@ -221,7 +221,7 @@ class Playhead:
 
     # ---- the source's part ---------------------------------------------------------------------------------------
 
-    def write(self, play: Play) -> None:
+    def write(self, play: PlayState) -> None:
         """Tell how it plays; the source's process alone."""
         flags = _VALID | (_PAUSED * play.paused) | (_LOOP * play.loop) | (_OWN_CLOCK * play.own_clock)
         data = _STATE.pack(
@@ -231,7 +231,7 @@ class Playhead:
         )  # fmt: skip
         self._state.write(data)
 
-    def asks(self, answered: int) -> tuple[int, Ask | None] | None:
+    def asks(self, answered: int) -> tuple[int, PlayheadRequest | None] | None:
         """Number and request that waits; None: there is none behind ``answered``. A request that is none is None."""
         asked = self._asked()
         if asked is None or asked[0] == answered:
@@ -270,7 +270,7 @@ class Playhead:
             finally:
                 self._shared.unlock(self._lock_byte)
 
-    def ask(self, ask: Ask) -> int:
+    def ask(self, ask: PlayheadRequest) -> int:
         """Leave a request, with the lock held; its number. The bell of the source's process is the caller's to ring."""
         document = msgspec.json.encode(ask)
         if len(document) > _MAX_ASK:
@@ -280,7 +280,7 @@ class Playhead:
         _atomics.cell_write(self._memory, self._ask_at, _ASK.pack(number, os.getpid(), 0, document))
         return number
 
-    def found(self, number: int) -> Found | None:
+    def found(self, number: int) -> PlayheadAnswer | None:
         """The answer to a request; None: there is none yet."""
         play = self.read()
         if play is None or play.asked != number:
@@ -288,10 +288,10 @@ class Playhead:
         try:
             return _FOUND.decode(play.answer)
         except msgspec.MsgspecError:
-            return Found(play.answer)
+            return PlayheadAnswer(play.answer)
 
 
-def answered(play: Play, number: int, found: Found) -> Play:
+def with_answer(play: PlayState, number: int, found: PlayheadAnswer) -> PlayState:
     """With the answer to a request."""
-    found = Found(cut(found.error, _MAX_ERROR).decode(), found.position_ns)
+    found = PlayheadAnswer(cut(found.error, _MAX_ERROR).decode(), found.position_ns)
     return play._replace(asked=number, answer=msgspec.json.encode(found).decode())

@@ -40,7 +40,7 @@ COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
 """Names of a worker's counters by its kind, in the order of their slots (at most 8)."""
 
 
-GUESTS: Final = 4
+GUEST_SLOTS: Final = 4
 """Places for programs from outside that write; the last slots of the table, with the first command queues."""
 
 WRITERS: Final[Mapping[str, int]] = {"grpc": 4, "mqtt": 5}
@@ -196,9 +196,9 @@ class ProcessTable(Sequence[ProcessSlot]):
     @staticmethod
     def write(memory: memoryview, header: Header, specs: Sequence[ProcessSpec]) -> None:
         """Name the slots of a new segment, the guests' included."""
-        first = header.process_capacity - GUESTS
+        first = header.process_capacity - GUEST_SLOTS
         slots = [(index, spec.name, spec.kind, spec.writer) for index, spec in enumerate(specs)]
-        slots += [(first + guest, f"guest-{guest + 1}", "guest", guest) for guest in range(GUESTS)]
+        slots += [(first + guest, f"guest-{guest + 1}", "guest", guest) for guest in range(GUEST_SLOTS)]
         for index, name, kind, writer in slots:
             at = header.processes_offset + index * SLOT_SIZE
             _FIXED.pack_into(memory, at, name.encode(), kind.encode(), 0 if writer is None else writer + 1)

@@ -14,8 +14,8 @@ AGAIN_S: Final = 0.01
 """So often a thread is told to stop until it has ended: one that is just about to wait does not notice."""
 
 
-class Word(Protocol):
-    """A bell: :class:`~shmio.segment.clock.Bell`, or the doorbell of a ring."""
+class WakeSource(Protocol):
+    """A bell: :class:`~shmio.segment.clock.Doorbell`, or the doorbell of a ring."""
 
     def relay(self, shared: bytearray, descriptor: int, turn_ns: int, /) -> None:
         """Wait for it, and tell, until it is stopped; without the interpreter's lock."""
@@ -27,7 +27,7 @@ class Relay:
     ``descriptor`` is readable at first, after each ring, and after ``turn_ns`` without one, until :meth:`heard`.
     """
 
-    def __init__(self, word: Word, name: str, turn_ns: int = TURN_NS) -> None:
+    def __init__(self, word: WakeSource, name: str, turn_ns: int = TURN_NS) -> None:
         self.descriptor = os.eventfd(0, os.EFD_CLOEXEC | os.EFD_NONBLOCK)
         self._shared = bytearray(_atomics.RELAY_SIZE)
         self._word = word

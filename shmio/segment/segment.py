@@ -28,7 +28,7 @@ from shmio.segment.clock import ClockPage, time_lock
 from shmio.segment.commands import CommandQueues
 from shmio.segment.events import EVENT_SIZE
 from shmio.segment.header import HEADER_SIZE, SLOT_SIZE, Header, SectionEntry, SectionKind, State
-from shmio.segment.model_channel import Link
+from shmio.segment.model_channel import ModelChannel
 from shmio.segment.playhead import Playhead
 from shmio.segment.processes import SUPERVISOR_LOCK, ProcessSpec, ProcessTable, supervisor_beat
 from shmio.segment.shm import SharedObject
@@ -84,18 +84,18 @@ def read_block(
         standing = standing_cell(memory, *part(SectionKind.STANDING))
         declared = declared_cell(memory, *part(SectionKind.DECLARED))
         lock_byte = head.process_capacity + FIRST_LINK + layout_at
-        link = Link(shared, memory, *part(SectionKind.LINK), lock_byte) if attributes.remote else None
+        channel = ModelChannel(shared, memory, *part(SectionKind.LINK), lock_byte) if attributes.remote else None
         playhead = (
             Playhead(shared, memory, *part(SectionKind.PLAYHEAD), lock_byte, clock) if attributes.replay else None
         )
     except (LayoutError, ValueError, msgspec.MsgspecError) as error:
         raise FormatError(f"{name}: block {described.name}: {error}") from None
-    linked_size = layout.size if link is None else link.frame_size
+    linked_size = layout.size if channel is None else channel.frame_size
     if not frames.frame_size == linked_size == layout.size or events.frame_size != EVENT_SIZE:
         raise FormatError(f"{name}: block {described.name}: rings and layout differ in size")
     return Block(
         described.name, layout, frames, events, queues, standing, declared, attributes,
-        lambda: header.retired(memory, head, layout_at), layout_at, clock, link, playhead,
+        lambda: header.retired(memory, head, layout_at), layout_at, clock, channel, playhead,
     )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ STANDING_SIZE: Final = 32_768
 CELL_SIZE: Final = 8 + STANDING_SIZE
 
 
-class Running(msgspec.Struct, frozen=True):
+class DeclaredState(msgspec.Struct, frozen=True):
     """How a declared injection is. ``state``: ``waiting``, ``active``, ``over``, or ``lifted`` before its time.
 
     ``seed``: from which all that is random in it follows, drawn by the source where the declaration has none.
@@ -36,7 +36,7 @@ class Running(msgspec.Struct, frozen=True):
     time_ns: int = 0
 
 
-class Standing(msgspec.Struct, frozen=True, omit_defaults=True):
+class StandingInjection(msgspec.Struct, frozen=True, omit_defaults=True):
     """One injection. The innermost comes first.
 
     ``direction``: ``out`` or ``in``. ``ranges``: (offset, size, mask): these bits of these bytes of the block.
@@ -52,7 +52,7 @@ class Standing(msgspec.Struct, frozen=True, omit_defaults=True):
     writer: int
     pid: int
     ranges: tuple[tuple[int, int, int], ...]
-    running: Running | None = None
+    running: DeclaredState | None = None
 
     @property
     def configured(self) -> bool:
@@ -85,7 +85,7 @@ class Standing(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 # As in layout/document.py: built before there are threads.
-_STANDING = msgspec.json.Decoder(tuple[Standing, ...])
+_STANDING = msgspec.json.Decoder(tuple[StandingInjection, ...])
 _DECLARED = msgspec.json.Decoder(tuple[Declaration, ...])
 _Item = TypeVar("_Item")
 
@@ -141,7 +141,7 @@ class DocumentCell(Generic[_Item]):
         _atomics.cell_write(self._memory, self._offset, document.ljust(STANDING_SIZE, b"\0"))
 
 
-StandingCell = DocumentCell[Standing]
+StandingCell = DocumentCell[StandingInjection]
 DeclaredCell = DocumentCell[Declaration]
 
 

@@ -15,7 +15,7 @@ from typing import Final
 from shmio.errors import CommandError, PathError, QualityError
 from shmio.local.attach import Attachment
 from shmio.segment import EventKind
-from shmio.segment.standing_injections import Standing
+from shmio.segment.standing_injections import StandingInjection
 from tests.faults.checker import Checker
 from tests.faults.checks import Counts, Source, word_at
 from tests.faults.inject_checks import QUIET_NS, SHOWN_NS, GuardCheck, LifeCheck
@@ -202,7 +202,7 @@ class Injecting:
         for one in self._standing(target.source.name):
             self._attachment.lift(target.source.name, one.id)
 
-    def _standing(self, source: str) -> list[Standing]:
+    def _standing(self, source: str) -> list[StandingInjection]:
         return standing(self._attachment, source, "n")
 
     def _tick(self, target: Target, order: Order | None = None) -> None:
@@ -234,7 +234,7 @@ class Injecting:
         target.guard.look(target.past[0])
 
 
-def standing(attachment: Attachment, source: str, initial: str) -> list[Standing]:
+def standing(attachment: Attachment, source: str, initial: str) -> list[StandingInjection]:
     """The injections over a source whose names begin so."""
     return [one for one in attachment.injections()[source] if one.name.startswith(initial)]
 

@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 
 from shmio.layout.model import Layout, Register
+from shmio.recorder.instance_follower import InstanceFollower
 from shmio.recorder.output import Output, create
 from shmio.recorder.recorder import Recorder
-from shmio.recorder.tap import Tap
 from shmio.recording.format.encoding import Gap, Reason
 from shmio.segment import BlockSpec, Event, EventKind, Frame, Quality, Record, Segment
 from shmio.segment.events import NO_WRITER
@@ -98,7 +98,7 @@ def test_a_file_that_begins_with_a_gap(instance: str, tmp_path: Path, check: Blo
         for number in range(1, 3000):
             writer.publish(image(FIRST + 2 * number, places(SIZE)), cycle=number)
         file, fd = create(tmp_path, instance)
-        assert Recorder(Tap(segment), Output(file, fd, limit_bytes=1 << 26), by="test").close()
+        assert Recorder(InstanceFollower(segment), Output(file, fd, limit_bytes=1 << 26), by="test").close()
         segment.unlink()
     recorded.check(file, 1 << 62, {"cell": check})
     assert check.counts.missed > 0, found

@@ -16,7 +16,7 @@ from shmio.errors import RecordingError
 from shmio.layout.model import Register
 from shmio.layout.topic import holder
 from shmio.layout.values.write import covering
-from shmio.recorder.selection import Part
+from shmio.recorder.selection import RecordedRegisters
 from shmio.recording.dump import Dump
 from shmio.recording.format.blocks import DumpBlock
 from shmio.recording.format.entries import Entry
@@ -47,12 +47,12 @@ class Parts:
         return Entry(entry.time_ns, block, part.keep(item) if isinstance(item, Frame) else item)
 
 
-def _part(block: DumpBlock, registers: Sequence[Register]) -> tuple[DumpBlock, Part]:
+def _part(block: DumpBlock, registers: Sequence[Register]) -> tuple[DumpBlock, RecordedRegisters]:
     """The block with these registers alone, and what makes its frames."""
     paths = {holder(block.layout, register) for register in registers}
     whole = tuple(register for register in block.layout.registers if register.path in paths)
     layout = replace(block.layout, registers=whole)
-    part = Part(layout, np.frombuffer(covering(whole, layout.size), np.uint8))
+    part = RecordedRegisters(layout, np.frombuffer(covering(whole, layout.size), np.uint8))
     digest = layout.hash.hex()
     of = "" if digest == block.layout_hash else block.of or block.layout_hash
     return replace(block, layout=layout, layout_hash=digest, of=of), part

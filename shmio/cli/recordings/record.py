@@ -16,11 +16,11 @@ from shmio.cli.target import target
 from shmio.config import Recorder as Settings
 from shmio.config import Trigger
 from shmio.errors import ControlError, PathError, RecordingError
-from shmio.recorder.attach import Attachments, ConfigFiles, no_attachments
+from shmio.recorder.attached_files import AttachedFiles, ConfigFiles, no_attachments
+from shmio.recorder.instance_follower import InstanceFollower, StartPositions
+from shmio.recorder.rotation import RotatingRecorder
 from shmio.recorder.selection import Selection
-from shmio.recorder.series import Series
-from shmio.recorder.tap import Start, Tap
-from shmio.recorder.triggered import Triggered
+from shmio.recorder.triggered import TriggeredRecorder
 from shmio.segment import Segment
 from shmio.supervisor import control
 
@@ -38,7 +38,7 @@ def execute(arguments: argparse.Namespace) -> int:
         selection = Selection(sources, arguments.registers or ())
         for missing in selection.nothing({name: block.layout for name, block in segment.blocks.items()}):
             raise PathError(missing)
-        tap = Tap(segment, Start(first=False), selection)
+        tap = InstanceFollower(segment, StartPositions(first=False), selection)
         news = _News(as_json=arguments.json)
         work = _work(arguments, tap, _attachments(segment, news))
         chosen = list(sources or segment.blocks)
@@ -61,17 +61,23 @@ def execute(arguments: argparse.Namespace) -> int:
         return 0 if whole else 1
 
 
-def _work(arguments: argparse.Namespace, tap: Tap, attachments: Attachments) -> Series | Triggered:
+def _work(
+    arguments: argparse.Namespace, tap: InstanceFollower, attachments: AttachedFiles
+) -> RotatingRecorder | TriggeredRecorder:
     settings = Settings(directory=str(arguments.directory), rotate_min=0, rotate_mb=0)
     if arguments.when is None:
-        return Series(tap, settings, BY, attachments)
+        return RotatingRecorder(tap, settings, BY, attachments)
     seconds = {name: value for name in ("before_s", "after_s") if (value := getattr(arguments, name)) is not None}
     trigger = Trigger(arguments.when, **seconds)
-    return Triggered(tap, settings, trigger, BY, attachments)
+    return TriggeredRecorder(tap, settings, trigger, BY, attachments)
 
 
 def _record(
-    segment: Segment, work: Series | Triggered, stopping: threading.Event, duration_s: float | None, news: _News
+    segment: Segment,
+    work: RotatingRecorder | TriggeredRecorder,
+    stopping: threading.Event,
+    duration_s: float | None,
+    news: _News,
 ) -> bool:
     """Whether it went on as long as was asked."""
     until_s = None if duration_s is None else time.monotonic() + duration_s
@@ -96,7 +102,7 @@ def _record(
             return until_s is None
 
 
-def _attachments(segment: Segment, news: _News) -> Attachments:
+def _attachments(segment: Segment, news: _News) -> AttachedFiles:
     """The files of the configuration, if the supervisor says where that is."""
     try:
         return ConfigFiles(Path(control.request(segment.header.control, control.Where(), WHERE_S)["config"]))
@@ -106,7 +112,9 @@ def _attachments(segment: Segment, news: _News) -> Attachments:
         return no_attachments
 
 
-def _sum_up(work: Series | Triggered, file: Path | None, directory: Path, news: _News, *, whole: bool) -> None:
+def _sum_up(
+    work: RotatingRecorder | TriggeredRecorder, file: Path | None, directory: Path, news: _News, *, whole: bool
+) -> None:
     counters = work.counters
     counts = {"frames": counters.frames, "events": counters.events, "missed": counters.missed}
     size = f", {work.written / 1e6:.2f} MB" if work.written else ""

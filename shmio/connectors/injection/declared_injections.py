@@ -27,7 +27,7 @@ from shmio.injection.expression import Number
 from shmio.injection.program import NEVER, compile_condition
 from shmio.layout.values.write import Write
 from shmio.segment import NO_WRITER, Block, Command, EventKind, Frame, Quality, Record
-from shmio.segment.standing_injections import Running, Standing
+from shmio.segment.standing_injections import DeclaredState, StandingInjection
 
 
 class ConditionValues:
@@ -119,7 +119,7 @@ class DeclaredInjections:
         time_ns = self._time_ns(frame.cycle) if self._own.playhead is None else frame.clock_ns
         self._publisher.injections.now = CycleImage(frame.cycle, time_ns, frame.raw)
 
-    def resume(self, standing: Standing, running: Running, seen: Bits) -> None:
+    def resume(self, standing: StandingInjection, running: DeclaredState, seen: Bits) -> None:
         """Go on with one of the process before this one; ``seen``: the image that consumers saw last."""
         owner = Owner(standing.writer, standing.pid)
         try:

@@ -17,7 +17,7 @@ from shmio.injection.expression import Memory, Number
 from shmio.injection.operations import Delay, Drop, Operation, OperationContext
 from shmio.layout.values.write import Write
 from shmio.segment import NO_WRITER, Direction
-from shmio.segment.standing_injections import Running
+from shmio.segment.standing_injections import DeclaredState
 
 MAX_HELD: Final = 256
 """Values that a delay over ``/in`` holds before writes are rejected."""
@@ -65,11 +65,11 @@ class DeclaredLayer(Layer):
         return len(self.held) >= MAX_HELD
 
     @property
-    def running(self) -> Running:
+    def running(self) -> DeclaredState:
         """How it is, for all to see."""
         now = self.activation
         declaration = self.program.declaration
-        return Running(declaration, now.state.value, self.seed, now.runs, now.cycle, now.time_ns)
+        return DeclaredState(declaration, now.state.value, self.seed, now.runs, now.cycle, now.time_ns)
 
     def advance(self, now: CycleImage, values: Sequence[Number | None]) -> bool:
         """Look at the next image, with the values that its condition reads; whether its state has changed."""
@@ -154,7 +154,7 @@ def declared(number: int, program: Program, owner: Owner, seed: int, *, keep: bo
     )
 
 
-def resumed(layer: DeclaredLayer, running: Running, seen: Bits) -> DeclaredLayer:
+def resumed(layer: DeclaredLayer, running: DeclaredState, seen: Bits) -> DeclaredLayer:
     """The layer as the process before this one had it; ``seen``: the image that consumers saw last."""
     state = State(running.state)
     layer.activation = Activation(layer.program.window, state, running.runs, running.cycle, running.time_ns)

@@ -16,7 +16,7 @@ from shmio.connectors.output import Output
 from shmio.layout.values.write import Write, apply
 from shmio.segment import Command, CommandKind, Direction, EventKind
 from shmio.segment.events import EVENT_SLOTS
-from shmio.segment.standing_injections import Standing
+from shmio.segment.standing_injections import StandingInjection
 
 LOOK_NS: Final = 400_000_000
 """How often it is looked whether the clients are still there: a shadow is to go within a second."""
@@ -173,7 +173,7 @@ class InjectionProcessor:
         return values
 
 
-def _cover(standing: Standing, size: int) -> Bits:
+def _cover(standing: StandingInjection, size: int) -> Bits:
     cover = np.zeros(size, np.uint8)
     for offset, count, mask in standing.ranges:
         cover[offset : offset + count] = mask

@@ -15,7 +15,7 @@ from shmio.connectors.output import Output
 from shmio.layout.values.write import Write
 from shmio.segment import NO_WRITER, Command, Direction, EventKind, Record
 from shmio.segment.events import EVENT_DATA_SIZE
-from shmio.segment.standing_injections import Standing, encode, ranges_of
+from shmio.segment.standing_injections import StandingInjection, encode, ranges_of
 
 GROWTH: Final = 64
 """What an injection may take in the segment beyond what it did when it was laid: its numbers grow."""
@@ -132,7 +132,7 @@ class LayerPublisher:
         running = layer.running if isinstance(layer, DeclaredLayer) else None
         shown = self._shown.get(layer.id)
         if shown is None or shown[0] != running:
-            standing = Standing(
+            standing = StandingInjection(
                 layer.id, layer.direction.name.lower(), layer.priority, layer.keep, layer.name,
                 layer.owner.writer, layer.owner.pid, self._ranges[layer.id], running,
             )  # fmt: skip

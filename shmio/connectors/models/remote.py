@@ -15,7 +15,7 @@ from shmio.layout.topic import find
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.write import Write
 from shmio.segment import BlockWriter
-from shmio.segment.model_channel import Answer, Ask, Joined, Link, ends_of
+from shmio.segment.model_channel import ConnectedModel, ModelAnswer, ModelChannel, ModelRequest, model_ports
 from shmio.simulation.images import Images
 
 TURN_NS: Final = 50_000_000
@@ -47,7 +47,7 @@ class Remote(Computed):
             raise ConfigError(
                 'outputs: this key is needed: patterns of the registers that the model computes, such as ["axes/**"]'
             )
-        ends = ends_of(layout, options.outputs, options.inouts)
+        ends = model_ports(layout, options.outputs, options.inouts)
         inputs = {register.path for register in ends.inputs}
         self._images = Images(
             layout,
@@ -59,7 +59,7 @@ class Remote(Computed):
         self._options = options
         self.timeout_s = options.timeout_ms / 1000
         self._doubt = ""
-        self._told: Joined | None = None  # who was connected when the source said so last
+        self._told: ConnectedModel | None = None  # who was connected when the source said so last
         self._stopped = False
 
     @property
@@ -74,11 +74,11 @@ class Remote(Computed):
 
     def attach(self, writer: BlockWriter) -> None:
         """Find the way to the model."""
-        link = writer.block.link
+        link = writer.block.model_channel
         if link is None:
             raise SegmentError(f"source {writer.block.source}: its block has no link to a model")
         self._writer = writer
-        self._link: Link = link
+        self._link: ModelChannel = link
         self._link.asked.begin()
 
     def connect(self, values: Mapping[str, Value], doubt: str) -> None:
@@ -115,7 +115,7 @@ class Remote(Computed):
         until_ns = time.monotonic_ns() + round(1e9 * self.timeout_s)
         images = self._images
         shown = images.with_given(images.shown)
-        ask = Ask(0, self._writer.cycle, time_ns, dt_ns, until_ns, self._doubt, bytes(images.commanded), shown)
+        ask = ModelRequest(0, self._writer.cycle, time_ns, dt_ns, until_ns, self._doubt, bytes(images.commanded), shown)
         answer = self._await(self._link.ask(ask, self._writer.now_ns()), model, until_ns)
         if answer.failure is not None:
             raise ModelError(f"model {model.name!r}: {answer.failure or 'it gave no reason'}")
@@ -127,7 +127,7 @@ class Remote(Computed):
         self._stopped = True
         self._link.answered.wake()
 
-    def _connected(self, model: Joined | None) -> Joined:
+    def _connected(self, model: ConnectedModel | None) -> ConnectedModel:
         if model is None:
             source = self._writer.block.source
             raise ConnectorError(
@@ -136,7 +136,7 @@ class Remote(Computed):
             )
         return model
 
-    def _await(self, number: int, model: Joined, until_ns: int) -> Answer:
+    def _await(self, number: int, model: ConnectedModel, until_ns: int) -> ModelAnswer:
         """The answer to an ask."""
         link = self._link
         while True:

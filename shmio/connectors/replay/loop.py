@@ -22,13 +22,22 @@ from shmio.errors import PathError, SegmentError, ValueRangeError
 from shmio.layout.topic import find, shorten
 from shmio.layout.values.write import Write, bits_of
 from shmio.segment import BlockWriter, Event, EventKind, Frame, Record, Stamp
-from shmio.segment.playhead import MAX_SPEED, MIN_SPEED, Ask, Find, Found, Move, Play, answered
+from shmio.segment.playhead import (
+    MAX_SPEED,
+    MIN_SPEED,
+    FindRequest,
+    MoveRequest,
+    PlayheadAnswer,
+    PlayheadRequest,
+    PlayState,
+    with_answer,
+)
 
 AHEAD_NS: Final = 60_000_000_000
 """A request may be of a moment that is so far ahead, and of any that has passed: its process may have been held up."""
 
 
-def moved(play: Play, ask: Move, clock_ns: int) -> tuple[Play, int | None]:
+def moved(play: PlayState, ask: MoveRequest, clock_ns: int) -> tuple[PlayState, int | None]:
     """How it plays from the request's moment on, and the position that is to be shown; None: it goes on where it is.
 
     ``clock_ns``: the instance's clock now. ValueRangeError: it cannot be.
@@ -71,7 +80,7 @@ SEARCH_PIECE = 256
 class Search:
     """A search under way, in pieces, so that what plays meanwhile goes on."""
 
-    def __init__(self, recorded: RecordedSource, find: Find, end_ns: int, *, keep: bool) -> None:
+    def __init__(self, recorded: RecordedSource, find: FindRequest, end_ns: int, *, keep: bool) -> None:
         """Up to before ``end_ns``. ``keep``: as consumers see the recording. PathError: no such register or kind."""
         self._end_ns = end_ns
         self._matches = (
@@ -80,14 +89,14 @@ class Search:
         self._entries: Iterator[Entry] = recorded.entries(find.after_ns + 1)
         self._what = f"event {find.event}" if find.event else f"change of {find.path}"
 
-    def go_on(self) -> Found | None:
+    def go_on(self) -> PlayheadAnswer | None:
         """Look a piece further; None: it is not over yet."""
         for _ in range(SEARCH_PIECE):
             entry = next(self._entries, None)
             if entry is None or entry.position_ns >= self._end_ns:
-                return Found(f"there is no {self._what} from here to the end of what is played")
+                return PlayheadAnswer(f"there is no {self._what} from here to the end of what is played")
             if self._matches(entry):
-                return Found(position_ns=entry.position_ns)
+                return PlayheadAnswer(position_ns=entry.position_ns)
         return None
 
 
@@ -100,7 +109,7 @@ def _event_matcher(name: str, *, keep: bool) -> Callable[[Entry], bool]:
     return lambda entry: isinstance(entry.item, Event) and entry.item.kind == kinds[name]
 
 
-def _change_matcher(recorded: RecordedSource, wanted: Find, *, keep: bool) -> Callable[[Entry], bool]:
+def _change_matcher(recorded: RecordedSource, wanted: FindRequest, *, keep: bool) -> Callable[[Entry], bool]:
     register = find(recorded.block.layout, wanted.path)
     span = slice(register.offset, register.offset + register.size)
     bits = bits_of(register)
@@ -131,7 +140,7 @@ ASK_TURN_NS: Final = 1_000_000
 BEHIND_NS: Final = 3_000_000_000
 """What was due before a request is played before it is answered, if that takes no longer; else it is left out."""
 
-Asked = tuple[int, Ask | None] | None
+Asked = tuple[int, PlayheadRequest | None] | None
 
 log = logging.getLogger("shmio.source")
 
@@ -170,7 +179,7 @@ class ReplayLoop:
         self._player = Player(source.recorded, self._output, keep=source.keep)
         self._search: tuple[int, Search] | None = None
         self._play, self._done_ns = beginning
-        self._round_before: Play | None = None
+        self._round_before: PlayState | None = None
         self.counters = Counters()
 
     @property
@@ -299,7 +308,7 @@ class ReplayLoop:
         at_ns = self._writer.now_ns()
         return Stamp(at_ns, self._head.clock_ns(at_ns))
 
-    def _keep(self, play: Play) -> None:
+    def _keep(self, play: PlayState) -> None:
         self._play = play
         self._head.write(play)
 
@@ -317,7 +326,7 @@ class ReplayLoop:
     def _before_ns(self, asked: Asked, clock_ns: int) -> int | None:
         """The moment of a request that waits, if what was due by then is to be played first, as it is in time."""
         number, ask = asked or (0, None)
-        if not isinstance(ask, Move) or number != self._play.asked + 1 or ask.position_ns is not None:
+        if not isinstance(ask, MoveRequest) or number != self._play.asked + 1 or ask.position_ns is not None:
             return None
         moment_ns = min(ask.clock_ns, clock_ns)
         return moment_ns if self._is_behind(moment_ns) and clock_ns - moment_ns < BEHIND_NS else None
@@ -330,34 +339,34 @@ class ReplayLoop:
         number, ask = asked
         if missed := number != self._play.asked + 1:
             self._catch_up(clock_ns)
-        if isinstance(ask, Find):
+        if isinstance(ask, FindRequest):
             return self._find(number, ask)
-        if not isinstance(ask, Move):
-            found = Found("the request makes no sense")
+        if not isinstance(ask, MoveRequest):
+            found = PlayheadAnswer("the request makes no sense")
         elif missed and ask.clock_ns <= self._play.anchor_ns:
-            found = Found()  # it is in what others have done
+            found = PlayheadAnswer()  # it is in what others have done
         else:
             found = self._move(ask, clock_ns)
         self._answer(number, found)
         return True
 
-    def _answer(self, number: int, found: Found) -> None:
+    def _answer(self, number: int, found: PlayheadAnswer) -> None:
         self._search = None
-        self._keep(answered(self._play, number, found))
+        self._keep(with_answer(self._play, number, found))
         self._writer.block.ring.wake()
 
-    def _find(self, number: int, ask: Find) -> bool:
+    def _find(self, number: int, ask: FindRequest) -> bool:
         if self._search is None or self._search[0] != number:
             try:
                 self._search = number, Search(self._source.recorded, ask, self._play.end_ns, keep=self._source.keep)
             except PathError as error:
-                self._answer(number, Found(str(error)))
+                self._answer(number, PlayheadAnswer(str(error)))
                 return True
         if (found := self._search[1].go_on()) is not None:
             self._answer(number, found)
         return True
 
-    def _move(self, ask: Move, clock_ns: int) -> Found:
+    def _move(self, ask: MoveRequest, clock_ns: int) -> PlayheadAnswer:
         """Play otherwise from a moment on."""
         play, behind = self._play, self._is_behind(min(ask.clock_ns, clock_ns + AHEAD_NS))
         before = self._round_before
@@ -367,13 +376,13 @@ class ReplayLoop:
         try:
             play, position_ns = moved(play, ask, clock_ns)
         except ValueRangeError as error:
-            return Found(str(error))
+            return PlayheadAnswer(str(error))
         self._keep(play)
         if position_ns is not None:
             self._show(position_ns)
         elif behind or was_ns - play.at_ns(clock_ns) > self._source.recorded.block.stale_ns:
             self._show(play.at_ns(clock_ns))  # or it is asked late to be where it was long ago
-        return Found()
+        return PlayheadAnswer()
 
     def _catch_up(self, clock_ns: int) -> None:
         """Play as others of this recording that have been moved since, for requests were missed."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from shmio.connectors.replay.source import Replay
 from shmio.errors import SegmentError
 from shmio.segment import NO_WRITER, Block, Stamp
-from shmio.segment.playhead import Play, Playhead
+from shmio.segment.playhead import Playhead, PlayState
 
 
 class ReplayStart(NamedTuple):
@@ -17,7 +17,7 @@ class ReplayStart(NamedTuple):
     None: there was none that played the same recording.
     """
 
-    play: Play
+    play: PlayState
     done_ns: int | None
 
     @property
@@ -49,7 +49,7 @@ def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]
         return ReplayStart(play, None)
 
 
-def _done_ns(block: Block, play: Play) -> int | None:
+def _done_ns(block: Block, play: PlayState) -> int | None:
     """The position of the last frame, or of what was told behind it."""
     last = block.latest()
     if last is None:
@@ -59,21 +59,21 @@ def _done_ns(block: Block, play: Play) -> int | None:
     return max(last.publish_ns, told.publish_ns if told is not None and behind else 0) - play.base_ns
 
 
-def _is_of(source: Replay, play: Play) -> bool:
+def _is_of(source: Replay, play: PlayState) -> bool:
     return (play.begin_ns, play.end_ns, play.utc_ns) == (*source.span, source.recording.utc_ns)
 
 
-def as_others(source: Replay, heads: Iterable[Playhead]) -> Play | None:
+def as_others(source: Replay, heads: Iterable[Playhead]) -> PlayState | None:
     """How what plays the same recording plays, as it was moved last; None: nothing does."""
     plays = [play for head in heads if (play := head.read()) is not None and _is_of(source, play)]
     return max(plays, key=lambda play: play.anchor_ns, default=None)
 
 
-def _as_configured(source: Replay, block: Block, started_ns: int) -> Play:
+def _as_configured(source: Replay, block: Block, started_ns: int) -> PlayState:
     span, options = source.span, source.options
     recorded = options.own_clock
     now_ns = block.clock.read().present_ns
-    return Play(
+    return PlayState(
         span.begin_ns,
         span.end_ns,
         anchor_ns=span.begin_ns if recorded else now_ns,
@@ -88,7 +88,7 @@ def _as_configured(source: Replay, block: Block, started_ns: int) -> Play:
     )
 
 
-def stamp(play: Play, position_ns: int, clock_ns: int) -> Stamp:
+def stamp(play: PlayState, position_ns: int, clock_ns: int) -> Stamp:
     """When what is at a position is published; ``clock_ns``: of the recording."""
     if not play.own_clock:
         clock_ns = play.due_ns(max(position_ns, play.position_ns))

@@ -9,7 +9,7 @@ from shmio.endpoints.in_flight import MAX_OPEN, CommandCost, End, InFlightTable,
 from shmio.errors import CommandError
 from shmio.layout.model import Register
 from shmio.layout.values.write import sizes
-from shmio.local.writer import REPLACED, RETIRED, Commander
+from shmio.local.writer import REPLACED, RETIRED, SourceWriter
 from shmio.segment import DONE, Block, EventKind
 
 Done = Callable[[EventKind, str], None]
@@ -22,14 +22,14 @@ class Inlet:
     def __init__(self, block: Block, writer: int) -> None:
         """``writer``: the command queue of this process. For a big layout this takes seconds."""
         self.block = block
-        self._commander = Commander(block, writer)
-        self._commander.prepare()
+        self._source_writer = SourceWriter(block, writer)
+        self._source_writer.prepare()
         self._pending = InFlightTable(writer)
         self._events = block.events.cursor()
 
     def check(self, register: Register) -> None:
         """CommandError: it is not writable, whatever the value."""
-        self._commander.check(register)
+        self._source_writer.check(register)
 
     def send(self, register: Register, value: object, done: Done) -> None:
         """Send a value of a register, an array or an element. CommandError, ValueRangeError: it was not sent."""
@@ -38,7 +38,7 @@ class Inlet:
             raise CommandError(f"{self.block.source}: too many commands are under way; wait for their results")
         if self.block.retired:
             raise CommandError(RETIRED)
-        self._pending.add(self._commander.submit({register.path: value}), cost, partial(_tell, done))
+        self._pending.add(self._source_writer.submit({register.path: value}), cost, partial(_tell, done))
 
     def look(self) -> None:
         """Take what has been told; give up what is overdue."""

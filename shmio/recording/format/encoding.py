@@ -122,7 +122,7 @@ class StepMark(msgspec.Struct, frozen=True):
     dt_ns: int
 
 
-class Life(StrEnum):
+class ProcessEvent(StrEnum):
     """What has happened to a process of the instance."""
 
     IS = "is"
@@ -145,12 +145,12 @@ class ProcessChange(msgspec.Struct, frozen=True):
     name: str
     kind: str
     pid: int
-    what: Life
+    what: ProcessEvent
     why: str
     restarts: int
 
 
-class Place(NamedTuple):
+class BlockPosition(NamedTuple):
     """Where a recording begins, or ends: behind these numbers of a block, which were recorded at ``log_ns``."""
 
     frame: int = 0
@@ -280,14 +280,14 @@ def decode_process(data: bytes) -> ProcessChange:
     return _decode_json(data, ProcessChange, "a change of a process")
 
 
-def encode_place(place: Place) -> str:
+def encode_position(place: BlockPosition) -> str:
     """A place as text."""
     return " ".join(map(str, place))
 
 
-def decode_place(text: str) -> Place:
+def decode_position(text: str) -> BlockPosition:
     """The place that a text tells; ValueError."""
     frame, event, log_ns = (int(number) for number in text.split(" ") if len(number) <= 20)
     if min(frame, event, log_ns) < 0:
         raise ValueError("a place is negative")
-    return Place(frame, event, log_ns)
+    return BlockPosition(frame, event, log_ns)

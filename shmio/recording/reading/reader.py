@@ -26,14 +26,14 @@ from shmio.recording.format.encoding import (
     PROCESS,
     PROFILE,
     STEP,
+    BlockPosition,
     Gap,
-    Place,
     ProcessChange,
     StepMark,
     decode_event,
     decode_frame,
     decode_gap,
-    decode_place,
+    decode_position,
     decode_process,
     decode_step,
     restore,
@@ -88,7 +88,7 @@ class Reader:
         self.records = Records(file, own=own, beat=beat)
         self.about: dict[str, str] = {}
         """What the recorder said of the instance."""
-        self.places: dict[int, Place] = {}
+        self.places: dict[int, BlockPosition] = {}
         """By section where the recorder before had come to, as far as it was known."""
         self.complete = False
         """Whether all channels are known, from a walk through the whole file."""
@@ -250,7 +250,7 @@ class Reader:
                 if metadata.name == ABOUT:
                     self.about = metadata.metadata
                 elif metadata.name == PLACES:
-                    self.places = {int(section): decode_place(place) for section, place in metadata.metadata.items()}
+                    self.places = {int(section): decode_position(place) for section, place in metadata.metadata.items()}
             elif record.opcode == Opcode.HEADER:
                 self._ours = self._profile(record) == PROFILE
             elif record.opcode == Opcode.ATTACHMENT and len(self.attachments) < MAX_ATTACHMENTS:

@@ -16,8 +16,8 @@ import pytest
 from mcap.opcode import Opcode
 
 from shmio.cli.dump import main
+from shmio.recorder.instance_follower import StartPositions
 from shmio.recorder.selection import Selection
-from shmio.recorder.tap import Start
 from shmio.recording.reading.reader import Reader
 from shmio.segment import EventKind, Quality, Record, Segment
 from shmio.testing.cell import until
@@ -275,7 +275,7 @@ def test_a_recording_that_was_not_closed_is_read_and_that_is_told(file: str, sai
 @pytest.fixture
 def damaged(segment: Segment, tmp_path: Path, file: str) -> tuple[str, str]:
     """A recording of 30 frames of cell in three chunks, and the same with a byte changed within the second."""
-    work = recorder(segment, tmp_path / "steady", selection=Selection(["press"]), start=Start(first=False))
+    work = recorder(segment, tmp_path / "steady", selection=Selection(["press"]), start=StartPositions(first=False))
     for turn in range(3):
         publish(segment.writer("press"), 10, first=10 * turn)
         work.turn()

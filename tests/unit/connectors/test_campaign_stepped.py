@@ -12,7 +12,7 @@ import pytest
 
 from shmio.config import Declaration
 from shmio.local.time_control import Coordinator
-from shmio.local.writer import Commander
+from shmio.local.writer import SourceWriter
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
 from shmio.segment.standing_injections import declared_document
 from tests.unit.connectors.models.test_stepped import GUEST, LAYOUT, MS, PERIOD_NS, Adder, Running
@@ -43,7 +43,7 @@ def played(instance: str, trouble: Callable[[int], None]) -> list[Shown]:
         coordinator = Coordinator(segment)
         stack.callback(coordinator.close)
         coordinator.take_over()
-        writer = Commander(segment.blocks["two"], GUEST)
+        writer = SourceWriter(segment.blocks["two"], GUEST)
         for step in range(10):
             if step == 4:
                 writer.submit({"given": 7})

@@ -14,7 +14,7 @@ from shmio.errors import CommandError, PathError
 from shmio.layout.values.codec import Value
 from shmio.local.attach import Attachment
 from shmio.segment import EventKind, Segment
-from shmio.segment.standing_injections import Standing, encode
+from shmio.segment.standing_injections import StandingInjection, encode
 from tests.unit.connectors.injection import test_processor as test_injector
 from tests.unit.connectors.injection.test_processor import LAYOUT, Rig
 
@@ -184,7 +184,7 @@ def test_all_injections_are_lifted_at_once_whoever_laid_them(rig: Rig, local: At
 
 
 def test_what_cannot_be_lifted_is_named(rig: Rig, local: Attachment) -> None:
-    one = Standing(5, "out", 0, keep=True, name="", writer=0, pid=0, ranges=())
+    one = StandingInjection(5, "out", 0, keep=True, name="", writer=0, pid=0, ranges=())
     rig.block.standing.write(encode([msgspec.json.encode(one)]))  # of which the source knows nothing
     with pytest.raises(CommandError, match="1 of 1 injections still stand: cell: there is no injection 5"):
         local.lift_all()

@@ -15,7 +15,7 @@ from shmio.connectors.schedule import Schedule
 from shmio.errors import CommandError, ConfigError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.local.reading import reading
-from shmio.local.writer import Commander
+from shmio.local.writer import SourceWriter
 from shmio.segment import Attributes, BlockSpec, EventKind, Frame, ProcessSpec, Provenance, Quality, Segment
 
 TABLE = b"""
@@ -39,7 +39,7 @@ def segment(instance: str) -> Iterator[Segment]:
 
 
 @contextmanager
-def running(segment: Segment) -> Iterator[Commander]:
+def running(segment: Segment) -> Iterator[SourceWriter]:
     """A process of the source, and a writer toward it."""
     options = registry.convert_options("memory", {})
     memory = registry.load("memory")(options, LAYOUT)
@@ -54,7 +54,7 @@ def running(segment: Segment) -> Iterator[Commander]:
     try:
         while (frame := cursor.next(20)) is None or frame.quality is not Quality.GOOD:
             assert frame is not None, "no frame"
-        yield Commander(segment.blocks["cell"], 4)
+        yield SourceWriter(segment.blocks["cell"], 4)
     finally:
         clock.stop()
         for thread in threads:
@@ -84,13 +84,13 @@ def test_what_is_written_is_there_at_once_and_stays(segment: Segment) -> None:
         assert frame.cycle * PERIOD_NS <= frame.clock_ns, "of a cycle that has not begun"
         cycles.append(frame.cycle)
 
-    with running(segment) as commander:
+    with running(segment) as source_writer:
         for number in range(20):
-            (outcome,) = commander.write({"position": number + 0.25})
+            (outcome,) = source_writer.write({"position": number + 0.25})
             assert outcome.kind is EventKind.WRITTEN
             assert values(segment)["position"] == number + 0.25, "the outcome was told before the frame"
             until("position", number + 0.25)
-        commander.write({"lamps/3": True, "name": "R800"})
+        source_writer.write({"lamps/3": True, "name": "R800"})
         until("name", "R800")
         assert cursor.missed == 0
         assert cycles == sorted(cycles)
@@ -101,9 +101,9 @@ def test_what_is_written_is_there_at_once_and_stays(segment: Segment) -> None:
 
 
 def test_what_is_not_named_writable_is_not_written(segment: Segment) -> None:
-    with running(segment) as commander:
+    with running(segment) as source_writer:
         with pytest.raises(CommandError, match="not writable"):
-            commander.write({"locked": 1})
+            source_writer.write({"locked": 1})
         assert values(segment)["locked"] == 0
 
 

@@ -11,7 +11,7 @@ import pytest
 import shmio
 from shmio.errors import CommandError, PathError, SegmentError, ValueRangeError
 from shmio.layout.model import Layout, Register
-from shmio.local.writer import Commander
+from shmio.local.writer import SourceWriter
 from shmio.segment import Attributes, BlockSpec, BlockWriter, Command, EventKind, ProcessSpec, Record, Segment
 
 LAYOUT = Layout(
@@ -81,7 +81,7 @@ def both(*answers: Answer) -> Answer:
 
 def test_each_value_has_its_outcome_in_the_order_given(writer: BlockWriter, source: list[Answer]) -> None:
     source.append(both(tell(EventKind.REFUSED, 0, 1, "no"), tell(EventKind.WRITTEN, 1, 1)))
-    outcomes = Commander(writer.block, 5).write({"count": 7, "bits": [True] * 11})
+    outcomes = SourceWriter(writer.block, 5).write({"count": 7, "bits": [True] * 11})
     assert [(o.path, o.kind, o.text, o.done) for o in outcomes] == [
         ("count", EventKind.REFUSED, "no", False),
         ("bits", EventKind.WRITTEN, "", True),
@@ -90,27 +90,27 @@ def test_each_value_has_its_outcome_in_the_order_given(writer: BlockWriter, sour
 
 def test_a_rejected_command_is_rejected_for_all(writer: BlockWriter, source: list[Answer]) -> None:
     source.append(tell(EventKind.REJECTED, text="not connected"))
-    outcomes = Commander(writer.block, 5).write({"count": 7, "bits/3": True})
+    outcomes = SourceWriter(writer.block, 5).write({"count": 7, "bits/3": True})
     assert [(o.kind, o.text) for o in outcomes] == [(EventKind.REJECTED, "not connected")] * 2
 
 
 def test_a_copy_by_fork_cannot_write(writer: BlockWriter, monkeypatch: pytest.MonkeyPatch) -> None:
-    commander = Commander(writer.block, 5)
+    source_writer = SourceWriter(writer.block, 5)
     monkeypatch.setattr("os.getpid", lambda: 1)
     with pytest.raises(CommandError, match="attach anew"):
-        commander.submit({"count": 7})
+        source_writer.submit({"count": 7})
     assert writer.block.commands.pop(5) is None
 
 
 def test_of_a_slow_source_a_command_waits_for_some_cycles(instance: str) -> None:
     block = BlockSpec("cell", LAYOUT, 5_000_000_000, 10**11, 1 << 16)
     with Segment.create(instance, [block], PROCESSES) as segment:
-        assert Commander(segment.blocks["cell"], 5).timeout_s == 15
+        assert SourceWriter(segment.blocks["cell"], 5).timeout_s == 15
         segment.unlink()
 
 
 def test_silence_is_unknown_after_the_time_is_over(writer: BlockWriter) -> None:
-    (outcome,) = Commander(writer.block, 5).write({"count": 7}, timeout_s=-0.95)
+    (outcome,) = SourceWriter(writer.block, 5).write({"count": 7}, timeout_s=-0.95)
     assert outcome.kind is EventKind.UNKNOWN
     assert "gave no answer in time" in outcome.text
 
@@ -125,20 +125,20 @@ def test_a_restart_of_the_source_is_told_without_waiting_for_ever(
 
     source.append(die)
     began = time.monotonic()
-    (outcome,) = Commander(writer.block, 5).write({"count": 7}, timeout_s=600)
+    (outcome,) = SourceWriter(writer.block, 5).write({"count": 7}, timeout_s=600)
     assert outcome.kind is EventKind.UNKNOWN
     assert "the source was restarted meanwhile" in outcome.text
     assert time.monotonic() - began < 60
 
 
 def test_what_cannot_be_written_is_refused_before_it_is_sent(writer: BlockWriter) -> None:
-    commander = Commander(writer.block, 5)
+    source_writer = SourceWriter(writer.block, 5)
     with pytest.raises(CommandError, match=r"cell/secret is not writable; .*`writable`"):
-        commander.submit({"count": 1, "secret": 1})
+        source_writer.submit({"count": 1, "secret": 1})
     with pytest.raises(PathError):
-        commander.submit({"nothing": 1})
+        source_writer.submit({"nothing": 1})
     with pytest.raises(ValueRangeError, match="cell/count: "):
-        commander.submit({"count": 70_000})
+        source_writer.submit({"count": 70_000})
     assert writer.block.commands.pop(5) is None
 
 

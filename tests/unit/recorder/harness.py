@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from shmio.layout.model import Layout, Register
+from shmio.recorder.instance_follower import FROM_THE_FIRST, InstanceFollower, StartPositions
 from shmio.recorder.output import Output, create
 from shmio.recorder.recorder import Recorder
 from shmio.recorder.selection import Selection
-from shmio.recorder.tap import FROM_THE_FIRST, Start, Tap
 from shmio.recording.format.encoding import Gap, ProcessChange
 from shmio.recording.reading.reader import Message, Reader
 from shmio.recording.reading.survey import survey
@@ -38,11 +38,17 @@ def publish(writer: BlockWriter, count: int, first: int = 0) -> None:
 
 
 def recorder(
-    segment: Segment, folder: Path, start: Start = FROM_THE_FIRST, selection: Selection | None = None, **options: Any
+    segment: Segment,
+    folder: Path,
+    start: StartPositions = FROM_THE_FIRST,
+    selection: Selection | None = None,
+    **options: Any,
 ) -> Recorder:
     """A recorder in this process."""
     path, fd = create(folder, segment.instance)
-    return Recorder(Tap(segment, start, selection), Output(path, fd, limit_bytes=1 << 24), by="test", **options)
+    return Recorder(
+        InstanceFollower(segment, start, selection), Output(path, fd, limit_bytes=1 << 24), by="test", **options
+    )
 
 
 def read(file: Path) -> list[Message]:

@@ -12,7 +12,7 @@ import pytest
 from mcap.opcode import Opcode
 
 from shmio.errors import RecordingError
-from shmio.recorder.attach import Attachment
+from shmio.recorder.attached_files import AttachedFile
 from shmio.recorder.closing import finalise
 from shmio.recording.check import check
 from shmio.recording.reading.reader import Reader
@@ -26,7 +26,7 @@ CHUNKS = 4
 @pytest.fixture
 def whole(segment: Segment, tmp_path: Path) -> Path:
     """A closed recording of several chunks."""
-    files = [Attachment("config/supervisor.toml", "application/toml", b"[instance]\n", 5)]
+    files = [AttachedFile("config/supervisor.toml", "application/toml", b"[instance]\n", 5)]
     work = recorder(segment, tmp_path, attachments=lambda source, _: [] if source else files)
     for turn in range(CHUNKS):
         for source in ("cell", "press")[: 1 + turn % 2]:

@@ -10,8 +10,8 @@ import zstandard
 from mcap.opcode import Opcode
 
 from shmio.recorder import predecessor
-from shmio.recorder.predecessor import places
-from shmio.recording.format.encoding import Place
+from shmio.recorder.predecessor import last_positions
+from shmio.recording.format.encoding import BlockPosition
 from shmio.recording.format.records import MAGIC, Record
 from shmio.recording.reading.reader import Reader
 from shmio.segment import Segment
@@ -33,10 +33,10 @@ def file(segment: Segment, tmp_path: Path) -> Path:
     return work.output.path
 
 
-def look(segment: Segment, folder: Path) -> tuple[dict[str, Place], int]:
+def look(segment: Segment, folder: Path) -> tuple[dict[str, BlockPosition], int]:
     """What is known by source; how often it was told that the search goes on."""
     beats: list[None] = []
-    found = places(folder, segment, "test", lambda: beats.append(None))
+    found = last_positions(folder, segment, "test", lambda: beats.append(None))
     return {name: found[block.section] for name, block in segment.blocks.items() if block.section in found}, len(beats)
 
 
@@ -119,4 +119,4 @@ def test_a_damaged_end_costs_only_the_blocks_that_are_in_it(segment: Segment, fi
     content = bytearray(file.read_bytes())
     content[last.at + last.size - 1] ^= 1
     file.write_bytes(content)
-    assert look(segment, file.parent)[0] == {"cell": expected["cell"], "press": Place(0, 0, 0)}
+    assert look(segment, file.parent)[0] == {"cell": expected["cell"], "press": BlockPosition(0, 0, 0)}

@@ -13,11 +13,11 @@ import pytest
 
 from shmio.errors import RecordingError
 from shmio.recorder import recorder as module
-from shmio.recorder.attach import Attachment
+from shmio.recorder.attached_files import AttachedFile
+from shmio.recorder.instance_follower import InstanceFollower, StartPositions
 from shmio.recorder.output import Output, create
 from shmio.recorder.recorder import Recorder
 from shmio.recorder.selection import Selection
-from shmio.recorder.tap import Start, Tap
 from shmio.recording.format.encoding import FRAME_V2, Reason, decode_event, decode_frame, restore
 from shmio.recording.reading.reader import Reader
 from shmio.segment import Event, EventKind, Frame, Provenance, Quality, Record, Segment
@@ -101,7 +101,7 @@ def test_events_are_missed_exactly_too(segment: Segment, tmp_path: Path) -> None
 def test_from_outside_it_begins_with_the_present(segment: Segment, tmp_path: Path) -> None:
     writer = segment.writer("cell")
     publish(writer, 10)
-    recording = recorder(segment, tmp_path, start=Start(first=False))
+    recording = recorder(segment, tmp_path, start=StartPositions(first=False))
     publish(writer, 3)
     assert recording.close()
     assert numbers(recording.output.path) == [11, 12, 13]
@@ -161,7 +161,7 @@ def test_a_block_that_came_and_went_between_two_looks_is_recorded(segment: Segme
 def test_from_outside_what_was_over_before_is_not_recorded(segment: Segment, tmp_path: Path) -> None:
     publish(segment.writer("cell"), 3)
     segment.change(add=[spec("cell", OTHER)], retire=["cell"])
-    recording = recorder(segment, tmp_path, start=Start(first=False))
+    recording = recorder(segment, tmp_path, start=StartPositions(first=False))
     publish(segment.writer("cell"), 1)
     assert recording.close()
     assert numbers(recording.output.path) == [1]
@@ -188,7 +188,7 @@ def test_a_chunk_is_in_the_file_within_the_second(
 
 
 def test_the_file_is_plain_mcap(segment: Segment, tmp_path: Path) -> None:
-    files = [Attachment("config/supervisor.toml", "application/toml", b"[instance]\n", 5)]
+    files = [AttachedFile("config/supervisor.toml", "application/toml", b"[instance]\n", 5)]
     recording = recorder(segment, tmp_path, attachments=lambda source, _: [] if source else files)
     writer = segment.writer("cell")
     publish(writer, 3 * RING)
@@ -227,7 +227,7 @@ def test_what_a_full_disk_costs_is_a_gap_and_it_goes_on(
 ) -> None:
     path, fd = create(tmp_path, segment.instance)
     output = Output(path, fd, limit_bytes=2000)
-    recording = Recorder(Tap(segment), output, by="test")
+    recording = Recorder(InstanceFollower(segment), output, by="test")
     monkeypatch.setattr(module, "CHUNK_S", 0.0)  # a chunk each turn
     writer = segment.writer("cell")
 

@@ -16,14 +16,14 @@ from shmio.config import Recorder as Settings
 from shmio.connectors.replay.recording import Recording
 from shmio.local.time_control import Coordinator
 from shmio.recorder import output as output_module
-from shmio.recorder.attach import no_attachments
-from shmio.recorder.follower import Entry
-from shmio.recorder.keeper import Keeper
+from shmio.recorder.attached_files import no_attachments
+from shmio.recorder.block_follower import BlockEntry
+from shmio.recorder.housekeeping import Housekeeper
+from shmio.recorder.instance_follower import InstanceFollower
 from shmio.recorder.output import Output
-from shmio.recorder.series import Series
-from shmio.recorder.tap import Tap
+from shmio.recorder.rotation import RotatingRecorder
 from shmio.recording.check import check
-from shmio.recording.format.encoding import Gap, Place, Reason
+from shmio.recording.format.encoding import BlockPosition, Gap, Reason
 from shmio.recording.reading.reader import Reader
 from shmio.segment import Event, EventKind, Record, Segment
 from shmio.testing.cell import until
@@ -33,15 +33,17 @@ from tests.unit.recorder.test_steps import marks
 DAY_S = 86_400
 
 
-def tend(work: Series) -> None:
+def tend(work: RotatingRecorder) -> None:
     """With no file before this one that waits for the disk."""
     work.recorder._writer.flush()
     until(lambda: all(old.output.ended for old in work._ending), "the file before")
     work.tend()
 
 
-def series(segment: Segment, folder: Path, **settings: Any) -> Series:
-    return Series(Tap(segment), Settings(directory=str(folder), **settings), "supervised", no_attachments)
+def series(segment: Segment, folder: Path, **settings: Any) -> RotatingRecorder:
+    return RotatingRecorder(
+        InstanceFollower(segment), Settings(directory=str(folder), **settings), "supervised", no_attachments
+    )
 
 
 def files(folder: Path) -> list[Path]:
@@ -75,7 +77,7 @@ def test_files_follow_each_other_without_a_frame_twice_or_missing(segment: Segme
             *_, last = (message for message in reader.messages() if message.channel.source == "cell")
         with Reader(file) as reader:
             begin = next(reader.messages()).channel
-            end = Place(numbers(before)[-1], numbers(before, kind=Event)[-1], last.log_ns)
+            end = BlockPosition(numbers(before)[-1], numbers(before, kind=Event)[-1], last.log_ns)
             assert reader.places[last.channel.section] == end
             assert begin.after == (numbers(before)[-1] if begin.topic == "cell/frames" else begin.after)
 
@@ -88,7 +90,7 @@ def test_a_gap_at_the_end_of_a_file_belongs_to_it(segment: Segment, tmp_path: Pa
     cell = work.tap.followers[0]
     gap = Gap("cell", cell.number, "frames", 101, 110, 10, Reason.OVERTAKEN, 0, 0)
     now_ns = work.tap.now()
-    work.put([Entry(now_ns, cell, gap)])
+    work.put([BlockEntry(now_ns, cell, gap)])
     work.recorder._writer.flush()
     work.tend()
     assert work.close() == []
@@ -96,7 +98,7 @@ def test_a_gap_at_the_end_of_a_file_belongs_to_it(segment: Segment, tmp_path: Pa
     assert gaps(first) == [gap]
     with Reader(second) as reader:
         list(reader.messages())
-        assert reader.places[cell.block.section] == Place(110, 1, now_ns)
+        assert reader.places[cell.block.section] == BlockPosition(110, 1, now_ns)
 
 
 def test_what_the_ring_lost_between_two_files_is_one_gap_in_the_second(segment: Segment, tmp_path: Path) -> None:
@@ -237,7 +239,7 @@ def test_a_series_does_not_write_on_where_the_file_before_was_not_written(
 
 def recorded(segment: Segment, folder: Path, age_days: float, by: str = "supervised") -> Path:
     """A closed recording of this age."""
-    work = Series(Tap(segment), Settings(directory=str(folder)), by, no_attachments)
+    work = RotatingRecorder(InstanceFollower(segment), Settings(directory=str(folder)), by, no_attachments)
     publish(segment.writer("cell"), 100)
     assert work.close() == []
     file = work.recorder.output.path
@@ -249,7 +251,7 @@ def recorded(segment: Segment, folder: Path, age_days: float, by: str = "supervi
 def keep(segment: Segment, folder: Path, present: Path | None = None, **settings: Any) -> set[Path]:
     """What is left after a look."""
     writing = {present} if present else set()
-    keeper = Keeper(segment.instance, Settings(directory=str(folder), **settings), "supervised", lambda: writing)
+    keeper = Housekeeper(segment.instance, Settings(directory=str(folder), **settings), "supervised", lambda: writing)
     keeper.look()
     return set(folder.iterdir())
 
@@ -286,7 +288,7 @@ def test_one_that_could_not_be_closed_while_it_was_held_is_closed_later(segment:
     whole = recorded(segment, tmp_path, 0)
     killed = tmp_path / f"{segment.instance}-20200101T000000Z.mem"
     killed.write_bytes(whole.read_bytes()[:-100])
-    keeper = Keeper(segment.instance, Settings(directory=str(tmp_path)), "supervised", set)
+    keeper = Housekeeper(segment.instance, Settings(directory=str(tmp_path)), "supervised", set)
     with Recording([killed]):
         keeper.look()
         with Reader(killed) as reader:
@@ -327,7 +329,7 @@ def test_what_cannot_be_deleted_is_told_once(
     segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     old = recorded(segment, tmp_path, 9)
-    keeper = Keeper(segment.instance, Settings(directory=str(tmp_path), keep_days=7), "supervised", set)
+    keeper = Housekeeper(segment.instance, Settings(directory=str(tmp_path), keep_days=7), "supervised", set)
 
     def refuse(_: Path) -> None:
         raise PermissionError(13, "Permission denied")

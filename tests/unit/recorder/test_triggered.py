@@ -14,10 +14,10 @@ from shmio.config import Recorder as Settings
 from shmio.config import Trigger as TriggerSettings
 from shmio.errors import ConfigError
 from shmio.recorder import output as output_module
-from shmio.recorder.attach import no_attachments
+from shmio.recorder.attached_files import no_attachments
+from shmio.recorder.instance_follower import FROM_THE_FIRST, InstanceFollower, StartPositions
 from shmio.recorder.selection import Selection
-from shmio.recorder.tap import FROM_THE_FIRST, Start, Tap
-from shmio.recorder.triggered import Triggered
+from shmio.recorder.triggered import TriggeredRecorder
 from shmio.recording.check import check
 from shmio.recording.reading.reader import Reader
 from shmio.segment import BlockWriter, Event, EventKind, Origin, Quality, Record, Segment, Stamp
@@ -35,7 +35,7 @@ class Bench:
         self,
         segment: Segment,
         folder: Path,
-        start: Start = FROM_THE_FIRST,
+        start: StartPositions = FROM_THE_FIRST,
         *,
         begin_s: int = 100_000,
         selection: Selection | None = None,
@@ -47,8 +47,8 @@ class Bench:
         self._begin_ns = segment.header.started_ns + begin_s * S
         self.writer: BlockWriter = segment.writer("cell", Stamp(self._begin_ns, begin_s * S))
         settings = TriggerSettings(**trigger)  # type: ignore[arg-type]
-        self.work = Triggered(
-            Tap(segment, start, selection),
+        self.work = TriggeredRecorder(
+            InstanceFollower(segment, start, selection),
             Settings(directory=str(folder), buffer_mb=buffer_mb),
             settings,
             "supervised",

@@ -12,7 +12,7 @@ from typing import Any, cast
 from shmio.layout.model import Layout, Register
 from shmio.recorder.output import Output
 from shmio.recorder.writer import Channels, Writer
-from shmio.recording.format.encoding import Gap, Life, ProcessChange, Reason, StepMark
+from shmio.recording.format.encoding import Gap, ProcessChange, ProcessEvent, Reason, StepMark
 from shmio.segment import Block, Event, EventKind, Frame, Provenance, Quality, Record
 
 START_NS = 1_700_000_000_000_000_000
@@ -120,7 +120,7 @@ class Build:
         """A step is done."""
         self.writer.step(StepMark(step, step * PERIOD_NS, PERIOD_NS), START_NS + step * PERIOD_NS)
 
-    def process(self, what: Life, at: int) -> None:
+    def process(self, what: ProcessEvent, at: int) -> None:
         """Something happened to the source's process."""
         self.writer.process(ProcessChange("cell", "source", 4711, what, "", 0), START_NS + at * PERIOD_NS)
 
@@ -157,7 +157,7 @@ def varied(file: Path, first: int = 1) -> Path:
     with build(file, first=first) as work:
         work.block("cell", after_event=(first - 1) // 15)
         work.block("press", section=2)
-        work.process(Life.IS, first)
+        work.process(ProcessEvent.IS, first)
         for number in range(first, 61):
             if number % 20 == 7:
                 work.frame(number, image(number), quality=Quality.BAD, reason="no answer")

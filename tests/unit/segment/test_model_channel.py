@@ -14,7 +14,7 @@ from shmio.errors import ConfigError, FormatError
 from shmio.layout.model import Layout, Register
 from shmio.segment import Attributes, BlockSpec, ProcessSpec, Segment
 from shmio.segment.header import SectionKind, read_sections, table_state
-from shmio.segment.model_channel import Ask, Joined, Link, ends_of
+from shmio.segment.model_channel import ConnectedModel, ModelChannel, ModelRequest, model_ports
 
 LAYOUT = Layout(
     "DRIVE",
@@ -33,7 +33,7 @@ HOLD = """
 import sys, time
 from shmio.segment import Segment
 with Segment.open(sys.argv[1], writable=True) as segment:
-    assert segment.blocks["drive"].link.join("held")
+    assert segment.blocks["drive"].model_channel.join("held")
     print("joined", flush=True)
     time.sleep(3600)
 """
@@ -49,18 +49,18 @@ def segment(instance: str) -> Iterator[Segment]:
         segment.unlink()
 
 
-def link_of(segment: Segment) -> Link:
-    link = segment.blocks["drive"].link
+def link_of(segment: Segment) -> ModelChannel:
+    link = segment.blocks["drive"].model_channel
     assert link is not None
     return link
 
 
-def ask(step: int, doubt: str = "") -> Ask:
-    return Ask(0, step, step * 1000, 1000, 77, doubt, struct.pack(">f8x", step), bytes(12))
+def ask(step: int, doubt: str = "") -> ModelRequest:
+    return ModelRequest(0, step, step * 1000, 1000, 77, doubt, struct.pack(">f8x", step), bytes(12))
 
 
 def test_only_a_block_with_outputs_has_one(segment: Segment) -> None:
-    assert segment.blocks["panel"].link is None
+    assert segment.blocks["panel"].model_channel is None
     assert link_of(segment).frame_size == LAYOUT.size
     assert link_of(segment).model() is None
 
@@ -71,7 +71,7 @@ def test_what_is_asked_is_answered(segment: Segment) -> None:
         source.asked.begin()
         assert model.newest() is None
         assert model.join("belt")
-        assert source.model() == Joined(1, os.getpid(), "belt")
+        assert source.model() == ConnectedModel(1, os.getpid(), "belt")
         number = source.ask(ask(5, "input target keeps its value"), 123)
         assert source.answer_to(number) is None
         found = model.newest()
@@ -99,13 +99,13 @@ def test_one_model_at_a_time_and_each_is_told_from_the_one_before(segment: Segme
         source = link_of(segment)
         assert link_of(first).join("one")
         assert not link_of(second).join("two")
-        assert source.model() == Joined(1, os.getpid(), "one")
+        assert source.model() == ConnectedModel(1, os.getpid(), "one")
         seen = source.answered.doorbell()
         link_of(first).leave()
         assert source.answered.doorbell() != seen, "a source that waits looks"
         assert source.model() is None
         assert link_of(second).join("ä" * 200)
-        assert source.model() == Joined(2, os.getpid(), "ä" * 51)
+        assert source.model() == ConnectedModel(2, os.getpid(), "ä" * 51)
 
 
 def test_a_model_has_computed_once_a_step_of_it_was_done_even_by_one_that_has_left(segment: Segment) -> None:
@@ -119,7 +119,7 @@ def test_a_model_has_computed_once_a_step_of_it_was_done_even_by_one_that_has_le
         assert not source.computed()
         model.answer(found, 456, b"\1" * 12)
         assert source.computed()
-        assert source.model() == Joined(1, os.getpid(), "belt"), "nothing else has changed"
+        assert source.model() == ConnectedModel(1, os.getpid(), "belt"), "nothing else has changed"
         model.leave()
         assert model.join("belt")
         assert source.computed()
@@ -131,7 +131,7 @@ def test_a_killed_process_has_left(segment: Segment) -> None:
         try:
             assert holder.stdout is not None
             assert holder.stdout.readline() == b"joined\n"
-            assert link_of(segment).model() == Joined(1, holder.pid, "held")
+            assert link_of(segment).model() == ConnectedModel(1, holder.pid, "held")
         finally:
             holder.kill()
             holder.wait()
@@ -139,10 +139,10 @@ def test_a_killed_process_has_left(segment: Segment) -> None:
 
 
 def test_inputs_and_outputs_are_those_that_the_patterns_say() -> None:
-    ends = ends_of(LAYOUT, ["axis"], ["lamps"])
+    ends = model_ports(LAYOUT, ["axis"], ["lamps"])
     assert [register.path for register in ends.inputs] == ["target", "lamps"]
     assert [register.path for register in ends.outputs] == ["axis/position", "axis/moving", "axis/ready", "lamps"]
-    assert ends_of(LAYOUT, ["**"], []).inputs == ()
+    assert model_ports(LAYOUT, ["**"], []).inputs == ()
 
 
 @pytest.mark.parametrize(
@@ -156,7 +156,7 @@ def test_inputs_and_outputs_are_those_that_the_patterns_say() -> None:
 )
 def test_patterns_that_name_nothing_are_refused(outputs: list[str], inouts: list[str], message: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        ends_of(LAYOUT, outputs, inouts)
+        model_ports(LAYOUT, outputs, inouts)
     assert str(caught.value).startswith(message)
 
 

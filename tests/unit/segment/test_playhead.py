@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 
 from shmio.errors import SegmentError
 from shmio.segment import Attributes, BlockSpec, Segment
-from shmio.segment.playhead import Find, Found, Move, Play, answered
+from shmio.segment.playhead import FindRequest, MoveRequest, PlayheadAnswer, PlayState, with_answer
 from tests.unit.recorder.harness import LAYOUT
 
 S = 1_000_000_000
-PLAY = Play(100 * S, 110 * S, 5 * S, 100 * S, 110 * S, 0, 0)
+PLAY = PlayState(100 * S, 110 * S, 5 * S, 100 * S, 110 * S, 0, 0)
 
 speeds = st.floats(0.01, 1000)
 positions = st.integers(100 * S, 110 * S)
@@ -72,15 +72,15 @@ def test_a_request_and_its_answer_pass(instance: str) -> None:
         head.write(PLAY)
         assert head.read() == PLAY
         with head.held():
-            number = head.ask(Move(7, paused=True))
-            assert head.asks(0) == (number, Move(7, paused=True))
+            number = head.ask(MoveRequest(7, paused=True))
+            assert head.asks(0) == (number, MoveRequest(7, paused=True))
             assert head.found(number) is None
-            head.write(answered(PLAY, number, Found("because " + "ä" * 500)))
+            head.write(with_answer(PLAY, number, PlayheadAnswer("because " + "ä" * 500)))
             assert head.asks(number) is None
             found = head.found(number)
             assert found is not None
             assert found.error.startswith("because ä")
-            assert head.ask(Find(8, "count")) == number + 1
+            assert head.ask(FindRequest(8, "count")) == number + 1
         segment.unlink()
 
 

@@ -21,9 +21,9 @@ from shmio.errors import CommandError
 from shmio.layout.model import Register
 from shmio.layout.topic import find
 from shmio.layout.values.write import Write, merge, sizes
-from shmio.local.writer import RETIRED, Commander, Ticket
+from shmio.local.writer import RETIRED, PendingCommand, SourceWriter
 from shmio.segment import Block, Event, EventKind
-from shmio.segment.commands import Laid
+from shmio.segment.commands import InjectionOptions
 
 RETRY_S: Final = 0.25
 """Pause before a source that has not lifted an injection is asked again."""
@@ -50,7 +50,7 @@ class CommandClient:
         self.write_subscriptions = WriteSubscriptions(block, stamp)
         self.followers = InjectionFollowers()
         self._loop = asyncio.get_running_loop()
-        self._commander = Commander(block, writer)
+        self._source_writer = SourceWriter(block, writer)
         self._prepared = False
         self._preparing = asyncio.Lock()
         self._in_flight = InFlightTable(writer)
@@ -104,7 +104,7 @@ class CommandClient:
     async def writable(self, registers: Iterable[Register]) -> bool:
         """Whether the configuration lets all of them be written."""
         await self._prepare()
-        return all(map(self._commander.is_writable, registers))
+        return all(map(self._source_writer.is_writable, registers))
 
     async def send(
         self,
@@ -120,7 +120,7 @@ class CommandClient:
         ``done`` is called once, when the end of all is known, a bounded time later; ``accepted`` before, if the source
         accepts them. CommandError: one is not writable, or the source is silent; ValueRangeError: neither is called.
         """
-        submit = partial(self._commander.submit, values, timeout_s)
+        submit = partial(self._source_writer.submit, values, timeout_s)
         await self._send(submit, self._cost(values), done, accepted, until_accepted=until_accepted)
 
     async def give(
@@ -136,33 +136,33 @@ class CommandClient:
 
         ``accepted`` is called of one over ``/in`` only.
         """
-        writes = self._commander.joined(values, raw)
+        writes = self._source_writer.joined(values, raw)
         cost = CommandCost.of([len(write.data) for write in writes])
-        await self._send(partial(self._commander.give, injection, writes), cost, done, accepted)
+        await self._send(partial(self._source_writer.give, injection, writes), cost, done, accepted)
 
-    def lay(self, bits: bytes, follower: InjectionFollower, done: Done, **laid: Unpack[Laid]) -> int:
+    def lay(self, bits: bytes, follower: InjectionFollower, done: Done, **laid: Unpack[InjectionOptions]) -> int:
         """Have an injection laid over these bits; its number. Never waits. CommandError: not sent."""
         writes = merge(bits, bits, [(0, len(bits))])
         cost = CommandCost.of([len(write.data) for write in writes], laid.get("name", ""))
-        return self._lay(self._commander.lay(writes, **laid), cost, follower, done)
+        return self._lay(self._source_writer.lay(writes, **laid), cost, follower, done)
 
     def declare(self, declaration: Declaration, follower: InjectionFollower, done: Done, *, keep: bool) -> int:
         """Have an injection laid that the source runs by itself; its number. Never waits. CommandError: not sent."""
         cost = CommandCost.of([len(msgspec.json.encode(declaration))], declaration.name)
-        return self._lay(self._commander.ask_to_declare(declaration, keep=keep), cost, follower, done)
+        return self._lay(self._source_writer.ask_to_declare(declaration, keep=keep), cost, follower, done)
 
-    def _lay(self, ticket: Ticket, cost: CommandCost, follower: InjectionFollower, done: Done) -> int:
+    def _lay(self, ticket: PendingCommand, cost: CommandCost, follower: InjectionFollower, done: Done) -> int:
         self._follow_up(ticket, cost, done)
         self.followers.add(ticket.number, follower)
         return ticket.number
 
     def lift(self, injection: int, done: Done) -> None:
         """Have an injection lifted. Never waits. CommandError: not sent."""
-        self._follow_up(self._commander.ask_to_lift(injection), CommandCost.of(()), done)
+        self._follow_up(self._source_writer.ask_to_lift(injection), CommandCost.of(()), done)
 
     async def _send(
         self,
-        submit: Callable[[], Ticket],
+        submit: Callable[[], PendingCommand],
         cost: CommandCost,
         done: Done,
         accepted: Callable[[], None] | None,
@@ -184,7 +184,7 @@ class CommandClient:
 
     def _follow_up(
         self,
-        ticket: Ticket,
+        ticket: PendingCommand,
         cost: CommandCost,
         done: Done,
         accepted: Callable[[], None] | None = None,
@@ -198,7 +198,7 @@ class CommandClient:
     async def _prepare(self) -> None:
         if not self._prepared:
             async with self._preparing:  # not on the loop: for a big layout it takes seconds
-                await asyncio.to_thread(self._commander.prepare)
+                await asyncio.to_thread(self._source_writer.prepare)
                 self._prepared = True
 
     def _cost(self, values: Collection[str]) -> CommandCost:
@@ -302,7 +302,9 @@ async def give(
     return await answer
 
 
-async def lay(commands: CommandClient, bits: bytes, follower: InjectionFollower, **laid: Unpack[Laid]) -> int:
+async def lay(
+    commands: CommandClient, bits: bytes, follower: InjectionFollower, **laid: Unpack[InjectionOptions]
+) -> int:
     """Lay an injection; its number. CommandError: the source refuses it, or does not answer."""
     return await _laid(commands, lambda done: commands.lay(bits, follower, done, **laid))
 

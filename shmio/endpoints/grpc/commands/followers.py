@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final, Protocol
 
 from shmio.segment import Event, EventKind
-from shmio.segment.pending_commands import Diverted, Gatherer
+from shmio.segment.pending_commands import CommandAssembler, CommandWrites
 
 _STACKED: Final = frozenset({EventKind.INJECTED, EventKind.LIFTED, EventKind.ACTIVATED, EventKind.DEACTIVATED})
 
@@ -16,7 +16,7 @@ class InjectionFollower:
     def happened(self, event: Event) -> None:
         """It was laid, has become active, is no longer, or was lifted."""
 
-    def divert(self, diverted: Diverted) -> None:
+    def divert(self, diverted: CommandWrites) -> None:
         """A command's values went to it."""
 
     def restack(self) -> None:
@@ -39,7 +39,7 @@ class WriteListener(Protocol):
         """What comes next is not all there was."""
 
 
-InjectionChange = Diverted | Event
+InjectionChange = CommandWrites | Event
 """What was diverted, or happened to injections; what was accepted, if somebody listens."""
 
 
@@ -49,18 +49,18 @@ class InjectionFollowers:
     def __init__(self) -> None:
         self._followers: dict[int, InjectionFollower] = {}
         self._listeners: dict[WriteListener, None] = {}  # in the order in which they came
-        self._gatherer = Gatherer()
+        self._assembler = CommandAssembler()
 
     def gather(self, event: Event) -> list[InjectionChange]:
         """What is to be told by this event."""
-        change: list[InjectionChange] = [*self._gatherer.follow(event)]
+        change: list[InjectionChange] = [*self._assembler.follow(event)]
         if (event.kind in _STACKED and not event.offset) or (event.kind == EventKind.ACCEPTED and self._listeners):
             change.append(event)  # of a long declaration's parts the first
         return change
 
     def skip(self) -> None:
         """Events were missed."""
-        self._gatherer = Gatherer()
+        self._assembler = CommandAssembler()
 
     def add(self, injection: int, follower: InjectionFollower) -> None:
         """Tell it from now on; before any of its events can have come."""
@@ -85,7 +85,7 @@ class InjectionFollowers:
 
     def tell(self, change: InjectionChange) -> None:
         """Tell those whom it concerns."""
-        if isinstance(change, Diverted):
+        if isinstance(change, CommandWrites):
             if follower := self._followers.get(change.injection):
                 follower.divert(change)
             return

@@ -22,7 +22,7 @@ from shmio.layout.values.write import covering, encode
 from shmio.local.writer import RETIRED
 from shmio.segment import DONE, Direction, EventKind
 from shmio.segment.changed_registers import ChangeScan
-from shmio.segment.pending_commands import Diverted, apply
+from shmio.segment.pending_commands import CommandWrites, apply
 
 Leave = Callable[[], None]
 
@@ -213,7 +213,7 @@ class Injection(InjectionFollower):
 
     # ---- as a follower of its block ----------------------------------------------------------------------------
 
-    def divert(self, diverted: Diverted) -> None:
+    def divert(self, diverted: CommandWrites) -> None:
         """A command's values went to it."""
         self._base.divert(diverted.writes)
         if self.inward:

@@ -21,7 +21,7 @@ from shmio.endpoints.grpc.streams.wakeups import WakeUps
 from shmio.errors import CommandError, EndpointError, PathError, ShmioError, ValueRangeError
 from shmio.layout.topic import shorten
 from shmio.segment import Block
-from shmio.segment.standing_injections import Standing
+from shmio.segment.standing_injections import StandingInjection
 from shmio.wire import shmio_v1_pb2 as wire
 
 MAX_INJECTIONS: Final = 256
@@ -190,7 +190,7 @@ class CommandCalls:
         lifted = await asyncio.gather(*(self._lift(block, one) for block, one in standing))
         return wire.LiftResponse(lifted=lifted)
 
-    async def _lift(self, block: Block, one: Standing) -> wire.Lifted:
+    async def _lift(self, block: Block, one: StandingInjection) -> wire.Lifted:
         failure = await command_client.lift(self._feeds[block.source].commands, one.id)
         return wire.Lifted(source=block.source, number=one.id, name=one.name, failure=failure)
 

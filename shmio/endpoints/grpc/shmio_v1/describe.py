@@ -11,7 +11,7 @@ from shmio.endpoints.grpc.shmio_v1.views import describe
 from shmio.local.status import ProcessStatus, SourceStatus, status_of
 from shmio.messages import declaration_to_wire
 from shmio.segment import Block, Segment
-from shmio.segment.standing_injections import Running, Standing
+from shmio.segment.standing_injections import DeclaredState, StandingInjection
 from shmio.wire import shmio_v1_pb2 as wire
 
 PART_REGISTERS = 4096
@@ -47,7 +47,7 @@ def layout_parts(block: Block) -> Iterator[wire.LayoutPart]:
         yield part
 
 
-def injection(block: Block, one: Standing) -> wire.Injection:
+def injection(block: Block, one: StandingInjection) -> wire.Injection:
     """An injection that stands on a block."""
     return wire.Injection(
         source=block.source,
@@ -63,7 +63,7 @@ def injection(block: Block, one: Standing) -> wire.Injection:
     )
 
 
-def _running(running: Running) -> wire.Running:
+def _running(running: DeclaredState) -> wire.Running:
     """How a declared one is."""
     declaration = running.declaration
     return wire.Running(

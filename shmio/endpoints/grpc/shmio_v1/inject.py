@@ -26,7 +26,7 @@ from shmio.layout.topic import Topic, shorten
 from shmio.layout.values.write import Write, covering, merge
 from shmio.segment import Direction, EventKind, Frame
 from shmio.segment.commands import MAX_NAME_BYTES
-from shmio.segment.pending_commands import Diverted, apply
+from shmio.segment.pending_commands import CommandWrites, apply
 from shmio.wire import shmio_v1_pb2 as wire
 
 _RANGES: Final = wire.Table.DESCRIPTOR.fields_by_name["ranges"].number
@@ -332,7 +332,7 @@ class InjectCall(InjectionFollower):
         self._shown, self._shown_image = frame, image
         return head(self._view.number, frame, whole=before is None) + body if body or quality else None
 
-    def divert(self, diverted: Diverted) -> None:
+    def divert(self, diverted: CommandWrites) -> None:
         """A command's values went to it: over ``/in`` what was written, over ``/out`` what others further in give."""
         self._base.divert(diverted.writes)
         if not self._inward:

@@ -11,7 +11,7 @@ import grpc
 
 from shmio.endpoints.grpc.services.error_status import Context, refuse
 from shmio.errors import ShmioError, ValueRangeError
-from shmio.local.replays import Replays, Wanted
+from shmio.local.replays import ReplayRequest, Replays
 from shmio.model.replay_status import Playing
 from shmio.segment import Segment
 from shmio.wire import shmio_v1_pb2 as wire
@@ -48,7 +48,7 @@ class ReplayCalls:
             await refuse(context, error)
         return wire.ReplayResponse(sources=map(_playing, found))
 
-    async def _change(self, wanted: Wanted) -> list[Playing]:
+    async def _change(self, wanted: ReplayRequest) -> list[Playing]:
         over = threading.Event()
         async with self._turn:
             try:
@@ -57,12 +57,12 @@ class ReplayCalls:
                 over.set()  # its thread goes on when the call is cancelled
 
 
-def _wanted(request: wire.ReplayRequest) -> Wanted:
+def _wanted(request: wire.ReplayRequest) -> ReplayRequest:
     """ValueRangeError: more than anybody means."""
     texts = (request.seek, request.until, request.change, request.event, *request.sources)
     if len(request.sources) > MAX_SOURCES or any(len(text) > MAX_TEXT for text in texts):
         raise ValueRangeError(f"at most {MAX_SOURCES} sources, and {MAX_TEXT} characters of each text, can be given")
-    return Wanted(
+    return ReplayRequest(
         request.paused if request.HasField("paused") else None,
         request.speed if request.HasField("speed") else None,
         request.seek,

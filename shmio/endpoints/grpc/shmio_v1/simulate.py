@@ -28,7 +28,7 @@ from shmio.layout.topic import find, holders, parse_topic, shorten
 from shmio.layout.values.codec import RegisterCodec, codec
 from shmio.logs import printable
 from shmio.segment import Block, Segment
-from shmio.segment.model_channel import MAX_NAME_BYTES, Ask, Link, ends_of
+from shmio.segment.model_channel import MAX_NAME_BYTES, ModelChannel, ModelRequest, model_ports
 from shmio.wire import shmio_v1_pb2 as wire
 
 
@@ -126,7 +126,7 @@ class SimulateCalls:
         self._segment = segment
         self._open: dict[int, SimulateCall] = {}  # by the section of their block
         for block in segment.blocks.values():
-            if block.link is not None:  # the process before this one may have died with its model
+            if block.model_channel is not None:  # the process before this one may have died with its model
                 self._ring(block)
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
@@ -180,8 +180,10 @@ class SimulateCalls:
         if source not in self._feeds:
             raise PathError(f"no source {shorten(source)!r}; there are: {', '.join(self._feeds)}")
         block = self._feeds[source].block
-        if block.link is None:
-            can = ", ".join(name for name, feed in self._feeds.items() if feed.block.link is not None) or "none"
+        if block.model_channel is None:
+            can = (
+                ", ".join(name for name, feed in self._feeds.items() if feed.block.model_channel is not None) or "none"
+            )
             raise CommandError(
                 f"{source}: no model can join it, for its connector is {block.attributes.connector!r}, not 'remote'; "
                 f"those that one can join: {can}"
@@ -224,16 +226,16 @@ class SimulateCall:
         self._wake = asyncio.Event()
         self._bell: WakeUp | None = None  # rings when the source has asked for a step
         self._handed = 0
-        self._asked: Ask | None = None  # what the model has in hand
+        self._asked: ModelRequest | None = None  # what the model has in hand
         self._given: DecodedImage | None = None
         self._image: bytearray | None = None  # with the outputs as the model has set them
         self._refused = ""
 
     @property
-    def _link(self) -> Link:
-        if self.block.link is None:
+    def _link(self) -> ModelChannel:
+        if self.block.model_channel is None:
             raise SegmentError(f"{self.block.source}: its block has no link")
-        return self.block.link
+        return self.block.model_channel
 
     async def join(self) -> bytes:
         """Take the link; the first message. ConflictError, ValueRangeError."""
@@ -286,7 +288,7 @@ class SimulateCall:
             else:
                 await self._wake.wait()
 
-    def _newest(self) -> Ask | None:
+    def _newest(self) -> ModelRequest | None:
         """The step that the source waits for, unless it has been handed out."""
         link = self._link
         if link.asked.head() == self._handed or (ask := link.newest()) is None:
@@ -294,7 +296,7 @@ class SimulateCall:
         self._handed = ask.number
         return ask if ask.until_ns > time.monotonic_ns() else None
 
-    def _work(self, ask: Ask) -> bytes:
+    def _work(self, ask: ModelRequest) -> bytes:
         """A serialised ``Do``: all inputs at first, then those that differ from what the model has."""
         before, now = self._given, self._inputs.columns.decode(ask.commanded)
         self._given = now
@@ -351,7 +353,7 @@ class SimulateCall:
 
 def _tables(block: Block) -> tuple[Selection, Selection]:
     """Inputs and outputs. ValueRangeError: they are too many; ConfigError."""
-    ends = ends_of(block.layout, block.attributes.outputs, block.attributes.inouts)
+    ends = model_ports(block.layout, block.attributes.outputs, block.attributes.inouts)
     tables = Selection(1, block, ends.inputs), Selection(2, block, ends.outputs)
     for table in tables:
         if len(table.registers) > MAX_REGISTERS or table.elements > MAX_ELEMENTS:

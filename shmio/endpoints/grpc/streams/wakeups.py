@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Final
 
 from shmio.segment import Block
-from shmio.segment.relay import TURN_NS, Relay, Word
+from shmio.segment.relay import TURN_NS, Relay, WakeSource
 
 Callback = Callable[[], object]
 
@@ -18,7 +18,7 @@ REST_S: Final = 0.005
 class WakeUp:
     """Rings for one word in shared memory, at first too, and now and then. For the event loop's thread."""
 
-    def __init__(self, word: Word, name: str, turn_ns: int = TURN_NS) -> None:
+    def __init__(self, word: WakeSource, name: str, turn_ns: int = TURN_NS) -> None:
         """``turn_ns``: it rings after so long without a ring, too."""
         self.listeners: dict[Callback, None] = {}  # in the order in which they came
         self.patient: set[Callback] = set()

@@ -18,7 +18,7 @@ from shmio.endpoints.grpc.time.open_streams import OpenStreams
 from shmio.endpoints.grpc.time.timeline import Timeline
 from shmio.endpoints.grpc.time.virtual_time import TimeStatus, VirtualTime
 from shmio.errors import ShmioError, TimeError
-from shmio.local.step_answers import Wait
+from shmio.local.step_answers import StepWait
 from shmio.local.time_control import Coordinator, Step, check_step
 from shmio.segment import ProcessSlot, Segment
 from shmio.segment.clock import ClockPage
@@ -55,7 +55,7 @@ class StepDriver:
             self._delivered.stop()
             self._delivered.join()
 
-    async def _stay(self, wait: Wait) -> None:
+    async def _stay(self, wait: StepWait) -> None:
         """Until its bell rings, which it does now and then in any case."""
         rung = asyncio.get_running_loop().create_future()
 
@@ -70,7 +70,7 @@ class StepDriver:
         finally:
             leave()
 
-    def _listen(self, wait: Wait, ring: Callable[[], None]) -> Callable[[], object]:
+    def _listen(self, wait: StepWait, ring: Callable[[], None]) -> Callable[[], object]:
         block = wait.block
         if block is not None:
             self._wake_ups.join(block, ring)
@@ -80,7 +80,7 @@ class StepDriver:
         return lambda: bell.listeners.pop(ring)
 
 
-def _brief(wait: Wait, rest_ns: int) -> bool:
+def _brief(wait: StepWait, rest_ns: int) -> bool:
     """Wait in the event loop's own thread, at most so long; whether the block's bell has rung."""
     if wait.block is None or rest_ns <= 0:
         return False

@@ -21,7 +21,7 @@ from shmio.injection.draw import SeededRandom
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.values.codec import Value, codec
 from shmio.local.reading import reading
-from shmio.local.writer import Commander
+from shmio.local.writer import SourceWriter
 from shmio.segment import (  # fmt: skip
     Attributes,
     BlockSpec,
@@ -66,7 +66,7 @@ class Rig:
         self.segment = segment
         self.block = segment.blocks[source]
         self.owners = {4: Owner(4, 100), 5: Owner(5, 200)}
-        self.client, self.other = Commander(self.block, 4), Commander(self.block, 5)
+        self.client, self.other = SourceWriter(self.block, 4), SourceWriter(self.block, 5)
         self.events = self.block.events.cursor()
         self.writer = segment.writer(source)
         self.output = Output(self.writer)

@@ -18,7 +18,7 @@ from shmio.errors import CommandError, PathError
 from shmio.layout.compiler import Source, compile_sources
 from shmio.layout.values.codec import Value
 from shmio.local.reading import Reading, reading
-from shmio.local.writer import Commander
+from shmio.local.writer import SourceWriter
 from shmio.segment import (  # fmt: skip
     Attributes,
     BlockSpec,
@@ -88,8 +88,8 @@ class Rig:
         self.owners = {4: Owner(4, 100), 5: Owner(5, 200)}
         self.asked: list[int] = []
         self.armed = armed
-        self.client = Commander(self.block, 4)
-        self.other = Commander(self.block, 5)
+        self.client = SourceWriter(self.block, 4)
+        self.other = SourceWriter(self.block, 5)
         self.frames = self.block.cursor()
         self.events = self.block.events.cursor()
         self.start()

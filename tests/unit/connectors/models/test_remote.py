@@ -16,21 +16,21 @@ from shmio.connectors import registry
 from shmio.connectors.models.remote import Remote
 from shmio.errors import ConfigError, SegmentError, TimeError
 from shmio.local.time_control import Coordinator
-from shmio.local.writer import Commander
+from shmio.local.writer import SourceWriter
 from shmio.segment import Attributes, BlockSpec, EventKind, Frame, ProcessSpec, Provenance, Quality, Segment
-from shmio.segment.model_channel import Ask, Link
+from shmio.segment.model_channel import ModelChannel, ModelRequest
 from tests.unit.connectors.models.test_stepped import GUEST, LAYOUT, MS, PATIENCE_S, PERIOD_NS, Running, latest, summed
 
 NOBODY = "no model is connected"
 LONG_MS = 9000
 """A time-out that does not pass."""
-Compute = Callable[[Ask], bytes | str | None]
+Compute = Callable[[ModelRequest], bytes | str | None]
 """An image, why it failed, or no answer."""
 MUTE = """
 import sys, time
 from shmio.segment import Segment
 with Segment.open(sys.argv[1], writable=True) as segment:
-    link = segment.blocks["sim"].link
+    link = segment.blocks["sim"].model_channel
     assert link.join("mute")
     print("joined", flush=True)
     while link.newest() is None:
@@ -58,7 +58,7 @@ def remote(timeout_ms: float = LONG_MS, inouts: tuple[str, ...] = (), **connecti
     return made  # type: ignore[no-any-return]
 
 
-def add(ask: Ask) -> bytes:
+def add(ask: ModelRequest) -> bytes:
     """``sum`` is one more, plus what is given; all else is what no model may change."""
     (total,) = struct.unpack_from(">I", ask.shown)
     _, given, other = struct.unpack(">III", ask.commanded)
@@ -70,10 +70,10 @@ class Model:
 
     def __init__(self, instance: str, compute: Compute = add, name: str = "adder") -> None:
         self.segment = Segment.open(instance, writable=True)
-        found = self.segment.blocks["sim"].link
+        found = self.segment.blocks["sim"].model_channel
         assert found is not None
-        self.link: Link = found
-        self.asks: list[Ask] = []
+        self.link: ModelChannel = found
+        self.asks: list[ModelRequest] = []
         self.reached = threading.Event()
         """It has been asked, and has answered or not."""
         self._compute = compute
@@ -141,15 +141,15 @@ def test_a_model_elsewhere_computes_its_outputs_and_nothing_else(instance: str) 
     with built(instance) as segment, Running(segment, "sim", remote()) as sim, Model(instance) as model:
         first = good(sim)
         assert (first.cycle, summed(first), first.provenance) == (0, 0, Provenance.SIMULATED)
-        coordinator, commander = Coordinator(segment), Commander(segment.blocks["sim"], GUEST)
+        coordinator, source_writer = Coordinator(segment), SourceWriter(segment.blocks["sim"], GUEST)
         coordinator.step(20 * MS)
         assert struct.unpack(">III", latest(segment, "sim").raw) == (1, 0, 0)
-        (outcome,) = commander.write({"given": 7})
+        (outcome,) = source_writer.write({"given": 7})
         assert outcome.kind is EventKind.WRITTEN
         assert struct.unpack(">III", latest(segment, "sim").raw) == (1, 0, 0), "shown from the next step on"
         coordinator.step(30 * MS)
         assert struct.unpack(">III", latest(segment, "sim").raw) == (9, 7, 0)
-        (outcome,) = commander.write({"sum": 7})
+        (outcome,) = source_writer.write({"sum": 7})
         assert outcome.kind is EventKind.REFUSED
         told = "the model computes sum: it is an output, which nobody writes; shmio inject shows others"
         assert outcome.text == told
@@ -160,7 +160,7 @@ def test_a_model_elsewhere_computes_its_outputs_and_nothing_else(instance: str) 
 
 
 def test_what_is_in_out_has_two_ends(instance: str) -> None:
-    def halve(ask: Ask) -> bytes:
+    def halve(ask: ModelRequest) -> bytes:
         (given,) = struct.unpack_from(">I", ask.commanded, 4)
         return struct.pack(">III", 0, given // 2, 0)
 
@@ -171,8 +171,8 @@ def test_what_is_in_out_has_two_ends(instance: str) -> None:
         Model(instance, halve) as model,
     ):
         good(sim)
-        coordinator, commander = Coordinator(segment), Commander(segment.blocks["sim"], GUEST)
-        commander.write({"given": 8})
+        coordinator, source_writer = Coordinator(segment), SourceWriter(segment.blocks["sim"], GUEST)
+        source_writer.write({"given": 8})
         for _ in range(2):
             coordinator.step()
         assert struct.unpack(">III", latest(segment, "sim").raw) == (0, 4, 0)
@@ -205,7 +205,7 @@ def test_without_a_model_each_step_fails_at_once_and_the_next_works_when_one_has
 
 
 def test_a_model_that_fails_fails_its_step_with_the_reason(instance: str) -> None:
-    def fails(ask: Ask) -> bytes | str:
+    def fails(ask: ModelRequest) -> bytes | str:
         return {2: "no solution", 3: ""}.get(ask.step, "") if ask.step in (2, 3) else add(ask)
 
     with built(instance) as segment, Running(segment, "sim", remote()) as sim, Model(instance, fails):
@@ -225,7 +225,7 @@ def test_a_late_answer_is_taken_for_no_other_step(instance: str) -> None:
     late = threading.Event()
     hold = threading.Event()
 
-    def slow(ask: Ask) -> bytes:
+    def slow(ask: ModelRequest) -> bytes:
         if ask.step == 1:
             assert hold.wait(PATIENCE_S)
             late.set()

@@ -22,7 +22,7 @@ from shmio.layout.topic import parse_topic
 from shmio.layout.values.codec import Value
 from shmio.layout.values.write import Write
 from shmio.local.time_control import Coordinator
-from shmio.local.writer import Commander
+from shmio.local.writer import SourceWriter
 from shmio.segment import (
     Attributes,
     BlockSpec,
@@ -332,11 +332,11 @@ class SlowToAccept(BlockWriter):
 def test_what_was_accepted_before_a_step_is_carried_out_in_it(instance: str) -> None:
     with built(instance, "sim") as segment, Running(segment, "sim", Adder(), SlowToAccept) as sim:
         sim.next()
-        coordinator, commander = Coordinator(segment), Commander(segment.blocks["sim"], GUEST)
+        coordinator, source_writer = Coordinator(segment), SourceWriter(segment.blocks["sim"], GUEST)
         expected = 0
         for given in range(1, 10):
             events = segment.blocks["sim"].events.cursor()
-            commander.submit({"given": given})
+            source_writer.submit({"given": given})
             while (event := events.next(PATIENCE_S)) is None or event.kind != EventKind.ACCEPTED:
                 assert event is not None
             coordinator.step()
@@ -347,10 +347,10 @@ def test_what_was_accepted_before_a_step_is_carried_out_in_it(instance: str) -> 
 def test_a_write_has_its_end_while_time_stands(instance: str) -> None:
     with built(instance, "sim") as segment, Running(segment, "sim", Adder()) as sim:
         sim.next()
-        coordinator, commander = Coordinator(segment), Commander(segment.blocks["sim"], GUEST)
+        coordinator, source_writer = Coordinator(segment), SourceWriter(segment.blocks["sim"], GUEST)
         coordinator.step(10 * MS)
         events = segment.blocks["sim"].events.cursor()
-        (outcome,) = commander.write({"given": 7})
+        (outcome,) = source_writer.write({"given": 7})
         assert outcome.kind is EventKind.WRITTEN
         told = [event for event in iter(events.poll, None) if event.kind == EventKind.WRITTEN]
         assert [(event.cycle, event.clock_ns) for event in told] == [(1, 10 * MS)], "events have the page's time"
@@ -541,11 +541,11 @@ def test_a_source_that_a_reload_has_removed_is_named(instance: str) -> None:
 def test_a_memory_shows_at_once_what_is_written_with_the_time_that_stands(instance: str) -> None:
     with built(instance, "panel") as segment, Running(segment, "panel", Memory(Memory.Options(), LAYOUT)) as panel:
         panel.next()
-        coordinator, commander = Coordinator(segment), Commander(segment.blocks["panel"], GUEST)
+        coordinator, source_writer = Coordinator(segment), SourceWriter(segment.blocks["panel"], GUEST)
         coordinator.step(3_600_000 * MS)
         assert segment.blocks["panel"].assess(panel.next()) == (Quality.GOOD, "")
         for given in (1, 2, 3):
-            (outcome,) = commander.write({"given": given})
+            (outcome,) = source_writer.write({"given": given})
             assert outcome.kind is EventKind.WRITTEN
             frame = latest(segment, "panel")
             assert (frame.raw[7], frame.cycle, frame.clock_ns) == (given, 1, 3_600_000 * MS)
@@ -558,10 +558,10 @@ def test_a_model_reads_of_a_memory_what_was_written_before_the_step(instance: st
     with built(instance, "a", "panel") as segment, ExitStack() as stack:
         stack.enter_context(Running(segment, "panel", Memory(Memory.Options(), LAYOUT))).next()
         stack.enter_context(Running(segment, "a", Adder(other="panel/given"))).next()
-        coordinator, commander = Coordinator(segment), Commander(segment.blocks["panel"], GUEST)
+        coordinator, source_writer = Coordinator(segment), SourceWriter(segment.blocks["panel"], GUEST)
         expected = 0
         for given in range(1, 20):
-            commander.write({"given": given})
+            source_writer.write({"given": given})
             coordinator.step()
             expected += 1 + given
             assert summed(latest(segment, "a")) == expected

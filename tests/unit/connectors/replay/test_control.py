@@ -13,7 +13,7 @@ from shmio.errors import CommandError, PathError, ShmioError, ValueRangeError
 from shmio.local import replays
 from shmio.local.attach import Attachment, attach
 from shmio.segment import EventKind, Quality, Record, Segment
-from shmio.segment.playhead import Found, Move, Playhead
+from shmio.segment.playhead import MoveRequest, Playhead, PlayheadAnswer
 from tests.unit.connectors.replay.harness import (
     BEGIN_NS,
     MS,
@@ -280,7 +280,7 @@ def held_up(segment: Segment, for_ns: int) -> tuple[Playhead, int]:
     assert play is not None
     head.write(play._replace(paused=False, anchor_ns=now_ns - for_ns))
     with head.held():
-        return head, head.ask(Move(now_ns, paused=True))
+        return head, head.ask(MoveRequest(now_ns, paused=True))
 
 
 def test_a_request_of_the_next_round_waits_until_this_one_is_played(tmp_path: Path, instance: str) -> None:
@@ -302,10 +302,10 @@ def test_a_request_that_was_read_late_is_done_as_of_its_moment(here: tuple[Playi
     assert head is not None
     now_ns = playing.block.clock.present_ns()
     with head.held():
-        number = head.ask(Move(now_ns - 90 * S, paused=False, speed=0.01, position_ns=BEGIN_NS))
+        number = head.ask(MoveRequest(now_ns - 90 * S, paused=False, speed=0.01, position_ns=BEGIN_NS))
         playing.clock.nudge()
         playing.until(lambda: head.found(number) is not None)
-        assert head.found(number) == Found()
+        assert head.found(number) == PlayheadAnswer()
     assert playing.next(lambda frame: frame.quality is Quality.BAD).reason == "replay: the recording is over"
 
 
@@ -335,7 +335,7 @@ def test_a_request_of_a_moment_just_behind_a_wrap_is_done_in_the_next_round(tmp_
         play = head.read()
         assert play is not None
         with head.held():
-            number = head.ask(Move(play.next_round().anchor_ns + 5_000, paused=True))
+            number = head.ask(MoveRequest(play.next_round().anchor_ns + 5_000, paused=True))
             cell.clock.nudge()
             cell.until(lambda: head.found(number) is not None)
         [status] = attachment.replay.status()
@@ -359,7 +359,7 @@ def test_a_request_of_a_moment_just_before_a_wrap_is_done_in_that_round(tmp_path
         play = head.read()
         assert play is not None
         with head.held():
-            number = head.ask(Move(play.anchor_ns - 5_000, paused=True))
+            number = head.ask(MoveRequest(play.anchor_ns - 5_000, paused=True))
             cell.clock.nudge()
             cell.until(lambda: head.found(number) is not None)
         [status] = attachment.replay.status()

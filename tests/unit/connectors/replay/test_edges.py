@@ -17,11 +17,11 @@ from shmio.connectors.replay.recording import Recording
 from shmio.connectors.replay.source import Replay
 from shmio.errors import CommandError, ConfigError, RecordingError
 from shmio.local.attach import attach
-from shmio.local.replays import Wanted
+from shmio.local.replays import ReplayRequest
 from shmio.local.time_control import Coordinator
 from shmio.recording.format.encoding import Gap, Reason
 from shmio.segment import EventKind, Quality, Record, Segment
-from shmio.segment.playhead import Move
+from shmio.segment.playhead import MoveRequest
 from tests.unit.connectors.replay.harness import (
     BEGIN_NS,
     LAYOUT,
@@ -171,7 +171,7 @@ def test_what_a_process_that_was_held_up_leaves_out_is_not_read(
         assert head is not None
         now_ns = segment.clock.present_ns()
         with head.held():
-            head.ask(Move(now_ns - 30 * S, paused=False, speed=1.0))
+            head.ask(MoveRequest(now_ns - 30 * S, paused=False, speed=1.0))
         segment.clock.slot_bell(0).ring()
         assert counts([playing.next()])[0] >= 1500
         assert len(read) < 200
@@ -215,7 +215,7 @@ def test_a_search_can_be_given_up(tmp_path: Path, instance: str, monkeypatch: py
             return len(asked) > 1
 
         with pytest.raises(CommandError, match="source cell has not answered: it was given up"):
-            attached.replay.change(Wanted(event="noted"), given_up)
+            attached.replay.change(ReplayRequest(event="noted"), given_up)
         [status] = attached.replay.seek(0.1)
         assert status.position_s == 0.1, "another request takes its place"
 

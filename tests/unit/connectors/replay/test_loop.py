@@ -11,9 +11,9 @@ import pytest
 from shmio.connectors.replay.player import OVER, STOPPED
 from shmio.local.attach import attach
 from shmio.local.time_control import Coordinator
-from shmio.local.writer import Commander
+from shmio.local.writer import SourceWriter
 from shmio.segment import NO_WRITER, EventKind, Origin, Provenance, Quality, Record
-from shmio.segment.playhead import Move
+from shmio.segment.playhead import MoveRequest
 from tests.unit.connectors.replay.harness import (
     BEGIN_NS,
     MS,
@@ -30,8 +30,8 @@ from tests.unit.connectors.replay.harness import (
 GUEST = 0
 
 
-def took(commander: Commander, value: int) -> str:
-    [outcome] = commander.write({"count": value})
+def took(source_writer: SourceWriter, value: int) -> str:
+    [outcome] = source_writer.write({"count": value})
     return f"{outcome.kind}: {outcome.text}"
 
 
@@ -113,17 +113,17 @@ def test_injections_of_the_recording_are_seen_or_not(tmp_path: Path, instance: s
     [file] = tmp_path.glob("*.mem")
     kept = injections == "keep"
     with built(instance) as segment, Playing(segment, file, injections=injections) as playing:
-        coordinator, commander = Coordinator(segment), Commander(segment.blocks["cell"], GUEST)
+        coordinator, source_writer = Coordinator(segment), SourceWriter(segment.blocks["cell"], GUEST)
         coordinator.step(10 * MS)
         [frame] = playing.frames()
         assert (frame.raw, frame.image) == (image(1), image(99) if kept else image(1))
         assert [event.kind for event in playing.happened()] == [EventKind.INJECTED] * kept + [EventKind.QUALITY]
         segment.processes.guests[0].take()
-        number = commander.inject(["other"])
-        commander.shadow(number, {"other": 7})
+        number = source_writer.inject(["other"])
+        source_writer.shadow(number, {"other": 7})
         shown = playing.next(lambda frame: frame.image[2:] == b"\0\7")
         assert (shown.raw, shown.image) == (image(1), image(99 if kept else 1, 7)), "ours lies over theirs"
-        commander.lift(number)
+        source_writer.lift(number)
         assert playing.next(lambda frame: frame.image[2:] == b"\0\0").image == frame.image
         coordinator.close()
 
@@ -132,8 +132,8 @@ def test_nothing_is_written(tmp_path: Path, instance: str) -> None:
     file = record(tmp_path, instance)
     with built(instance) as segment, Playing(segment, file) as cell:
         cell.next()  # it accepts by now
-        commander = Commander(segment.blocks["cell"], GUEST)
-        assert took(commander, 5) == "refused: source cell is a replay: nothing is written"
+        source_writer = SourceWriter(segment.blocks["cell"], GUEST)
+        assert took(source_writer, 5) == "refused: source cell is a replay: nothing is written"
         kinds = [event.kind for event in cell.happened()]
     assert kinds == [EventKind.ACCEPTED, EventKind.REFUSED]
 
@@ -236,7 +236,7 @@ def test_a_loop_leaves_out_what_is_a_round_late(tmp_path: Path, instance: str) -
         assert head is not None
         now_ns = segment.clock.present_ns()
         with head.held():
-            head.ask(Move(now_ns - 5 * S, paused=False))
+            head.ask(MoveRequest(now_ns - 5 * S, paused=False))
         segment.clock.slot_bell(0).ring()
         assert cell.next().clock_ns > now_ns - S
         cell.until(lambda: cell.loop.counters.overruns >= 200)

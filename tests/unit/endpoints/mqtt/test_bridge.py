@@ -13,7 +13,7 @@ import pytest
 from shmio.config import Mqtt, MqttTopic, Sparkplug
 from shmio.endpoints.mqtt.bridge import Bridge
 from shmio.segment import BlockWriter, ProcessSpec, Provenance, Quality, Segment
-from shmio.segment.standing_injections import Standing, encode
+from shmio.segment.standing_injections import StandingInjection, encode
 from shmio.testing.mosquitto import Mosquitto
 from tests.unit.endpoints.harness import LAYOUT, image
 from tests.unit.endpoints.mqtt.harness import PREFIX, Listener, bridge, listening
@@ -109,7 +109,7 @@ def test_json_says_whose_value_is_injected_also_if_it_is_the_same(segment: Segme
 
     def stand(*places: tuple[int, int]) -> None:
         ones = [
-            Standing(number, "out", 0, keep=False, name="", writer=0, pid=1, ranges=((at, size, 255),))
+            StandingInjection(number, "out", 0, keep=False, name="", writer=0, pid=1, ranges=((at, size, 255),))
             for number, (at, size) in enumerate(places)
         ]
         cell.standing.write(encode(map(msgspec.json.encode, ones)))

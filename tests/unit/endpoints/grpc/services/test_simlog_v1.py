@@ -10,7 +10,7 @@ import grpc
 import pytest
 
 from shmio.config import Declaration
-from shmio.local.writer import Commander
+from shmio.local.writer import SourceWriter
 from shmio.segment import Direction, Quality, Segment
 from shmio.wire import simlog_v1_pb2 as wire
 from tests.unit.endpoints.grpc.commands.test_publish import counted, counts, message, with_plant
@@ -302,7 +302,7 @@ def test_somebody_else_may_lift_it_and_the_stream_says_so(segment: Segment) -> N
             originals = await laid(served, target, "s")
             (one,) = segment.blocks["cell"].standing.read()
             assert one.name.startswith("s of ipv4:127.0.0.1:")
-            await asyncio.to_thread(Commander(segment.blocks["cell"], GUEST).lift, one.id)
+            await asyncio.to_thread(SourceWriter(segment.blocks["cell"], GUEST).lift, one.id)
             while (got := await _end(originals)) is None:
                 pass
             assert got == (Status.ABORTED, f"{target}: somebody has lifted it")
@@ -472,7 +472,7 @@ def test_a_program_lays_one_beneath_or_above_those_of_clients(segment: Segment) 
     async def test(served: Endpoint, device: Plant) -> None:
         originals = await laid(served, "cell/step", "s")
         await value(originals)
-        program = Commander(segment.blocks["cell"], GUEST)
+        program = SourceWriter(segment.blocks["cell"], GUEST)
         inner = await asyncio.to_thread(program.inject, ["step"], priority=-1, direction=Direction.OUT)
         await asyncio.to_thread(program.shadow, inner, {"step": 11})
         await seen(originals, "11")
@@ -499,7 +499,7 @@ def test_publishing_to_a_shadow_is_counted_and_its_refusals_logged(
 def test_what_declared_injections_further_in_make_of_it_is_in_the_originals(segment: Segment) -> None:
     async def test(served: Endpoint, device: Plant) -> None:
         consumer = served.subscribe("cell/step")
-        program = Commander(segment.blocks["cell"], GUEST)
+        program = SourceWriter(segment.blocks["cell"], GUEST)
         declaration = Declaration(name="hundred", target="cell/step", operation="offset", value=100)
         number = await asyncio.to_thread(program.declare, declaration)
         await seen(consumer, "100")

@@ -218,7 +218,7 @@ def test_what_it_has_set_too_late_is_shown_with_the_next_step(instance: str) -> 
         assert "did not answer within 200 ms" in text, "it has the first one in hand still"
         await model.done(1, assignments=assigned(**{"axis/count": 1}))
         number = 2
-        link = served.segment.blocks["drive"].link
+        link = served.segment.blocks["drive"].model_channel
         assert link is not None
         while True:  # a busy machine may need more than one
             number += 1
@@ -317,7 +317,7 @@ def test_a_second_model_is_refused_by_the_name_of_the_first(instance: str) -> No
 def test_one_that_another_process_has_is_refused_too(instance: str) -> None:
     async def test(served: Endpoint, drive: Running) -> None:
         with Segment.open(served.segment.instance, writable=True) as other:
-            link = other.blocks["drive"].link
+            link = other.blocks["drive"].model_channel
             assert link is not None
             assert link.join("local")
             code, text = await refusal(Raw(served).join())

@@ -62,7 +62,7 @@ def test_its_connection_breaks(instance: str, stage: str, reset: bool) -> None:
             await until_calls(served, 1)
         if stage == "within a step":
             step = stepping(served)
-            link = served.segment.blocks["drive"].link
+            link = served.segment.blocks["drive"].model_channel
             assert link is not None
 
             async def asked() -> bool:

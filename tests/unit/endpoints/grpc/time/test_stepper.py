@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator
 from typing import Any
 
 from shmio.endpoints.grpc.time.stepper import StepDriver
-from shmio.local.step_answers import Wait
+from shmio.local.step_answers import StepWait
 from shmio.local.time_control import Step
 
 MANY = 1_000_000
@@ -43,11 +43,11 @@ def test_a_source_that_rings_much_before_it_answers_does_not_hold_up_the_loop() 
     waits: list[int] = []
 
     class Coordinator:
-        def stepping(self, dt_ns: int | None) -> Generator[Wait, None, Step]:
+        def stepping(self, dt_ns: int | None) -> Generator[StepWait, None, Step]:
             block: Any = Block()
             while len(waits) < MANY and len(turns) < 3:
                 waits.append(0)
-                yield Wait(block, 0, 1_000_000_000)
+                yield StepWait(block, 0, 1_000_000_000)
             return DONE
 
     async def others() -> None:

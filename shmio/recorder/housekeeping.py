@@ -35,7 +35,7 @@ class _File(NamedTuple):
     changed_ns: int
 
 
-class Keeper:
+class Housekeeper:
     """The thread. It touches only recordings of this instance by this kind of recorder (``by``), of this user.
 
     Never those that are being written, by whomever.

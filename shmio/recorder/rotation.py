@@ -10,12 +10,12 @@ from typing import Final
 
 from shmio.config import Recorder as Settings
 from shmio.errors import RecordingError
-from shmio.recorder.attach import Attachments
-from shmio.recorder.follower import Aside, Entry
+from shmio.recorder.attached_files import AttachedFiles
+from shmio.recorder.block_follower import BlockEntry, InstanceEntry
+from shmio.recorder.instance_follower import InstanceFollower, StartPositions
 from shmio.recorder.output import Output, create
 from shmio.recorder.recorder import CLOSE_S, Counters, Recorder
-from shmio.recorder.tap import Start, Tap
-from shmio.recording.format.encoding import Place, Reason
+from shmio.recording.format.encoding import BlockPosition, Reason
 
 FIRST_WAIT_S: Final = 1.0
 MAX_WAIT_S: Final = 600.0
@@ -24,7 +24,7 @@ MAX_WAIT_S: Final = 600.0
 log = logging.getLogger("shmio.recorder")
 
 
-class Series:
+class RotatingRecorder:
     """Takes a new file when the present one is large or old enough, from the entry on with which that ends.
 
     Also when an fsync of a file has failed: of that nobody can say any more what the disk has. Then the new file begins
@@ -34,12 +34,12 @@ class Series:
 
     def __init__(
         self,
-        tap: Tap,
+        tap: InstanceFollower,
         settings: Settings,
         by: str,
-        attachments: Attachments,
+        attachments: AttachedFiles,
         *,
-        places: Mapping[int, Place] | None = None,
+        places: Mapping[int, BlockPosition] | None = None,
         about: Mapping[str, str] | None = None,
         counters: Counters | None = None,
     ) -> None:
@@ -61,8 +61,8 @@ class Series:
 
     def _begin(
         self,
-        tap: Tap,
-        places: Mapping[int, Place] | None,
+        tap: InstanceFollower,
+        places: Mapping[int, BlockPosition] | None,
         about: Mapping[str, str],
         after: Output | None = None,
     ) -> Recorder:
@@ -85,11 +85,11 @@ class Series:
         """Record what has been published; whether there is more at once. RecordingError: the file was removed."""
         return self.recorder.turn()
 
-    def put(self, entries: Iterable[Entry | Aside]) -> None:
+    def put(self, entries: Iterable[BlockEntry | InstanceEntry]) -> None:
         """Record what the tap gave. RecordingError: the file was removed."""
         self.recorder.put(entries)
 
-    def end(self) -> Mapping[int, Place]:
+    def end(self) -> Mapping[int, BlockPosition]:
         """Nothing more comes: have all files closed, however long the disk takes; where it ended, by section."""
         self.recorder.end()
         return self.recorder.places
@@ -100,7 +100,7 @@ class Series:
         return all(recorder.output.ended for recorder in (*self._ending, self.recorder))
 
     @property
-    def tap(self) -> Tap:
+    def tap(self) -> InstanceFollower:
         """What is recorded from: another one after a file that was given up."""
         return self.recorder.tap
 
@@ -172,7 +172,7 @@ class Series:
         about = {"doubtful": output.path.name, "doubtful_from": str(output.synced)}
         tap, places = self.tap, None
         if self._takes:
-            tap = tap.again(Start(doubtful.confirmed, True, Reason.UNSURE))
+            tap = tap.again(StartPositions(doubtful.confirmed, True, Reason.UNSURE))
         else:  # somebody else's, who has no more of what is in doubt
             self.recorder.settle()
             places = self.recorder.places

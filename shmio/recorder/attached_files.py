@@ -16,7 +16,7 @@ MAX_FILE_BYTES: Final = 16 << 20
 log = logging.getLogger("shmio.recorder")
 
 
-class Attachment(NamedTuple):
+class AttachedFile(NamedTuple):
     """A file that goes with a recording."""
 
     name: str
@@ -25,11 +25,11 @@ class Attachment(NamedTuple):
     changed_ns: int = 0
 
 
-Attachments = Callable[[str | None, int], list[Attachment]]
+AttachedFiles = Callable[[str | None, int], list[AttachedFile]]
 """Gives the files to attach: those of the instance for None, those of a source for its name and its block's number."""
 
 
-def no_attachments(_source: str | None, _block: int) -> list[Attachment]:
+def no_attachments(_source: str | None, _block: int) -> list[AttachedFile]:
     """None at all."""
     return []
 
@@ -41,7 +41,7 @@ class ConfigFiles:
         self._file = file
         self._told: set[str] = set()
 
-    def __call__(self, source: str | None, block: int) -> list[Attachment]:
+    def __call__(self, source: str | None, block: int) -> list[AttachedFile]:
         """The configuration itself for None, the layout's sources for a source's block: as they are now."""
         if source is None:
             return self._read("config", [self._file], TOML)
@@ -54,7 +54,7 @@ class ConfigFiles:
         names = [name for layout in layouts for name in ([layout] if isinstance(layout, str) else layout)]
         return self._read(f"sources/{source}/{block}", [config.path(name) for name in names], TEXT)
 
-    def _read(self, folder: str, files: list[Path], media_type: str) -> list[Attachment]:
+    def _read(self, folder: str, files: list[Path], media_type: str) -> list[AttachedFile]:
         found = []
         for file in files:
             try:
@@ -67,7 +67,7 @@ class ConfigFiles:
             if len(data) > MAX_FILE_BYTES:
                 self._tell(f"{file} is not attached: larger than {MAX_FILE_BYTES} bytes")
                 continue
-            found.append(Attachment(f"{folder}/{file.name}", media_type, data, max(0, changed_ns)))
+            found.append(AttachedFile(f"{folder}/{file.name}", media_type, data, max(0, changed_ns)))
         return found
 
     def _tell(self, why: str) -> None:

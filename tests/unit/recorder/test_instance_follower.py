@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from shmio.recorder import attach
+from shmio.recorder import attached_files, instance_follower
 from shmio.recorder import recorder as recorder_module
-from shmio.recorder import tap as tap_module
-from shmio.recorder.attach import Attachment
-from shmio.recorder.tap import Tap, Watch
-from shmio.recording.format.encoding import Life, ProcessChange, decode_process, encode_json
+from shmio.recorder.attached_files import AttachedFile
+from shmio.recorder.instance_follower import InstanceFollower, ProcessWatch
+from shmio.recording.format.encoding import ProcessChange, ProcessEvent, decode_process, encode_json
 from shmio.recording.reading.reader import Reader
 from shmio.segment import Activity, ProcessSpec, Report, Segment
 from shmio.segment.processes import Phase, ProcessSlot, Supervised
@@ -24,13 +23,13 @@ def to(slot: ProcessSlot, phase: Phase, pid: int, restarts: int = 0, why: str = 
     slot.supervised = Supervised(phase, restarts, 0, why)
 
 
-def told(watch: Watch) -> list[tuple[str, str, int, str]]:
+def told(watch: ProcessWatch) -> list[tuple[str, str, int, str]]:
     return [(change.name, change.what, change.pid, change.why) for change in watch.look()]
 
 
 def test_a_life_is_told(segment: Segment) -> None:
     slot = segment.processes.find("cell")
-    watch = Watch(segment)
+    watch = ProcessWatch(segment)
     to(slot, Phase.STARTING, 7)
     assert told(watch) == []
     to(slot, Phase.RUNNING, 7)
@@ -53,7 +52,7 @@ def test_a_life_is_told(segment: Segment) -> None:
 def test_one_whose_end_was_over_between_two_looks_is_told(segment: Segment) -> None:
     slot = segment.processes.find("cell")
     to(slot, Phase.RUNNING, 7)
-    watch = Watch(segment)
+    watch = ProcessWatch(segment)
     to(slot, Phase.STARTING, 7, 1, "killed by SIGKILL")
     assert told(watch) == [("cell", "died", 7, "killed by SIGKILL")]
     to(slot, Phase.RUNNING, 8, 1)
@@ -69,7 +68,7 @@ def test_one_whose_end_was_over_between_two_looks_is_told(segment: Segment) -> N
 def test_a_process_that_a_reload_takes_out_or_adds_is_told(segment: Segment) -> None:
     slot = segment.processes.find("cell")
     to(slot, Phase.RUNNING, 7)
-    watch = Watch(segment)
+    watch = ProcessWatch(segment)
     segment.processes.remove(slot)
     to(segment.processes.add(ProcessSpec("press", "source")), Phase.RUNNING, 9)
     assert told(watch) == [("cell", "removed", 7, ""), ("press", "started", 9, "")]
@@ -78,7 +77,7 @@ def test_a_process_that_a_reload_takes_out_or_adds_is_told(segment: Segment) -> 
 def test_a_recording_says_how_processes_are_and_what_happens_to_them(
     segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tap_module, "TURN_S", 0.0)
+    monkeypatch.setattr(instance_follower, "TURN_S", 0.0)
     slot = segment.processes.find("cell")
     to(slot, Phase.RUNNING, 7)
     work = recorder(segment, tmp_path)
@@ -89,15 +88,15 @@ def test_a_recording_says_how_processes_are_and_what_happens_to_them(
     assert work.close()
     found = changes(work.output.path)
     assert found == [
-        ProcessChange("cell", "source", 7, Life.IS, "", 0),
-        ProcessChange("cell", "source", 7, Life.DIED, "killed by SIGKILL", 0),
+        ProcessChange("cell", "source", 7, ProcessEvent.IS, "", 0),
+        ProcessChange("cell", "source", 7, ProcessEvent.DIED, "killed by SIGKILL", 0),
     ]
 
 
 def test_what_there_was_no_room_for_is_how_things_stand_afterwards(
     segment: Segment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(tap_module, "TURN_S", 0.0)
+    monkeypatch.setattr(instance_follower, "TURN_S", 0.0)
     slot = segment.processes.find("cell")
     work = recorder(segment, tmp_path)
     work.turn()
@@ -108,7 +107,7 @@ def test_what_there_was_no_room_for_is_how_things_stand_afterwards(
     work.turn()
     assert work.close()
     found = changes(work.output.path)
-    assert found == [ProcessChange("cell", "source", 7, Life.IS, "", 0)]
+    assert found == [ProcessChange("cell", "source", 7, ProcessEvent.IS, "", 0)]
 
 
 def test_a_configuration_that_changes_is_attached_again(
@@ -118,8 +117,8 @@ def test_a_configuration_that_changes_is_attached_again(
     texts = [b"one", b"one", b"two", b"two", b""]
     now = [texts[0]]
 
-    def attachments(source: str | None, _: int) -> list[Attachment]:
-        config = Attachment("config/supervisor.toml", "application/toml", now[0], 5)
+    def attachments(source: str | None, _: int) -> list[AttachedFile]:
+        config = AttachedFile("config/supervisor.toml", "application/toml", now[0], 5)
         return [config] if source is None and now[0] else []
 
     work = recorder(segment, tmp_path, attachments=attachments)
@@ -139,9 +138,9 @@ def test_a_configuration_that_changes_is_attached_again(
 def test_the_largest_file_is_attached_and_a_larger_one_is_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(attach, "MAX_FILE_BYTES", 10)
+    monkeypatch.setattr(attached_files, "MAX_FILE_BYTES", 10)
     file = tmp_path / "supervisor.toml"
-    files = attach.ConfigFiles(file)
+    files = attached_files.ConfigFiles(file)
     file.write_bytes(bytes(10))
     assert [(one.name, one.data) for one in files(None, 0)] == [("config/supervisor.toml", bytes(10))]
     file.write_bytes(bytes(11))
@@ -151,7 +150,7 @@ def test_the_largest_file_is_attached_and_a_larger_one_is_not(
 
 
 def test_behind_many_entries_the_next_turn_comes_sooner(segment: Segment) -> None:
-    tap = Tap(segment)
+    tap = InstanceFollower(segment)
     tap.take()
     calm_s = tap.pause_s
     publish(segment.writer("cell"), 1)
@@ -169,5 +168,5 @@ def test_what_is_no_change_is_refused(data: bytes) -> None:
 
 
 def test_a_change_comes_out_as_it_went_in() -> None:
-    change = ProcessChange("cell", "source", 7, Life.DIED, "grün", 3)
+    change = ProcessChange("cell", "source", 7, ProcessEvent.DIED, "grün", 3)
     assert decode_process(encode_json(change)) == change

@@ -5,29 +5,29 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Generic, NamedTuple, TypeVar
 
-from shmio.recorder.selection import Part
-from shmio.recording.format.encoding import Gap, Place, ProcessChange, Reason, StepMark
+from shmio.recorder.selection import RecordedRegisters
+from shmio.recording.format.encoding import BlockPosition, Gap, ProcessChange, Reason, StepMark
 from shmio.segment import Block, Cursor, Event, Frame
 
 Item = TypeVar("Item", bound=Frame | Event)
 
 
-class Entry(NamedTuple):
+class BlockEntry(NamedTuple):
     """Something of a block that is to be recorded, with the time it has there."""
 
     log_ns: int
-    follower: Follower
+    follower: BlockFollower
     item: Frame | Event | Gap
 
 
-class Aside(NamedTuple):
+class InstanceEntry(NamedTuple):
     """Something of the instance that is to be recorded, with the time it has there."""
 
     log_ns: int
     item: StepMark | ProcessChange
 
 
-class _Side(Generic[Item]):
+class _Stream(Generic[Item]):
     """The frames, or the events."""
 
     def __init__(self, what: str, cursor: Cursor[Item], log_ns: int, reason: Reason) -> None:
@@ -44,19 +44,19 @@ class _Side(Generic[Item]):
         return self.held
 
 
-class Follower:
+class BlockFollower:
     """Follows one block. ``done`` when a reload has ended the block and all of it was taken."""
 
     def __init__(
         self,
         block: Block,
         number: int,
-        place: Place,
+        place: BlockPosition,
         reason: Reason,
         log_time: Callable[[int], int],
         *,
         over: bool = False,
-        part: Part | None = None,
+        part: RecordedRegisters | None = None,
     ) -> None:
         """``number``: of the block in the recording. ``reason``: why something may be missing at the beginning.
 
@@ -67,14 +67,14 @@ class Follower:
         self.number = number
         self.begin = place
         self.over = over
-        self.part = part or Part(block.layout)
+        self.part = part or RecordedRegisters(block.layout)
         self.done = False
         self._log_time = log_time
         self._log_ns = place.log_ns
-        self._frames = _Side("frames", block.cursor(after=place.frame), place.log_ns, reason)
-        self._events = _Side("events", block.events.cursor(after=place.event), place.log_ns, reason)
+        self._frames = _Stream("frames", block.cursor(after=place.frame), place.log_ns, reason)
+        self._events = _Stream("events", block.events.cursor(after=place.event), place.log_ns, reason)
 
-    def take(self, limit: int) -> Iterator[Entry]:
+    def take(self, limit: int) -> Iterator[BlockEntry]:
         """At most about so many entries that are there by now."""
         retired = self.block.retired  # before looking: what was published before the end is still read
         for _ in range(limit):
@@ -85,13 +85,13 @@ class Follower:
                 return
             yield from self._entries(side)
 
-    def rest(self) -> Iterator[Entry]:
+    def rest(self) -> Iterator[BlockEntry]:
         """Gaps at the end, which no later entry has shown."""
         for side in (self._frames, self._events):
             if side.cursor.last > side.last and side.held is None:
-                yield Entry(self._log_ns, self, self._gap(side, side.cursor.last, 0))
+                yield BlockEntry(self._log_ns, self, self._gap(side, side.cursor.last, 0))
 
-    def _next(self) -> _Side[Frame] | _Side[Event] | None:
+    def _next(self) -> _Stream[Frame] | _Stream[Event] | None:
         """The side whose entry comes first."""
         frame = self._frames.peek()
         event = self._events.peek()
@@ -101,17 +101,17 @@ class Follower:
             frame = self._frames.peek()  # it was published between the two looks
         return self._events if frame is None or event.frame < frame.number else self._frames
 
-    def _entries(self, side: _Side[Frame] | _Side[Event]) -> Iterator[Entry]:
+    def _entries(self, side: _Stream[Frame] | _Stream[Event]) -> Iterator[BlockEntry]:
         item = side.held
         assert item is not None  # noqa: S101  _next has looked
         # Never back: the order of one block is that of its numbers, whatever its clock does.
         self._log_ns = log_ns = max(self._log_ns, self._log_time(self.block.clock.monotonic_ns(item.clock_ns)))
         if item.number > side.last + 1:
-            yield Entry(log_ns, self, self._gap(side, item.number - 1, log_ns))
+            yield BlockEntry(log_ns, self, self._gap(side, item.number - 1, log_ns))
         side.held, side.last, side.log_ns, side.reason = None, item.number, log_ns, Reason.OVERTAKEN
-        yield Entry(log_ns, self, item)
+        yield BlockEntry(log_ns, self, item)
 
-    def _gap(self, side: _Side[Frame] | _Side[Event], last: int, before_ns: int) -> Gap:
+    def _gap(self, side: _Stream[Frame] | _Stream[Event], last: int, before_ns: int) -> Gap:
         first = side.last + 1
         return Gap(
             self.block.source,

@@ -6,18 +6,18 @@ import time
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Final, NamedTuple
 
-from shmio.recorder.follower import Aside, Entry, Follower
+from shmio.recorder.block_follower import BlockEntry, BlockFollower, InstanceEntry
 from shmio.recorder.selection import Selection
-from shmio.recording.format.encoding import Life, Place, ProcessChange, Reason, StepMark
+from shmio.recording.format.encoding import BlockPosition, ProcessChange, ProcessEvent, Reason, StepMark
 from shmio.segment import Block, Segment
 from shmio.segment.clock import ClockState
 from shmio.segment.events import EVENT_SIZE
 from shmio.segment.processes import Phase, ProcessSlot
 
-_DOWN: Final[Mapping[Phase, Life]] = {Phase.BACKOFF: Life.DIED, Phase.FATAL: Life.GAVE_UP}
+_DOWN: Final[Mapping[Phase, ProcessEvent]] = {Phase.BACKOFF: ProcessEvent.DIED, Phase.FATAL: ProcessEvent.GAVE_UP}
 
 
-class _State(NamedTuple):
+class _ProcessState(NamedTuple):
     """A process at one look."""
 
     kind: str
@@ -27,7 +27,7 @@ class _State(NamedTuple):
     why: str
 
 
-class Watch:
+class ProcessWatch:
     """Compares the table with what it was at the last look. An end is told however soon the process is back."""
 
     def __init__(self, segment: Segment) -> None:
@@ -40,7 +40,7 @@ class Watch:
         changes = []
         for name, old in before.items():
             if name not in self._known:
-                changes.append(_change(name, old, Life.REMOVED))
+                changes.append(_change(name, old, ProcessEvent.REMOVED))
         for name, now in self._known.items():
             changes += _between(name, before.get(name), now)
         return changes
@@ -49,36 +49,36 @@ class Watch:
         """What runs, or fails to, as of the last look."""
         found = []
         for name, state in self._known.items():
-            what = Life.IS if state.phase is Phase.RUNNING else _DOWN.get(state.phase)
+            what = ProcessEvent.IS if state.phase is Phase.RUNNING else _DOWN.get(state.phase)
             if what is not None:
                 found.append(_change(name, state, what))
         return found
 
-    def _now(self) -> dict[str, _State]:
+    def _now(self) -> dict[str, _ProcessState]:
         return {slot.name: _state(slot) for slot in self._segment.processes}
 
 
-def _state(slot: ProcessSlot) -> _State:
+def _state(slot: ProcessSlot) -> _ProcessState:
     told = slot.supervised
-    return _State(slot.kind, told.phase, slot.report.pid, told.restarts, told.note)
+    return _ProcessState(slot.kind, told.phase, slot.report.pid, told.restarts, told.note)
 
 
-def _change(name: str, state: _State, what: Life) -> ProcessChange:
+def _change(name: str, state: _ProcessState, what: ProcessEvent) -> ProcessChange:
     return ProcessChange(name, state.kind, state.pid, what, state.why, state.restarts)
 
 
-def _between(name: str, old: _State | None, now: _State) -> Iterator[ProcessChange]:
+def _between(name: str, old: _ProcessState | None, now: _ProcessState) -> Iterator[ProcessChange]:
     phase = old.phase if old else Phase.STOPPED
     again = now.phase is Phase.STARTING or (old is not None and now.restarts > old.restarts)
     if old and phase is Phase.RUNNING and again and now.phase not in _DOWN:
         crashed = now.restarts > old.restarts and now.why  # one that was told to begin anew leaves no reason
-        yield _change(name, old._replace(why=now.why), Life.DIED if crashed else Life.ENDED)
+        yield _change(name, old._replace(why=now.why), ProcessEvent.DIED if crashed else ProcessEvent.ENDED)
     if now.phase in _DOWN and now.phase is not phase:
         yield _change(name, now, _DOWN[now.phase])
     if now.phase is Phase.RUNNING and (old is None or phase is not Phase.RUNNING or now.pid != old.pid):
-        yield _change(name, now._replace(why=""), Life.STARTED)
+        yield _change(name, now._replace(why=""), ProcessEvent.STARTED)
     if now.phase is Phase.STOPPED and phase is not Phase.STOPPED:
-        yield _change(name, now, Life.ENDED)
+        yield _change(name, now, ProcessEvent.ENDED)
 
 
 TURN_S: Final = 0.1
@@ -88,47 +88,49 @@ BATCH_BYTES: Final = 2 << 20
 """About as much of one block in one turn; what is left comes in the next, at once."""
 
 
-class Start(NamedTuple):
+class StartPositions(NamedTuple):
     """Where to begin: behind these places, by section; blocks without one at their first frame, or at the present."""
 
-    places: Mapping[int, Place] = {}
+    places: Mapping[int, BlockPosition] = {}
     first: bool = True
     reason: Reason = Reason.NOT_RUNNING
     """Why something may be missing at the beginning."""
 
 
-FROM_THE_FIRST: Final = Start()
+FROM_THE_FIRST: Final = StartPositions()
 
 
-class Tap:
+class InstanceFollower:
     """Takes from the blocks of a segment what they publish, each entry once. Use from one thread.
 
     Blocks that a reload adds or puts in the place of others are followed too. Files may follow each other on one tap:
     nothing is lost between them.
     """
 
-    def __init__(self, segment: Segment, start: Start = FROM_THE_FIRST, selection: Selection | None = None) -> None:
+    def __init__(
+        self, segment: Segment, start: StartPositions = FROM_THE_FIRST, selection: Selection | None = None
+    ) -> None:
         """``selection``: what of it; default: all."""
         self.segment = segment
         self.start = start
-        self.followers: list[Follower] = []
+        self.followers: list[BlockFollower] = []
         """Of the blocks that are there, or whose end has not been taken yet."""
         self.done = 0
         """The last step of virtual time of which all has been taken."""
         self._selection = selection or Selection()
         self._watched: set[str] = set()
-        self._watching: list[Follower] = []
+        self._watching: list[BlockFollower] = []
         self._seen: set[int] = set()
         """Sections whose blocks are followed, were, or need not be."""
         self._blocks = 0
         self._lively = False
-        self._watch = Watch(segment)
+        self._watch = ProcessWatch(segment)
         self._watched_s = time.monotonic()
         self._follow(start)
 
-    def again(self, start: Start) -> Tap:
+    def again(self, start: StartPositions) -> InstanceFollower:
         """Another tap of the same that is to be recorded, from elsewhere on."""
-        tap = Tap(self.segment, start, self._selection)
+        tap = InstanceFollower(self.segment, start, self._selection)
         tap.done = self.done
         return tap
 
@@ -144,8 +146,8 @@ class Tap:
                 self._watch_block(block)
 
     def _watch_block(self, block: Block) -> None:
-        place = Place(block.ring.head(), block.events.head())
-        self._watching.append(Follower(block, 0, place, Reason.OVERTAKEN, self.log_time))
+        place = BlockPosition(block.ring.head(), block.events.head())
+        self._watching.append(BlockFollower(block, 0, place, Reason.OVERTAKEN, self.log_time))
 
     def log_time(self, monotonic_ns: int) -> int:
         """Time in a recording, UTC by the instance's start: it goes on evenly whatever is done to the wall clock."""
@@ -156,13 +158,13 @@ class Tap:
         """The time in a recording now."""
         return self.log_time(time.monotonic_ns())
 
-    def take(self) -> tuple[list[Entry | Aside], bool]:
+    def take(self) -> tuple[list[BlockEntry | InstanceEntry], bool]:
         """What has been published, in order; whether there is more at once."""
         state = self.segment.clock.read()  # before looking: what was published for the step that is done is there
         self.segment.refresh()
         if self.segment.blocks is not self._known:
             self._follow(FROM_THE_FIRST)
-        entries: list[Entry | Aside] = []
+        entries: list[BlockEntry | InstanceEntry] = []
         more, most = False, 0
         for follower in (*self.followers, *self._watching):
             batch = max(16, BATCH_BYTES // (follower.block.layout.size + EVENT_SIZE))
@@ -184,15 +186,15 @@ class Tap:
             entries += self._asides(self._watch.look())
         return entries, more
 
-    def standing(self) -> list[Aside]:
+    def standing(self) -> list[InstanceEntry]:
         """How the processes are at present."""
         return self._asides(self._watch.standing())
 
-    def _asides(self, changes: Iterable[ProcessChange]) -> list[Aside]:
+    def _asides(self, changes: Iterable[ProcessChange]) -> list[InstanceEntry]:
         now_ns = self.now()
-        return [Aside(now_ns, change) for change in changes]
+        return [InstanceEntry(now_ns, change) for change in changes]
 
-    def rest(self) -> list[Entry]:
+    def rest(self) -> list[BlockEntry]:
         """What was missed at the very end, which no later entry has shown: there will be none."""
         return [entry for follower in self.followers for entry in follower.rest()]
 
@@ -204,15 +206,15 @@ class Tap:
             [TURN_S / 10 if self._lively else TURN_S, *(ring.slot_count * ring.period_ns / 8e9 for ring in rings)]
         )
 
-    def _step(self, state: ClockState) -> list[Aside]:
+    def _step(self, state: ClockState) -> list[InstanceEntry]:
         """The end of this step, of which all has been taken, and of those before it."""
         self.done = state.done
         if state.done != state.step or not state.dt_ns:  # nobody tells how far that one went
             return []
         log_ns = self.log_time(self.segment.clock.monotonic_ns(state.time_ns))
-        return [Aside(log_ns, StepMark(state.step, state.time_ns, state.dt_ns))]
+        return [InstanceEntry(log_ns, StepMark(state.step, state.time_ns, state.dt_ns))]
 
-    def _follow(self, start: Start) -> None:
+    def _follow(self, start: StartPositions) -> None:
         """Follow what is not followed yet: blocks that a reload has ended, too, unless all they have is recorded."""
         self._known = self.segment.blocks
         ended = self.segment.ended
@@ -228,9 +230,11 @@ class Tap:
             place = start.places.get(block.section)
             reason = start.reason if place or start.first else Reason.OVERTAKEN
             if place is None:
-                place = Place() if start.first else Place(block.ring.head(), block.events.head())
+                place = BlockPosition() if start.first else BlockPosition(block.ring.head(), block.events.head())
             over = block in ended
             if over and (place.frame, place.event) == (block.ring.head(), block.events.head()):
                 continue
             self._blocks += 1
-            self.followers.append(Follower(block, self._blocks, place, reason, self.log_time, over=over, part=part))
+            self.followers.append(
+                BlockFollower(block, self._blocks, place, reason, self.log_time, over=over, part=part)
+            )
