@@ -1,6 +1,6 @@
 """shmio: shared-memory I/O for digital twins of multi-robot cells.
 
-A local program begins with :func:`attach`, one that looks into recordings with :func:`open_dump`.
+Programs on the same host start with :func:`attach`; :func:`open_dump` reads recordings.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ __all__ = ["__version__", "attach", "open_dump"]
 
 
 def __getattr__(name: str) -> Any:
-    """Import them when they are first asked for: most processes of an instance do without."""
+    """Import a public function on first use: most processes of an instance need neither."""
     if name == "attach":
         from shmio.local.attach import attach  # noqa: PLC0415
 

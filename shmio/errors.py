@@ -1,4 +1,4 @@
-"""Every error shmio raises on purpose, with one root.
+"""All errors that shmio raises on purpose, below one root class.
 
 ::
 
@@ -11,24 +11,24 @@
     ├── WrongInstanceError the running instance of this name was started from another configuration file
     ├── SegmentError       the shared memory cannot be used
     │   ├── NotRunningError      no running instance of that name
-    │   │   └── UnfinishedError      its segment is just being made, or its maker died
+    │   │   └── UnfinishedError      the segment is incomplete: in creation, or its creator died
     │   ├── AlreadyRunningError  another supervisor holds the instance
     │   └── FormatError          the segment's format is not one this version knows
     ├── CommandError       a command cannot be sent to its source, or was not carried out
-    ├── TimeError          time cannot be moved, or a step failed
+    ├── TimeError          the instance's clock cannot be moved, or a step failed
     ├── QualityError       the value exists but is not good
     ├── ConnectorError     the device did not answer as it should; carries a reason code
     ├── ModelError         a simulation model is declared wrongly, or its code failed; names it, and the line
-    ├── RecordingError     a recording cannot be written, or is none that this version can read
-    ├── MissingLibraryError  an optional library is not installed; names the command that does it
+    ├── RecordingError     a recording cannot be written, or this version cannot read it
+    ├── MissingLibraryError  an optional library is not installed; names the command for it
     ├── EndpointError      an address cannot be served
     ├── RemoteError        an instance cannot be reached by gRPC, or does not answer as it should
-    │   ├── LostError            nothing serves there at present; it may come back
-    │   └── UnknownClientError   it wants to know who asks
+    │   ├── LostError            nothing serves this address at present; it may come back
+    │   └── UnknownClientError   the endpoint requires a known client
     └── ControlError       the supervisor refused or did not answer
         └── UnreachableError     its socket cannot be connected to
 
-The command-line tools print the message of any of these as one line and exit with status 1.
+The command-line tools print the message of any of these errors and exit with status 1.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ class ConfigError(ShmioError):
 class LayoutError(ShmioError):
     """A layout source cannot be compiled; ``str()`` is one line for each diagnostic.
 
-    ``diagnostics`` holds them as objects with file, line and column, warnings included; it is empty when the
-    error is not about a source text.
+    ``diagnostics`` holds them as objects with file, line and column, warnings included.
+    It is empty when the error is not about a source text.
     """
 
     def __init__(self, message: str, diagnostics: Sequence[Diagnostic] = ()) -> None:
@@ -76,7 +76,7 @@ class ConflictError(ShmioError):
 
 
 class WrongInstanceError(ShmioError):
-    """An instance of this name runs, but not from the given configuration file; the message has both paths."""
+    """The running instance of this name has another configuration file; the message names both."""
 
 
 class SegmentError(ShmioError):
@@ -88,7 +88,7 @@ class NotRunningError(SegmentError):
 
 
 class UnfinishedError(NotRunningError):
-    """The instance's segment is just being made, or its maker died before it was whole."""
+    """The instance's segment is incomplete: it is being created, or its creator died."""
 
 
 class AlreadyRunningError(SegmentError):
@@ -100,11 +100,17 @@ class FormatError(SegmentError):
 
 
 class CommandError(ShmioError):
-    """A command cannot be sent to its source, or the source or its device did not carry it out; says which and why."""
+    """A command could not be sent, or was not carried out by the source or its device.
+
+    The message says which, and why.
+    """
 
 
 class TimeError(ShmioError):
-    """Another program moves time, or a step failed; names who it is, or who did not answer, and why."""
+    """Another program controls the instance's clock, or a step failed.
+
+    The message names that program, or what did not answer, and the reason.
+    """
 
 
 class QualityError(ShmioError):
@@ -114,7 +120,8 @@ class QualityError(ShmioError):
 class ConnectorError(ShmioError):
     """The device is absent or did not answer as the protocol demands.
 
-    The base loop drops the connection on any of these. ``str()`` becomes the frame's reason text.
+    The connectors' base loop closes the connection on this error. ``str()`` becomes the frame's
+    reason text.
     """
 
 
@@ -127,23 +134,26 @@ class EndpointError(ShmioError):
 
 
 class ModelError(ShmioError):
-    """A simulation model is declared wrongly, or its code failed; the message has the model's name, and the line."""
+    """A simulation model is declared wrongly, or its code failed; the message has name and line."""
 
 
 class RemoteError(ShmioError):
-    """An instance's endpoint cannot be reached, does not let us in, or does not answer as it should; names it."""
+    """An instance's endpoint is unreachable, refuses the client, or answers unexpectedly.
+
+    The message names the endpoint.
+    """
 
 
 class LostError(RemoteError):
-    """Nothing serves at this address, or the connection to it was lost; it may come back."""
+    """Nothing serves this address, or the connection was lost; it may come back."""
 
 
 class UnknownClientError(RemoteError):
-    """The endpoint wants a token, and was shown none, or one that it does not know."""
+    """The endpoint requires a token, and the client presented none or an unknown one."""
 
 
 class RecordingError(ShmioError):
-    """A recording cannot be written, or a file is no recording that this version can read; names the file."""
+    """A recording cannot be written, or this version cannot read it; the message names the file."""
 
 
 class ControlError(ShmioError):

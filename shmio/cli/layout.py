@@ -12,7 +12,7 @@ from shmio.cli.run import add_json, complete, dumps, run
 from shmio.errors import ConfigError, LayoutError
 from shmio.layout.compiler import Program, Source
 from shmio.layout.document import describe
-from shmio.layout.image import complaints
+from shmio.layout.image import initial_value_warnings
 from shmio.layout.model import MAX_BLOCK_BYTES, Layout, Register
 from shmio.layout.source.lexer import MAX_SOURCE_BYTES
 from shmio.logs import printable
@@ -93,7 +93,7 @@ def _complain(lines: Iterable[object]) -> None:
 
 def _unread(layout: Layout) -> Iterator[str]:
     """Say which initial values mean nothing here; an emulated PLC would start without them."""
-    for text in complaints(layout):
+    for text in initial_value_warnings(layout):
         yield f"{layout.name}: warning: {text}"
 
 

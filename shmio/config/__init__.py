@@ -1,4 +1,4 @@
-"""``supervisor.toml``: read, checked, resolved (architecture: *Config*)."""
+"""Read, check and resolve ``supervisor.toml`` (architecture: *Config*)."""
 
 from shmio.config.address import Address, UnixAddress, parse_address
 from shmio.config.model import Config, Declaration, Emulator, Grpc, Instance, Recorder, Source, Tls, Token, Trigger

@@ -11,19 +11,19 @@ from shmio.errors import ConfigError
 
 UNIX: Final = "unix:"
 MAX_PATH_BYTES: Final = 107
-"""Of a UNIX socket: sun_path holds 108 with the final zero, unix(7)."""
+"""Longest path of a UNIX socket: sun_path holds 108 bytes with the final zero, unix(7)."""
 
 
 @dataclass(frozen=True, slots=True)
 class Address:
-    """A host name or literal, and a TCP port (0: any free one)."""
+    """A host name or IP address, and a TCP port (0: any free port)."""
 
     host: str
     port: int
 
     @classmethod
     def parse(cls, text: str) -> Address:
-        """Read ``127.0.0.1:8089``, ``localhost:0`` or ``[::1]:8089``; ConfigError otherwise."""
+        """Parse ``127.0.0.1:8089``, ``localhost:0`` or ``[::1]:8089``; ConfigError otherwise."""
         host, colon, port = text.rpartition(":")
         if host.startswith("[") and host.endswith("]"):
             host = host[1:-1]
@@ -38,7 +38,7 @@ class Address:
 
     @property
     def loopback(self) -> bool:
-        """Whether only this machine can reach it. A name other than ``localhost`` is not trusted to be."""
+        """Whether only this machine can reach the address; of names, only ``localhost`` counts."""
         if self.host == "localhost":
             return True
         try:
@@ -49,13 +49,13 @@ class Address:
 
 @dataclass(frozen=True, slots=True)
 class UnixAddress:
-    """A UNIX socket, by its file."""
+    """The path of a UNIX socket."""
 
     path: str
 
     @classmethod
     def parse(cls, text: str) -> UnixAddress:
-        """Read ``unix:PATH``, or ``unix:///PATH`` as gRPC writes it; ConfigError otherwise."""
+        """Parse ``unix:PATH``, or ``unix:///PATH`` as gRPC writes it; ConfigError otherwise."""
         path = text.removeprefix(UNIX)
         if path.startswith("//"):
             path = path[2:]
@@ -70,10 +70,10 @@ class UnixAddress:
 
     @property
     def loopback(self) -> bool:
-        """Only this machine can reach it."""
+        """Always True: only this machine can reach a UNIX socket."""
         return True
 
 
 def parse_address(text: str) -> Address | UnixAddress:
-    """Read either; ConfigError otherwise."""
+    """Parse ``host:port`` or ``unix:PATH``; ConfigError otherwise."""
     return UnixAddress.parse(text) if text.startswith(UNIX) else Address.parse(text)

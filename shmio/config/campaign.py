@@ -1,4 +1,4 @@
-"""Files of declared injections that are not a configuration: campaigns for ``shmio inject --file``."""
+"""Campaigns: files of declared injections for ``shmio inject --file``."""
 
 from __future__ import annotations
 
@@ -14,13 +14,18 @@ from shmio.errors import ConfigError
 
 
 class Campaign(Section):
-    """The whole file."""
+    """The contents of a campaign file."""
 
     injection: list[Declaration]
 
 
 def read_campaign(file: Path) -> list[Declaration]:
-    """The ``[[injection]]`` sections of a file that has nothing else; ConfigError names file, key and remedy."""
+    """Read the ``[[injection]]`` sections of a campaign file.
+
+    Raises:
+        ConfigError: The file is invalid; the message names the file, the key and the remedy.
+
+    """
     tables = read_tables(file)
     try:
         return parse_campaign(tables)
@@ -29,7 +34,7 @@ def read_campaign(file: Path) -> list[Declaration]:
 
 
 def parse_campaign(tables: dict[str, Any]) -> list[Declaration]:
-    """The same of tables that are read already, such as ``{"injection": [{"name": …}]}``."""
+    """Check the tables of a campaign, such as ``{"injection": [{"name": …}]}``; ConfigError."""
     if isinstance(tables.get("injection"), dict):
         raise ConfigError("injection: write [[injection]], in two brackets: there can be several")
     check_text(tables, "")

@@ -1,4 +1,4 @@
-"""What holds for declared injections wherever they come from, and files of nothing but these."""
+"""Rules for declared injections that need no layout, whichever file declares them."""
 
 from __future__ import annotations
 
@@ -11,13 +11,20 @@ from shmio.config.model import Declaration
 from shmio.errors import ConfigError
 
 MAX_DECLARATIONS: Final = 256
-"""In one file."""
-MAX_DIMENSIONS: Final = 6  # of an array, as in layout/model.py, which imports from here
+"""Limit for one file."""
+MAX_DIMENSIONS: Final = 6  # of an array; the same as in layout/model.py, which imports shmio.config
 
 
 @dataclass(frozen=True)
 class Keys:
-    """Which keys an operation has: ``needed``, and ``choice``: sets of which exactly one is there, ``free`` ones."""
+    """The keys of an operation.
+
+    Attributes:
+        needed: Required keys.
+        choice: Sets of keys, of which exactly one must be given completely.
+        free: Optional keys.
+
+    """
 
     needed: tuple[str, ...] = ()
     choice: tuple[tuple[str, ...], ...] = ()
@@ -25,7 +32,7 @@ class Keys:
 
     @property
     def known(self) -> set[str]:
-        """All of them."""
+        """All keys of the operation."""
         return {*self.needed, *self.free, *(key for keys in self.choice for key in keys)}
 
 
@@ -45,13 +52,13 @@ _OPERANDS: Final = tuple(dict.fromkeys(key for keys in KEYS.values() for key in 
 
 
 def check_declarations(declarations: Sequence[Declaration]) -> None:
-    """Refuse what no layout could make right; ConfigError with the key ``injection[…]….``."""
+    """Raise ConfigError, with its key ``injection[…]…``, for the first fault no layout can cure."""
     for fault in declaration_faults(declarations):
         raise ConfigError(fault)
 
 
 def declaration_faults(declarations: Sequence[Declaration]) -> Iterator[str]:
-    """What no layout could make right, each with its key."""
+    """Yield each fault that no layout can cure, with its key."""
     if len(declarations) > MAX_DECLARATIONS:
         yield f"injection: {len(declarations)} of them; at most {MAX_DECLARATIONS}"
         return
@@ -60,12 +67,12 @@ def declaration_faults(declarations: Sequence[Declaration]) -> Iterator[str]:
         first = seen.setdefault(declaration.name, index)
         if first != index:
             yield f"injection[{index}].name: {declaration.name!r} is already the name of injection[{first}]"
-        for complaint in complaints(declaration):
-            yield f"injection[{index}].{complaint}"
+        for contradiction in contradictions(declaration):
+            yield f"injection[{index}].{contradiction}"
 
 
-def complaints(declaration: Declaration) -> Iterator[str]:
-    """What contradicts itself in a declaration; each begins with the key."""
+def contradictions(declaration: Declaration) -> Iterator[str]:
+    """Yield each contradiction within a declaration, beginning with the key."""
     operation = declaration.operation
     keys = KEYS[operation]
     given = {key for key in _OPERANDS if getattr(declaration, key) is not None}
@@ -93,7 +100,7 @@ def complaints(declaration: Declaration) -> Iterator[str]:
 
 
 def _fault(value: Any, depth: int = 0) -> str:
-    """Why a value is none that can be sent and compared; empty if it is."""
+    """Return why a value cannot be sent or compared, or an empty string."""
     if isinstance(value, list):
         if depth > MAX_DIMENSIONS:
             return f"lists within more than {MAX_DIMENSIONS} others"

@@ -1,4 +1,4 @@
-"""What is wrong with a configuration, all of it in one go, each with its line: collected here, and bounded."""
+"""Collect all faults of a configuration, each with its line, within a bound."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from shmio.errors import ConfigError, LayoutError
 
 MAX_SHOWN: Final = 1_000
 MAX_CHARACTERS: Final = 500
-"""Of one fault: what it quotes may be as long as the file."""
+"""Limit for one fault, which may quote text as long as the file."""
 _KEY: Final = re.compile(r"[A-Za-z0-9_-]+(?:\[[0-9]+\]|\.[A-Za-z0-9_-]+)*(?=[:\s])")
 _PLACE: Final = re.compile(r"\b(source|emulator|injection)\[([0-9]+)\]")
 
 
 class Faults:
-    """Collects what is wrong with one file. Messages begin with the key that they are about."""
+    """Collects the faults of one file; each message begins with its key."""
 
     def __init__(self, file: Path, tables: Mapping[str, Any], text: str = "") -> None:
         self._file = file
@@ -31,7 +31,7 @@ class Faults:
         self._layout: LayoutError | None = None
         self.count = 0
         self.places: Mapping[str, Sequence[int]] = {}
-        """Where in the file the sections are that are left, when those with faults are left out."""
+        """For each kind of section, the indices in the file of those that are kept."""
 
     @cached_property
     def _lines(self) -> Lines:
@@ -42,11 +42,11 @@ class Faults:
 
     @property
     def full(self) -> bool:
-        """Whether no more are shown: what is costly to say need not be found."""
+        """Whether further faults are only counted, so callers can skip costly checks."""
         return self.count >= MAX_SHOWN
 
     def add(self, message: str) -> None:
-        """Note a fault: ``key: what is wrong``."""
+        """Add a fault, ``key: what is wrong``."""
         if self.full:
             self.count += 1
             return
@@ -66,7 +66,7 @@ class Faults:
 
     @contextmanager
     def catching(self) -> Iterator[None]:
-        """Note what is raised inside, and go on behind."""
+        """Add the ConfigError or LayoutError raised in the ``with`` block instead of raising it."""
         try:
             yield
         except ConfigError as error:
@@ -77,7 +77,7 @@ class Faults:
                 self._note(line)
 
     def raise_any(self) -> None:
-        """ConfigError with a line for each fault, LayoutError if all are of one layout; neither: there is none."""
+        """Raise ConfigError with a line for each fault, or LayoutError if all are of one layout."""
         if not self.count:
             return
         if self._layout is not None and [*self._found] == str(self._layout).splitlines():
@@ -87,7 +87,7 @@ class Faults:
 
 
 def shortened(message: str) -> str:
-    """A message without the middle of what it quotes at length."""
+    """Return a message, with its middle cut out if it is too long."""
     if len(message) <= MAX_CHARACTERS:
         return message
     return f"{message[: MAX_CHARACTERS // 2]} … {message[-MAX_CHARACTERS // 2 :]}"

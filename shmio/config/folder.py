@@ -1,4 +1,7 @@
-"""Whether a folder can be written, found out by writing: permissions alone do not tell of full and read-only disks."""
+"""Check by writing whether a folder is writable.
+
+Permissions alone do not reveal full and read-only disks.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-_PROBE: Final = bytes(4096)  # a file without data has room on a full disk, too
+_PROBE: Final = bytes(4096)  # a file without data fits on a full disk, too
 _FULL: Final = (errno.ENOSPC, errno.EDQUOT)
 _NO_UNNAMED: Final = (errno.EOPNOTSUPP, errno.EISDIR)
 _MEANING: Final = {
@@ -24,16 +27,20 @@ _MEANING: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Obstacle:
-    """Why a folder cannot be written, and what to do. ``full``: there is no room, which may change at any time."""
+    """Why a folder cannot be written, and what to do.
+
+    ``full`` means that the disk has no room, which may change at any time.
+    """
 
     reason: str
     full: bool = False
 
 
 def unwritable(folder: Path) -> Obstacle | None:
-    """Why no file can be made in a folder, which may have to be made first, and what to do; None if one can.
+    """Return why no file can be created in a folder, or None if one can.
 
-    Nothing is left there. The file system may take its time to answer.
+    The folder need not exist yet: then its nearest existing parent is tried. No file is left
+    behind. The call may block on a slow file system.
     """
     try:
         place = next(path for path in (folder, *folder.parents) if path.exists())

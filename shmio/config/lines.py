@@ -1,4 +1,4 @@
-"""Where each key of a TOML text stands, which its parser does not tell; and keys that no parser should be given."""
+"""Find the line of each key of a TOML text, and keys that are too long for the parser."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import re
 from typing import Final
 
 MAX_KEY: Final = 1_000
-"""Characters of a key, all of its dotted parts together."""
+"""Maximum characters of a key, all dotted parts together."""
 MAX_PARTS: Final = 64
-"""Dotted parts of a key: what a parser takes for one grows with their square."""
+"""Maximum dotted parts of a key: the parser's time grows with their square."""
 _TOKEN: Final = re.compile(
     r"""\#[^\n]*|\"\"\"(?:\\.|[^\\])*?(?:\"{3,5}|\Z)|'''.*?(?:'{3,5}|\Z)|"(?:\\.|[^"\\\n])*"?|'[^'\n]*'?"""
     r"""|\[\[|\]\]|[\[\]{}=.,\n]|[^\s"'\#\[\]{}=.,]+""",
@@ -18,27 +18,30 @@ _OPENING, _CLOSING = frozenset(["[", "[[", "{"]), frozenset(["]", "]]", "}"])
 
 
 def too_long(text: str, most: int = MAX_KEY) -> int:
-    """The line of the first key that no parser should be given, of more characters or too many parts; 0: none is."""
+    """Return the line of the first key with too many characters or parts, or 0."""
     if all(len(line) <= most and line.count(".") < MAX_PARTS for line in text.split("\n")):
         return 0
     return Lines(text, most).too_long
 
 
 class Lines:
-    """The line of each key, as messages name it: ``source[0].host``. Made in one pass over the text."""
+    """The line of each key by its name in messages, such as ``source[0].host``.
+
+    One pass over the text finds all keys.
+    """
 
     def __init__(self, text: str, most: int = MAX_KEY) -> None:
         self._most = most
         self._lines: dict[str, int] = {}
         self._counts: dict[str, int] = {}
         self.double: tuple[str, int, int] | None = None
-        """The first key that is there twice, and the lines of both."""
+        """The first duplicate key, and the lines of both occurrences."""
         self.too_long = 0
-        """The line of the first key that is longer than that, where reading ends; 0 if there is none."""
+        """The line of the first key that is too long, where reading ends; 0 if there is none."""
         self._read(text)
 
     def of(self, key: str) -> int:
-        """The line of a key, or else of what it is in; 0 if that is not there either."""
+        """Return the line of a key, or of the innermost table around it that is found, or 0."""
         while key:
             if key in self._lines:
                 return self._lines[key]
@@ -101,7 +104,7 @@ class Lines:
         return table
 
     def _resolve(self, parts: list[str], table: str, last: str | None = None) -> str:
-        """The key of these parts; of several tables of one name the last one is meant."""
+        """Return the key of these parts; of several tables with one name, the last one."""
         key = table
         for part in parts:
             key = f"{key}.{part}" if key else part

@@ -1,4 +1,4 @@
-"""Who may be reached from where: the rules of addresses, tokens and roles."""
+"""Rules for listening addresses, tokens and roles."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _DIGITS: Final = frozenset("0123456789abcdef")
 
 
 def check_listening(config: Config, catching: Callable[[], AbstractContextManager[None]]) -> None:
-    """Addresses, and what may be reached there in plain text; tokens and roles.
+    """Check listening addresses, plain-text access, tokens and roles.
 
-    ``catching``: what makes a context that keeps a ConfigError for later.
+    ``catching`` returns a context manager that collects a ConfigError instead of raising it.
     """
     for index, emulator in enumerate(config.emulator):
         key, remedy = f"emulator[{index}].listen", "insecure = true beside it"
@@ -47,12 +47,15 @@ def resolve(grpc: Grpc, config: Config) -> None:
 
 
 def encrypted(grpc: Grpc, address: Listening) -> bool:
-    """Whether an address of :attr:`Grpc.listening` speaks TLS. A UNIX socket never does: nobody is between."""
+    """Return whether an address of :attr:`Grpc.listening` uses TLS; a UNIX socket needs none."""
     return grpc.tls is not None and not address.insecure and not address.listen.startswith(UNIX)
 
 
 def takes_tokens(grpc: Grpc, address: Listening) -> bool:
-    """Whether tokens may be shown there: nobody else can read them on the way, or it is written down as meant."""
+    """Return whether an address accepts tokens.
+
+    It does if nobody else can read them on the way, or if the configuration allows it explicitly.
+    """
     return encrypted(grpc, address) or parse_address(address.listen).loopback or address.tokens_in_plain_text
 
 

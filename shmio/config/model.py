@@ -1,4 +1,4 @@
-"""The sections of ``supervisor.toml`` as types; what each key means is in docs/reference/config.md."""
+"""The sections of ``supervisor.toml`` as types; docs/reference/config.md explains each key."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ ReplayedInjections = Literal["keep", "leave out"]
 DistributionName = Literal["uniform", "gaussian"]
 OperationName = Literal["set", "offset", "scale", "clamp", "noise", "random", "freeze", "delay", "drop", "flip"]
 TypeBytes = Annotated[dict[Text, Annotated[int, Meta(ge=1, le=1 << 20)]], Meta(max_length=1000)]
-"""Sizes of types whose members are not known, by their names."""
+"""Sizes in bytes of types whose members are unknown, by type name."""
 RealtimePriority = Annotated[int, Meta(ge=1, le=99)]
-"""Of SCHED_FIFO, sched(7)."""
+"""Priority under SCHED_FIFO, sched(7)."""
 
 ROLES = ("read", "write", "inject", "control")
-"""What a client of the gRPC endpoint may be allowed."""
+"""The permissions that clients of the gRPC endpoint can have."""
 
 
 class Instance(Section):
-    """``[instance]``: what holds for all processes."""
+    """``[instance]``: settings for all processes."""
 
     name: Name
     log_dir: Text = "logs"
@@ -43,8 +43,8 @@ class Instance(Section):
 class Source(Section):
     """``[[source]]``: a producer of registers.
 
-    ``options`` are the connector's own keys; ``texts`` those of the ``properties`` file that are not overruled, text
-    there whatever their type. The connector, which knows the types, checks both.
+    ``options`` are the connector's own keys. ``texts`` are the keys of the ``properties`` file that
+    no key overrides, as text whatever their type. The connector knows the types and checks both.
     """
 
     name: Name
@@ -64,17 +64,17 @@ class Source(Section):
 
     @property
     def period_ns(self) -> int:
-        """Time between two cycles."""
+        """Time between two cycles, in ns."""
         return round(self.period_ms * 1_000_000)
 
     @property
     def stale_ns(self) -> int:
-        """Age from which a frame is bad: as configured, else 5 periods and at least 500 ms."""
+        """Age in ns from which a frame is bad: as configured, or 5 periods, at least 500 ms."""
         return round(1_000_000 * (self.stale_ms or max(5 * self.period_ms, 500.0)))
 
 
 class Emulator(Section):
-    """``[[emulator]]``: a process that plays a controller."""
+    """``[[emulator]]``: a process that emulates a controller."""
 
     name: Name
     kind: Text
@@ -89,7 +89,7 @@ class Emulator(Section):
 
 
 class Tls(Section):
-    """PEM files of the endpoint; with ``client_ca`` clients must show a certificate of it."""
+    """``[grpc.tls]``: PEM files; with ``client_ca``, clients must present a certificate of it."""
 
     certificate: Text
     key: Text
@@ -97,7 +97,7 @@ class Tls(Section):
 
 
 class Token(Section):
-    """``[[grpc.token]]``: a bearer token, by the file that holds it or by its hash, and what who shows it may do."""
+    """``[[grpc.token]]``: a bearer token, given by its file or its hash, and its holder's roles."""
 
     name: Name
     roles: Texts
@@ -106,7 +106,7 @@ class Token(Section):
 
 
 class Client(Section):
-    """``[[grpc.client]]``: what clients may do whose certificate has a name that one of the patterns fits."""
+    """``[[grpc.client]]``: the roles of clients whose certificate's name matches a pattern."""
 
     subject: Text | Texts
     roles: Texts
@@ -118,7 +118,7 @@ class Client(Section):
 
 
 class Listening(Section):
-    """``[[grpc.address]]``: an address with roles for clients that show nothing."""
+    """``[[grpc.address]]``: an address with roles for clients without token and certificate."""
 
     listen: Text
     roles: Texts = field(default_factory=lambda: ["read"])
@@ -140,12 +140,12 @@ class Grpc(Section):
 
     @property
     def guarded(self) -> bool:
-        """Whether the addresses of ``listen`` ask who is there."""
+        """Whether the addresses of ``listen`` require a token or a client certificate."""
         return bool(self.token or self.client)
 
     @property
     def listening(self) -> dict[str, Listening]:
-        """All addresses, by the keys that name them; those of ``listen`` with the roles of who shows nothing."""
+        """All addresses by key; those of ``listen`` with the roles of unauthenticated clients."""
         roles = [] if self.guarded else list(ROLES)
         found = {
             f"grpc.listen[{index}]": Listening(
@@ -160,7 +160,7 @@ class Grpc(Section):
 
 
 class Trigger(Section):
-    """``[recorder.trigger]``: record only what happens around the moments when a condition is true."""
+    """``[recorder.trigger]``: record only around the times when a condition is true."""
 
     when: Text
     before_s: Annotated[float, Meta(ge=0, le=3600)] = 10.0
@@ -184,12 +184,12 @@ class Recorder(Section):
 
     @property
     def buffer_bytes(self) -> int:
-        """The most that waits in memory for a disk that is slow or full."""
+        """Maximum bytes that wait in memory for a slow or full disk."""
         return round(self.buffer_mb * 1e6)
 
 
 class Replay(Section):
-    """``[replay]``: what ``--mode replay`` plays in place of the sources."""
+    """``[replay]``: the recording that ``--mode replay`` plays in place of the sources."""
 
     file: Text | Texts | None = None
     start: float | Text | None = None
@@ -202,9 +202,9 @@ class Replay(Section):
 
 
 class Declaration(Section, omit_defaults=True):
-    """``[[injection]]``: an injection that the source's process runs by itself; docs/reference/injections.md.
+    """``[[injection]]``: an injection that the source's process runs; docs/reference/injections.md.
 
-    Which operation takes which keys, and what they must be, is in ``declaration``.
+    The module ``declaration`` has the rules for the keys of each operation.
     """
 
     name: Name
@@ -230,7 +230,7 @@ class Declaration(Section, omit_defaults=True):
 
 
 class Config(Section):
-    """The whole file, with the folder that its paths are relative to."""
+    """The whole configuration, with the folder that its paths are relative to."""
 
     instance: Instance
     source: list[Source] = []
@@ -243,7 +243,7 @@ class Config(Section):
     folder: str = "."
 
     def path(self, text: str) -> Path:
-        """A path of the file as an absolute one."""
+        """Return a path of the configuration as an absolute path."""
         return (Path(self.folder) / text).resolve()
 
     @property

@@ -1,4 +1,4 @@
-"""PEM files, tried by TLS itself, and what is wrong with one in words."""
+"""Load PEM files by TLS itself, and explain errors."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ from shmio.errors import ConfigError
 
 
 def load_pair(context: ssl.SSLContext, certificate: str, key: str, where: str) -> None:
-    """Have a context show this certificate.
+    """Load a certificate and its key into a context.
 
-    ssl.SSLError; ConfigError, beginning with ``where``: it needs a passphrase.
+    Raises:
+        ssl.SSLError: A file is unusable, or the key belongs to another certificate.
+        ConfigError: The key needs a passphrase; the message begins with ``where``.
+
     """
     try:
         context.load_cert_chain(certificate, key, password=_refuse_to_ask)
@@ -19,7 +22,7 @@ def load_pair(context: ssl.SSLContext, certificate: str, key: str, where: str) -
 
 
 def load_authority(context: ssl.SSLContext, name: str, key: str) -> None:
-    """Have a context trust this one. ConfigError, with its key in front."""
+    """Make a context trust the authorities in a file; ConfigError begins with ``key``."""
     try:
         context.load_verify_locations(name)
     except ssl.SSLError as error:
@@ -29,7 +32,7 @@ def load_authority(context: ssl.SSLContext, name: str, key: str) -> None:
 
 
 def detail(error: ssl.SSLError) -> str:
-    """What TLS says of it, to go behind what we say."""
+    """Return TLS's own reason in brackets, to append to a message, or an empty string."""
     return f" ({error.reason})" if error.reason else ""
 
 

@@ -1,4 +1,4 @@
-"""The seed's ``plc.ini``: ``key=value`` lines without sections (D6.5, section 4.2)."""
+"""Properties files such as ``plc.ini``: lines ``key=value`` (D6.5, section 4.2)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,12 @@ MAX_FILE_BYTES = 64 << 10
 def read_properties(file: Path, key: str) -> dict[str, str]:
     """Read a properties file as text values; ``key`` is the section that names it, for messages.
 
-    Blank lines, ``[section]`` lines and lines that begin with ``#``, ``;`` or ``!`` are passed over. ConfigError: no
-    such file, not text, a line that is neither, the same key twice.
+    Blank lines, ``[section]`` lines and lines that begin with ``#``, ``;`` or ``!`` are skipped.
+
+    Raises:
+        ConfigError: The file cannot be read, is too large or not UTF-8, or has an invalid line or
+            a duplicate key.
+
     """
     try:
         with file.open("rb") as stream:

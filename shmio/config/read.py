@@ -1,4 +1,4 @@
-"""From the file to a checked :class:`Config`; every message names the file, the full key and the remedy."""
+"""Read a file into a checked :class:`Config`; each message names file, full key and remedy."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ SECTION_PROCESSES = frozenset({"broker", "grpc", "mqtt", "recorder", "supervisor
 MAX_FILE_BYTES = 1 << 20
 MAX_DEPTH = 64
 MAX_SECTIONS = 1_000
-"""Of one name that are looked at."""
+"""Maximum sections of one name that are checked."""
 MAX_SOURCES = 200
-"""An instance has no more processes."""
+"""Maximum sources of an instance."""
 
 _TABLES: dict[str, type[Section]] = {
     "instance": Instance,
@@ -75,7 +75,7 @@ _SEVERAL = {
     "mqtt.account",
     "mqtt.topic",
 }
-_SLIPPED = re.compile(r"[A-Za-z]:[\x00-\x1f\\]")  # a Windows path in double quotes, whose \t became a tab
+_SLIPPED = re.compile(r"[A-Za-z]:[\x00-\x1f\\]")  # a Windows path in double quotes, \t being a tab
 _DERIVED = ("folder", "options", "texts")  # fields that are no keys of the file
 _Table = TypeVar("_Table", bound=Section)
 
@@ -83,7 +83,10 @@ _Table = TypeVar("_Table", bound=Section)
 def load(file: Path) -> Config:
     """Read, check and resolve a ``supervisor.toml``.
 
-    Raises ConfigError: no such file, not TOML, unknown key, wrong type, a rule of the contract broken; a line for each.
+    Raises:
+        ConfigError: The file cannot be read or is not TOML, or it has unknown keys, values of a
+            wrong type, or breaks other rules. The message has a line for each fault.
+
     """
     found = examine(file)
     found.faults.raise_any()
@@ -91,28 +94,28 @@ def load(file: Path) -> Config:
 
 
 class Examined(NamedTuple):
-    """A configuration without the sections in which something is wrong, and what that is."""
+    """A configuration without its faulty sections, and the faults."""
 
     config: Config
     faults: Faults
     broken: dict[int, tuple[str, dict[str, Any], dict[str, str]]]
-    """Of the sources that are left out, by their places: connector, and its own keys, inline and of its properties."""
+    """The omitted sources by index: connector, its own keys, and those of the properties file."""
 
 
 def examine(file: Path) -> Examined:
-    """Read a ``supervisor.toml`` and find all that is wrong with it; ConfigError: it cannot be read at all."""
+    """Read a ``supervisor.toml`` and collect all its faults; ConfigError if it cannot be parsed."""
     text = read_text(file)
     tables = parse(file, text)
     return _examine(tables, file.resolve().parent, Faults(file, tables, text))
 
 
 def read_tables(file: Path) -> dict[str, Any]:
-    """The file's TOML, unchecked; ConfigError."""
+    """Parse a TOML file without checking its keys; ConfigError."""
     return parse(file, read_text(file))
 
 
 def read_text(file: Path) -> str:
-    """The file's text; ConfigError."""
+    """Return a file's text; ConfigError if it is unreadable, too large, or not UTF-8."""
     try:
         with file.open("rb") as stream:
             data = stream.read(MAX_FILE_BYTES + 1)
@@ -131,12 +134,12 @@ def read_text(file: Path) -> str:
 
 
 def parse(file: Path, text: str) -> dict[str, Any]:
-    """The tables of a text; ConfigError: not TOML, or keys that no parser should be given."""
+    """Parse TOML text; ConfigError if it is not TOML, or its keys or nesting are excessive."""
     if line := too_long(text):
         raise ConfigError(f"{file}:{line}: a key is longer than {MAX_KEY} characters or {MAX_PARTS} parts")
     try:
         tables = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # a TOMLDecodeError, or a number that int() does not take
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError, or a number too long for int()
         raise ConfigError(f"{file}: not TOML: {explain_toml(error, text)}") from None
     if _depth(tables) > MAX_DEPTH:
         raise ConfigError(f"{file}: tables and lists are nested more than {MAX_DEPTH} deep")
@@ -144,7 +147,7 @@ def parse(file: Path, text: str) -> dict[str, Any]:
 
 
 def _depth(value: Any) -> int:
-    """How deep tables and lists are nested; without recursion, for they may be nested deeper than that goes."""
+    """Return how deep tables and lists are nested, without recursion, which depth could exhaust."""
     depth, level = 0, [value]
     while level and depth <= MAX_DEPTH:
         depth += 1
@@ -172,7 +175,7 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
     config = convert({**sound, "folder": str(folder)}, Config)
     for fault in _name_faults(config):
         faults.add(fault)
-    if not faults:  # what refers to another section may refer to one that is left out, or named otherwise
+    if not faults:  # otherwise, references to other sections may point to one that was omitted
         for fault in _reference_faults(config):
             faults.add(fault)
     for fault in (*_time_faults(config), *_rotation_faults(config), *declaration_faults(config.injection)):
@@ -190,12 +193,12 @@ def _examine(tables: dict[str, Any], folder: Path, faults: Faults) -> Examined:
 
 @cache
 def _fields(kind: type[Section]) -> tuple[msgspec.structs.FieldInfo, ...]:
-    """The keys of a section."""
+    """Return the keys of a section."""
     return tuple(field for field in msgspec.structs.fields(kind) if field.name not in _DERIVED)
 
 
 class _Structure:
-    """Looks at each key of each section by itself: whether it is known, there, and of its type."""
+    """Checks each key of each section on its own: whether it is known, present, and of its type."""
 
     def __init__(
         self, faults: Faults, folder: Path, broken: dict[int, tuple[str, dict[str, Any], dict[str, str]]]
@@ -205,7 +208,7 @@ class _Structure:
         self._broken = broken
 
     def sections(self, tables: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[int]]]:
-        """The sections without a fault, and where in the file those are of which there can be several."""
+        """Return the faultless sections, and for repeatable sections their indices in the file."""
         sound: dict[str, Any] = {}
         places: dict[str, list[int]] = {}
         hinted = self._unknown(tables, "", Config)
@@ -258,7 +261,7 @@ class _Structure:
             self._faults.add(f"{key}: expected tables [[{key}]]")
 
     def table(self, value: Any, key: str, name: str) -> tuple[bool, dict[str, Any]]:
-        """Whether there is no fault in a table, and the keys without one."""
+        """Return whether a table has no fault, and its faultless keys."""
         if not isinstance(value, dict):
             self._faults.add(f"{key}: expected a table [{name}]")
             return False, {}
@@ -286,7 +289,7 @@ class _Structure:
         return [self.table(item, f"{key}[{index}]", name)[1] for index, item in enumerate(self._first(value, key))]
 
     def _first(self, value: list[Any], key: str) -> list[Any]:
-        """Those of several sections that are looked at."""
+        """Return the sections to check, at most ``MAX_SECTIONS``."""
         if len(value) > MAX_SECTIONS:
             self._faults.add(f"{key}: {len(value)} of them; at most {MAX_SECTIONS} are looked at")
         return value[:MAX_SECTIONS]
@@ -303,7 +306,7 @@ class _Structure:
         return True
 
     def _unknown(self, table: dict[str, Any], key: str, kind: type[Section]) -> set[str]:
-        """Note the keys that nobody knows; return those that were meant, perhaps."""
+        """Add a fault for each unknown key; return the known keys that may have been meant."""
         known = [name for name in kind.__struct_fields__ if name not in _DERIVED]
         hinted: set[str] = set()
         for name in table:
@@ -318,7 +321,7 @@ class _Structure:
 
 
 def convert(tables: dict[str, Any], kind: type[_Table]) -> _Table:
-    """The tables as this type; ConfigError names what is unknown or of a wrong type by its full key."""
+    """Convert tables to a type; ConfigError has the full key that is unknown or wrongly typed."""
     try:
         return msgspec.convert(tables, kind)
     except msgspec.ValidationError as error:
@@ -338,7 +341,7 @@ def _unknown(key: str, table: str, whole: type[Section] = Config) -> str:
 
 
 def unknown_option(index: int, key: str, known: list[str]) -> str:
-    """Message for a key of ``source[index]`` that neither the contract nor the connector knows."""
+    """Return the message for a key of ``source[index]`` that is unknown, to the connector, too."""
     names = [*known, *(name for name in Source.__struct_fields__ if name not in _DERIVED)]
     hint = _hint(key, names, f"the connector knows: {', '.join(known)}")
     return f"source[{index}].{key}: unknown key; {hint}"
@@ -350,13 +353,16 @@ def _hint(key: str, names: list[str], otherwise: str) -> str:
 
 
 def check_text(value: Any, key: str) -> None:
-    """No control characters: no file name or terminal takes them. (Not a pattern: msgspec 0.22 crashes at exit.)."""
+    """Raise ConfigError for control characters, which file names and terminals cannot take.
+
+    This is no pattern of a type because msgspec 0.22 then crashes at exit.
+    """
     for fault in text_faults(value, key):
         raise ConfigError(fault)
 
 
 def text_faults(value: Any, key: str) -> Iterator[str]:
-    """Control characters in texts, wherever they are inside."""
+    """Yield a fault for each text with control characters, at any depth."""
     if isinstance(value, str) and any(char < " " or char == "\x7f" for char in value):
         path = "; a path with backslashes is written in single quotes" if _SLIPPED.search(value) else ""
         yield f"{key}: must not hold control characters{path}"

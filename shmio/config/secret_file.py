@@ -1,4 +1,4 @@
-"""A file that holds a secret: its user's alone."""
+"""Read files that hold a secret and that only their owner may access."""
 
 from __future__ import annotations
 
@@ -12,12 +12,20 @@ _OTHERS: Final = stat.S_IRWXG | stat.S_IRWXO
 
 
 def read_secret(key: str, name: str, most_bytes: int, *, instead: str) -> bytes:
-    """Its bytes, at most so many. ConfigError, beginning with ``key``, never says what is in it.
+    """Return the first ``most_bytes`` bytes of a secret's file.
 
-    ``instead``: what is to be made anew if others could have read it.
+    Args:
+        key: The configuration key, with which messages begin.
+        name: Path of the file.
+        most_bytes: Maximum number of bytes to read.
+        instead: The replacement to make if others could have read the secret, for the message.
+
+    Raises:
+        ConfigError: The file cannot be read, or others may access it; never quotes its contents.
+
     """
     try:
-        fd = os.open(name, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # which a pipe without a writer would block
+        fd = os.open(name, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # else a pipe without a writer blocks
     except OSError as error:
         raise ConfigError(f"{key}: {error.strerror}") from None
     try:

@@ -1,4 +1,4 @@
-"""What all sections of ``supervisor.toml`` are."""
+"""Base class of all sections of ``supervisor.toml``."""
 
 from __future__ import annotations
 
@@ -11,4 +11,4 @@ Texts = Annotated[list[Text], Meta(min_length=1)]
 
 
 class Section(Struct, forbid_unknown_fields=True, kw_only=True):
-    """A table of the file: unknown keys are refused."""
+    """A table of the file; unknown keys are refused."""

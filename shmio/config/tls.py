@@ -1,4 +1,4 @@
-"""The endpoint's PEM files, tried by TLS itself: gRPC does not tell a bad one from a busy port."""
+"""Read and test the gRPC endpoint's PEM files: gRPC reports a bad file like a busy port."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from shmio.errors import ConfigError
 
 
 class TlsFiles(NamedTuple):
-    """What the files hold; ``client_ca`` is None when clients need no certificate."""
+    """The contents of the PEM files; ``client_ca`` is None when clients need no certificate."""
 
     certificate: bytes
     key: bytes
@@ -20,7 +20,7 @@ class TlsFiles(NamedTuple):
 
 
 def read_tls(tls: Tls) -> TlsFiles:
-    """Read and try them; ConfigError names the key of the file that will not do."""
+    """Read and test the PEM files; ConfigError names the key of an unusable file."""
     found = TlsFiles(
         key=_read("key", tls.key),
         certificate=_read("certificate", tls.certificate),

@@ -1,4 +1,4 @@
-"""The endpoint's bearer tokens: read from their files, and known by their hashes from there on."""
+"""Read the gRPC endpoint's bearer tokens, of which only hashes are kept."""
 
 from __future__ import annotations
 
@@ -15,7 +15,10 @@ MAX_LENGTH: Final = 1024
 
 
 class Secret(NamedTuple):
-    """A token: ``digest`` is its SHA-256. A hash of a random text needs no salt, and to test one must cost little."""
+    """A token's name, roles and SHA-256 digest.
+
+    A random text needs no salt, and each check must be cheap.
+    """
 
     name: str
     roles: frozenset[str]
@@ -23,7 +26,7 @@ class Secret(NamedTuple):
 
 
 def read_tokens(tokens: Sequence[Token]) -> tuple[Secret, ...]:
-    """Read the files of all; ConfigError names the key of one that will not do, and never says what is in it."""
+    """Read all tokens; ConfigError names the key of an invalid token and never quotes it."""
     found: dict[bytes, Secret] = {}
     for index, token in enumerate(tokens):
         key = f"grpc.token[{index}]"
@@ -35,7 +38,7 @@ def read_tokens(tokens: Sequence[Token]) -> tuple[Secret, ...]:
 
 
 def digest(token: bytes) -> bytes:
-    """What a token is known by."""
+    """Return a token's SHA-256 digest."""
     return hashlib.sha256(token).digest()
 
 

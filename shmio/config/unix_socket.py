@@ -1,4 +1,4 @@
-"""The file of a UNIX socket to listen on: who has it, whether it may be cleared, who may open it."""
+"""Create and clear the file of a UNIX socket to listen on."""
 
 from __future__ import annotations
 
@@ -16,15 +16,18 @@ from shmio.errors import EndpointError
 
 
 def clear(path: str) -> None:
-    """Remove a socket that nobody listens on any more, as a killed process leaves it.
+    """Remove a socket file that a killed process has left.
 
-    EndpointError: the file is in the way; it is another process's, or no socket.
+    Raises:
+        EndpointError: Another process listens there, the file is not a socket, or it cannot be
+            removed.
+
     """
     if (reason := obstacle(path)) is not None:
         raise EndpointError(f"cannot listen on unix:{path}: {reason}")
     try:
         Path(path).unlink(missing_ok=True)
-    except OSError as error:  # another user's, in a folder for all
+    except OSError as error:  # another user's file in a shared folder
         raise EndpointError(
             f"cannot listen on unix:{path}: what another process has left there cannot be removed ({error.strerror}): "
             "have its owner do it, or choose another path"
@@ -32,7 +35,7 @@ def clear(path: str) -> None:
 
 
 def obstacle(path: str) -> str | None:
-    """Why a process of this user cannot listen there; None if it can."""
+    """Return why this user's processes cannot listen at a path, or None if they can."""
     folder = Path(path).parent
     if not folder.is_dir():
         return f"there is no folder {folder}: mkdir -p it, or choose another path"
@@ -50,7 +53,7 @@ def obstacle(path: str) -> str | None:
 
 
 def listened_on(path: str) -> bool:
-    """Whether somebody listens there; of one that may not be opened it is taken for granted."""
+    """Return whether a process listens at a path; True as well if this user may not connect."""
     with socket.socket(socket.AF_UNIX) as probe:
         probe.setblocking(False)  # its queue may be full
         try:
@@ -63,25 +66,29 @@ def listened_on(path: str) -> bool:
 
 
 class SocketFile:
-    """A socket that this process makes, to be removed when it no longer listens."""
+    """The file of a socket that this process creates, and removes when it stops listening."""
 
     def __init__(self, path: str, gid: int | None) -> None:
-        """Its user may open it, or a group's users as well."""
+        """Set the path; only this user may connect, and the members of group ``gid`` if given."""
         self._path = path
         self._gid = gid
         self._inode = 0
 
     @contextmanager
     def binding(self) -> Iterator[str]:
-        """Where to bind it; afterwards it is at its path. EndpointError: it cannot be, or something is there by now.
+        """Yield a temporary path to bind the socket to, then move the socket to its own path.
 
-        That is in a folder which nobody else can enter: nobody opens the socket before it has its mode, whatever the
-        process's umask is, which all threads share.
+        The temporary folder is closed to other users. So nobody can connect before the socket has
+        its mode, whatever the process's umask, which all threads share.
+
+        Raises:
+            EndpointError: The socket cannot be created, or another file is at its path by now.
+
         """
         path, name = Path(self._path), secrets.token_hex(8)
         try:
             with TemporaryDirectory(prefix=".shmio-", dir=path.parent) as folder:
-                # By its descriptor, for a socket's path must be short.
+                # Through the folder's descriptor, because a socket's path must be short.
                 inside = os.open(folder, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)
                 try:
                     yield f"/proc/self/fd/{inside}/{name}"
@@ -89,7 +96,7 @@ class SocketFile:
                     if self._gid is not None:
                         os.chown(made, -1, self._gid)
                     made.chmod(0o600 if self._gid is None else 0o660)
-                    os.link(made, path)  # not renamed: that would take the place of what is there by now
+                    os.link(made, path)  # renaming would replace a file that is there by now
                     self._inode = os.lstat(path).st_ino
                 finally:
                     os.close(inside)
@@ -97,7 +104,7 @@ class SocketFile:
             raise EndpointError(f"unix:{self._path}: {error.strerror}") from None
 
     def remove(self) -> None:
-        """Remove it, unless somebody else has one of that name by now."""
+        """Remove the socket's file, unless another file has its name by now."""
         with suppress(FileNotFoundError):
             if os.lstat(self._path).st_ino == self._inode:
                 Path(self._path).unlink()

@@ -1,4 +1,4 @@
-"""What msgspec and tomllib find wrong, in the words of the file's user."""
+"""Reword errors of msgspec and tomllib for the configuration's author."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from shmio.config.mqtt.model import BrokerName, PayloadName
 
 MAX_LINE = 80
 MAX_HINTED = 100
-"""Characters of a word for which a similar one is looked for."""
+"""Longest word, in characters, for which a similar one is suggested."""
 _QUOTES = "'"
 _DOUBLE = ("Cannot overwrite", "Cannot declare", "Duplicate inline table key")
 _ESCAPE = ("Unescaped", "Invalid hex", "Escaped character", "Illegal character")
@@ -31,7 +31,7 @@ _WORDS = {
     "operation": OperationName,
     "payload": PayloadName,
 }
-"""Keys that take one of a few words."""
+"""Keys whose value is one of a few words."""
 _TYPES = {
     "int": "a whole number",
     "float": "a number",
@@ -43,7 +43,7 @@ _TYPES = {
 
 
 def explain(error: ValidationError, key: str = "") -> str:
-    """``key: what is wrong``. ``key``: of what was converted, when it is not a whole table."""
+    """Return ``key: what is wrong``; ``key`` is needed if the converted value is no whole table."""
     text, _, at = str(error).partition(" - at `$")
     path = f"{key}{at.rstrip('`')}".lstrip(".")
     missing = re.search(r"missing required field `([^`]*)`", text)
@@ -62,14 +62,14 @@ def explain(error: ValidationError, key: str = "") -> str:
 
 
 def near(word: str, names: Iterable[str]) -> list[str]:
-    """The name that was meant, perhaps, in whatever case it is written; empty if none is similar."""
+    """Return a list with the most similar name, regardless of case, or an empty list."""
     folded = {name.lower(): name for name in names}
     found = difflib.get_close_matches(word.lower(), folded, 1) if len(word) <= MAX_HINTED else []
     return [folded[found[0]]] if found else []
 
 
 def meant(word: str, names: Iterable[str]) -> str:
-    """What to add to a message about a word that is none of these."""
+    """Return the suggestion to append to a message about an unknown word."""
     return "".join(f"; did you mean {name}?" for name in near(word, names))
 
 
@@ -78,7 +78,7 @@ def _types(match: re.Match[str]) -> str:
 
 
 def explain_toml(error: Exception, text: str) -> str:
-    """The parser's message, the line it is about, and what to write instead where that is a frequent slip."""
+    """Return the parser's message with the line and, for frequent slips, the correction."""
     if isinstance(error, ValueError) and not isinstance(error, TOMLDecodeError):  # int() takes no more of them
         return "a number in it has too many digits"
     place = _PLACE.search(str(error))
@@ -108,7 +108,7 @@ def _slip(message: str, line: str, column: int) -> str:
 
 
 def named(message: str, tables: Mapping[str, Any]) -> str:
-    """The message, with the name of the source, emulator or injection that its key tells by number."""
+    """Append the name of the source, emulator or injection that a message's key gives by number."""
     key = re.match(r"(source|emulator|injection)\[(\d+)\](?!\.name:)", message)
     if key is None:
         return message

@@ -1,1 +1,1 @@
-"""Layouts: from data-block sources to registers, their values, names and changes. Pure; no I/O."""
+"""Layouts: compile data-block sources to registers, and encode and name their values. No I/O."""

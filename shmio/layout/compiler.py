@@ -1,7 +1,8 @@
-"""Data-block sources to layouts: read, parse, place, emit.
+"""Compile data-block sources to layouts: decode, parse, place, emit.
 
-No I/O: the caller reads the files. Sources are those TIA Portal exports (``.db``, ``.udt``, ``.scl``) and those of
-STEP 7 classic (``.awl``), given together when one uses types, function blocks or constants of another.
+No I/O: the caller reads the files. Sources are exports of TIA Portal (``.db``, ``.udt``, ``.scl``)
+and of STEP 7 classic (``.awl``). Files are compiled together when one uses types, function blocks
+or constants of another.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from shmio.layout.source.text_encoding import decode
 
 MAX_ALL_REGISTERS = 500_000
 MAX_ALL_STRUCTURES = 500_000
-"""Of all blocks that are compiled together; a small source can have many large ones."""
+"""Limits for all blocks compiled together: a small source can declare many large ones."""
 
 _Declaration = TypeVar("_Declaration", TypeDeclaration, BlockDeclaration, ConstantDeclaration)
 
@@ -45,7 +46,7 @@ _OPTIMIZED = (
 
 @dataclass(frozen=True)
 class Source:
-    """A file's name, for diagnostics, and its bytes as read."""
+    """One source file: its name, for diagnostics, and its bytes as read."""
 
     file: str
     text: bytes
@@ -53,7 +54,10 @@ class Source:
 
 @dataclass(frozen=True)
 class Compiled:
-    """The layouts of all data blocks, in source order. ``unused``: types whose size was given, and nothing is of."""
+    """Result of a compilation: the layouts in source order, and the warnings.
+
+    ``unused`` names the types whose size was given although nothing has this type.
+    """
 
     layouts: tuple[Layout, ...]
     warnings: tuple[Diagnostic, ...]
@@ -61,8 +65,8 @@ class Compiled:
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
-    """A data block that the sources hold."""
+class BlockName:
+    """Name and number of a data block that the sources declare."""
 
     name: str
     number: int | None
@@ -71,25 +75,29 @@ class Held:
 def compile_sources(
     sources: Sequence[Source], *, blocks: Collection[str] | None = None, type_bytes: Mapping[str, int] | None = None
 ) -> Compiled:
-    """Compile the data blocks of one or several files that may use each other's types, or a tag table (``.toml``).
+    """Compile the data blocks of files that may use each other's types, or one tag table.
 
     Args:
         sources: The files.
-        blocks: Names of the data blocks wanted, in any case; what is wrong with others does not count. None: all.
-        type_bytes: Sizes of types whose members are not known, by their names in any case.
+        blocks: Names of the data blocks to compile, in any case. Errors in other blocks are
+            ignored. None compiles all blocks.
+        type_bytes: Sizes in bytes of types whose members are unknown, by type name in any case.
+
+    Returns:
+        The layouts in source order, with the warnings.
 
     Raises:
-        LayoutError: ``diagnostics`` has everything found, errors first.
+        LayoutError: A source is wrong; ``diagnostics`` has everything found, errors first.
 
     """
     return Program(sources).compile(blocks, type_bytes)
 
 
 class Program:
-    """Sources that have been read: which data blocks they hold is known, and each can be compiled by itself."""
+    """Parsed sources, whose data blocks can be compiled together or one at a time."""
 
     def __init__(self, sources: Sequence[Source]) -> None:
-        """Read them. LayoutError: a tag table that is none."""
+        """Parse the sources. LayoutError: a tag table is invalid, or given with other files."""
         self._files = [source.file for source in sources]
         self._general = Report(self._files)
         self._table: Layout | None = None
@@ -97,7 +105,7 @@ class Program:
         self._types: dict[str, TypeDeclaration] = {}
         self._constants: dict[str, ConstantDeclaration] = {}
         self._doubles: list[Diagnostic] = []
-        self.blocks: tuple[Held, ...] = ()
+        self.blocks: tuple[BlockName, ...] = ()
         with suppress(TooManyErrors):
             self._read(sources)
 
@@ -107,7 +115,7 @@ class Program:
             if source.file.endswith(tags.SUFFIX):
                 if len(sources) == 1:
                     self._table = tags.compile_tags(source.file, source.text, report)
-                    self.blocks = (Held(self._table.name, None),)
+                    self.blocks = (BlockName(self._table.name, None),)
                     return
                 report.add(Diagnostic(source.file, 1, 1, "a tag table stands alone, not together with other files"))
                 report.raise_errors()
@@ -120,13 +128,13 @@ class Program:
         self._constants, _ = self._by_name([declaration for unit in self._units for declaration in unit.constants])
         blocks = [declaration for unit in self._units for declaration in unit.blocks]
         self._by_name(blocks)
-        self.blocks = tuple(Held(block.name, block.number) for block in blocks)
+        self.blocks = tuple(BlockName(block.name, block.number) for block in blocks)
         if not blocks and not report.errors and not any(fault.severity == "error" for fault in self._faults()):
             file = sources[0].file if sources else "<none>"
             report.add(Diagnostic(file, 1, 1, "expected a DATA_BLOCK, found none"))
 
     def _by_name(self, declarations: Sequence[_Declaration]) -> tuple[dict[str, _Declaration], dict[str, Diagnostic]]:
-        """The declarations by their names in lower case, and what is wrong with names that are there twice."""
+        """Index declarations by name in lower case; return an error for each duplicate, too."""
         found: dict[str, _Declaration] = {}
         doubles: dict[str, Diagnostic] = {}
         for declaration in declarations:
@@ -138,7 +146,10 @@ class Program:
         return found, doubles
 
     def _faults(self) -> Iterator[Diagnostic]:
-        """What is wrong with all declarations, and odd; of a function block it counts only where that is used."""
+        """Errors and warnings of all declarations, without those of function blocks.
+
+        A function block's faults count only where it is used.
+        """
         for unit in self._units:
             declarations: list[TypeDeclaration | BlockDeclaration] = [*unit.types, *unit.blocks]
             for declaration in sorted(declarations, key=lambda one: (one.position.line, one.position.column)):
@@ -147,7 +158,12 @@ class Program:
         yield from self._doubles
 
     def compile(self, blocks: Collection[str] | None = None, type_bytes: Mapping[str, int] | None = None) -> Compiled:
-        """Compile all data blocks, or those of these names; LayoutError. See :func:`compile_sources`."""
+        """Compile all data blocks, or those named; see :func:`compile_sources`.
+
+        Raises:
+            LayoutError: A source is wrong; ``diagnostics`` has everything found, errors first.
+
+        """
         if self._table is not None:
             return Compiled((self._table,), tuple(self._general.warnings))
         report = Report(self._files)
@@ -187,7 +203,7 @@ class Program:
         return Compiled(tuple(layouts), tuple(report.warnings), unused)
 
     def _report_chosen(self, wanted: Sequence[BlockDeclaration], report: Report) -> None:
-        """Report what is wrong with these blocks alone."""
+        """Report only the faults of these blocks."""
         names: dict[str, BlockDeclaration] = {}
         for block in wanted:
             report.extend(block.faults)

@@ -1,6 +1,7 @@
-"""The JSON form of a layout: what ``shmio-layout --json`` prints and what segments and recordings hold.
+"""JSON form of a layout, as ``shmio-layout --json`` prints it and segments and recordings store it.
 
-Reading trusts nothing: types are checked strictly, then everything that can be computed is computed again.
+Reading trusts nothing: types are checked strictly, then every value that can be computed is
+computed again and compared.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ class _Layout(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
     byte_order: ByteOrder = "big"
 
 
-_DECODER = msgspec.json.Decoder(_Layout)  # built here: msgspec crashes when two threads are the first to use a type
+_DECODER = msgspec.json.Decoder(_Layout)  # msgspec crashes if two threads use a type first
 
 
 def describe(layout: Layout) -> dict[str, object]:
@@ -91,7 +92,9 @@ def dump(layout: Layout) -> bytes:
 def load(data: bytes) -> Layout:
     """Read and validate a layout's JSON.
 
-    Raises LayoutError: anything is not as ``dump`` would write it for a possible layout.
+    Raises:
+        LayoutError: The JSON is not what ``dump`` writes for a valid layout.
+
     """
     if len(data) > MAX_JSON_BYTES:
         raise LayoutError(f"layout: larger than {MAX_JSON_BYTES} bytes")

@@ -1,8 +1,9 @@
 """Glob patterns over register paths.
 
-``*`` stays within a segment, ``**`` crosses them and as a segment of its own may be none; the name of an array or
-a structure covers what is below it. Segments may be percent-encoded like those of a path, so that ``%2A`` is a
-star in a name. Patterns come from clients: matching takes time linear in the path, whatever the pattern.
+``*`` matches within one segment. ``**`` crosses segments; as a whole segment it also matches none.
+The name of an array or a structure covers everything below it. Segments may be percent-encoded
+like those of a path, so ``%2A`` is a literal star. Patterns come from clients: matching time is
+linear in the path's length, whatever the pattern.
 """
 
 from __future__ import annotations
@@ -20,12 +21,15 @@ _PIECES = re.compile(r"\*+|[^*]+")
 
 
 class Glob:
-    """One compiled pattern.
+    """A compiled pattern.
 
-    The states of a non-deterministic automaton are the bits of one integer: bit i is set when the first i
-    tokens of the pattern have been matched (Baeza-Yates and Gonnet, 1992).
+    The states of a non-deterministic automaton are the bits of one integer: bit i is set when the
+    first i tokens of the pattern have been matched (Baeza-Yates and Gonnet, 1992).
 
-    Raises PathError for an empty or overlong pattern, an empty segment, or a wrong percent-encoding.
+    Raises:
+        PathError: The pattern is empty or too long, or has an empty segment or a wrong
+            percent-encoding.
+
     """
 
     def __init__(self, pattern: str) -> None:
@@ -53,7 +57,7 @@ class Glob:
         self._start = self._close(1)
 
     def matches(self, path: str) -> bool:
-        """Whether the pattern matches the path, or something the path lies below."""
+        """Return whether the pattern matches the path or a structure or array that contains it."""
         final = 1 << self._final
         states = self._start
         for char in path:
@@ -65,14 +69,14 @@ class Glob:
         return bool(states & final)
 
     def reaches(self, path: str) -> bool:
-        """Whether the pattern may match something below the path, as an array's element."""
+        """Return whether the pattern may match something below the path: an array element."""
         states = self._start
         for char in f"{path}/":
             states = self._step(states, char)
         return states != 0
 
     def _step(self, states: int, char: str) -> int:
-        """The states after one more character."""
+        """Return the states after one more character."""
         stay = self._crossing if char == "/" else self._stars
         return self._close(((states & self._literals.get(char, 0)) << 1) | (states & stay))
 
@@ -87,7 +91,7 @@ class Glob:
         self._final += 1
 
     def _close(self, states: int) -> int:
-        """Add the states that are reached without a character."""
+        """Add the states that are reachable without consuming a character."""
         while True:
             forks = states & self._forks
             more = states | (states & self._stars | forks) << 1 | forks << 3
@@ -97,7 +101,7 @@ class Glob:
 
 
 def _pieces(segment: str) -> list[str]:
-    """Split a segment into runs of stars and literal text, the text in a path's canonical encoding."""
+    """Split a segment into runs of stars and literal text, with the text in canonical encoding."""
     if "*" not in segment:
         return [encode_segment(decode_segment(segment))]
     pieces = _PIECES.findall(segment)
@@ -106,9 +110,11 @@ def _pieces(segment: str) -> list[str]:
 
 
 def select(layout: Layout, patterns: Iterable[str]) -> tuple[int, ...]:
-    """Return the indices of the registers that any of the patterns matches, ascending.
+    """Return the indices of the registers that match any of the patterns, ascending.
 
-    Raises PathError: a malformed pattern.
+    Raises:
+        PathError: A pattern is malformed.
+
     """
     chosen: set[int] = set()
     for pattern in patterns:
@@ -124,11 +130,15 @@ def select(layout: Layout, patterns: Iterable[str]) -> tuple[int, ...]:
 
 
 def named(layout: Layout, topic: Topic) -> list[Register]:
-    """Return the registers that a topic's path names, of whatever form; for a pattern there may be none.
+    """Return the registers that a topic's path names.
 
-    A register, an array's element, a slice of an array as its elements (``Inputs/3..7``), a bit or another part of an
-    integer, a structure, a glob; all registers for an empty path. Raises PathError: no such register, or a malformed
-    pattern.
+    The path names a register, an array element, a slice of an array (``Inputs/3..7``, returned as
+    its elements), a bit or another part of an integer, a structure, or a glob. An empty path names
+    all registers; a glob may match none.
+
+    Raises:
+        PathError: There is no such register, or the pattern is malformed.
+
     """
     if not topic.path:
         return list(layout.registers)

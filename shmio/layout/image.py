@@ -1,4 +1,4 @@
-"""A block as the controller has it after a download: every register at its initial value."""
+"""Initial image of a block, as after a download to the controller: all initial values."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from shmio.layout.topic import shorten
 from shmio.layout.values.codec import Value, codec
 from shmio.layout.values.literal import default_text, parse_literal
 
-MAX_TOLD: Final = 20
-"""Of so many initial values that cannot be read each is named."""
+MAX_LISTED: Final = 20
+"""Number of unreadable initial values that are listed one by one."""
 
 
 def initial_frame(layout: Layout) -> tuple[bytearray, tuple[str, ...]]:
-    """Return the frame, and the paths of registers whose initial value could not be read.
+    """Return the initial frame, and the paths of registers whose initial value cannot be read.
 
-    Those have their type's default: a source may name constants that only the controller knows.
+    These registers get their type's default: a source may name constants that only the
+    controller knows.
     """
     frame = bytearray(layout.size)
     unread: list[str] = []
@@ -36,17 +37,20 @@ def unread(layout: Layout) -> tuple[Register, ...]:
     return tuple(r for r in layout.registers if r.initial is not None and _given(r) is None)
 
 
-def complaints(layout: Layout) -> Iterator[str]:
-    """Say which initial values cannot be read, a line each, as far as they are not too many."""
+def initial_value_warnings(layout: Layout) -> Iterator[str]:
+    """Yield a line for each initial value that cannot be read.
+
+    After ``MAX_LISTED`` of them, one line counts the rest.
+    """
     registers = unread(layout)
-    for register in registers[:MAX_TOLD]:
+    for register in registers[:MAX_LISTED]:
         value = " ".join((register.initial or "").split())
         yield (
             f"the initial value {shorten(value, 40)} of {register.path} cannot be read as {register.type}; "
             f"an emulated PLC starts it at {default_text(register.element)}"
         )
-    if len(registers) > MAX_TOLD:
-        yield f"{len(registers) - MAX_TOLD} more initial values cannot be read"
+    if len(registers) > MAX_LISTED:
+        yield f"{len(registers) - MAX_LISTED} more initial values cannot be read"
 
 
 def _given(register: Register) -> Value | None:

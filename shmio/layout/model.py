@@ -1,7 +1,7 @@
-"""What a compiled layout is: a block, its registers, and where each of them lies.
+"""The compiled layout: a block, its registers, and the address of each.
 
-Everything here is immutable and free of I/O. ``Layout`` is what the segment, the recordings and
-``shmio-layout --json`` hold; the JSON form is in ``document.py``.
+Everything here is immutable and free of I/O. Segments, recordings and ``shmio-layout --json``
+hold a ``Layout``; its JSON form is in ``document.py``.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ Dims = tuple[tuple[int, int], ...]
 
 MAX_DIMENSIONS = 6
 MAX_DEPTH = 32  # nested structures; Siemens allows 8
-MAX_STANDARD_BYTES = 65_536  # what an S7-1500 allows a block with standard access
+MAX_STANDARD_BYTES = 65_536  # limit of an S7-1500 for a block with standard access
 MAX_BLOCK_BYTES = 1 << 20  # any block: optimized ones, and those of other sources
 MAX_REGISTERS = 100_000
 MAX_ELEMENTS = 1 << 20  # of all registers together
-MAX_STRUCTURES = 200_000  # of a block; they count even when they hold no register
+MAX_STRUCTURES = 200_000  # of a block, including structures without registers
 
 
 @dataclass(frozen=True, slots=True)
 class Diagnostic:
-    """One thing a layout source has wrong; ``str()`` is ``file:line:col: severity: message``."""
+    """An error or warning about a source; ``str()`` is ``file:line:col: severity: message``."""
 
     file: str
     line: int
@@ -47,13 +47,19 @@ class Diagnostic:
 class Register:
     """A named, typed value at a fixed place in a block.
 
-    ``path``: member names, percent-encoded, joined by ``/``; no source and no direction.
-    ``type``: S7 name of the element, upper case, ``STRING[20]`` for lengths.
-    ``dims``: (low, high) of each dimension; ``()`` for a scalar.
-    ``offset``: first byte in the block. ``bit``: 0-7 for BOOL, else None.
-    ``size``: bytes from the first to the last that holds data, without trailing padding. ``count``: elements.
-    ``initial``: the source's text of the initial value.
-    ``partial``: a slice of a row of bits, which begins at ``bit``; others' bits may be in its first and last byte.
+    Attributes:
+        path: Member names, percent-encoded and joined by ``/``, without source and direction.
+        type: S7 name of the element type in upper case; strings with length: ``STRING[20]``.
+        dims: (low, high) of each dimension; ``()`` for a scalar.
+        offset: First byte in the block.
+        bit: 0-7 for BOOL, else None.
+        size: Bytes from the first to the last that holds data, without trailing padding.
+        count: Number of elements.
+        comment: The source's comment on the member.
+        initial: The source's text of the initial value.
+        partial: Whether this is a slice of a row of bits, which begins at ``bit``; its first and
+            last byte may hold bits of other registers.
+
     """
 
     path: str
@@ -74,7 +80,7 @@ class Register:
 
     @property
     def element(self) -> ElementType:
-        """The elementary type; raises KeyError for a name that is none (a validated layout has none)."""
+        """The elementary type; KeyError for an unknown name, which no validated layout has."""
         found = element_type(self.type)
         if found is None:
             raise KeyError(self.type)
@@ -94,7 +100,7 @@ class Layout:
 
     @cached_property
     def by_path(self) -> Mapping[str, int]:
-        """Index into ``registers`` of each path."""
+        """The index into ``registers`` for each path."""
         return {register.path: index for index, register in enumerate(self.registers)}
 
     @cached_property
@@ -102,7 +108,7 @@ class Layout:
         """SHA-256 of the canonical JSON: equal for equal layouts."""
         return hashlib.sha256(self.to_json()).digest()
 
-    # Structures are ranges of sorted paths: a table of all structures' paths could be far larger than the layout.
+    # A structure is a range of sorted paths; a table of all structures could far exceed the layout.
     @cached_property
     def _sorted(self) -> _Sorted:
         return _Sorted(register.path for register in self.registers)
@@ -112,11 +118,11 @@ class Layout:
         return _Sorted(register.path.lower() for register in self.registers)
 
     def members(self, prefix: str) -> tuple[int, ...]:
-        """Return the indices of the registers below a struct or an array of structs, ``()`` if none."""
+        """Return the indices of the registers below a structure or an array of structures."""
         return self._sorted.below(prefix)
 
     def in_any_case(self, path: str) -> str | None:
-        """Return the path of a register or structure that is this one in some case, None if there is none."""
+        """Return the register's or structure's path that equals this one but for case, or None."""
         wanted = path.lower()
         at = self._sorted_in_lower_case.first(wanted)
         if at is None:
@@ -124,9 +130,15 @@ class Layout:
         return "/".join(self.registers[at].path.split("/")[: wanted.count("/") + 1])
 
     def element(self, register: Register, index: tuple[int, ...]) -> Register:
-        """Return one element of an array register as a scalar register, its path ending in the index.
+        """Return one element of an array as a scalar register whose path ends in the index.
 
-        Raises PathError: the index has not as many dimensions as the array, or is outside its bounds.
+        Args:
+            register: The array.
+            index: One declared index for each dimension.
+
+        Raises:
+            PathError: The index is out of bounds or has another number of dimensions.
+
         """
         if len(index) != len(register.dims) or not all(
             low <= i <= high for i, (low, high) in zip(index, register.dims, strict=True)
@@ -153,16 +165,19 @@ class Layout:
         )
 
     def to_json(self) -> bytes:
-        """Return the canonical JSON, UTF-8: the object of ``shmio-layout --json`` and ``byte_order``."""
+        """Return canonical JSON: the object of ``shmio-layout --json`` plus ``byte_order``."""
         from shmio.layout.document import dump  # noqa: PLC0415  (document imports this module)
 
         return dump(self)
 
     @classmethod
     def from_json(cls, data: bytes) -> Layout:
-        """Read what ``to_json`` wrote, from a source that may be hostile.
+        """Read and validate the JSON that ``to_json`` writes; the data may be hostile.
 
-        Raises LayoutError: not such JSON, or a layout that cannot be: overlaps, wrong sizes, out of bounds.
+        Raises:
+            LayoutError: The JSON is malformed, or the layout is impossible: registers that overlap,
+                have wrong sizes, or are outside the block.
+
         """
         from shmio.layout.document import load  # noqa: PLC0415
 
@@ -170,7 +185,7 @@ class Layout:
 
 
 class _Sorted:
-    """Paths in order, with their places in the layout: all below a structure stand together."""
+    """Sorted paths with their indices in the layout; all paths below a structure are adjacent."""
 
     def __init__(self, paths: Iterable[str]) -> None:
         ordered = sorted((path, index) for index, path in enumerate(paths))
@@ -178,13 +193,13 @@ class _Sorted:
         self._indices = [index for _, index in ordered]
 
     def below(self, prefix: str) -> tuple[int, ...]:
-        """The indices of the paths below the prefix, ascending."""
+        """Return the indices of the paths below the prefix, ascending."""
         start = bisect_left(self._paths, f"{prefix}/")
         stop = bisect_left(self._paths, f"{prefix}0", start)  # "0" follows "/" in Unicode
         return tuple(sorted(self._indices[start:stop]))
 
     def first(self, path: str) -> int | None:
-        """The index of the path, or else of the first one below it."""
+        """Return the index of the path, or else of the first path below it."""
         for at in (bisect_left(self._paths, path), bisect_left(self._paths, f"{path}/")):
             if at < len(self._paths) and f"{self._paths[at]}/".startswith(f"{path}/"):
                 return self._indices[at]
@@ -192,7 +207,10 @@ class _Sorted:
 
 
 def bit_positions(register: Register) -> list[tuple[int, int]]:
-    """Return (byte, bit) of each element of a BOOL register, from its first byte on; the last index runs fastest."""
+    """Return (byte, bit) of each element of a BOOL register, relative to its first byte.
+
+    The last index runs fastest.
+    """
     if not register.dims or register.partial:
         return [divmod((register.bit or 0) + flat, 8) for flat in range(register.count)]
     row = range(register.shape[-1])
@@ -201,9 +219,10 @@ def bit_positions(register: Register) -> list[tuple[int, int]]:
 
 
 def element_position(element: ElementType, shape: tuple[int, ...], flat: int) -> tuple[int, int | None]:
-    """Return (byte, bit) of an array's element relative to its start; ``flat`` counts row by row.
+    """Return (byte, bit) of an array element relative to the array's start.
 
-    A row of bits begins at a byte; all other elements follow each other at their stride.
+    ``flat`` counts elements row by row. Each row of bits begins at a whole byte; all other elements
+    follow each other at their stride.
     """
     if element.base != "BOOL":
         return flat * element.stride, None
@@ -212,7 +231,7 @@ def element_position(element: ElementType, shape: tuple[int, ...], flat: int) ->
 
 
 def array_size(element: ElementType, shape: tuple[int, ...]) -> int:
-    """Return the bytes from the first to the last that holds data; without trailing padding."""
+    """Return an array's size in bytes, without trailing padding."""
     if not shape:
         return element.size
     if element.base == "BOOL":

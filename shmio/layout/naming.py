@@ -1,4 +1,4 @@
-"""What bytes and bits of a block are called: the paths by which :func:`shmio.layout.topic.find` finds them."""
+"""Find the paths of bytes and bits of a block, as :func:`shmio.layout.topic.find` reads them."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from shmio.layout.values.write import Write, bits_of
 
 
 def paths_of(layout: Layout, writes: Iterable[Write]) -> list[str]:
-    """Return the paths of the bits that writes set, in address order: whole registers, or else slices, elements, bits.
+    """Return the paths of the bits that writes set, in address order.
 
-    Of what has no parts, as a REAL, its path; nothing for bytes that are no register's, or outside the block.
+    A register that is written in part is named by slices, elements, bytes or bits. A type without
+    parts, such as REAL, is named as a whole. Bytes outside the block or of no register are skipped.
     """
     bits = bytearray(layout.size)
     touched: set[int] = set()
@@ -27,7 +28,7 @@ def paths_of(layout: Layout, writes: Iterable[Write]) -> list[str]:
 
 
 def path_at(layout: Layout, offset: int) -> str:
-    """Return the path of the register, or of the array's element, that lies at a byte; empty if there is none."""
+    """Return the path of the register or array element at a byte, or an empty string."""
     for index in _overlapping(layout, offset, offset + 1):
         register = layout.registers[index]
         if not register.dims or register.bit is not None:
@@ -38,7 +39,7 @@ def path_at(layout: Layout, offset: int) -> str:
 
 
 def _overlapping(layout: Layout, start: int, stop: int) -> range:
-    """The registers that share a byte with a range."""
+    """Return the indices of the registers that share a byte with a range."""
     first = bisect_right(layout.registers, start, key=lambda register: register.offset + register.size)
     return range(first, bisect_left(layout.registers, stop, key=lambda register: register.offset))
 
@@ -59,7 +60,7 @@ def _of(layout: Layout, register: Register, bits: bytearray) -> Iterator[str]:
 
 
 def _share(register: Register, bits: bytearray) -> bytes:
-    """The part of these bits that is a register's."""
+    """Return the bits that belong to a register."""
     there = bytes(bits[register.offset : register.offset + register.size])
     if register.bit is None or register.dims:
         return there
@@ -67,7 +68,7 @@ def _share(register: Register, bits: bytearray) -> bytes:
 
 
 def _touched(array: Register, share: bytes) -> range:
-    """The elements among which those lie that have some of these bits."""
+    """Return a range of elements that includes all those with some of these bits."""
     first, stop = len(share) - len(share.lstrip(b"\0")), len(share.rstrip(b"\0"))
     if array.bit is None:
         return range(first // array.element.stride, min(array.count, -(-stop // array.element.stride)))
@@ -77,7 +78,7 @@ def _touched(array: Register, share: bytes) -> range:
 
 
 def _index(array: Register, flat: int) -> tuple[int, ...]:
-    """The declared indices of an element; the last runs fastest."""
+    """Return the declared indices of an element; the last index runs fastest."""
     index: tuple[int, ...] = ()
     for low, high in reversed(array.dims):
         flat, place = divmod(flat, high - low + 1)
@@ -86,7 +87,7 @@ def _index(array: Register, flat: int) -> tuple[int, ...]:
 
 
 def _elements(layout: Layout, array: Register, share: bytes, bits: bytearray) -> Iterator[str]:
-    """Those of an array; neighbours within its last dimension as a slice."""
+    """Yield the paths of an array's elements; neighbours within its last dimension form a slice."""
     run: list[tuple[int, ...]] = []
     for flat in _touched(array, share):
         index = _index(array, flat)
@@ -110,7 +111,10 @@ def _run(layout: Layout, array: Register, run: list[tuple[int, ...]]) -> str:
 
 
 def _parts(layout: Layout, register: Register, share: bytes) -> Iterator[str]:
-    """Bits of an integer; whole bytes, words and double words of it as such, the least significant first."""
+    """Yield the paths of an integer's bits, least significant first.
+
+    Whole bytes, words and double words are named as such.
+    """
     ascending = share[::-1] if layout.byte_order == "big" else share
     at = 0
     while at < len(ascending):

@@ -1,8 +1,8 @@
-"""Parts of registers, as registers of their own: a slice of an array, and bits, bytes and words of an integer.
+"""Parts of registers as registers: slices of arrays, and bits, bytes and words of integers.
 
-- ``Inputs/2..5``: a range in place of an array's last index, an array of one dimension;
-- ``Outputs/13.%X0``: as STEP 7's slice access, a bit of an integer (0 the lowest), or ``.%B1`` (a byte), ``.%W0``,
-  ``.%D0``, the least significant first.
+- ``Inputs/2..5``: a range in place of an array's last index; the slice has one dimension.
+- ``Outputs/13.%X0``: a bit of an integer, as in STEP 7's slice access; bit 0 is the lowest.
+  ``.%B1`` is a byte, ``.%W0`` a word, ``.%D0`` a double word; number 0 is the least significant.
 
 A member's name never ends in such a part: its ``%`` would be encoded.
 """
@@ -17,16 +17,18 @@ from shmio.layout.model import Layout, Register, array_size
 from shmio.layout.types import INTEGERS
 
 PART: Final = re.compile(r"(?P<head>.+)\.%(?P<kind>[XBWD])(?P<number>[0-9]{1,3})")
-"""A last segment that names a part of an integer."""
+"""Matches a last segment that names a part of an integer."""
 RANGE: Final = re.compile(r"(?P<low>0|-?[1-9][0-9]{0,9})\.\.(?P<high>0|-?[1-9][0-9]{0,9})")
-"""A last segment that names a slice."""
+"""Matches a last segment that names a slice."""
 _WIDTHS: Final = {"B": ("BYTE", 1), "W": ("WORD", 2), "D": ("DWORD", 4)}
 
 
 def part_of(layout: Layout, register: Register, kind: str, number: int) -> Register:
-    """Return a bit (kind ``X``), byte, word or double word of an integer.
+    """Return a bit (kind ``X``), byte (``B``), word (``W``) or double word (``D``) of an integer.
 
-    Raises PathError: the register is no integer, or not so wide.
+    Raises:
+        PathError: The register is not an integer, or has no such part.
+
     """
     path = f"{register.path}.%{kind}{number}"
     if register.dims or register.type not in INTEGERS:
@@ -49,9 +51,13 @@ def part_of(layout: Layout, register: Register, kind: str, number: int) -> Regis
 
 
 def slice_of(layout: Layout, array: Register, leading: tuple[int, ...], low: int, high: int) -> Register:
-    """Return the elements ``low`` to ``high`` within an array's last dimension; ``leading``: its other indices.
+    """Return the elements ``low`` to ``high`` of an array's last dimension as one register.
 
-    Raises PathError: there is no such row, or not all of these elements.
+    ``leading`` holds the indices of the other dimensions.
+
+    Raises:
+        PathError: The array has no such row, or lacks some of these elements.
+
     """
     path = "/".join((array.path, *map(str, leading), f"{low}..{high}"))
     if len(array.dims) != len(leading) + 1:

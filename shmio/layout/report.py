@@ -1,4 +1,4 @@
-"""Collecting diagnostics, within a bound."""
+"""Collect a bounded number of diagnostics."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ MAX_WARNINGS = 1000
 
 
 class TooManyErrors(ShmioError):  # noqa: N818  (a signal to stop, never seen outside the compiler)
-    """There are ``MAX_ERRORS`` already; the rest of the sources is not read."""
+    """``MAX_ERRORS`` have been found; the rest of the sources is not read."""
 
 
 class Report:
-    """The errors and warnings of one run over these files."""
+    """Errors and warnings of one compilation of these files."""
 
     def __init__(self, files: Sequence[str]) -> None:
         self._order = {file: position for position, file in enumerate(files)}
@@ -25,9 +25,13 @@ class Report:
         self.warnings: list[Diagnostic] = []
 
     def add(self, diagnostic: Diagnostic) -> None:
-        """Keep a diagnostic, unless it is there, or the last error was at the same place: then it follows from that.
+        """Keep a diagnostic, unless it is a duplicate or a consequence of the last error.
 
-        Raises TooManyErrors: this was the last error there is room for.
+        An error at the same place as the one before counts as its consequence.
+
+        Raises:
+            TooManyErrors: The report has reached ``MAX_ERRORS``.
+
         """
         if diagnostic in self._seen:
             return
@@ -42,12 +46,12 @@ class Report:
             self.warnings.append(diagnostic)
 
     def extend(self, diagnostics: Iterable[Diagnostic]) -> None:
-        """Keep several, as :meth:`add` does."""
+        """Add several diagnostics; see :meth:`add`."""
         for diagnostic in diagnostics:
             self.add(diagnostic)
 
     def raise_errors(self) -> None:
-        """Raise LayoutError with all that was found, in source order, if any of it is an error."""
+        """Raise LayoutError with all diagnostics, errors in source order, if there is any error."""
         if self.errors:
             self.errors.sort(key=lambda error: (self._order.get(error.file, 0), error.line, error.column))
             lines = [str(error) for error in self.errors]

@@ -1,6 +1,7 @@
-"""Paths as TIA Portal writes them, for what people type: ``"Axes"[2]."Vel"``, ``Inputs[8].%X0``, ``Grid[1,*]``.
+"""Translate paths typed in TIA Portal's spelling: ``"Axes"[2]."Vel"``, ``Grid[1,*]``.
 
-A name of ours may hold dots, brackets and quotes, too: text that names something as it is keeps that meaning.
+Member names may themselves contain dots, brackets and quotes. Text that already names something
+in shmio's spelling therefore keeps that meaning.
 """
 
 from __future__ import annotations
@@ -22,12 +23,15 @@ _INDEX = re.compile(r"-?[0-9]+(?:\.\.-?[0-9]+)?|\*")
 
 
 def may_be_foreign(text: str) -> bool:
-    """Whether text has any sign of TIA's spelling; else there is nothing to look for."""
+    """Return whether text has a character that is typical of TIA Portal's spelling."""
     return _SIGNS.search(text) is not None
 
 
 def block_path(text: str, layout: Layout) -> str:
-    """Return a path or pattern within a block in our own spelling; text that names nothing there as it is."""
+    """Return a path or pattern within a block in shmio's spelling.
+
+    Text that names nothing in the block is returned unchanged.
+    """
     if not may_be_foreign(text) or _names(layout, text):
         return text
     path = _translated(text)
@@ -37,9 +41,10 @@ def block_path(text: str, layout: Layout) -> str:
 
 
 def topic_path(text: str, layouts: Mapping[str, Layout], default: str | None) -> str:
-    """The same for a path that may begin with its source, and end in ``/in`` or ``/out``.
+    """Return a topic in shmio's spelling: a path that may name its source and a direction.
 
-    The data block's own name, with which TIA's paths begin, stands for the source that has it.
+    The data block's own name, with which TIA Portal's paths begin, stands for its source.
+    Text that names nothing is returned unchanged.
     """
     if not may_be_foreign(text) or _is_topic(text, layouts, default):
         return text
@@ -60,7 +65,7 @@ def _is_topic(text: str, layouts: Mapping[str, Layout], default: str | None) -> 
 
 
 def _names(layout: Layout, path: str) -> bool:
-    """Whether a path or a pattern names something in a block."""
+    """Return whether a path or a pattern names something in a block."""
     try:
         if "*" in path:
             return any(True for _ in chosen(layout, path))
@@ -76,12 +81,12 @@ def _is_block(name: str, layout: Layout) -> bool:
 
 
 def _escaped(name: str) -> str:
-    """A name that may be percent-encoded by now."""
+    """Encode the names ``in`` and ``out``; other names may be percent-encoded already."""
     return encode_segment(name) if name in ("in", "out") else name
 
 
 def _translated(text: str) -> str:
-    """The text in our spelling; empty if it is none of TIA's."""
+    """Return the text in shmio's spelling, or an empty string if it is not in TIA Portal's."""
     if len(text) > MAX_TOPIC or "://" in text:
         return ""
     segments, at, joined = list[str](), 0, True  # joined: a name is due

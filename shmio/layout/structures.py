@@ -1,6 +1,7 @@
-"""Structures of known shape: those that SimlogAPI version 1 has messages for, ``proto/simlog_v1.proto``.
+"""Structures for which SimlogAPI version 1 has messages (``proto/simlog_v1.proto``).
 
-In a tag table they are types; in a data block a structure is one of them if it has its members, in any order and case.
+A tag table uses them as types. In a data block, a structure is recognised by its members, in any
+order and case.
 """
 
 from __future__ import annotations
@@ -18,18 +19,18 @@ Elementary = Literal["float", "uint32", "uint64", "string"]
 MAX_JOINTS: Final = 64
 MAX_POINTS: Final = 512
 MAX_REGISTERS: Final = 4096
-"""Of a structure; the longest trajectory in a tag table has fewer."""
+"""Limit for one structure; the longest trajectory in a tag table has fewer."""
 
 
 class Member(NamedTuple):
-    """One member. ``type``: elementary, or the name of another structure."""
+    """One member of a structure; ``type`` is elementary or the name of another structure."""
 
     name: str
     type: str
     many: Literal["", "joints", "points"] = ""
-    """What there is one of it for, if it is an array."""
+    """If the member is an array, what each of its elements stands for."""
     needed: bool = True
-    """Whether a structure without it is of another shape."""
+    """Whether a structure must have this member to be recognised."""
 
 
 _HEADER: Final = Member("header", "Header", needed=False)
@@ -72,7 +73,7 @@ CONTENTS: Final[Mapping[str, str]] = {
     "SafetyZone": "safety_zone",
     "SafetyZoneCmd": "safety_zone_cmd",
 }
-"""Those that a message may hold by themselves, and the field of the message."""
+"""The structures that a message can hold, with the message's field for each."""
 
 _S7: Final[Mapping[str, str]] = {"float": "REAL", "uint32": "UDINT", "uint64": "ULINT", "string": "STRING[80]"}
 _FITS: Final[Mapping[str, frozenset[str]]] = {
@@ -87,10 +88,14 @@ _INDEX = re.compile(r"-?[0-9]{1,10}")
 
 
 def members(text: str) -> dict[str, str] | None:
-    """The members of a structure as a tag table's type names it, by path, and their types; None: it is none.
+    """Return a tag table's structure type as member types by path; None for any other type.
 
-    ``SafetyZone``, ``JointTrajectoryPoint[6]``, ``JointTrajectory[6, 20]``: joints, points. ValueRangeError: lengths
-    are missing, or too many or too large.
+    Lengths follow the name: ``SafetyZone`` has none, ``JointTrajectoryPoint[6]`` has joints,
+    ``JointTrajectory[6, 20]`` has joints and points.
+
+    Raises:
+        ValueRangeError: Lengths are missing, too many, or too large.
+
     """
     match = _TYPE.fullmatch(text.strip())
     if match is None or match[1] not in CONTENTS:
@@ -121,13 +126,13 @@ def _expanded(shape: str, lengths: Mapping[str, int], prefix: str) -> Iterator[t
 
 
 Found = Mapping[str, "Register | Found | Sequence[Found]"]
-"""What there is of a shape's members, by the shape's names: a register, a structure, or structures in their order."""
+"""Members by the shape's names: a register, a structure, or an ordered list of structures."""
 
 
 def recognise(path: str, registers: Sequence[Register]) -> tuple[str, Found] | None:
-    """The shape that a structure of these registers has, and its members; None: none of those in ``CONTENTS``.
+    """Return the shape in ``CONTENTS`` that these registers have, with its members, or None.
 
-    All needed members are there, with types that fit, and no others.
+    A shape fits if all its needed members are there with fitting types, and no other members.
     """
     if not 0 < len(registers) <= MAX_REGISTERS:
         return None
@@ -143,7 +148,10 @@ _Parts = Sequence[tuple[Sequence[str], Register]]
 
 
 def _match(shape: str, parts: _Parts) -> Found | None:
-    """``parts``: the names, in lower case, that lead to each register from here."""
+    """Return the members of a shape, or None if the registers do not fit it.
+
+    ``parts`` has the names, in lower case, that lead to each register.
+    """
     groups = _by_name(parts)
     if groups.keys() - {member.name for member in SHAPES[shape]}:
         return None

@@ -1,10 +1,12 @@
-"""Topic paths: how a register is named from outside.
+"""Topics: the paths by which clients name registers.
 
-``<source>/<member>/…[/<index>…]`` and then, if given, ``/in`` or ``/out``. Before these, a path may end in a part of
-a register: a slice in place of the last index (``Inputs/2..5``), or a bit or another part of an integer
-(``Inputs/8.%X0``), as ``parts.py`` has them. A leading slash is accepted, and so
-is ``<SCHEME>://``, whose scheme is a source's name in any case. In a member's name ``/ % + #`` are
-percent-encoded, and so is the first letter of a member named exactly ``in`` or ``out``.
+A topic is ``<source>/<member>/…[/<index>…]``, optionally followed by ``/in`` or ``/out``. Before
+the direction, the path may end in a part of a register (see ``parts.py``): a slice in place of the
+last index (``Inputs/2..5``), or a bit or another part of an integer (``Inputs/8.%X0``).
+
+A leading slash is accepted, and so is ``<SCHEME>://``, whose scheme is a source's name in any case.
+In a member's name ``/ % + #`` are percent-encoded, and so is the first letter of a member named
+exactly ``in`` or ``out``.
 """
 
 from __future__ import annotations
@@ -41,8 +43,8 @@ _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 class Topic:
     """A register's path within a source, and a direction if one was named.
 
-    ``path`` is in canonical encoding and empty when the text named only the source. ``named``: whether the text named
-    the source, which else is the default one.
+    ``path`` is in canonical encoding, and empty when the text named only the source. ``named``
+    tells whether the text named the source; otherwise the source is the default one.
     """
 
     source: str
@@ -62,9 +64,12 @@ def encode_segment(name: str) -> str:
 
 
 def decode_segment(segment: str) -> str:
-    """Return the member's name of one path segment.
+    """Return the member's name that a path segment encodes.
 
-    Raises PathError: a ``%`` without two hexadecimal digits, bytes that are not UTF-8, or a part of a register.
+    Raises:
+        PathError: A ``%`` lacks its two hexadecimal digits, the bytes are not UTF-8, or the segment
+            names a part of a register.
+
     """
     if "%" not in segment:
         return segment
@@ -88,10 +93,16 @@ def decode_segment(segment: str) -> str:
 
 
 def canonical_path(path: str, *, parts: bool = False) -> str:
-    """Return a path with each segment in its one canonical encoding; ``parts``: it may end in a part of an integer.
+    """Return a path with each segment in canonical encoding.
 
-    Raises PathError: an empty segment, a wrong percent-encoding, control characters, which no name has, or more
-    segments than the deepest layout has.
+    Args:
+        path: The path, with any valid encoding.
+        parts: Whether the path may end in a part of an integer.
+
+    Raises:
+        PathError: A segment is empty or wrongly encoded, the path has control characters, or it has
+            more segments than the deepest layout.
+
     """
     segments = path.split("/", MAX_SEGMENTS)
     if len(segments) > MAX_SEGMENTS:
@@ -110,10 +121,17 @@ def canonical_path(path: str, *, parts: bool = False) -> str:
 def parse_topic(text: str, sources: Collection[str], default: str | None) -> Topic:
     """Split a topic into source, path and direction.
 
-    A first segment that is a source's name, or a reserved name, is the source; otherwise ``default`` is.
-    A text that names the source alone gives an empty path: the whole block.
+    Args:
+        text: The topic. Its first segment is the source if it is a source's name or reserved.
+        sources: Names of the sources.
+        default: The source of a topic that names none; None if a topic must name one.
 
-    Raises PathError: no such source, no default where one is needed, or a malformed path.
+    Returns:
+        The topic. Its path is empty if the text names only the source: the whole block.
+
+    Raises:
+        PathError: The source is unknown or missing, or the path is malformed.
+
     """
     if len(text) > MAX_TOPIC:
         raise PathError(f"{shorten(text)}: a path is at most {MAX_TOPIC} characters long")
@@ -151,7 +169,7 @@ def _source_of_scheme(scheme: str, sources: Collection[str]) -> str:
 
 
 def _which(first: str, sources: Collection[str]) -> str:
-    """What to say of a path whose first segment is no source, where none can be left out."""
+    """Return the error text for a path that must begin with a source and does not."""
     if not sources:
         return "there is no source"
     some = [f"{source}/…" for source in sources][:_SOURCES_SHOWN]
@@ -160,16 +178,16 @@ def _which(first: str, sources: Collection[str]) -> str:
 
 
 def look_up(layout: Layout, topic: Topic) -> Register:
-    """As :func:`find`; the PathError names the source, and says so if the topic did not."""
-    return _told(layout, topic, find)
+    """Find the register of a topic as :func:`find` does, with the source in its PathError."""
+    return _with_source_in_errors(layout, topic, find)
 
 
 def look_up_each(layout: Layout, topic: Topic) -> list[Register]:
-    """As :func:`find_each`, with the errors of :func:`look_up`."""
-    return _told(layout, topic, lambda layout, path: list(find_each(layout, path)))
+    """Find the registers of a topic as :func:`find_each` does, with the source in its PathError."""
+    return _with_source_in_errors(layout, topic, lambda layout, path: list(find_each(layout, path)))
 
 
-def _told(layout: Layout, topic: Topic, search: Callable[[Layout, str], _Found]) -> _Found:
+def _with_source_in_errors(layout: Layout, topic: Topic, search: Callable[[Layout, str], _Found]) -> _Found:
     try:
         return search(layout, topic.path)
     except PathError as error:
@@ -181,9 +199,11 @@ def _told(layout: Layout, topic: Topic, search: Callable[[Layout, str], _Found])
 
 
 def find(layout: Layout, path: str) -> Register:
-    """Return the register of a canonical path, or what the path names of one: an element, a slice, a bit.
+    """Return the register, element, slice, bit or other part that a canonical path names.
 
-    Raises PathError: there is none; the message has near names.
+    Raises:
+        PathError: There is none; the message suggests similar names.
+
     """
     index = layout.by_path.get(path)
     if index is not None:
@@ -204,13 +224,13 @@ def find(layout: Layout, path: str) -> Register:
 
 
 def names_part(path: str) -> bool:
-    """Whether a path ends as that of a slice, or of a bit or another part of an integer."""
+    """Return whether a path names a slice, or a bit or another part of an integer."""
     last = path.rpartition("/")[2]
     return bool(PART.fullmatch(last) or RANGE.fullmatch(last))
 
 
 def holders(path: str) -> Iterator[str]:
-    """A canonical path, and those of what it may be a part of: elements, arrays, structures."""
+    """Yield a canonical path and the paths that contain it: elements, arrays, structures."""
     yield path
     if part := PART.fullmatch(path):
         path = part["head"]
@@ -220,12 +240,17 @@ def holders(path: str) -> Iterator[str]:
 
 
 def holder(layout: Layout, register: Register) -> str:
-    """The path of the register of a layout that this one, which :func:`find` has found, is or is a part of."""
+    """Return the path of the layout's register that contains a result of :func:`find`."""
     return next(path for path in holders(register.path) if path in layout.by_path)
 
 
 def find_each(layout: Layout, path: str) -> Iterator[Register]:
-    """As :func:`find`; of a slice the elements."""
+    """Yield the register that a canonical path names, or each element of the slice it names.
+
+    Raises:
+        PathError: There is none; see :func:`find`.
+
+    """
     register = find(layout, path)
     head, _, last = path.rpartition("/")
     if path in layout.by_path or not RANGE.fullmatch(last):
@@ -237,7 +262,7 @@ def find_each(layout: Layout, path: str) -> Iterator[Register]:
 
 
 def _array(layout: Layout, path: str) -> tuple[Register, tuple[int, ...]] | None:
-    """The register, an array in a sound path, that a path is or lies below by indices; and these."""
+    """Split a path into a register and trailing indices, or return None."""
     indices: tuple[int, ...] = ()
     while (index := layout.by_path.get(path)) is None:
         path, _, last = path.rpartition("/")
@@ -263,7 +288,7 @@ def _unknown(layout: Layout, path: str) -> str:
 
 
 def near(layout: Layout, path: str) -> list[str]:
-    """Up to three paths of registers, elements or structures that are like this one, whatever the case."""
+    """Return up to three paths of registers, elements or structures that resemble this one."""
     wanted = path[:_NEAR_CHARACTERS].lower()
     head, indices = wanted, ""
     while not (same := layout.in_any_case(head)) and _INDEX.fullmatch(last := head.rpartition("/")[2]):
@@ -286,7 +311,7 @@ def near(layout: Layout, path: str) -> list[str]:
 
 
 def _where_it_ends(layout: Layout, path: str) -> tuple[str, str, list[str]]:
-    """(the longest prefix that is a structure, the segment after it, the names that could stand there)."""
+    """Return the longest prefix that is a structure, the segment after it, and the names there."""
     known, below = path, tuple[int, ...]()
     while known and not below:
         known = known.rpartition("/")[0]
@@ -298,5 +323,5 @@ def _where_it_ends(layout: Layout, path: str) -> tuple[str, str, list[str]]:
 
 
 def shorten(text: str, limit: int = 120) -> str:
-    """Return text that fits an error message."""
+    """Return text cut to a length that fits an error message."""
     return text if len(text) <= limit else f"{text[: limit - 1]}…"

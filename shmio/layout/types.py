@@ -1,7 +1,7 @@
 """The elementary types of S7: name, size and alignment.
 
-Sizes and alignments are those of a block with standard access, as Siemens' STEP 7 help gives them under
-"Data types"; ``docs/reference/layout-rules.md`` has the whole table.
+Sizes and alignments are those of a block with standard access, as given in Siemens' STEP 7 help
+under "Data types"; ``docs/reference/layout-rules.md`` has the whole table.
 """
 
 from __future__ import annotations
@@ -17,11 +17,15 @@ DEFAULT_STRING = 254
 
 @dataclass(frozen=True, slots=True)
 class ElementType:
-    """One elementary type, a string with its length included.
+    """An elementary type; a string type includes its length.
 
-    ``name`` is canonical (``DATE_AND_TIME``, never ``DT``; ``STRING[20]``); ``base`` is the name without the
-    length; ``size`` is in bytes (1 for BOOL, which takes one bit of it); ``align`` is 1 or 2 bytes;
-    ``length`` is the most characters of a string, 0 for all other types.
+    Attributes:
+        name: The canonical name: ``DATE_AND_TIME``, never ``DT``; ``STRING[20]``.
+        base: The name without the length.
+        size: Size in bytes; 1 for BOOL, which takes one bit of it.
+        align: Alignment in bytes, 1 or 2.
+        length: Maximum number of characters of a string, 0 for all other types.
+
     """
 
     name: str
@@ -32,7 +36,7 @@ class ElementType:
 
     @property
     def stride(self) -> int:
-        """Bytes from one array element to the next; BOOL, which packs bits, is the exception."""
+        """Bytes from one array element to the next, except for BOOL, which packs bits."""
         return -(-self.size // self.align) * self.align
 
 
@@ -49,8 +53,9 @@ _FIXED = {
     name: ElementType(name, name, size, 1 if size == 1 else 2) for size, names in _SIZES.items() for name in names
 }
 
-# Hardware data types and parameter types are numbers that name something; Siemens' help gives the type under each
-# ("Hardware data types"; "Format of the parameter types BLOCK, COUNTER, TIMER": a binary number in a word).
+# Hardware data types and parameter types are numbers that identify something. Siemens' help gives
+# each one's underlying type ("Hardware data types"; "Format of the parameter types BLOCK, COUNTER,
+# TIMER": a binary number in a word).
 # fmt: off
 _NAMING = {
     "UINT": (
@@ -84,13 +89,13 @@ _STRING = re.compile(r"(W?STRING)(?:\[([0-9]{1,5})\])?")
 
 
 def string_limit(base: str) -> int:
-    """Return the most characters ``STRING`` or ``WSTRING`` may be declared with."""
+    """Return the maximum declared length of ``STRING`` or ``WSTRING``, in characters."""
     return MAX_STRING if base == "STRING" else MAX_WSTRING
 
 
 @lru_cache(maxsize=1024)
 def element_type(name: str) -> ElementType | None:
-    """Return the elementary type of this name, in any case and with aliases, or None if there is none."""
+    """Return the elementary type with this name, or None; case does not matter, aliases count."""
     upper = name.upper()
     fixed = _FIXED.get(ALIASES.get(upper, upper))
     if fixed is not None:

@@ -78,7 +78,9 @@ class LayoutFiles:
         return compiled.layouts
 
 
-def _choose(key: str, section: Source | Emulator, blocks: Sequence[compiler.Held], number: int | None) -> compiler.Held:
+def _choose(
+    key: str, section: Source | Emulator, blocks: Sequence[compiler.BlockName], number: int | None
+) -> compiler.BlockName:
     held = ", ".join(block.name for block in blocks)
     if section.block is not None:
         for block in blocks:

@@ -17,7 +17,7 @@ from shmio.config.read import examine
 from shmio.config.wording import meant
 from shmio.errors import ConfigError, PathError
 from shmio.layout.glob import Glob
-from shmio.layout.image import complaints
+from shmio.layout.image import initial_value_warnings
 from shmio.layout.model import Layout
 from shmio.layout.spelling import block_path, topic_path
 from shmio.layout.topic import find, look_up, names_part, near, parse_topic
@@ -329,7 +329,7 @@ def _not_emulated(config: Config) -> Iterator[str]:
 def _unread(emulated: dict[str, tuple[Layout, ...]]) -> Iterator[str]:
     """Initial values that mean nothing to an emulator."""
     for name, layouts in emulated.items():
-        for text in (text for layout in layouts for text in complaints(layout)):
+        for text in (text for layout in layouts for text in initial_value_warnings(layout)):
             yield f"emulator {name!r}: {text}"
 
 

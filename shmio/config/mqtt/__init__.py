@@ -1,1 +1,1 @@
-"""``[mqtt]`` of ``supervisor.toml``: its keys, their rules, TLS and accounts."""
+"""The section ``[mqtt]`` of ``supervisor.toml``: keys, rules, TLS files and accounts."""

@@ -1,4 +1,4 @@
-"""Passwords of MQTT: ours at a broker elsewhere, and those of our own broker's clients."""
+"""MQTT passwords: shmio's at an external broker, and those of its own broker's clients."""
 
 from __future__ import annotations
 
@@ -15,14 +15,19 @@ from shmio.errors import ConfigError
 
 MAX_BYTES: Final = 1 << 20
 ROUNDS: Final = 101
-"""Of mosquitto's own hashes, as its versions up to 2.0 make them; passwords come once a connection."""
+"""PBKDF2 rounds, as mosquitto up to 2.0 uses; a password is checked once per connection."""
 KEY: Final = "mqtt.password_file"
 _HASH: Final = re.compile(r"\$[0-9a-z-]{1,16}\$")
-"""How a hash begins, of whatever kind."""
+"""Matches the beginning of a hash of any kind."""
 
 
 def read_password(name: str) -> str:
-    """Our password: the file's first line. ConfigError; never says what is in it."""
+    """Return the password for an external broker: the file's first line.
+
+    Raises:
+        ConfigError: The file is unusable or its first line is empty; never quotes its contents.
+
+    """
     password = _read(name).split("\n", 1)[0].rstrip("\r")
     if not password:
         raise ConfigError(f"{KEY}: {name}: its first line, the password, is empty")
@@ -30,12 +35,16 @@ def read_password(name: str) -> str:
 
 
 def read_accounts(name: str, roles: Sequence[MqttAccount] = ()) -> dict[str, str]:
-    """Names and hashes of who may connect to our broker.
+    """Return the password hashes of the accounts of shmio's own broker, by account name.
 
-    A line each: ``name:password``, or ``name:hash`` as mosquitto_passwd writes it. ``roles``: accounts that have to
-    have a line.
+    Args:
+        name: Path of the file. Each line is ``name:password``, or ``name:hash`` as
+            mosquitto_passwd writes it.
+        roles: Accounts that must have a line.
 
-    ConfigError names the line that will not do, and never says what is in it.
+    Raises:
+        ConfigError: A line is invalid or missing; names the line and never quotes it.
+
     """
     accounts: dict[str, str] = {}
     for number, line in enumerate(_read(name).splitlines(), 1):
@@ -64,14 +73,14 @@ def read_accounts(name: str, roles: Sequence[MqttAccount] = ()) -> dict[str, str
 
 
 def hashed(password: str) -> str:
-    """A hash as mosquitto knows it: PBKDF2 with SHA-512 (mosquitto-passwd(5))."""
+    """Return a password's hash for mosquitto: PBKDF2 with SHA-512 (mosquitto-passwd(5))."""
     salt = secrets.token_bytes(12)
     digest = hashlib.pbkdf2_hmac("sha512", password.encode(), salt, ROUNDS)
     return f"$7${ROUNDS}${base64.b64encode(salt).decode()}${base64.b64encode(digest).decode()}"
 
 
 def _is_hash(secret: str) -> bool:
-    """Whether this is a hash that mosquitto knows: ``$7$ROUNDS$SALT$DIGEST``, or ``$6$SALT$DIGEST``."""
+    """Return whether mosquitto knows a hash: ``$7$ROUNDS$SALT$DIGEST`` or ``$6$SALT$DIGEST``."""
     fields = secret.split("$")
     try:
         pbkdf2 = fields[:2] == ["", "7"] and len(fields) == 5 and 0 < int(fields[2]) <= 10_000_000

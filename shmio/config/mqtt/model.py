@@ -1,4 +1,4 @@
-"""``[mqtt]`` as types; what each key means is in docs/reference/config.md."""
+"""The section ``[mqtt]`` as types; docs/reference/config.md explains each key."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ PayloadName = Literal["text", "json", "structure", "frames"]
 
 
 class MqttTls(Section):
-    """``[mqtt.tls]``: PEM files. ``ca``: whose certificates are trusted, of an external broker the host's if not given.
+    """``[mqtt.tls]``: PEM files.
 
-    ``certificate`` and ``key``: what an external broker is shown, or what our own one shows its clients.
+    ``ca`` issues the peer's certificates; without it, an external broker's certificate is checked
+    with the host's authorities. ``certificate`` and ``key`` identify shmio to an external broker,
+    or shmio's own broker to its clients.
     """
 
     ca: Text | None = None
@@ -24,7 +26,7 @@ class MqttTls(Section):
 
 
 class MqttTopic(Section):
-    """``[[mqtt.topic]]``: how the registers that ``match`` names are published; of several rules the first counts."""
+    """``[[mqtt.topic]]``: how matching registers are published; the first matching rule counts."""
 
     match: Text | Texts
     publish: bool = True
@@ -42,7 +44,7 @@ class MqttTopic(Section):
 
 
 class Sparkplug(Section):
-    """``[mqtt.sparkplug]``: the instance as an edge node of Sparkplug B; ``node``: default the instance's name."""
+    """``[mqtt.sparkplug]``: the instance as a Sparkplug B edge node, by default of its own name."""
 
     group: Text
     node: Text | None = None
@@ -54,14 +56,15 @@ class Sparkplug(Section):
 
     @property
     def patterns(self) -> list[str]:
-        """Globs over paths that begin with their source: what is a metric."""
+        """Globs that select the metrics, over paths that begin with their source."""
         return [self.match] if isinstance(self.match, str) else self.match
 
 
 class MqttAccount(Section):
-    """``[[mqtt.account]]``: what an account of our own broker may do; without ``name``: who shows no account.
+    """``[[mqtt.account]]``: the roles of an account of shmio's own broker.
 
-    ``publish``: topic filters of what ``write`` allows beside commands.
+    Without ``name`` it holds for clients without an account. ``publish`` has filters of the topics
+    that the role ``write`` allows besides commands.
     """
 
     roles: Texts
@@ -70,7 +73,7 @@ class MqttAccount(Section):
 
 
 class Mqtt(Section):
-    """``[mqtt]``: the bridge to a broker, and the broker itself unless it is ``external``."""
+    """``[mqtt]``: the bridge to a broker, and the broker itself unless that is ``external``."""
 
     broker: BrokerName = "embedded"
     listen: Text | None = None

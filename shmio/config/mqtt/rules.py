@@ -1,4 +1,4 @@
-"""The rules of ``[mqtt]``: where the broker is, who may reach it and do what there, what topics may be called."""
+"""Rules of the section ``[mqtt]``: the broker's address, its accounts' roles, and topic names."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ PORT: Final = 1883
 TLS_PORT: Final = 8883
 MAX_PREFIX: Final = 256
 ROLES: Final = ("read", "write")
-"""What an account of our own broker may be allowed: to subscribe, and to publish commands."""
+"""Roles of accounts of shmio's own broker: to subscribe, and to publish commands."""
 _ELSEWHERE: Final = ("host", "port", "username")
-"""Keys that say where a broker is that is not ours, and who we are there."""
+"""Keys with the address of an external broker, and shmio's user name there."""
 
 
 def check_mqtt(config: Config) -> None:
-    """Addresses, what may be reached there in plain text, and the keys that go together. ConfigError."""
+    """Check addresses, plain-text access, and which keys go together; ConfigError."""
     mqtt = config.mqtt
     if mqtt is None:
         return
@@ -42,7 +42,7 @@ def check_mqtt(config: Config) -> None:
 
 
 def own_topics(mqtt: Mqtt, instance: str) -> list[str]:
-    """Filters of all topics that are the instance's: where nobody else publishes, and where commands come."""
+    """Return filters of all the instance's own topics, which it publishes or reads commands from."""
     found = [f"{mqtt.prefix or f'shmio/{instance}'}/#"]
     if mqtt.sparkplug is not None:
         found.append(f"spBv1.0/{mqtt.sparkplug.group}/+/{mqtt.sparkplug.node or instance}/#")
@@ -50,7 +50,7 @@ def own_topics(mqtt: Mqtt, instance: str) -> list[str]:
 
 
 def resolve_mqtt(mqtt: Mqtt, config: Config) -> None:
-    """Make the section's paths absolute, and give it its prefix."""
+    """Make the section's paths absolute, and set the default prefix."""
     mqtt.prefix = mqtt.prefix or f"shmio/{config.instance.name}"
     if mqtt.password_file is not None:
         mqtt.password_file = str(config.path(mqtt.password_file))
@@ -61,7 +61,7 @@ def resolve_mqtt(mqtt: Mqtt, config: Config) -> None:
 
 
 def brokers(mqtt: Mqtt) -> list[Address]:
-    """The external brokers, in the order in which they are tried; ConfigError."""
+    """Return the external brokers' addresses in the order of attempts; ConfigError."""
     port = mqtt.port or (PORT if mqtt.tls is None else TLS_PORT)
     hosts = [mqtt.host] if isinstance(mqtt.host, str) else mqtt.host or []
     found = []
@@ -81,7 +81,7 @@ def _has_port(host: str) -> bool:
 
 
 def _is_no_text(part: str) -> bool:
-    """Whether it has what brokers end a connection for: controls, and what is no character (MQTT 5.0, 1.5.4)."""
+    """Return whether text has control or non-characters, which brokers refuse (MQTT 5.0, 1.5.4)."""
     return any(category(one) == "Cc" or 0xFDD0 <= ord(one) <= 0xFDEF or ord(one) & 0xFFFE == 0xFFFE for one in part)
 
 
@@ -183,7 +183,7 @@ def _check_filter(key: str, topics: str, own: Sequence[str]) -> None:
 
 
 def _overlap(one: Sequence[str], other: Sequence[str]) -> bool:
-    """Whether there may be a topic that both filters match."""
+    """Return whether a topic could match both filters."""
     if ["#"] in (list(one[:1]), list(other[:1])):
         return True
     if not one or not other:

@@ -1,4 +1,4 @@
-"""The PEM files of ``[mqtt.tls]``, tried by TLS itself."""
+"""TLS contexts from the PEM files of ``[mqtt.tls]``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,11 @@ from shmio.errors import ConfigError
 
 
 def client_context(tls: MqttTls) -> ssl.SSLContext:
-    """For a broker elsewhere: its certificate must be one of ``ca``, or of the host's own authorities. ConfigError."""
+    """Return the TLS context for an external broker; ConfigError.
+
+    ``ca`` must have issued the broker's certificate, or one of the host's authorities if there is
+    no ``ca``.
+    """
     context = ssl.create_default_context()
     if tls.ca is not None:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
@@ -22,7 +26,7 @@ def client_context(tls: MqttTls) -> ssl.SSLContext:
 
 
 class _Socket(ssl.SSLSocket):
-    """Is closed when no TLS comes about; who makes it then has no other way to."""
+    """Closes itself when the TLS handshake fails; its creator could not close it then."""
 
     def do_handshake(self, block: bool = False) -> None:
         try:
@@ -33,7 +37,10 @@ class _Socket(ssl.SSLSocket):
 
 
 def server_context(tls: MqttTls) -> ssl.SSLContext:
-    """For our own broker; with ``ca`` clients must show a certificate of it. ConfigError."""
+    """Return the TLS context of shmio's own broker; ConfigError.
+
+    With ``ca``, clients must present a certificate issued by it.
+    """
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     _show(context, tls)
     if tls.ca is not None:

@@ -15,7 +15,7 @@ from typing import Final
 import msgspec
 
 from shmio.config import Declaration
-from shmio.config.declaration import complaints
+from shmio.config.declaration import contradictions
 from shmio.connectors.injection.declared_layer import MAX_HELD, DeclaredLayer, declared, resumed
 from shmio.connectors.injection.layers import Bits, CycleImage, Owner
 from shmio.connectors.injection.published import LayerPublisher, in_parts, layer_event, lost
@@ -135,7 +135,7 @@ class DeclaredInjections:
         """Lay what a command declares; why not, or empty."""
         try:
             declaration = _DECODER.decode(b"".join(write.data for write in command.writes))
-            for complaint in complaints(declaration):
+            for complaint in contradictions(declaration):
                 return complaint
             program = self._program(declaration)
         except (msgspec.MsgspecError, ConfigError, RecursionError) as error:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from shmio.config import Declaration, load
 from shmio.config.campaign import read_campaign
-from shmio.config.declaration import KEYS, complaints
+from shmio.config.declaration import KEYS, contradictions
 from shmio.errors import ConfigError
 
 GOOD = """
@@ -91,7 +91,7 @@ def test_a_name_is_given_once(tmp_path: Path) -> None:
 )
 def test_operands_go_with_their_operation(operation: str, keys: dict[str, object], message: str) -> None:
     declared = msgspec.convert({"name": "x", "target": "a", "operation": operation, **keys}, Declaration)
-    assert next(complaints(declared)).startswith(message)
+    assert next(contradictions(declared)).startswith(message)
 
 
 values = st.one_of(st.integers(), st.floats(), st.booleans(), st.text(max_size=5), st.lists(st.integers(), max_size=3))
@@ -106,5 +106,5 @@ def test_what_is_not_complained_of_can_be_sent(operation: str, keys: dict[str, o
         declared = msgspec.convert({"name": "x", "target": "a", "operation": operation, **keys}, Declaration)
     except msgspec.ValidationError:
         return
-    if not list(complaints(declared)):
+    if not list(contradictions(declared)):
         assert msgspec.json.decode(msgspec.json.encode(declared), type=Declaration) == declared
