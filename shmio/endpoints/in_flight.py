@@ -1,4 +1,4 @@
-"""Commands toward one source whose end has not come yet."""
+"""The in-flight table: commands to one source whose outcomes are not known yet."""
 
 from __future__ import annotations
 
@@ -12,43 +12,51 @@ from shmio.segment import DONE, ENDS, Event, EventKind
 from shmio.segment.events import EVENT_DATA_SIZE
 
 MAX_OPEN: Final = 512
-"""Events that may be outstanding: a quarter of the ring, so that none is overwritten before it is read."""
+"""Bound of outstanding events: a quarter of the ring, so that none is overwritten unread."""
 
 End = tuple[EventKind, str]
-"""What became of an item, one of ``ENDS`` or, if that is waited for, ACCEPTED; and the reason, if there is one."""
+"""An item's outcome and its reason: one of ``ENDS``, or ACCEPTED if the command ends with that."""
 Done = Callable[[Sequence[End]], None]
-"""Called once with the ends of a command's values."""
+"""Called once, with the outcome of each of a command's values."""
 
 
 def worst(ends: Sequence[End]) -> End:
-    """One end for all: the first that is not what was wanted."""
+    """Return the first outcome that is not a success, or the first of all if there is none."""
     return next((end for end in ends if end[0] not in DONE), ends[0])
 
 
 def in_words(end: End) -> str:
-    """What became of one that is not what was wanted."""
+    """Return a failed outcome as text."""
     kind, reason = end
     return f"{kind}: {reason}"
 
 
 class CommandCost(NamedTuple):
-    """At most so many bytes in the queue, and events until its end, has a command."""
+    """Upper bounds of what a command needs: bytes in the queue, and events until its end."""
 
     record_bytes: int
     events: int
 
     @classmethod
     def of(cls, sizes: Collection[int], name: str = "") -> CommandCost:
-        """That of one with items of so many bytes."""
+        """Return the cost of a command with items of these sizes, in bytes."""
         events = sum(2 + size // EVENT_DATA_SIZE for size in sizes)
         return cls(64 + 4 * len(name) + sum(24 + size for size in sizes), events)
 
 
 @dataclass(slots=True)
 class InFlightCommand:
-    """``values``: the items of each of its values; ``accepted``: called once, if the source accepts it.
+    """A command in flight.
 
-    ``until_accepted``: to be accepted is the end.
+    Attributes:
+        incarnation: The source's process that the command was sent to.
+        until_ns: When waiting ends, by the monotonic clock.
+        cost: The space it may need.
+        values: For each value, the range of its items.
+        done: Called once, with the outcome of each value.
+        accepted: Called once, if the source accepts the command.
+        until_accepted: Whether acceptance already ends the command.
+
     """
 
     incarnation: int
@@ -59,18 +67,18 @@ class InFlightCommand:
     accepted: Callable[[], None] | None = None
     until_accepted: bool = False
     taken: bool = False
-    """Whether the source has it, out of the queue."""
+    """Whether the source has taken the command out of the queue."""
     open_events: int = 0
-    """At most so many are still to come."""
+    """Upper bound of the events that are still to come."""
     _ends: dict[int, End] = field(default_factory=dict)
 
     @property
     def items(self) -> int:
-        """How many it has."""
+        """Number of the command's items."""
         return self.values[-1].stop
 
     def hear(self, event: Event) -> bool:
-        """Take in what an event says; whether the end of all is known by now."""
+        """Process one event; return whether all outcomes are known."""
         if not self.taken and event.kind == EventKind.ACCEPTED and self.accepted is not None:
             self.accepted()
         self.taken = True
@@ -84,19 +92,19 @@ class InFlightCommand:
         return len(self._ends) == self.items
 
     def finish(self, missing: str = "") -> None:
-        """Tell the ends; ``missing``: why that of some items is not known."""
+        """Report the outcomes. ``missing``: why some of them are unknown."""
         unknown = EventKind.UNKNOWN, missing
         self.done([worst([self._ends.get(item, unknown) for item in items]) for items in self.values])
 
 
 class InFlightTable:
-    """Those of one writer, by their numbers."""
+    """The commands of one writer that are in flight, by number."""
 
     def __init__(self, writer: int) -> None:
         self.open_events = 0
-        """At most so many are still to come."""
+        """Upper bound of the events that are still to come."""
         self.untaken_bytes = 0
-        """Of records that may still lie in the queue."""
+        """Size of the records that may still be in the queue."""
         self._writer = writer
         self._by_number: dict[int, InFlightCommand] = {}
 
@@ -105,7 +113,7 @@ class InFlightTable:
 
     @property
     def due_ns(self) -> int | None:
-        """When the first one is not waited for any more; None: there is none."""
+        """When waiting for the first command ends, by the monotonic clock; None: there is none."""
         return min((pending.until_ns for pending in self._by_number.values()), default=None)
 
     def add(
@@ -117,7 +125,7 @@ class InFlightTable:
         *,
         until_accepted: bool = False,
     ) -> None:
-        """Follow one that was sent."""
+        """Add a command that was sent. Arguments as of :class:`InFlightCommand`."""
         self._by_number[ticket.number] = InFlightCommand(
             ticket.incarnation, ticket.until_ns, cost, [items for _, items in ticket.values], done, accepted,
             until_accepted, open_events=cost.events,
@@ -126,7 +134,7 @@ class InFlightTable:
         self.open_events += cost.events
 
     def hear(self, event: Event) -> bool:
-        """Take in what the source says; whether it says anything of these, or that it has started."""
+        """Process an event; return whether it concerns these commands or the source's start."""
         if event.kind == EventKind.STARTED:
             self._restarted(event.incarnation)
             return True
@@ -143,11 +151,11 @@ class InFlightTable:
         return True
 
     def hurry(self) -> None:
-        """Wait no longer than it takes to come: the ends may be among what was missed."""
+        """Shorten all time-outs, because the awaited events may be among missed ones."""
         self._hurry(self._by_number.values())
 
     def expire(self) -> bool:
-        """Give up what is overdue; whether there is one among it that the source has not even taken."""
+        """End the overdue commands; return whether the source has not even taken one of them."""
         now_ns = time.monotonic_ns()
         overdue = [(number, one) for number, one in self._by_number.items() if one.until_ns <= now_ns]
         for number, _ in overdue:
@@ -155,12 +163,15 @@ class InFlightTable:
         return any(not pending.taken for _, pending in overdue)
 
     def end(self, reason: str) -> None:
-        """Nothing more is heard of any of them."""
+        """End all commands, because no more events will come."""
         for number in list(self._by_number):
             self._end(number, reason)
 
     def _restarted(self, incarnation: int) -> None:
-        """A successor rejects what its predecessor had not taken; of what it had taken nobody knows."""
+        """End the commands that the source's previous process had taken: their outcome is unknown.
+
+        The new process rejects those that were not taken, so these only get a short time-out.
+        """
         before = [(number, one) for number, one in self._by_number.items() if one.incarnation != incarnation]
         for number, pending in before:
             if pending.taken:

@@ -27,11 +27,11 @@ from shmio.worker import BEAT_S, Worker
 
 CALLS_S: Final = 1.0
 FOREIGN_LOGGERS: Final = ("asyncio", "grpc._cython.cygrpc")
-"""Loggers of others that clients can have write."""
+"""Loggers of libraries that clients can cause to write."""
 
 
 def run(worker: Worker) -> None:
-    """Serve until told to stop."""
+    """Serve until the worker is stopped."""
     memory.limit_arenas()
     rations = {name: LogRateLimit(one_kind=name != "shmio.grpc") for name in ("shmio.grpc", *FOREIGN_LOGGERS)}
     for name, ration in rations.items():
@@ -92,7 +92,7 @@ async def _serve(worker: Worker) -> None:
     reading: asyncio.Task[list[str]] | None = None
     while not stopping.is_set():
         reading = reading or loop.create_task(feeds.follow())
-        await asyncio.wait((reading,), timeout=BEAT_S)  # big layouts take longer than a hang: it beats meanwhile
+        await asyncio.wait((reading,), timeout=BEAT_S)  # a large layout takes long: the heartbeat goes on meanwhile
         if reading.done():
             if changed := reading.result():
                 worker.log.info("a reload added, changed or ended %s", ", ".join(changed))
@@ -120,20 +120,23 @@ async def _serve(worker: Worker) -> None:
 
 
 def _end_now(worker: Worker) -> NoReturn:
-    """End the process, as gRPC serves no more. No cleaning up: it would free what gRPC's threads still write to."""
+    """End the process without cleaning up, because gRPC has stopped serving.
+
+    Cleaning up would free memory that gRPC's threads still write to.
+    """
     worker.log.error("gRPC stopped serving; this process ends, and the supervisor starts another")
     logging.shutdown()
     os._exit(1)
 
 
 async def _calls_end() -> None:
-    """Wait for the calls that the server has told to end: the loop's own end would have each log a traceback."""
+    """Wait for the ending calls; otherwise each would log a traceback at the loop's end."""
     if calls := asyncio.all_tasks() - {asyncio.current_task()}:
         await asyncio.wait(calls, timeout=CALLS_S)
 
 
 class _Place(NamedTuple):
-    """What the instance has beside its ``[grpc]`` section."""
+    """Settings of the instance outside its ``[grpc]`` section."""
 
     config_file: Path | None
     gid: int | None
@@ -147,8 +150,8 @@ def _settings(worker: Worker) -> tuple[Grpc, _Place]:
 
 
 async def _take_anew(worker: Worker, file: Path, listeners: Listeners, server: Server, turn: asyncio.Lock) -> None:
-    """Take tokens and roles as the configuration has them by now; calls that these do not allow end."""
-    async with turn:  # of two, the one that has read later must be the last
+    """Read tokens and roles anew, and end the calls that they no longer allow."""
+    async with turn:  # of two reloads, the one that reads later must win
         try:
             config = await asyncio.to_thread(load, file)
             if config.grpc is None:

@@ -32,9 +32,10 @@ log = logging.getLogger("shmio.grpc")
 
 
 class CommandClient:
-    """Sends commands to a block's source, in order, and keeps no more under way than it can hear the end of.
+    """Sends commands to a block's source in order, and reports what became of each.
 
-    For the event loop's thread.
+    No more commands are in flight than there is room for their events. For the event loop's
+    thread.
     """
 
     def __init__(
@@ -44,7 +45,7 @@ class CommandClient:
         wake_ups: WakeUps,
         stamp: Callable[[Event], tuple[int, int]],
     ) -> None:
-        """``writer``: the command queue of this process. ``stamp``: see :class:`WriteSubscriptions`."""
+        """``writer``: this process's command queue. ``stamp``: see :class:`WriteSubscriptions`."""
         self.block = block
         self.stamp = stamp
         self.write_subscriptions = WriteSubscriptions(block, stamp)
@@ -55,7 +56,7 @@ class CommandClient:
         self._preparing = asyncio.Lock()
         self._in_flight = InFlightTable(writer)
         self._silent = False
-        self._turn = asyncio.Lock()  # who waits for room is served in order
+        self._turn = asyncio.Lock()  # callers that wait for room are served in order
         self._freed: asyncio.Future[None] | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._event_follower = EventFollower(
@@ -69,12 +70,12 @@ class CommandClient:
 
     @property
     def alive(self) -> bool:
-        """Whether the block's events are being followed, as long as there are any."""
+        """Whether the block's events are being followed, or the block has retired."""
         return self._event_follower.alive or self.block.retired
 
     @property
     def over(self) -> bool:
-        """Whether nothing is left of it: it follows no events, and has no value under way and no stream."""
+        """Whether no events are followed, no command is in flight, and nobody listens to writes."""
         return not (
             self._event_follower.alive
             or self._in_flight
@@ -84,25 +85,25 @@ class CommandClient:
         )
 
     def start(self) -> None:
-        """Begin to follow the events."""
+        """Start following the block's events."""
         self._event_follower.start()
 
     def stop(self) -> None:
-        """Follow them no more."""
+        """Stop following the block's events."""
         self._event_follower.stop()
         if self._timer is not None:
             self._timer.cancel()
 
     def catch_up(self) -> None:
-        """Deliver what has been told so far, to those who listen to what is written too."""
+        """Process all events so far, which also delivers the writes to subscribers."""
         self._event_follower.catch_up()
 
     def ready(self, values: Mapping[str, object]) -> bool:
-        """Whether :meth:`send`, or :meth:`give`, would not have to wait."""
+        """Return whether :meth:`send` or :meth:`give` of these values would not have to wait."""
         return self._prepared and not self._turn.locked() and self._has_room(self._cost(values))
 
     async def writable(self, registers: Iterable[Register]) -> bool:
-        """Whether the configuration lets all of them be written."""
+        """Return whether the configuration allows all these registers to be written."""
         await self._prepare()
         return all(map(self._source_writer.is_writable, registers))
 
@@ -115,10 +116,20 @@ class CommandClient:
         timeout_s: float | None = None,
         until_accepted: bool = False,
     ) -> None:
-        """Send values of registers, by path, as one command as soon as there is room.
+        """Send registers' values, by path, as one command; wait for room if necessary.
 
-        ``done`` is called once, when the end of all is known, a bounded time later; ``accepted`` before, if the source
-        accepts them. CommandError: one is not writable, or the source is silent; ValueRangeError: neither is called.
+        Args:
+            values: Values by register path.
+            done: Called once within a bounded time, with the outcome of each value.
+            accepted: Called before that, if the source accepts the command.
+            timeout_s: How long to wait for outcomes, in s; None: the default.
+            until_accepted: Whether acceptance already ends the command.
+
+        Raises:
+            CommandError: A register is not writable, or the source does not answer. Nothing was
+                sent, and neither function is called; the same holds for the next error.
+            ValueRangeError: A value does not fit its register.
+
         """
         submit = partial(self._source_writer.submit, values, timeout_s)
         await self._send(submit, self._cost(values), done, accepted, until_accepted=until_accepted)
@@ -132,22 +143,28 @@ class CommandClient:
         *,
         raw: Sequence[Write] = (),
     ) -> None:
-        """The same for values, and ``raw`` bytes, as an injection's; items are not values.
+        """Send values, and ``raw`` bytes, as those of an injection; otherwise as :meth:`send`.
 
-        ``accepted`` is called of one over ``/in`` only.
+        Outcomes are per write, not per value. ``accepted`` is only called for an injection over
+        ``/in``.
         """
         writes = self._source_writer.joined(values, raw)
         cost = CommandCost.of([len(write.data) for write in writes])
         await self._send(partial(self._source_writer.give, injection, writes), cost, done, accepted)
 
     def lay(self, bits: bytes, follower: InjectionFollower, done: Done, **laid: Unpack[InjectionOptions]) -> int:
-        """Have an injection laid over these bits; its number. Never waits. CommandError: not sent."""
+        """Ask the source to lay an injection over ``bits``, and return its number without waiting.
+
+        Raises:
+            CommandError: The command was not sent.
+
+        """
         writes = merge(bits, bits, [(0, len(bits))])
         cost = CommandCost.of([len(write.data) for write in writes], laid.get("name", ""))
         return self._lay(self._source_writer.lay(writes, **laid), cost, follower, done)
 
     def declare(self, declaration: Declaration, follower: InjectionFollower, done: Done, *, keep: bool) -> int:
-        """Have an injection laid that the source runs by itself; its number. Never waits. CommandError: not sent."""
+        """Ask the source to lay a declared injection, which it runs itself; as :meth:`lay`."""
         cost = CommandCost.of([len(msgspec.json.encode(declaration))], declaration.name)
         return self._lay(self._source_writer.ask_to_declare(declaration, keep=keep), cost, follower, done)
 
@@ -157,7 +174,7 @@ class CommandClient:
         return ticket.number
 
     def lift(self, injection: int, done: Done) -> None:
-        """Have an injection lifted. Never waits. CommandError: not sent."""
+        """Ask the source to lift an injection, without waiting. CommandError: it was not sent."""
         self._follow_up(self._source_writer.ask_to_lift(injection), CommandCost.of(()), done)
 
     async def _send(
@@ -176,7 +193,7 @@ class CommandClient:
                 await self._freed
             if self.block.retired:
                 raise CommandError(RETIRED)
-            if self._silent and self._in_flight:  # one at a time asks whether it is back
+            if self._silent and self._in_flight:  # one command at a time probes the source
                 raise CommandError(
                     f"source {self.block.source} does not answer; shmio-supervisor status says how it fares"
                 )
@@ -197,12 +214,12 @@ class CommandClient:
 
     async def _prepare(self) -> None:
         if not self._prepared:
-            async with self._preparing:  # not on the loop: for a big layout it takes seconds
+            async with self._preparing:  # in a thread: a large layout takes seconds
                 await asyncio.to_thread(self._source_writer.prepare)
                 self._prepared = True
 
     def _cost(self, values: Collection[str]) -> CommandCost:
-        """What a command with these costs; PathError."""
+        """Return the cost of a command with these values. PathError: no such register."""
         return CommandCost.of([size for path in values for size in sizes(find(self.block.layout, path))])
 
     def _has_room(self, cost: CommandCost) -> bool:
@@ -210,7 +227,7 @@ class CommandClient:
         fits = pending.untaken_bytes + cost.record_bytes <= self.block.commands.capacity
         return self._silent or not pending or (fits and pending.open_events + cost.events <= MAX_OPEN)
 
-    # ---- what the source says --------------------------------------------------------------------------------
+    # ---- events of the source --------------------------------------------------------------------------------
 
     def _on_event(self, event: Event) -> None:
         for channel, message in self.write_subscriptions.follow(event):
@@ -224,7 +241,7 @@ class CommandClient:
                 self._set_timer()
 
     def _missed(self, count: int) -> None:
-        """Ends of commands may be among it, too: these are not waited for longer than it takes to come."""
+        """Process a gap in the events, which may have held outcomes of commands."""
         reason = f"{count} events of source {self.block.source} were missed"
         self.write_subscriptions.skip()
         self.followers.skip()
@@ -242,7 +259,7 @@ class CommandClient:
         if self._freed is not None and not self._freed.done():
             self._freed.set_result(None)
 
-    # ---- and what it does not say ----------------------------------------------------------------------------
+    # ---- time-outs -----------------------------------------------------------------------------------------
 
     def _set_timer(self) -> None:
         if self._timer is not None:
@@ -263,13 +280,13 @@ class CommandClient:
 
 
 class Answer:
-    """What becomes of a command, to be waited for."""
+    """An awaitable for the outcomes of a command."""
 
     def __init__(self) -> None:
         self._ends: asyncio.Future[Sequence[End]] = asyncio.get_running_loop().create_future()
 
     def done(self, ends: Sequence[End]) -> None:
-        """It is known."""
+        """Set the outcomes; for ``done`` of :class:`CommandClient`."""
         if not self._ends.done():
             self._ends.set_result(ends)
 
@@ -284,9 +301,13 @@ async def write(
     *,
     until_accepted: bool = False,
 ) -> Sequence[End]:
-    """Write values by path, as one command; what became of each.
+    """Write values by path, as one command, and return the outcome of each.
 
-    PathError, ValueRangeError; CommandError: not writable, or the source takes nothing. Nothing has been sent then.
+    Raises:
+        PathError: There is no such register. Nothing was sent, as with the other errors.
+        ValueRangeError: A value does not fit its register.
+        CommandError: A register is not writable, or the source does not answer.
+
     """
     answer = Answer()
     await commands.send(values, answer.done, timeout_s=timeout_s, until_accepted=until_accepted)
@@ -296,7 +317,7 @@ async def write(
 async def give(
     commands: CommandClient, injection: int, values: Mapping[str, object], raw: Sequence[Write] = ()
 ) -> Sequence[End]:
-    """Give values by path, and raw bytes, as an injection's; what became of them, of neighbours in one."""
+    """Give an injection's values and raw bytes; return the outcomes, of adjacent writes as one."""
     answer = Answer()
     await commands.give(injection, values, answer.done, raw=raw)
     return await answer
@@ -305,12 +326,22 @@ async def give(
 async def lay(
     commands: CommandClient, bits: bytes, follower: InjectionFollower, **laid: Unpack[InjectionOptions]
 ) -> int:
-    """Lay an injection; its number. CommandError: the source refuses it, or does not answer."""
+    """Lay an injection and return its number.
+
+    Raises:
+        CommandError: The source refuses the injection, or does not answer.
+
+    """
     return await _laid(commands, lambda done: commands.lay(bits, follower, done, **laid))
 
 
 async def declare(commands: CommandClient, declaration: Declaration, follower: InjectionFollower, *, keep: bool) -> int:
-    """Lay one that the source runs by itself; its number. CommandError: as of :func:`lay`."""
+    """Lay a declared injection, which the source runs itself, and return its number.
+
+    Raises:
+        CommandError: As for :func:`lay`.
+
+    """
     return await _laid(commands, lambda done: commands.declare(declaration, follower, done, keep=keep))
 
 
@@ -326,13 +357,13 @@ async def _laid(commands: CommandClient, send: Callable[[Done], int]) -> int:
     if kind is EventKind.INJECTED:
         return number
     commands.followers.remove(number)
-    if kind is EventKind.UNKNOWN:  # it may stand
+    if kind is EventKind.UNKNOWN:  # the source may have laid it
         await lift(commands, number)
     raise CommandError(f"{commands.block.source}: {reason}")
 
 
 async def lift(commands: CommandClient, injection: int) -> str:
-    """Lift an injection; why it still stands, or empty."""
+    """Lift an injection; return why it still stands, or an empty text if it does not."""
     try:
         _check(commands)
         answer = Answer()
@@ -344,9 +375,10 @@ async def lift(commands: CommandClient, injection: int) -> str:
 
 
 async def have_lifted(commands: CommandClient, injection: int, name: str) -> None:
-    """Have the source lift one of ours, for as long as that takes: nobody else will while this process lives.
+    """Lift an injection of this process, retrying until the source has done so.
 
-    Its follower is told nothing more. ``name``: what it is called in the log.
+    No other process would lift it while this one lives. Its follower gets no more events.
+    ``name``: what the log calls the injection.
     """
     commands.followers.remove(injection)
     while stands(commands, injection) and (reason := await lift(commands, injection)):
@@ -355,7 +387,7 @@ async def have_lifted(commands: CommandClient, injection: int, name: str) -> Non
 
 
 def stands(commands: CommandClient, injection: int) -> bool:
-    """Whether it still does."""
+    """Return whether an injection still stands."""
     standing = commands.block.standing.read()
     return not commands.block.retired and any(one.id == injection and not one.lifted for one in standing)
 

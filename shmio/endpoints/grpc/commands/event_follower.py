@@ -1,4 +1,4 @@
-"""The one follower of a block's events: hands them over as they come, a few at a time."""
+"""Follows the events of one block and passes them on, a few at a time."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from shmio.segment import Block, Event
 log = logging.getLogger("shmio.grpc")
 
 BATCH: Final = 32
-"""Most events that are looked at at once, so that streams get their turn in between."""
+"""Events that are processed before the event loop serves the streams."""
 
 
 class EventFollower:
-    """Listens to one block's bell. For the event loop's thread."""
+    """Reads a block's events whenever the block wakes the event loop. For that loop's thread."""
 
     def __init__(
         self,
@@ -29,40 +29,47 @@ class EventFollower:
         missed: Callable[[int], None],
         retired: Callable[[], None],
     ) -> None:
-        """``heed`` is called with each event, ``heeded`` after some of them.
+        """Prepare to follow events from now on; see :meth:`start`.
 
-        ``missed``: with how many were overwritten before they were read; ``retired``: when the block's last was heeded.
+        Args:
+            block: The block whose events are followed.
+            wake_ups: Wakes this follower.
+            on_event: Called with each event.
+            on_batch_end: Called after each batch of events.
+            missed: Called with the number of events that were overwritten before they were read.
+            retired: Called after the last event of a block that has retired.
+
         """
         self._block = block
         self._wake_ups = wake_ups
         self._on_event, self._on_batch_end, self._on_missed, self._retired = on_event, on_batch_end, missed, retired
         self._loop = asyncio.get_running_loop()
         self._cursor = block.events.cursor()
-        self._missed = 0  # events, as last told
-        self._again = False  # whether the loop is about to look without a bell
+        self._missed = 0  # events, as last reported
+        self._again = False  # whether another look is scheduled
         self.alive = False
-        """Whether it listens."""
+        """Whether events are being followed."""
 
     def start(self) -> None:
-        """Begin to listen."""
+        """Start following events."""
         self.alive = True
         self._wake_ups.join(self._block, self._look, patient=True)
 
     def stop(self) -> None:
-        """Listen no more."""
+        """Stop following events."""
         if self.alive:
             self.alive = False
             self._wake_ups.leave(self._block, self._look)
 
     def catch_up(self) -> None:
-        """Hand over what has been told so far."""
+        """Process all events that there are so far."""
         newest = self._block.events.head()
         while self.alive and self._cursor.last < newest:
             self._look()
 
     def _look(self) -> None:
         if not self.alive:
-            return  # it has left while the bell rang
+            return  # stopped during the wake-up
         try:
             self._follow()
         except Exception:
@@ -74,7 +81,7 @@ class EventFollower:
         self._look()
 
     def _follow(self) -> None:
-        retired = self._block.retired  # before looking: what was told before the end is still heeded
+        retired = self._block.retired  # before reading: events before the end are still processed
         for count in range(BATCH):
             event = self._cursor.poll()
             if (missed := self._cursor.missed - self._missed) > 0:

@@ -1,4 +1,4 @@
-"""Who has laid injections on one block, or listens to what is written to it, and what concerns them of its events."""
+"""Passes the events of one block to the injections on it, and to listeners of writes."""
 
 from __future__ import annotations
 
@@ -11,40 +11,43 @@ _STACKED: Final = frozenset({EventKind.INJECTED, EventKind.LIFTED, EventKind.ACT
 
 
 class InjectionFollower:
-    """Who has laid an injection, and overrides what concerns him; called in the event loop's thread."""
+    """Receives an injection's events; subclasses override what they need.
+
+    Called in the event loop's thread.
+    """
 
     def happened(self, event: Event) -> None:
-        """It was laid, has become active, is no longer, or was lifted."""
+        """Take an event: the injection was laid, activated, deactivated or lifted."""
 
     def divert(self, diverted: CommandWrites) -> None:
-        """A command's values went to it."""
+        """Take the values of a command that the injection diverted."""
 
     def restack(self) -> None:
-        """An injection was laid or lifted, became active or is no longer, on the same source."""
+        """React to another injection on the source: laid, lifted, activated or deactivated."""
 
     def lifted(self, reason: str) -> None:
-        """It was lifted."""
+        """React to the injection's end. ``reason``: why it was lifted."""
 
     def fail(self, reason: str) -> None:
-        """What comes next is not all there was."""
+        """React to missed events."""
 
 
 class WriteListener(Protocol):
-    """Who listens to what is written; called in the event loop's thread."""
+    """Receives accepted writes; called in the event loop's thread."""
 
     def accept(self, event: Event) -> None:
-        """The source has accepted this part of a command."""
+        """Take a part of a command that the source has accepted."""
 
     def fail(self, reason: str) -> None:
-        """What comes next is not all there was."""
+        """React to missed events: the writes that follow are not complete."""
 
 
 InjectionChange = CommandWrites | Event
-"""What was diverted, or happened to injections; what was accepted, if somebody listens."""
+"""Diverted values, an event of an injection, or an accepted write if there is a listener."""
 
 
 class InjectionFollowers:
-    """By the number of their injection."""
+    """The followers of a block's injections, by number, and the listeners of its writes."""
 
     def __init__(self) -> None:
         self._followers: dict[int, InjectionFollower] = {}
@@ -52,39 +55,39 @@ class InjectionFollowers:
         self._assembler = CommandAssembler()
 
     def gather(self, event: Event) -> list[InjectionChange]:
-        """What is to be told by this event."""
+        """Process an event; return what :meth:`tell` has to pass on."""
         change: list[InjectionChange] = [*self._assembler.follow(event)]
         if (event.kind in _STACKED and not event.offset) or (event.kind == EventKind.ACCEPTED and self._listeners):
-            change.append(event)  # of a long declaration's parts the first
+            change.append(event)  # the first part of a long declaration
         return change
 
     def skip(self) -> None:
-        """Events were missed."""
+        """Forget incomplete commands after missed events."""
         self._assembler = CommandAssembler()
 
     def add(self, injection: int, follower: InjectionFollower) -> None:
-        """Tell it from now on; before any of its events can have come."""
+        """Add an injection's follower, before any of its events can have come."""
         self._followers[injection] = follower
 
     def remove(self, injection: int) -> None:
-        """Tell it nothing more."""
+        """Remove an injection's follower."""
         self._followers.pop(injection, None)
 
     def listen(self, listener: WriteListener) -> None:
-        """Tell it what is accepted from now on."""
+        """Add a listener for writes that are accepted from now on."""
         self._listeners[listener] = None
 
     def leave(self, listener: WriteListener) -> None:
-        """Tell it nothing more."""
+        """Remove a listener."""
         self._listeners.pop(listener, None)
 
     @property
     def busy(self) -> bool:
-        """Whether anybody listens to what is written."""
+        """Whether there is a listener of writes."""
         return bool(self._listeners)
 
     def tell(self, change: InjectionChange) -> None:
-        """Tell those whom it concerns."""
+        """Pass a change on to the followers and listeners that it concerns."""
         if isinstance(change, CommandWrites):
             if follower := self._followers.get(change.injection):
                 follower.divert(change)
@@ -103,14 +106,14 @@ class InjectionFollowers:
                 follower.restack()
 
     def fail(self, reason: str) -> None:
-        """Tell all that something was missed."""
+        """Report missed events to all followers and listeners."""
         for follower in list(self._followers.values()):
             follower.fail(reason)
         for listener in list(self._listeners):
             listener.fail(reason)
 
     def end(self, reason: str) -> None:
-        """All injections are gone."""
+        """Report to all followers that their injections are gone."""
         followers, self._followers = self._followers, {}
         for follower in followers.values():
             follower.lifted(reason)

@@ -9,21 +9,27 @@ from shmio.layout.topic import Topic, look_up
 
 
 class Shape(NamedTuple):
-    """What a path names. ``path``: canonical, in the block."""
+    """The registers that a path names.
+
+    Attributes:
+        path: Canonical path in the block.
+        registers: One register or array element, or all registers below a structure.
+        whole: Whether the path names a register or an element, not a structure.
+
+    """
 
     path: str
     registers: tuple[Register, ...]
     whole: bool
-    """Whether it is a register, or an array's element, as a whole; else a structure."""
 
     @property
     def elements(self) -> int:
-        """Numbers, bits and texts in it."""
+        """Number of values in all registers: numbers, bits and texts."""
         return sum(register.count for register in self.registers)
 
 
 def shape(layout: Layout, topic: Topic) -> Shape:
-    """What a topic names in a layout; PathError."""
+    """Return what a topic names in a layout. PathError: nothing."""
     below = layout.members(topic.path)
     if below:
         return Shape(topic.path, tuple(layout.registers[index] for index in below), whole=False)

@@ -1,4 +1,4 @@
-"""A block as it will be when what its source has accepted is done."""
+"""The image of a block with the accepted commands that are not in a frame yet."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from shmio.segment.pending_commands import apply
 
 
 class PendingImage:
-    """``image``: a frame, and what was accepted behind it. ``mask``: the bits that the present command has written."""
+    """A frame's image with the commands applied that were accepted after it.
+
+    ``mask`` has the bits set that the present command writes.
+    """
 
     def __init__(self, block: Block) -> None:
         self.image = bytearray(block.layout.size)
@@ -17,7 +20,10 @@ class PendingImage:
         self._frame = -1
 
     def begin(self, number: int) -> None:
-        """A command begins, behind this frame; frames that come between its parts must not undo the first ones."""
+        """Begin a command that was accepted after this frame.
+
+        A frame that comes between the command's parts does not reset the image.
+        """
         if number != self._frame:
             frame = self._block.read(number) or self._block.latest()
             self._frame = number
@@ -25,15 +31,15 @@ class PendingImage:
         self.mask = bytearray(len(self.mask))
 
     def put(self, event: Event) -> None:
-        """A part of it."""
+        """Apply a part of the command."""
         apply(self.image, (Write(event.offset, event.mask, event.data),))
         apply(self.mask, (ones(event),))
 
     def forget(self) -> None:
-        """Something was not put: the image is worth nothing."""
+        """Discard the image, because a part of a command is missing."""
         self._frame = -1
 
 
 def ones(event: Event) -> Write:
-    """The bits that a part of a command writes, all set."""
+    """Return a write that sets all bits that a part of a command writes."""
     return Write(event.offset, event.mask, b"\xff" * len(event.data))

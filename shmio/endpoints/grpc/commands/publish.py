@@ -1,4 +1,4 @@
-"""Values that clients send toward sources, whichever wire they come by."""
+"""Writes the values that clients publish, for all SimlogAPI versions."""
 
 from __future__ import annotations
 
@@ -22,76 +22,76 @@ from shmio.layout.topic import shorten
 from shmio.segment import DONE, EventKind
 
 TURNS: Final = 3
-"""One of gRPC's threads may be held up by the machine with what it has received, while others go on."""
+"""Turns that are awaited, as one of gRPC's threads may be delayed with what it received."""
 
 
 class ReceiveBarrier:
-    """A turn of the queue through which all that gRPC has received goes to the event loop.
+    """Waits until the handlers have all messages that gRPC has received so far.
 
-    What a handler is waiting for and has come lies in that queue; so does, behind it, the end of an operation that has
-    nothing to wait for: that a channel which was never used is not shut down.
+    Received messages pass through a queue to the event loop. The barrier puts an operation
+    behind them that ends at once: watching an unused channel, which is not shut down.
     """
 
     def __init__(self) -> None:
         self._channel: grpc.aio.Channel | None = None
 
     async def handled(self) -> None:
-        """Wait until handlers have been given what came before."""
+        """Wait until the handlers have what was received before."""
         if self._channel is None:
             self._channel = grpc.aio.insecure_channel("unix:///dev/null")
         for _ in range(TURNS):
             await self._channel.wait_for_state_change(grpc.ChannelConnectivity.SHUTDOWN)
 
     async def close(self) -> None:
-        """Nothing is waited for any more."""
+        """Close the channel that the barrier uses."""
         if self._channel is not None:
             await self._channel.close()
 
 
 SETTLE_S: Final = 5.0
-"""So long a step waits for what its client has sent before it, and goes on sending."""
+"""Longest time that a step waits for a client's earlier values while it sends more."""
 MAX_VALUES: Final = 256
-"""Registers that one structure may write at once; a cycle of the source takes as many."""
+"""Bound of the registers in one structure: as many as a source takes in one cycle."""
 LARGE_ELEMENTS: Final = 1024
-"""An array of as many takes noticeable time to read."""
+"""From this many elements on, an array is read in a thread, as it takes noticeable time."""
 
 
 class _Destination(NamedTuple):
-    """Where a value goes. ``send``: as :meth:`CommandClient.send`; ``ready``: whether that would not have to wait."""
+    """Where a value goes. ``send`` sends it; ``ready``: whether that would not have to wait."""
 
     send: Callable[[Done, Callable[[], None]], Coroutine[None, None, None]]
     ready: bool
 
 
 class Request(NamedTuple):
-    """One value for one topic; ``read`` says what it is for each register, by path, or raises ValueRangeError."""
+    """One value for one topic. ``read`` returns it by register path, or raises ValueRangeError."""
 
     path: str
     read: Callable[[Shape], Mapping[str, object]]
 
 
 Parse = Callable[[bytes], Request]
-"""What a message asks for; DecodeError: it is none."""
+"""Reads a message. DecodeError: it is not valid."""
 
 
 class _PublishCall:
-    """One Publish call: how many of its values are under way, and who waits for them."""
+    """One Publish call, with the number of its values in flight."""
 
     def __init__(self) -> None:
         self.received = 0
         self.open = 0
         self.settled: asyncio.Future[None] | None = None
-        self.unanswered = 0  # values that their source has neither accepted nor refused
+        self.unanswered = 0  # values that no source has accepted or refused yet
         self._answered: asyncio.Future[None] | None = None
 
     async def answered(self) -> None:
-        """Wait until sources have answered all that has been received."""
+        """Wait until the sources have accepted or refused all values received so far."""
         while self.unanswered:
             self._answered = self._answered or asyncio.get_running_loop().create_future()
             await asyncio.shield(self._answered)
 
     def answer(self) -> None:
-        """One is answered."""
+        """Count a value that its source has accepted or refused."""
         self.unanswered -= 1
         if not self.unanswered and self._answered is not None:
             self._answered.set_result(None)
@@ -99,7 +99,7 @@ class _PublishCall:
 
 
 class _PublishedValue:
-    """One value of a stream."""
+    """One value of a Publish call."""
 
     def __init__(self, stream: _PublishCall) -> None:
         self._stream = stream
@@ -108,13 +108,13 @@ class _PublishedValue:
         stream.unanswered += 1
 
     def answer(self) -> None:
-        """Its source has accepted or refused it."""
+        """Note that the source has accepted or refused the value."""
         if not self._answered:
             self._answered = True
             self._stream.answer()
 
     def end(self) -> None:
-        """It has its end."""
+        """Note that the value's outcome is known."""
         self.answer()
         stream = self._stream
         stream.open -= 1
@@ -123,16 +123,17 @@ class _PublishedValue:
 
 
 async def _read(request: Request, found: Shape) -> Mapping[str, object]:
-    """A request's values; those of a large array beside the event loop. ValueRangeError."""
+    """Return a request's values, reading large arrays in a thread. ValueRangeError: wrong type."""
     if found.elements < LARGE_ELEMENTS:
         return request.read(found)
     return await asyncio.to_thread(request.read, found)
 
 
 class Publisher:
-    """Serves Publish. One wrong message ends neither its stream nor anything else: it is counted, logged, passed over.
+    """Serves Publish and Write.
 
-    Every message is in the end one of ``published``, the device has it, or ``refused``.
+    A wrong message of a stream is counted, logged and skipped; the stream goes on. Every
+    message is in the end counted as ``published``, if the device has it, or as ``refused``.
     """
 
     def __init__(self, topics: Topics, shadows: Shadows) -> None:
@@ -146,13 +147,13 @@ class Publisher:
 
     @property
     def refused(self) -> int:
-        """Messages that were not carried out, or of which it is not known."""
+        """Number of messages that were not carried out, or whose outcome is unknown."""
         return self._refusals.count
 
     async def publish(self, messages: AsyncIterator[bytes], parse: Parse, peer: str) -> Empty:
-        """Take a stream's messages in order; return when the end of each is known, after the stream's.
+        """Write a stream's values in order; return when the stream and all its values have ended.
 
-        What was taken is carried out even if the client is gone meanwhile.
+        Values that were received are written even if the client disconnects.
         """
         stream = _PublishCall()
         streams = self._streams.setdefault(peer, set())
@@ -184,19 +185,20 @@ class Publisher:
             self._refusals.add(str(error), path, peer)
             value.end()
             return
-        except BaseException:  # its call ends
+        except BaseException:  # the call ends
             value.end()
             raise
         sending = self._send(destination, partial(self._ended, value, path, peer), value.answer)
         if destination.ready:
             await sending
-        else:  # meanwhile nothing is read: the client is slowed down by the flow control of its stream
+        else:  # reads nothing meanwhile: flow control slows the client down
             await asyncio.shield(self._keep(sending))
 
     async def settle(self, peer: str) -> None:
-        """Wait until sources have accepted or refused all that has come on a client's streams.
+        """Wait until sources have accepted or refused all values received from a client.
 
-        What has come and was not read yet is read. A client that goes on sending is waited for ``SETTLE_S`` at most.
+        This includes received values that were not read yet. A client that goes on sending is
+        waited for ``SETTLE_S`` at most.
         """
         if peer not in self._streams:
             return
@@ -210,10 +212,18 @@ class Publisher:
                     await self._arrivals.handled()
 
     async def write(self, request: Request, peer: str) -> tuple[EventKind, str]:
-        """Write one value: (ACCEPTED, "") as soon as its source has accepted it, else how it ended before, and why.
+        """Write one value; return when its source has accepted it.
 
-        PathError, ValueRangeError, CommandError: it was not sent. Of one that was accepted the log says if the device
-        does not take it after all.
+        If the device does not take an accepted value after all, that is logged.
+
+        Returns:
+            ``(ACCEPTED, "")``, or the outcome and its reason if the source did not accept.
+
+        Raises:
+            PathError: There is no such topic. Nothing was sent, as with the other errors.
+            ValueRangeError: The value does not fit.
+            CommandError: The topic is not writable, or the source does not answer.
+
         """
         answer: asyncio.Future[tuple[EventKind, str]] = asyncio.get_running_loop().create_future()
 
@@ -225,7 +235,7 @@ class Publisher:
             end = worst(ends)
             if end[0] in DONE:
                 self.published += 1
-                accepted()  # which nobody said, if an injection took all of it
+                accepted()  # no event says so if an injection diverted all of it
             elif answer.done():
                 self._refusals.add(in_words(end), request.path, peer)
             else:
@@ -241,7 +251,7 @@ class Publisher:
         return await answer
 
     async def _resolve(self, request: Request) -> _Destination:
-        """What is to be written where; PathError, ValueRangeError, CommandError."""
+        """Resolve a request; raises what :meth:`write` raises."""
         if shadow := self._shadows.find(request.path):
             if shadow.kind is ShadowKind.ORIGINALS:
                 raise CommandError(f"{shorten(request.path)}: originals come from here; values go to the shadow's /in")

@@ -1,4 +1,4 @@
-"""From a client's path to a source and a register, whichever wire it came by."""
+"""Resolves clients' paths to sources and registers, for all services."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from shmio.layout.topic import Topic, look_up, parse_topic, shorten
 
 
 class TimeTopic(Enum):
-    """A topic of time, which no source has: its path in canonical form."""
+    """The topics of time, which belong to no source; the values are canonical paths."""
 
     STEP = "simlog/step"
-    """The number of each step, when all else of that has been told."""
+    """Each step's number, sent after all values of the step."""
     CLOCK = "model/clock"
     """Simulation time."""
 
@@ -25,15 +25,15 @@ _TIME_TOPICS: Final = {time_topic.value: time_topic for time_topic in TimeTopic}
 
 
 class Topics:
-    """Looks paths up among the sources that there are by now."""
+    """Looks paths up among the present sources."""
 
     def __init__(self, feeds: Mapping[str, Feed], default_source: str | None) -> None:
-        """``default_source``: that of paths which name none; default: the only one."""
+        """``default_source``: for paths without a source; None: the only source there is."""
         self._feeds = feeds
         self._default = default_source
 
     def topic(self, path: str) -> Topic:
-        """What a path says; PathError: no source of that name."""
+        """Parse a path. PathError: there is no such source."""
         topic = self._parse(path)
         if topic.source not in self._feeds:
             if self._time_topic(topic):
@@ -45,14 +45,14 @@ class Topics:
         return topic
 
     def time_topic(self, path: str) -> TimeTopic | None:
-        """The topic of time that a path names; None: another one. PathError as of :meth:`topic`."""
+        """Return the topic of time that a path names, or None. PathError as for :meth:`topic`."""
         return self._time_topic(self._parse(path))
 
     def _time_topic(self, topic: Topic) -> TimeTopic | None:
         return _TIME_TOPICS.get(f"{topic.source}/{topic.path}") if topic.direction != "in" else None
 
     def name(self, path: str) -> str:
-        """One name for all ways to write a path, also one that names nothing here."""
+        """Return the canonical form of a path, even if it names nothing."""
         try:
             return str(self._parse(path))
         except PathError:
@@ -63,15 +63,15 @@ class Topics:
         return parse_topic(path, self._feeds, default)
 
     def feed(self, source: str) -> Feed:
-        """The feed of a source; PathError: a reload has removed it."""
+        """Return a source's feed. PathError: a reload has removed the source."""
         if source not in self._feeds:
             raise PathError(f"source {source} was removed by a reload")
         return self._feeds[source]
 
     def layout(self, topic: Topic) -> Layout:
-        """The layout of a topic's source; PathError as of :meth:`feed`."""
+        """Return the layout of a topic's source. PathError as for :meth:`feed`."""
         return self.feed(topic.source).block.layout
 
     def register(self, topic: Topic) -> Register:
-        """The register of a topic; PathError: there is none, the message has near names."""
+        """Return a topic's register. PathError: there is none; the message lists similar names."""
         return look_up(self.layout(topic), topic)

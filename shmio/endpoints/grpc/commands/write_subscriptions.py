@@ -1,4 +1,4 @@
-"""What is written to registers, for those who listen to their ``/in``."""
+"""Delivers accepted writes to the subscribers of registers' ``/in``."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from shmio.segment import Block, Event, EventKind
 
 
 class Listener(Protocol):
-    """One stream; called in the event loop's thread."""
+    """A stream's subscription to writes; called in the event loop's thread."""
 
     def deliver(self, message: Sized) -> None:
-        """Take one message for this stream."""
+        """Take one message."""
 
     def fail(self, reason: str) -> None:
-        """End: what comes next is not all there was."""
+        """End the stream, because writes were missed."""
 
 
 class InChannel:
-    """A subject as somebody listens to its ``/in``."""
+    """A subject whose ``/in`` has listeners."""
 
     def __init__(self, subject: Subject) -> None:
         self.encode = subject.encode
@@ -36,7 +36,7 @@ Message = tuple[InChannel, Sized]
 
 
 class _Written(NamedTuple):
-    """A :class:`BlockImage` of a block as it will be."""
+    """A :class:`BlockImage` that has the accepted writes in it."""
 
     number: int
     clock_ns: int
@@ -47,26 +47,26 @@ _NOBODY: Final = (0, 0, 0)
 
 
 class WriteSubscriptions:
-    """Turns accepted writes of all writers into messages, in the order in which the source accepted them.
+    """Makes messages of all writers' accepted writes, in the order of acceptance.
 
-    A subject is shown when a command has written all of it. One of which only a part is written, as an array's
-    element, is shown when that is known to be all, with the rest as of the frame before the command. A command whose
-    first events nobody followed is passed over: it could only be shown in part.
+    A subject is delivered as soon as a command has written all of it. If a command writes only
+    a part, such as one array element, the subject is delivered at the command's end, and the
+    rest is taken from the frame before. Commands whose first events were missed are skipped.
     """
 
     def __init__(self, block: Block, stamp: Callable[[Event], tuple[int, int]]) -> None:
-        """``stamp``: number and time, ns of the instance's clock, of the message about an event."""
+        """``stamp`` returns an event's number and time, in ns of the instance's clock."""
         self._block = block
         self._stamp = stamp
         self._channels: dict[Subject, InChannel] = {}
         self._table: tuple[InChannel, ...] = ()
         self._pending_image = PendingImage(block)
-        self._command = _NOBODY  # the one accepted last; it is not known at first, nor after a gap
-        self._whole = False  # whether all of it so far has been put
-        self._partly: dict[InChannel, Event] = {}  # channels it has written a part of
+        self._command = _NOBODY  # accepted last; unknown at first and after a gap
+        self._whole = False  # whether all its parts so far were applied
+        self._partly: dict[InChannel, Event] = {}  # channels that it has written in part
 
     def listen(self, subject: Subject, listener: Listener) -> None:
-        """Join: what is accepted from now on is delivered."""
+        """Add a listener for writes that are accepted from now on."""
         channel = self._channels.get(subject)
         if channel is None:
             channel = self._channels[subject] = InChannel(subject)
@@ -74,7 +74,7 @@ class WriteSubscriptions:
         channel.listeners[listener] = None
 
     def leave(self, subject: Subject, listener: Listener) -> None:
-        """Leave; the last listener takes the channel with it."""
+        """Remove a listener; the channel ends with its last one."""
         channel = self._channels[subject]
         channel.listeners.pop(listener, None)
         if not channel.listeners:
@@ -83,26 +83,26 @@ class WriteSubscriptions:
 
     @property
     def busy(self) -> bool:
-        """Whether anybody listens."""
+        """Whether there is a listener."""
         return bool(self._channels)
 
     def fail(self, reason: str) -> None:
-        """End all streams."""
+        """End all listeners' streams."""
         for channel in self._table:
             for listener in channel.listeners:
                 listener.fail(reason)
 
     def skip(self) -> None:
-        """Events were missed: what is known of the command they may have belonged to is worth nothing."""
+        """Forget the present command, because events were missed."""
         self._command, self._whole = _NOBODY, False
         self._pending_image.forget()
         self._partly.clear()
 
     def follow(self, event: Event) -> list[Message]:
-        """The messages that an event gives rise to."""
+        """Process an event and return the messages to deliver."""
         command = _command(event)
         if event.kind != EventKind.ACCEPTED:
-            # Ends of commands before it may come between the parts of one.
+            # Outcomes of earlier commands may come between the parts of this one.
             return self._rest() if command == self._command or event.kind == EventKind.STARTED else []
         messages: list[Message] = []
         table = self._table
@@ -124,7 +124,7 @@ class WriteSubscriptions:
         return messages
 
     def _begins(self, event: Event) -> bool:
-        """Whether it is surely the first of its command, by the events before it."""
+        """Return whether the events before show that this is its command's first."""
         for number in range(event.number - 1, 0, -1):
             before = self._block.events.read(number)
             if before is None:
@@ -134,7 +134,7 @@ class WriteSubscriptions:
         return True
 
     def _touch(self, channel: InChannel, event: Event, messages: list[Message]) -> None:
-        """Show a channel when the last of its bits is written; what remains in part is shown by :meth:`_rest`."""
+        """Add a channel's message once all its bits are written; :meth:`_rest` adds others."""
         bits = int.from_bytes(event.mask.to_bytes(1, "big") if event.mask else b"\xff" * len(event.data), "big")
         shift = 8 * (channel.stop - event.offset - len(event.data))
         if not (bits << shift if shift >= 0 else bits >> -shift) & channel.bits:
@@ -146,7 +146,7 @@ class WriteSubscriptions:
         self._show(channel, event, messages)
 
     def _rest(self) -> list[Message]:
-        """The channels of which the command has written a part: it is over when something else is told."""
+        """Return the messages of channels written in part, because the command is complete."""
         messages: list[Message] = []
         for channel, event in self._partly.items():
             self._show(channel, event, messages)

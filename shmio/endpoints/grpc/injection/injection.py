@@ -1,4 +1,4 @@
-"""One injection of this endpoint's clients: what it diverts goes to them, what they give goes to its source."""
+"""An injection of SimlogAPI clients: they read what it diverts, and their values replace it."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Leave = Callable[[], None]
 
 
 class ShownImage(NamedTuple):
-    """An image as one of an injection's topics shows it."""
+    """An image with number and time, as a topic of an injection shows it."""
 
     number: int
     clock_ns: int
@@ -36,7 +36,7 @@ class ShownImage(NamedTuple):
 
 
 class _Tap:
-    """Those who are shown every value that goes one way; each wire's message is made once."""
+    """The listeners to one of an injection's two directions; each encoding is made once."""
 
     def __init__(self) -> None:
         self._channels: dict[str, tuple[Encode, set[Listener]]] = {}
@@ -65,23 +65,24 @@ class _Tap:
 
 
 class Injection(InjectionFollower):
-    """One, from being laid until it is lifted, by whomever. For the event loop, but what a feed calls.
+    """An injection over the registers of ``shape``, from laying to lifting.
 
-    It is laid over the registers of ``shape``, which is what ``target`` names in the layout of ``feed``. Its
-    *originals* are what it diverts: over ``/out`` what comes from the source, or from injections beneath it; over
-    ``/in`` what is written. Its *gifts* are what its clients give instead.
+    ``shape`` is what ``target`` names in the layout of ``feed``. The injection's *originals* are
+    the values that it diverts: over ``/out`` those of the source or of inner injections, over
+    ``/in`` those that are written. Its *given values* are what its clients send instead. For the
+    event loop's thread.
     """
 
     def __init__(self, target: Topic, shape: Shape, feed: Feed, name: str) -> None:
-        """``name``: what it is called in the list of all; laying begins at once."""
+        """Begin laying the injection. ``name``: its name in the list of all injections."""
         self.target = target
         self.shape = shape
         self.feed = feed
         self.inward = target.direction == "in"
         self.over = ""
-        """Why it stands no more; empty: it does, or is about to."""
+        """Why the injection is over; empty: it stands, or is being laid."""
         self.ends: dict[object, Callable[[], object]] = {}
-        """What is called when it is over, by whom it is for."""
+        """Functions that are called when the injection is over, by the object that added them."""
         frame = feed.block.latest()
         self._base = InjectionBase(feed.block, frame.image if frame else b"")
         self._given_image = bytearray(self._base.given)
@@ -89,13 +90,13 @@ class Injection(InjectionFollower):
         self._subjects: dict[Subject, None] = {}
         self._diverted, self._given = _Tap(), _Tap()
         self._laid = asyncio.get_running_loop().create_task(self._lay(name))
-        self._laid.add_done_callback(lambda laid: laid.cancelled() or laid.exception())  # told to who waits, if any
+        self._laid.add_done_callback(lambda laid: laid.cancelled() or laid.exception())  # a waiter sees the error
         self._lifting: asyncio.Task[None] | None = None
 
     # ---- laid, and lifted --------------------------------------------------------------------------------------
 
     async def laid(self) -> None:
-        """Wait until it stands. CommandError: the source refuses it, or does not answer."""
+        """Wait until the injection stands. CommandError: the source refuses or does not answer."""
         await asyncio.shield(self._laid)
 
     async def _lay(self, name: str) -> None:
@@ -113,11 +114,11 @@ class Injection(InjectionFollower):
             self._finish(str(error))
             raise CommandError(f"{self.target}: {error}") from None
         finally:
-            if self.over:  # by now, or because it is not known whether it stands
+            if self.over:  # ended meanwhile, or it is unknown whether it stands
                 self._have_it_lifted()
 
     def end(self, reason: str) -> None:
-        """Have it lifted."""
+        """Lift the injection. ``reason``: becomes :attr:`over`."""
         if not self.over:
             self._finish(reason)
             if self._laid.done():
@@ -133,16 +134,20 @@ class Injection(InjectionFollower):
         for call in ends.values():
             call()
 
-    # ---- what its clients give ---------------------------------------------------------------------------------
+    # ---- given values ------------------------------------------------------------------------
 
     def ready(self, values: Mapping[str, object]) -> bool:
-        """Whether :meth:`give` would not have to wait."""
+        """Return whether :meth:`give` of these values would not have to wait."""
         return self._laid.done() and self.feed.commands.ready(values)
 
     async def give(self, values: Mapping[str, object], done: Done, accepted: Callable[[], None] | None = None) -> None:
-        """Send values as this injection's; ``done`` and ``accepted`` as of :meth:`CommandClient.give`.
+        """Send values as this injection's; the functions are those of :meth:`CommandClient.give`.
 
-        PathError: it stands no more; CommandError, ValueRangeError: not sent.
+        Raises:
+            PathError: The injection is over.
+            CommandError: The source does not answer. Nothing was sent, as with the next error.
+            ValueRangeError: A value does not fit.
+
         """
         await self.laid()
         if self.over:
@@ -175,13 +180,16 @@ class Injection(InjectionFollower):
             self._given.show(ShownImage(now.number, now.clock_ns, bytes(self._given_image)))
 
     def given_values(self, wire: str, encode: Encode, lane: EventLane) -> Leave:
-        """Show what its clients give from now on; how to leave again."""
+        """Listen to the values given from now on; return the function that leaves."""
         return self._given.listen(wire, encode, lane)
 
-    # ---- what it diverts ---------------------------------------------------------------------------------------
+    # ---- originals ---------------------------------------------------------------------------
 
     def originals(self, wire: str, encode: Encode, outbox: Outbox, path: str, finish: Finish = bytes) -> Leave:
-        """Show what it diverts, over ``/out`` the present value first; how to leave again. ``path``: for messages."""
+        """Listen to what the injection diverts; return the function that leaves.
+
+        Over ``/out`` the present value comes first. ``path`` is named in failures.
+        """
         if self.inward:
             return self._diverted.listen(wire, encode, EventLane(outbox, path, finish))
         subject = Subject(
@@ -197,7 +205,7 @@ class Injection(InjectionFollower):
         return partial(self.feed.leave, subject, lane)
 
     def present(self) -> ShownImage | None:
-        """The original of ``/out`` as of now, if it is good."""
+        """Return the present original of ``/out``; None: it is not good, or ``/in`` is diverted."""
         frame = None if self.inward else self.feed.present()
         return None if frame is None else self._original(frame)
 
@@ -211,10 +219,10 @@ class Injection(InjectionFollower):
         for subject in self._subjects:
             self.feed.tell_again(subject)
 
-    # ---- as a follower of its block ----------------------------------------------------------------------------
+    # ---- events of the source ----------------------------------------------------------------
 
     def divert(self, diverted: CommandWrites) -> None:
-        """A command's values went to it."""
+        """Take the values of a command that the injection diverted."""
         self._base.divert(diverted.writes)
         if self.inward:
             self._diverted.show(ShownImage(*self.feed.commands.stamp(diverted.event), bytes(self._base.given)))
@@ -223,14 +231,14 @@ class Injection(InjectionFollower):
             self._tell_again()
 
     def restack(self) -> None:
-        """An injection was laid or lifted, on the same source."""
+        """React to another injection on the source that was laid or lifted."""
         if not self.inward and self._base.restack():
             self._tell_again()
 
     def lifted(self, reason: str) -> None:
-        """It was lifted, and not by us."""
+        """React to the injection's end, which this endpoint did not ask for."""
         self._finish(f"it was lifted: {reason}" if reason != "lifted" else "somebody has lifted it")
 
     def fail(self, reason: str) -> None:
-        """What comes next is not all there was."""
+        """React to missed events: fail the listeners to originals."""
         self._diverted.fail(reason)

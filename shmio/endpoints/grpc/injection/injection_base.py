@@ -1,4 +1,4 @@
-"""What an injection over ``/out`` stands over: what the source delivers, or clients' injections further in give."""
+"""The image beneath an injection: what the source delivers, with inner injections applied."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from shmio.segment.pending_commands import apply
 
 
 class InjectionBase:
-    """The image beneath one injection of a block."""
+    """The image beneath one injection: the source's bytes with inner injections applied."""
 
     def __init__(self, block: Block, image: bytes = b"") -> None:
-        """``image``: as it is at first, as far as others further in give it; default: zeros."""
+        """``image``: the initial values of inner injections; default: zeros."""
         self.number = 0
-        """The injection's, once that is known."""
+        """The injection's number, once it is known; 0 before."""
         self.given = bytearray(image or bytes(block.layout.size))
-        """What was diverted to it so far."""
+        """The values that were diverted to the injection so far, as an image."""
         self._block = block
-        self._inner: tuple[bytes, bytes] | None = None  # bits that injections further in give, and values
+        self._inner: tuple[bytes, bytes] | None = None  # bits that inner injections set, and their values
 
     def divert(self, writes: Iterable[Write]) -> None:
-        """An injection further in gave these values."""
+        """Apply values that were diverted to the injection."""
         apply(self.given, writes)
 
     def restack(self) -> bool:
-        """Look what lies beneath it by now; whether that is something else."""
+        """Read which inner injections stand; return whether the image beneath has changed."""
         before = self._inner
         bits = np.zeros(len(self.given), np.uint8)
         for one in self._block.standing.read() if self.number else ():
@@ -41,7 +41,7 @@ class InjectionBase:
         return self._inner != before
 
     def image(self, raw: bytes) -> bytes:
-        """An image that the source delivered, as the injection finds it."""
+        """Return the image beneath the injection, given what the source delivered."""
         inner = self._inner
         if inner is None:
             return raw

@@ -1,4 +1,4 @@
-"""The injections that clients have laid through this endpoint, and the topics that these bring."""
+"""The injections of SimlogAPI clients, and the shadow topics that come with them."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from shmio.layout.topic import Topic, encode_segment, shorten
 from shmio.local.writer import RETIRED
 
 MAX_INJECTIONS: Final = 64
-"""Of this endpoint, over one source."""
+"""Bound of this endpoint's injections over one source."""
 MAX_PATH: Final = 1024
-"""Characters of a shadow's path, or of a prefix."""
+"""Longest path of a shadow, or prefix, in characters."""
 LOOK_S: Final = 0.25
-"""How often it is looked whether clients without a stream are still there: a shadow is to go within a second."""
+"""Interval of checks for disconnected clients: their injections are to end within a second."""
 UNSEEN_S: Final = 10.0
-"""So long an injection stands without a stream if it cannot be seen whether its client is there."""
+"""How long an injection without a stream stands if its client's connection cannot be seen."""
 
 _MARKS: Final = frozenset(mark.value for mark in TimeTopic)
 _SCHEME: Final = re.compile(r"^[^/:]*://")
@@ -36,16 +36,16 @@ log = logging.getLogger("shmio.grpc")
 
 
 class ShadowKind(Enum):
-    """What a topic of an injection is."""
+    """The kinds of shadow topics."""
 
     GIVEN = "gifts"
-    """Clients write to it, and read what all of them have written."""
+    """Clients write the injection's values to it, and read what all clients have written."""
     ORIGINALS = "originals"
-    """Clients read what the injection diverts."""
+    """Clients read from it what the injection diverts."""
 
 
 class Shadow(NamedTuple):
-    """One topic of an injection."""
+    """A shadow topic of an injection."""
 
     injection: Injection
     kind: ShadowKind
@@ -53,14 +53,14 @@ class Shadow(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Client:
-    """Who holds an injection without a stream. ``peer``: None if it cannot be seen whether its connection stands."""
+    """A client that holds an injection without a stream. ``peer``: None if it cannot be seen."""
 
     peer: Peer | None
     until_s: float
 
 
 class Shadows:
-    """All of them. One is lifted when nobody holds it any more."""
+    """All shadow topics and their injections; an injection is lifted when nobody holds it."""
 
     def __init__(self, topics: Topics) -> None:
         self._topics = topics
@@ -69,17 +69,28 @@ class Shadows:
         self._looking: asyncio.Task[None] | None = None
 
     def find(self, path: str) -> Shadow | None:
-        """The topic that a path names, if it is one of an injection."""
+        """Return the shadow topic that a path names, or None."""
         return self._named.get(self._topics.name(path)) if self._named else None
 
     async def lay(
         self, target: Topic, shape: Shape, kinds: Mapping[str, ShadowKind], holder: object, peer: str
     ) -> Injection:
-        """Have an injection with these topics laid, or join the one that there is; the holder holds it.
+        """Lay an injection with these shadow topics, or join the one that exists.
 
-        ValueRangeError: a topic is the target itself; ConflictError: a path is in use for another target;
-        EndpointError: too many; CommandError: the source refuses; PathError: a reload has removed it. ``peer``: who
-        asks, for the list of all injections.
+        Args:
+            target: What the injection is over.
+            shape: What the target names in the source's layout.
+            kinds: The shadow topics, by path.
+            holder: Whoever holds the injection until :meth:`release`.
+            peer: The client, for the list of all injections.
+
+        Raises:
+            ValueRangeError: A shadow topic is the target itself.
+            ConflictError: A path is in use for another target.
+            EndpointError: There are too many injections.
+            CommandError: The source refuses the injection.
+            PathError: A reload has removed the source.
+
         """
         target = replace(target, direction=target.direction or "out")
         injection = self._joined(target, kinds)
@@ -102,7 +113,7 @@ class Shadows:
     async def lay_for_client(
         self, target: Topic, shape: Shape, kinds: Mapping[str, ShadowKind], peer: str
     ) -> Injection:
-        """The same for one who has no stream of it yet: its connection holds it, until a stream does."""
+        """Lay an injection as :meth:`lay`; the client's connection holds it until a stream does."""
         seen = peer_of(peer)
         if seen not in await asyncio.to_thread(connected):
             seen = None
@@ -113,13 +124,13 @@ class Shadows:
         return injection
 
     def hold(self, injection: Injection, stream: object) -> None:
-        """Have a stream hold an injection, instead of those who have none."""
+        """Have a stream hold an injection, in place of clients without a stream."""
         holders = self._holders.get(injection, set())
         holders.difference_update([holder for holder in holders if isinstance(holder, _Client)])
         holders.add(stream)
 
     def release(self, injection: Injection, holder: object) -> None:
-        """Let go; the last one has it lifted."""
+        """End a hold on an injection, which is lifted when its last hold ends."""
         holders = self._holders.get(injection, set())
         if holder in holders:
             holders.remove(holder)
@@ -127,13 +138,13 @@ class Shadows:
                 injection.end("nobody holds it any more")
 
     def move(self, sources: Collection[str]) -> None:
-        """These sources have other blocks by now: what lay over the ones before is gone."""
+        """End the injections over sources whose blocks a reload has replaced."""
         for injection in list(self._holders):
             if injection.target.source in sources:
                 injection.end(RETIRED)
 
     def _joined(self, target: Topic, kinds: Mapping[str, ShadowKind]) -> Injection | None:
-        """The injection that has these topics; ConflictError: they are another one's."""
+        """Return the injection that has these topics. ConflictError: another target has them."""
         found: Injection | None = None
         for path, kind in kinds.items():
             name = self._topics.name(path)
@@ -152,7 +163,7 @@ class Shadows:
         self._named = {name: shadow for name, shadow in self._named.items() if shadow.injection is not injection}
 
     async def _look(self) -> None:
-        """Let go for clients without a stream whose connection has ended."""
+        """Release the injections of clients without a stream whose connection has ended."""
         while clients := self._clients():
             await asyncio.sleep(LOOK_S)
             there = await asyncio.to_thread(connected)
@@ -172,16 +183,16 @@ class Shadows:
 
 
 def shadow_path(path: str) -> str:
-    """A path that a client wants for a shadow; ValueRangeError: it cannot be one."""
+    """Check a path that a client wants for a shadow. ValueRangeError: it is not usable."""
     if not path.strip("/") or len(path) > MAX_PATH or not path.isprintable():
         raise ValueRangeError(f"the path of a shadow has 1 to {MAX_PATH} printable characters, not {shorten(path)!r}")
     return path
 
 
 def shadow_paths(prefix: str, target: Topic) -> tuple[str, str]:
-    """The paths of a target's shadow under a prefix, which many targets may share: to give values, and for originals.
+    """Return the paths of a target's two shadow topics: for given values, and for originals.
 
-    ValueRangeError: the prefix cannot be one.
+    Many targets may share a prefix. ValueRangeError: the prefix is not usable.
     """
     if len(prefix) > MAX_PATH or not prefix.isprintable():
         raise ValueRangeError(f"shadowPathPrefix has at most {MAX_PATH} printable characters, not {shorten(prefix)!r}")

@@ -1,4 +1,4 @@
-"""Who is there, and what they may do: tokens, certificates and the roles of an address."""
+"""Access control: tokens, certificates, and the roles of a listening address."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _SERVICES: Final[Mapping[str, Mapping[str, str]]] = {
     "grpc.health.v1.Health": {READ: "Check Watch List"},
     "grpc.reflection.v1alpha.ServerReflection": {READ: "ServerReflectionInfo"},
 }
-"""Services, and in each the calls of a role."""
+"""The calls of each service, by the role that they need."""
 
 
 def _calls() -> Iterator[tuple[str, str]]:
@@ -66,7 +66,7 @@ _LOCAL: Final = ("unix:", "ipv4:127.", "ipv6:%5B::1%5D:", "ipv6:[::1]:")
 
 
 class DeniedError(ShmioError):
-    """A call is refused before anything of it is done; says what to do."""
+    """A call is refused before it does anything; the message says what to do."""
 
     def __init__(self, code: grpc.StatusCode, message: str) -> None:
         super().__init__(message)
@@ -74,7 +74,7 @@ class DeniedError(ShmioError):
 
 
 class Credentials(NamedTuple):
-    """What a client shows: the hash of its token, and the names in its certificate."""
+    """A client's credentials: the hash of its token, and the names in its certificate."""
 
     token: bytes | None = None
     names: tuple[str, ...] = ()
@@ -83,12 +83,12 @@ class Credentials(NamedTuple):
     def of(
         cls, metadata: Iterable[tuple[str, str | bytes]], shown: Mapping[str, Iterable[bytes]] | None
     ) -> Credentials:
-        """``metadata`` of the call, ``shown`` by the connection (its authentication context)."""
+        """Read credentials from a call's metadata and its connection's authentication context."""
         token = None
         for key, value in metadata:
             if key == "authorization":
                 text = value if isinstance(value, str) else value.decode("latin-1")
-                # An other scheme is no token of ours: it is hashed as a whole, and fits none.
+                # A header of another scheme is hashed as a whole, and matches no token.
                 bare = text[len(_SCHEME) :] if text.lower().startswith(_SCHEME) else text
                 token = digest(bare.strip().encode())
         if not shown:
@@ -99,18 +99,18 @@ class Credentials(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Keys:
-    """Who is known: tokens and patterns of certificates' names. A reload replaces it."""
+    """The configured tokens and certificate name patterns; a reload replaces them."""
 
     secrets: Sequence[Secret] = ()
     clients: Sequence[Client] = ()
 
     @classmethod
     def of(cls, config: Grpc) -> Keys:
-        """Read them; ConfigError."""
+        """Read tokens and patterns. ConfigError: a token's file is not usable."""
         return cls(read_tokens(config.token), tuple(config.client))
 
     def secret(self, shown: bytes) -> Secret | None:
-        """The token of this hash; it takes as long for a wrong one as for a right one."""
+        """Return the token with this hash, in the same time for a wrong hash as for a right one."""
         found = None
         for secret in self.secrets:
             if hmac.compare_digest(secret.digest, shown):
@@ -118,7 +118,7 @@ class Keys:
         return found
 
     def roles(self, names: Sequence[str]) -> frozenset[str]:
-        """Those of a certificate with these names."""
+        """Return the roles of a certificate with these names."""
         return frozenset(
             role
             for client in self.clients
@@ -128,16 +128,16 @@ class Keys:
 
 
 class ListenerAccess:
-    """One listening address: who may call what there. ``keys`` may be replaced at any time."""
+    """Decides who may call what at one listening address; ``keys`` may be replaced at any time."""
 
     def __init__(self, keys: Keys, anonymous: Iterable[str] = ROLES, *, takes_tokens: bool = True) -> None:
-        """``anonymous``: roles of clients that show nothing. ``takes_tokens``: False where others could read them."""
+        """``anonymous``: roles without credentials. ``takes_tokens``: whether tokens are safe here."""
         self.keys = keys
         self.anonymous = frozenset(anonymous)
         self._takes_tokens = takes_tokens
 
     def admit(self, method: str, shown: Credentials) -> str | None:
-        """The name of the token with which a call may be made, None without one; DeniedError."""
+        """Check a call, and return the name of the client's token or None. DeniedError: refused."""
         needed = NEEDS.get(method)
         if needed is None:
             raise DeniedError(
@@ -153,7 +153,7 @@ class ListenerAccess:
 
     def _secret(self, shown: bytes) -> Secret | None:
         if not self.keys.secrets:
-            return None  # nobody asked for it
+            return None  # no tokens are configured
         if not self._takes_tokens:
             raise DeniedError(
                 grpc.StatusCode.UNAUTHENTICATED,
@@ -197,9 +197,9 @@ class ListenerAccess:
 def holder_of(
     peer: str, metadata: Iterable[tuple[str, str | bytes]], shown: Mapping[str, Iterable[bytes]] | None
 ) -> object:
-    """Who holds what a name of its own choice stands for: who shows a token or a certificate, by that; else its host.
+    """Return the owner of a name that a client has chosen: its credentials, else its host.
 
-    Equal for two connections of one client: which of its ports it came by says nothing.
+    Two connections of one client are equal, whichever ports they have.
     """
     credentials = Credentials.of(metadata, shown)
     if credentials.token or credentials.names:
@@ -211,7 +211,7 @@ def holder_of(
 
 
 def client_of(peer: str, token: str | None) -> str:
-    """Who shares the limits of a client: a token's users; a host; on this one, a connection."""
+    """Return the unit that limits apply to: a token, else a host, on this host a connection."""
     if token is not None:
         return f"token {token}"
     return peer if peer.startswith(_LOCAL) else peer.rpartition(":")[0]

@@ -34,7 +34,7 @@ _NO_CALL: Final = "there is no such call: see the services by reflection"
 
 
 def check_version() -> None:
-    """EndpointError: this grpcio does not have what we build on."""
+    """Check that grpcio has the private names needed here. EndpointError: it lacks some."""
     missing = [
         f"{name}.{member}".rstrip(".")
         for name, members in _NEEDED.items()
@@ -49,17 +49,17 @@ def check_version() -> None:
 
 
 class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
-    """Its serving task gets registered calls alone."""
+    """A gRPC core whose serving task only gets calls of registered methods."""
 
     def start_workers(self) -> None:
-        """Begin to refuse the others."""
+        """Start the workers that refuse calls of unknown names."""
         self._taking = asyncio.Lock()  # one request for a call at a time is enough, and leaves the rest to the core
         self.refused = 0
         self._workers = [asyncio.create_task(self._refuse()) for _ in range(WORKERS)]
 
     @property
     def alive(self) -> bool:
-        """Whether it serves. Once it does not, it never will again: the process has to end."""
+        """Whether the core serves. If not, it never will again, and the process has to end."""
         return bool(self.is_running()) and not any(worker.done() for worker in self._workers)
 
     def _make_request_call_future(self, method: bytes | None) -> asyncio.Future[Any]:
@@ -80,38 +80,38 @@ class Core(getattr(cygrpc, "AioServer", object)):  # type: ignore[misc]
             context = cygrpc._ServicerContext(state, None, None, asyncio.get_running_loop())
             try:
                 await context.abort(grpc.StatusCode.UNIMPLEMENTED, _NO_CALL)
-            except (grpc.aio.AbortError, grpc.aio.InternalError):  # told; or its client is gone
+            except (grpc.aio.AbortError, grpc.aio.InternalError):  # sent, or the client is gone
                 pass
             finally:
                 del state, context  # which hold the call
 
 
 class CoreServer(AioServer):  # type: ignore[misc]
-    """Over such a core."""
+    """An asyncio gRPC server with such a core."""
 
     def __init__(self, options: Sequence[tuple[str, Any]], interceptor: grpc.aio.ServerInterceptor) -> None:
-        """Nobody but us makes one: what grpc.aio.server() also takes is left out."""
+        """Create a server with one interceptor and without grpc.aio.server()'s other arguments."""
         check_version()
         self._loop = cygrpc.get_working_loop()
         self._server: Core = Core(self._loop, None, (), (interceptor,), tuple(options), None)
 
     @property
     def alive(self) -> bool:
-        """Whether it serves."""
+        """Whether the server serves."""
         return bool(self._server.alive)
 
     @property
     def refused(self) -> int:
-        """Calls of unknown names, since the start."""
+        """Number of calls of unknown names since the start."""
         return int(self._server.refused)
 
     async def start(self) -> None:
-        """Begin to serve."""
+        """Start serving."""
         await super().start()
         self._server.start_workers()
 
 
 def _kept(request: asyncio.Task[Any]) -> asyncio.Future[Any]:
-    """A request for a call that stays when whoever waits for it is cancelled: the core writes to what belongs to it."""
-    request.add_done_callback(lambda done: done.cancelled() or done.exception())  # nobody else may look
+    """Shield a request for a call from cancellation, because the core writes to its memory."""
+    request.add_done_callback(lambda done: done.cancelled() or done.exception())  # no one else may retrieve the error
     return asyncio.shield(request)

@@ -1,4 +1,4 @@
-"""What every call of every service passes: who is there, how many calls there are, whether its message is one."""
+"""The guard of every call: access, limits on open calls, and validity of the message."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ Decode = Callable[[bytes], Any]
 
 @dataclass(frozen=True, slots=True)
 class CallLimits:
-    """Of calls, and connections, that are open at once, on all addresses together.
+    """Limits on open connections and calls, on all addresses together.
 
-    When fewer than ``reserve`` are free, only a client with fewer than ``share`` gets another: one that opens thousands
-    leaves room for the others.
+    When fewer than ``reserve`` calls are free, only clients with fewer than ``share`` calls may
+    open another, so that a client that opens thousands leaves room for the others.
     """
 
     connections: int = 2048
@@ -34,11 +34,11 @@ class CallLimits:
     reserve: int = 1024
     share: int = 64
     message_s: float = 10.0
-    """The longest time that a call may take to send the one message it consists of."""
+    """Time that a call with a single request may take to send it, in s."""
 
 
 class _Call:
-    """One that is open. ``denial``: why it has to end, if it has to."""
+    """An open call. ``denial``: why it has to end, if it has to."""
 
     __slots__ = ("access", "client", "denial", "method", "shown", "task")
 
@@ -51,28 +51,28 @@ class _Call:
         self.denial: DeniedError | None = None
 
     def end(self, denial: DeniedError) -> None:
-        """Have it end with this."""
+        """Cancel the call; its status becomes ``denial``."""
         self.denial = denial
         if self.task is not None:
             self.task.cancel()
 
 
 class OpenCalls:
-    """All calls that are open, whichever address they came by; for the event loop's thread."""
+    """All open calls, on all addresses; for the event loop's thread."""
 
     def __init__(self, limits: CallLimits | None = None) -> None:
         self.limits = limits or CallLimits()
         self.refusals = Refusals("call refused", "call")
         self._open: set[_Call] = set()
         self._by_client: Counter[str] = Counter()
-        self._silent: dict[_Call, float] = {}  # whose one message is waited for, and until when: the first is due first
+        self._silent: dict[_Call, float] = {}  # calls without their message yet, and their time-outs in order
         self._timer: asyncio.TimerHandle | None = None
 
     def __len__(self) -> int:
         return len(self._open)
 
     def enter(self, method: str, access: ListenerAccess, context: Context) -> _Call:
-        """Admit one, or DeniedError. It has to :meth:`leave`."""
+        """Admit a call, which has to :meth:`leave` later. DeniedError: it is refused."""
         peer = context.peer()
         shown = Credentials.of(context.invocation_metadata() or (), context.auth_context())
         try:
@@ -87,17 +87,17 @@ class OpenCalls:
         return call
 
     def leave(self, call: _Call) -> None:
-        """It has ended."""
+        """Remove a call that has ended."""
         self._open.discard(call)
         self._by_client[call.client] -= 1
         if not self._by_client[call.client]:
             del self._by_client[call.client]
 
     async def message(self, call: _Call, context: Context) -> Any:
-        """The one message of a call, or EOF. One that does not come in time ends the call."""
+        """Return a call's single message, or EOF; end the call if none comes in time."""
         loop = asyncio.get_running_loop()
         self._silent[call] = due_s = loop.time() + self.limits.message_s
-        if self._timer is None:  # one for all: nearly every message comes at once
+        if self._timer is None:  # one timer for all: nearly every message is there at once
             self._timer = loop.call_at(due_s, self._end_silent)
         try:
             return await context.read()
@@ -116,7 +116,7 @@ class OpenCalls:
             call.end(DeniedError(grpc.StatusCode.DEADLINE_EXCEEDED, f"{call.method}: {limit}"))
 
     def review(self) -> int:
-        """End the calls that would not be admitted any more; how many."""
+        """End the calls that would not be admitted any more, and return their number."""
         ended = 0
         for call in self._open:
             try:
@@ -142,10 +142,11 @@ class OpenCalls:
 
 
 class CallGuard(grpc.aio.ServerInterceptor):
-    """Stands before all calls of one listening address.
+    """Checks every call of one listening address.
 
-    To gRPC each call is one with a stream of requests, so that who calls is known, and counted, before the first
-    message has come; and bytes that are no message end the call with a word, and nothing in the log.
+    For gRPC every call has a stream of requests. So a call is checked and counted before its
+    first message arrives, and an invalid message ends the call with a status, without a
+    traceback in the log.
     """
 
     def __init__(self, access: ListenerAccess, calls: OpenCalls) -> None:
@@ -156,14 +157,14 @@ class CallGuard(grpc.aio.ServerInterceptor):
     async def intercept_service(
         self, continuation: Callable[[Any], Awaitable[Handler]], handler_call_details: Any
     ) -> Handler:
-        """The call's handler, behind the gate."""
+        """Return the call's handler with the checks in front."""
         method: str = handler_call_details.method
         if method not in self._handlers:
             self._handlers[method] = self._guarded(method, await continuation(handler_call_details))
         return self._handlers[method]
 
     def _guarded(self, method: str, handler: Handler) -> Handler:
-        found: Any = handler  # what it has depends on its kind
+        found: Any = handler  # its attributes depend on its kind
         behaviour = found.stream_stream or found.stream_unary or found.unary_stream or found.unary_unary
         decode = handler.request_deserializer
         many = inspect.isasyncgenfunction(behaviour)
@@ -188,7 +189,7 @@ class CallGuard(grpc.aio.ServerInterceptor):
                 if call.denial is None:
                     raise
                 await context.abort(call.denial.code, str(call.denial))
-            except grpc.aio.InternalError:  # nothing can be sent any more: its client is gone, which is no news
+            except grpc.aio.InternalError:  # the client is gone, and nothing can be sent
                 raise asyncio.CancelledError from None
             finally:
                 self._calls.leave(call)
@@ -198,7 +199,7 @@ class CallGuard(grpc.aio.ServerInterceptor):
         return grpc.stream_unary_rpc_method_handler(run, None, handler.response_serializer)
 
     async def _message(self, call: _Call, decode: Decode | None, context: Context) -> Any:
-        """The one message of a call."""
+        """Return the decoded single message of a call."""
         data = await self._calls.message(call, context)
         if data is grpc.aio.EOF:
             await context.abort(grpc.StatusCode.INVALID_ARGUMENT, f"{call.method}: the call has no message")

@@ -1,6 +1,6 @@
-"""Which clients are still connected, though no call of theirs is open.
+"""Finds out which clients are connected, even without an open call.
 
-gRPC tells a server of the end of a call, not of a connection; the kernel knows.
+gRPC reports the end of a call to a server, but not of a connection; the kernel knows.
 """
 
 from __future__ import annotations
@@ -17,11 +17,14 @@ _TABLES: Final = (Path("/proc/self/net/tcp"), Path("/proc/self/net/tcp6"))
 _PEER: Final = re.compile(r"ipv[46]:(.+):([0-9]{1,5})")
 
 Peer = tuple[IPv4Address | IPv6Address, int]
-"""The client's end of a connection."""
+"""Address and port of a connection's remote end."""
 
 
 def peer_of(text: str) -> Peer | None:
-    """The client's end, as gRPC names it (``ipv4:127.0.0.1:5000``, ``ipv6:%5B::1%5D:5000``); None: it is not of TCP."""
+    """Parse gRPC's name of a client, such as ``ipv4:127.0.0.1:5000`` or ``ipv6:%5B::1%5D:5000``.
+
+    None: the connection is not TCP.
+    """
     match = _PEER.fullmatch(unquote(text))
     if match is None:
         return None
@@ -32,7 +35,7 @@ def peer_of(text: str) -> Peer | None:
 
 
 def connected() -> frozenset[Peer]:
-    """The other ends of all connections of this host that stand; none where the kernel does not tell."""
+    """Return the remote ends of this host's TCP connections, as far as the kernel lists them."""
     return frozenset(peer for table in _TABLES for peer in _read(table))
 
 
@@ -49,11 +52,11 @@ def _read(table: Path) -> Iterator[Peer]:
 
 
 def _address(words: bytes) -> IPv4Address | IPv6Address:
-    """An address as the kernel prints it: words of four bytes, each in the host's order."""
+    """Read an address from the kernel's tables: words of four bytes in the host's byte order."""
     data = b"".join(words[at : at + 4][::-1] for at in range(0, len(words), 4))
     return _plain(ip_address(data))
 
 
 def _plain(address: IPv4Address | IPv6Address) -> IPv4Address | IPv6Address:
-    """An IPv4 address that is written as one of IPv6 is the same one."""
+    """Return the IPv4 address of an IPv4-mapped IPv6 address, and others unchanged."""
     return getattr(address, "ipv4_mapped", None) or address

@@ -1,4 +1,7 @@
-"""How many connections the process has descriptors for: they must not run out, for then nothing works any more."""
+"""Limits the connections to the file descriptors that the process may have.
+
+Without free descriptors nothing in the process would work.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +9,17 @@ import resource
 from typing import Final
 
 OWN: Final = 256
-"""What the process needs beside connections, and far more."""
+"""Descriptors reserved for everything but connections; more than enough."""
 EACH: Final = 1
-"""Descriptors set aside for a connection."""
+"""Descriptors reserved for each connection."""
 
 
 FEW: Final = 64
-"""So few connections are too few for the programs around a cell."""
+"""With fewer connections than this the endpoint reports a shortage."""
 
 
 def shortage(connections: int, wanted: int) -> str:
-    """What ``status`` says when there is room for so few; empty: there is enough."""
+    """Return the note for ``status`` if connections are short; empty: there are enough."""
     if connections >= min(FEW, wanted):
         return ""
     files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
@@ -28,7 +31,7 @@ def shortage(connections: int, wanted: int) -> str:
 
 
 def room(wanted: int) -> int:
-    """So many connections, or as many as the limit of open files allows, which is raised as far as it may be."""
+    """Raise the limit of open files as far as needed; return the connections that it allows."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     needed = OWN + EACH * wanted
     if soft != resource.RLIM_INFINITY and soft < needed:

@@ -1,7 +1,8 @@
-"""Health (``grpc.health.v1``) of the endpoint, its services and its sources; for the event loop's thread.
+"""Health (``grpc.health.v1``) of the endpoint, its services and its sources.
 
-grpcio-health-checking has a servicer, too: it tells watchers under the lock that a change of what they watch needs, and
-so one that does not read stops all news of that service, and the end of the process.
+The servicer of grpcio-health-checking is not used: it sends to watchers under a lock that
+status changes need. So a watcher that does not read blocks all changes of that service, and
+the process's end.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ Context = grpc.aio.ServicerContext[Any, Any]
 
 
 class Health(health_pb2_grpc.HealthServicer):
-    """Tells each watcher the newest status, however slowly it reads."""
+    """Serves the status of services, conflated for slow watchers; for the event loop's thread."""
 
     def __init__(self) -> None:
         self._serving: dict[str, bool] = {}
@@ -28,26 +29,26 @@ class Health(health_pb2_grpc.HealthServicer):
         self._over = False
 
     def set(self, service: str, *, serving: bool) -> None:
-        """Show it; nothing changes any more once it is over."""
+        """Set a service's status; without effect after :meth:`end`."""
         if not self._over:
             self._serving[service] = serving
             for changed in self._watchers.get(service, ()):
                 changed.set()
 
     def end(self) -> None:
-        """Show that nothing is served from now on."""
+        """Set all services to not serving, for good."""
         for service in list(self._serving):
             self.set(service, serving=False)
         self._over = True
 
     async def Check(self, request: wire.HealthCheckRequest, context: Context) -> wire.HealthCheckResponse:  # noqa: N802  the name of the call
-        """The status of a service; NOT_FOUND."""
+        """Return a service's status. Status NOT_FOUND: no such service."""
         if request.service not in self._serving:
             await context.abort(grpc.StatusCode.NOT_FOUND, f"{shorten(request.service)!r}: no such service")
         return self._status(request.service)
 
     async def Watch(self, request: wire.HealthCheckRequest, _: Context) -> AsyncIterator[wire.HealthCheckResponse]:  # noqa: N802
-        """Stream the status of a service, which may be unknown, and each change that is not over before it is read."""
+        """Stream a service's status and its changes, conflated; the service may be unknown."""
         changed = asyncio.Event()
         watchers = self._watchers.setdefault(request.service, set())
         watchers.add(changed)

@@ -1,4 +1,4 @@
-"""The endpoint's listening addresses, as they are configured, and again when that is read anew."""
+"""The endpoint's listening addresses and their access rules, which a reload may change."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shmio.endpoints.grpc.server.access import Keys, ListenerAccess
 
 
 class Listener(NamedTuple):
-    """An address, and who may do what there."""
+    """A listening address and its access rules."""
 
     address: Address | UnixAddress
     access: ListenerAccess
@@ -18,10 +18,10 @@ class Listener(NamedTuple):
 
 
 class Listeners:
-    """All of them, with the same keys."""
+    """All listening addresses; they share tokens and certificate patterns."""
 
     def __init__(self, config: Grpc) -> None:
-        """ConfigError: a token's file will not do."""
+        """Read the configuration. ConfigError: a token's file is not usable."""
         keys = Keys.of(config)
         self._listeners = {
             key: Listener(
@@ -34,11 +34,11 @@ class Listeners:
 
     @property
     def listeners(self) -> list[Listener]:
-        """To listen on."""
+        """The listening addresses."""
         return list(self._listeners.values())
 
     def take(self, config: Grpc) -> None:
-        """Take tokens, clients and roles as they are by now; ConfigError: they stay as they were."""
+        """Adopt new tokens, clients and roles. ConfigError: the old ones stay."""
         keys = Keys.of(config)
         for key, address in config.listening.items():
             if key in self._listeners:

@@ -1,4 +1,4 @@
-"""Memory that a flood of calls took goes back to the host. What is not glibc's does not know these calls."""
+"""Returns memory to the host after floods of calls; without effect outside glibc."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from typing import Any, Final
 
 M_ARENA_MAX: Final = -8
 ARENAS: Final = 2
-"""Each of gRPC's threads would have one of its own, and what is free in one serves no other."""
+"""Number of malloc arenas; by default each thread has its own, whose free memory no other uses."""
 FLOOD_CALLS: Final = 1000
-"""So many refused calls are worth to look at the free memory."""
+"""Number of refused calls after which free memory is returned."""
 EVERY_S: Final = 5.0
 AFTER_S: Final = 60.0
 
 
 def limit_arenas() -> None:
-    """Have all threads share few arenas; to be called before they start."""
+    """Have all threads share few malloc arenas; to be called before threads start."""
     if (mallopt := getattr(ctypes.CDLL(None), "mallopt", None)) is not None:
         mallopt(M_ARENA_MAX, ARENAS)
 
 
 class Trimmer:
-    """Gives back what is free during floods, and for a while after them: gRPC frees what belongs to a call later."""
+    """Returns free memory during floods and for a while after: gRPC frees a call's memory later."""
 
     def __init__(
         self, clock_s: Callable[[], float] = time.monotonic, trim: Callable[[int], object] | None = None
@@ -34,7 +34,7 @@ class Trimmer:
         self._due_s = self._until_s = 0.0
 
     def look(self, refused: int) -> None:
-        """``refused``: calls so far."""
+        """Return free memory if it is time. ``refused``: number of refused calls so far."""
         now_s = self._clock_s()
         if refused - self._seen >= FLOOD_CALLS:
             self._seen, self._until_s = refused, now_s + AFTER_S

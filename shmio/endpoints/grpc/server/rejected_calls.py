@@ -1,4 +1,4 @@
-"""Counting and logging what clients sent in vain; one that does nothing else must not fill the log."""
+"""Counts and logs refused messages and calls, with a limit on log lines."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from shmio.logs import fields
 
 TURN_S: Final = 10.0
 LINES: Final = 10
-"""Most lines in a turn; of what is more, one line tells how many."""
+"""Most log lines in ``TURN_S``; one more line reports how many others there were."""
 
 log = logging.getLogger("shmio.grpc")
 
 
 class Refusals:
-    """Messages, or calls, that were refused, in all; for the event loop's thread."""
+    """Counts and logs refused messages or calls; for the event loop's thread."""
 
     def __init__(self, what: str = "publish refused", about: str = "topic", turn_s: float = TURN_S) -> None:
-        """``about``: the name that the log has for what was refused."""
+        """``what`` begins each log line; ``about`` is the log field that names what was refused."""
         self.count = 0
         self._what = what
         self._about = about
@@ -28,7 +28,7 @@ class Refusals:
         self._in_turn = 0
 
     def add(self, reason: str, name: str, peer: str) -> None:
-        """Count one, and log it if there is a line left."""
+        """Count a refusal, and log it if the limit allows."""
         self.count += 1
         self._in_turn += 1
         if self._in_turn == 1:

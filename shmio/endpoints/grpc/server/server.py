@@ -32,9 +32,9 @@ STOP_S: Final = 2.5
 log = logging.getLogger("shmio.grpc")
 
 OPTIONS = [
-    ("grpc.so_reuseport", 0),  # else a second server would take the same port in silence
+    ("grpc.so_reuseport", 0),  # else a second server could silently take the same port
     ("grpc.max_receive_message_length", MAX_REQUEST_BYTES),
-    # A call that waited for its turn is not cancelled for it: its client knows how long it wants to wait.
+    # A call that waited long in the queue is not cancelled: its client sets its own deadline.
     ("grpc.server_max_unrequested_time_in_server", 3600),
     # A client whose host vanished is noticed within half a minute.
     ("grpc.keepalive_time_ms", 20_000),
@@ -44,36 +44,45 @@ OPTIONS = [
 
 
 class Server:
-    """All services on each of the addresses, each behind a gate."""
+    """Serves all services on each listening address, behind a :class:`CallGuard` each."""
 
     def __init__(self, services: Services, calls: OpenCalls | None = None) -> None:
         self.calls = OpenCalls() if calls is None else calls
-        """Those that are open, on all addresses."""
+        """The open calls on all addresses."""
         self._services = services
         self._health = Health()
         self._servers: list[CoreServer] = []
         self._files: dict[str, SocketFile] = {}
         self._connections = 1
-        """How many each address may have."""
         self.shortage = ""
-        """What is wrong though it serves: it has room for few."""
+        """Note for ``status`` if the endpoint serves with too few connections; else empty."""
         logging.getLogger("grpc._cython.cygrpc").addFilter(_is_news)
 
     @property
     def alive(self) -> bool:
-        """Whether all addresses are served. If not, the process has to end: a server made anew corrupts its memory."""
+        """Whether all addresses are served.
+
+        If not, the process has to end: a second server in the process would corrupt its memory.
+        """
         return all(server.alive for server in self._servers)
 
     @property
     def unknown(self) -> int:
-        """Calls of unknown names, since the start; all were refused."""
+        """Number of calls of unknown names since the start; all were refused."""
         return sum(server.refused for server in self._servers)
 
     async def start(self, listeners: Sequence[Listener], tls: Tls | None = None, gid: int | None = None) -> list[int]:
-        """Listen on all addresses; the ports, for those that were 0.
+        """Listen on all addresses and return their ports.
 
-        ``gid``: the group that may open UNIX sockets, too. ConfigError: a file of ``tls`` cannot be used.
-        EndpointError names the address in the way.
+        Args:
+            listeners: The addresses; port 0 means any free port.
+            tls: Certificate and key for encrypted addresses.
+            gid: A group that may also open UNIX sockets.
+
+        Raises:
+            ConfigError: A file of ``tls`` cannot be used.
+            EndpointError: An address, which the message names, cannot be used.
+
         """
         credentials = _credentials(tls) if tls else None
         wanted = self.calls.limits.connections
@@ -94,11 +103,11 @@ class Server:
         return ports
 
     async def set_source(self, source: str, good: bool) -> None:
-        """Show a source's quality as the health of ``source.<name>``."""
+        """Set the health of ``source.<name>`` to a source's quality."""
         self._health.set(f"source.{source}", serving=good)
 
     async def stop(self) -> None:
-        """Say so, end all streams, close. It takes no longer than ``STOP_S``, whatever clients do."""
+        """Set health to not serving, end all calls and close, within ``STOP_S``."""
         self._health.end()
         ends = [asyncio.create_task(server.stop(GRACE_S)) for server in self._servers]
         if ends and (await asyncio.wait(ends, timeout=STOP_S))[1]:
@@ -111,7 +120,7 @@ class Server:
     ) -> int:
         address = listener.address
         if isinstance(address, UnixAddress):
-            clear(address.path)  # gRPC itself would take it from a living process
+            clear(address.path)  # gRPC itself would take the path from a running process
         try:
             if isinstance(address, Address):
                 if credentials and listener.encrypted:
@@ -130,9 +139,9 @@ class Server:
         return int(port)
 
     def _server(self, gate: CallGuard) -> CoreServer:
-        # No connection is told to have room for more than all calls. When 1000 wait to be looked at, gRPC breaks off
-        # some at random: clients that begin with thousands of subscriptions at once would lose some. Each method has
-        # its own queue; that of unknown names may fill up, and then is what a flood of them costs in memory.
+        # A connection may have as many streams as there may be calls in all. gRPC ends some
+        # calls at random when 1000 wait: clients that open thousands at once would lose some. Each
+        # method has its own queue. A flood of unknown names can only fill the queue for those.
         most = self.calls.limits.calls
         pending = "grpc.server.max_pending_requests"
         options: list[tuple[str, Any]] = [
@@ -161,5 +170,5 @@ def _credentials(tls: Tls) -> grpc.ServerCredentials:
 
 
 def _is_news(record: logging.LogRecord) -> bool:
-    """What gRPC says, with a traceback, of headers that are not UTF-8 is none: any client may send them."""
+    """Filter gRPC's tracebacks about headers that are not UTF-8: any client can cause them."""
     return not str(record.msg).startswith("Invalid encoding on ")

@@ -1,4 +1,4 @@
-"""Long work of one request in portions: the event loop serves the others in between."""
+"""Splits long work of one request into time slices, so that the event loop serves others."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from collections.abc import AsyncIterator, Iterable
 from typing import Final, TypeVar
 
 HELD_S: Final = 0.005
-"""How long work may hold the event loop at a time."""
+"""Longest time that such work may block the event loop at once."""
 
 T = TypeVar("T")
 
 
 async def time_sliced(items: Iterable[T]) -> AsyncIterator[T]:
-    """Each of the items; others get their turn whenever those before have taken ``HELD_S``."""
+    """Yield the items; let other tasks run whenever ``HELD_S`` has passed."""
     begun_s = time.perf_counter()
     for item in items:
         yield item

@@ -1,4 +1,4 @@
-"""The streams that follow one block, and whether all of them have enough for now."""
+"""Back-pressure: bounds on what waits for clients, and when a block need not be read."""
 
 from __future__ import annotations
 
@@ -11,28 +11,31 @@ from shmio.endpoints.grpc.streams.channel import Stream
 from shmio.segment import Block, Cursor, Frame
 
 WINDOW_S: Final = 0.25
-"""So often it is looked at."""
+"""Length of the window in which a client's losses are compared with its values."""
 BEHIND_S: Final = 5.0
-"""At the next multiple of this one that is far behind is tried again, for what it loses meanwhile does not say how fast
-it is: with all others, for what is read for one of them is there for all."""
+"""A client that is far behind is tried again at the next multiple of this time.
+
+Its losses while it is behind do not show how fast it could be. All clients are tried at the
+same time, because a frame that is read for one of them is available to all.
+"""
 PART: Final = 3
-"""A client that has lost more than one in so many values is far behind."""
+"""A client that loses more than one value in this many is far behind."""
 LATE_S: Final = 0.002
-"""What is for one that is far behind waits no longer if there is something newer."""
+"""A value for a client that is far behind is dropped after this time if there is a newer one."""
 
 
 class LossMonitor:
-    """Of one client's stream. Times in s, on any clock."""
+    """Decides from one client's lost values whether it is far behind. Times in s, on any clock."""
 
     def __init__(self) -> None:
         self.behind = False
-        """Whether it is far behind: then what waits for it makes it no better off, only later."""
+        """Whether the client is far behind: queued values would only reach it later."""
         self._offered = 0
         self._lost = 0
         self._until_s = 0.0
 
     def offer(self, now_s: float) -> None:
-        """There is a value for it."""
+        """Count one value for the client; at the end of a window decide anew."""
         if now_s >= self._until_s:
             self.behind = not self.behind and PART * self._lost > self._offered
             self._offered = self._lost = 0
@@ -40,35 +43,35 @@ class LossMonitor:
         self._offered += 1
 
     def lose(self, count: int) -> None:
-        """So many were dropped for newer ones."""
+        """Count values that were dropped in favour of newer ones."""
         self._lost += count
 
     def skip(self, count: int) -> None:
-        """So many were not even offered."""
+        """Count values that were never queued; they count as offered and as lost."""
         self._offered += count
         self._lost += count
 
 
 BOUND_BYTES: Final = 8 << 20
-"""Of values, and of events, that wait in a stream."""
+"""Limit of the values, and of the events, that wait in one stream."""
 TOTAL_BYTES: Final = 256 << 20
-"""Of all that waits in all streams: when there is more, a stream may hold no more than its equal part of it."""
+"""Limit of all messages that wait in all streams; beyond it each stream has an equal share."""
 
 
 class TotalBacklog:
-    """What waits in all streams."""
+    """Size of the messages that wait in all streams, and the number of these streams."""
 
     def __init__(self) -> None:
         self.size = 0
         self.streams = 0
 
     def over(self, size: int) -> bool:
-        """Whether there is too much of it, and a stream that holds so much has a part in that."""
+        """Return whether all is too much and a stream of ``size`` bytes is over its share."""
         return self.size > TOTAL_BYTES and size > TOTAL_BYTES // max(1, self.streams)
 
 
 class Backlog:
-    """Messages of one kind that wait."""
+    """Count and size of the messages of one kind that wait in one stream."""
 
     def __init__(self, total: TotalBacklog) -> None:
         self.count = 0
@@ -76,20 +79,20 @@ class Backlog:
         self._total = total
 
     def full(self, message: Sized, bound: int, bound_bytes: int | None = None) -> bool:
-        """Whether one more would be too much. A single one never is, however long."""
+        """Return whether one more message would exceed a bound. A single message never does."""
         most = BOUND_BYTES if bound_bytes is None else bound_bytes
         size = self.size + len(message)
         return self.count > 0 and (self.count >= bound or size > most or self._total.over(size))
 
     def add(self, message: Sized) -> None:
-        """One waits."""
+        """Count a message that begins to wait."""
         size = len(message)
         self.count += 1
         self.size += size
         self._total.size += size
 
     def remove(self, message: Sized) -> None:
-        """It waits no more."""
+        """Count out a message that was sent or dropped."""
         size = len(message)
         self.count -= 1
         self.size -= size
@@ -97,22 +100,27 @@ class Backlog:
 
 
 CATCH_UP_FRAMES: Final = 48
-"""A feed that is further behind than this goes on with the newest frame: what it skips is conflated, not lost.
+"""A feed that is further behind than this skips to the newest frame: the rest is conflated.
 
-So does one that nobody listens to. Frames, not a time as for the MQTT bridge, which falls behind only if it is held up
-itself: here what clients are too slow for waits in the ring, and each takes it late, as many as an outbox has room for.
+A feed without listeners also skips. The bound is a number of frames. The MQTT bridge has a
+time instead, because it falls behind only if it is delayed itself. Here frames that clients
+are too slow for wait in the ring, up to the number that an outbox has room for.
 """
 FEW_FRAMES: Final = 8
-"""So many, if they are new, are better than the newest alone for a client that is behind: it need not wait for more."""
+"""A client that is behind gets this many frames, if they are new, so that it need not wait."""
 LOOK_S: Final = 0.02
-"""Now and then what comes is looked at, whoever has something to take: it may be bad news."""
+"""Frames are read at least this often, even if all clients are busy: quality may be bad."""
 
 
 class BackPressure:
-    """Of a feed, which need not read what nobody can take: when one of them can, it is what is newest then."""
+    """Back-pressure for the streams that follow one block.
+
+    The feed reads no frames while all of its streams are busy. As soon as a stream can take
+    more, the feed continues with the newest frames.
+    """
 
     def __init__(self, block: Block, refill: Callable[[], object]) -> None:
-        """``refill``: called when one of them can take more."""
+        """``refill`` is called when a stream can take more."""
         self._block = block
         self._refill = refill
         self._streams: Counter[Stream] = Counter()
@@ -120,22 +128,22 @@ class BackPressure:
         self._until_s = 0.0
 
     def join(self, stream: Stream) -> None:
-        """One more topic of a stream."""
+        """Add one topic of a stream."""
         self._streams[stream] += 1
         if self._passing:
             stream.refills[self._refill] = None
 
     def leave(self, stream: Stream) -> None:
-        """One less."""
+        """Remove one topic of a stream."""
         self._streams[stream] -= 1
         if not self._streams[stream]:
             del self._streams[stream]
             stream.refills.pop(self._refill, None)
 
     def passes(self) -> bool:
-        """Whether what comes now is not to be read yet: all have something to take, and will ask for more.
+        """Return whether the feed should read nothing now, because all streams are busy.
 
-        Now and then it is, ``LOOK_S`` after the last time.
+        Busy streams call ``refill`` later. ``LOOK_S`` after the last read the answer is False.
         """
         if not self._streams:
             return False
@@ -149,7 +157,7 @@ class BackPressure:
         return time.monotonic() <= self._until_s
 
     def look(self, cursor: Cursor[Frame]) -> Cursor[Frame]:
-        """Where to go on, now that what there is is looked at: without what is too much, or too old."""
+        """Return the cursor to continue with: after the frames that are too many or too old."""
         passing, self._passing = self._passing, False
         self._until_s = time.monotonic() + LOOK_S
         behind = passing and all(stream.behind for stream in self._streams)

@@ -1,4 +1,4 @@
-"""Who listens to what comes out of a block: a subject, and the streams that want it."""
+"""Channels of a block: each is one subject with the streams that listen to it."""
 
 from __future__ import annotations
 
@@ -10,69 +10,69 @@ from shmio.segment.changed_registers import ChangeScan, entries
 
 
 class Stream(Protocol):
-    """What goes to one client."""
+    """A client's stream, as back-pressure sees it."""
 
     refills: dict[Callable[[], object], None]
-    """Called, once, as soon as it has nothing to send."""
+    """Functions that are called once, as soon as the stream has nothing to send."""
 
     @property
     def busy(self) -> bool:
-        """Whether its client takes what there was for it."""
+        """Whether messages wait, or the client is still taking the last one."""
 
     @property
     def behind(self) -> bool:
-        """Whether that is far less than there could be."""
+        """Whether the client loses so many values that it is far behind."""
 
     def skip(self, frames: int, topics: int) -> None:
-        """So many frames of so many topics were not delivered to it, which is too slow for them."""
+        """Count frames that were not delivered to ``topics`` topics of a slow client."""
 
 
 class Listener(Protocol):
-    """A stream's part in one subject; called in the event loop's thread."""
+    """A stream's subscription to one subject; called in the event loop's thread."""
 
     @property
     def stream(self) -> Stream:
-        """The whole of it."""
+        """The stream that this listener belongs to."""
 
     since: int
-    """Frame whose value the stream already has."""
+    """Number of the frame whose value the stream already has."""
 
     def deliver(self, message: Sized, at_s: float | None = None) -> None:
-        """Take one message for this stream. ``at_s``: of when it is, by the clock of its topic; default: now."""
+        """Take one message. ``at_s``: its time by the topic's clock, in s; default: now."""
 
     def keep(self, message: Sized) -> None:
-        """Take one message of a step: it must not be left out."""
+        """Take one message of a step, which must not be dropped."""
 
     def lose(self) -> None:
-        """Quality is bad: what was not sent yet must not be sent any more."""
+        """Drop the messages that were not sent yet, because quality has turned bad."""
 
 
 class Channel:
-    """A subject as somebody listens to it: how a frame becomes a message, and who gets it."""
+    """A subject that has listeners: how a frame becomes a message, and who gets it."""
 
     def __init__(self, subject: Subject, slot: int) -> None:
-        """``slot``: its place in the feed's table."""
+        """``slot``: the channel's index in the feed's table."""
         self.encode = subject.encode
         self.listeners: dict[Listener, None] = {}  # in the order in which they came
         self.slot = slot
         first = subject.registers[0]
         self.order = first.offset, first.bit or 0, subject.path, subject.wire
-        """Of those that a step has changed, whoever came first."""
+        """Sort key: the channels that a step has changed are delivered in the block's order."""
         self.changed = subject.changed
         self.entries = b"" if self.changed else entries(subject.registers, slot)
 
 
 class ChannelTable(NamedTuple):
-    """The channels of a block."""
+    """All channels of a block, and the change scan over them."""
 
     slots: tuple[Channel | None, ...]
     scan: ChangeScan
     apart: tuple[Channel, ...]
-    """Those that the scan does not look at."""
+    """Channels that decide by a function of their own whether they have changed."""
 
     @classmethod
     def of(cls, channels: Collection[Channel], slots: int) -> ChannelTable:
-        """That of these; ``slots``: of places, of which some may be free."""
+        """Build the table of these channels. ``slots``: its length; some slots may be free."""
         places: list[Channel | None] = [None] * slots
         for channel in channels:
             places[channel.slot] = channel

@@ -1,6 +1,6 @@
-"""Protobuf's wire format, for messages that are put together of parts which many share.
+"""Protobuf's wire format, for messages that are assembled from shared parts.
 
-Serialised fields may be concatenated: together they are a message (protobuf.dev, "Encoding").
+Serialised fields may be concatenated to a message (protobuf.dev, "Encoding").
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ _SHORT: Final = [bytes((number,)) for number in range(0x80)]
 
 
 def varint(number: int) -> bytes:
-    """A number from 0 on."""
+    """Encode a number that is not negative."""
     if number < 0x80:
         return _SHORT[number]
     if number < 0x4000:
@@ -25,15 +25,15 @@ def varint(number: int) -> bytes:
 
 
 def delimited(data: bytes) -> bytes:
-    """Bytes behind their length."""
+    """Encode bytes with their length in front."""
     return varint(len(data)) + data
 
 
 def field(field_number: int, data: bytes) -> bytes:
-    """A field of this number that is bytes, text, a message, or packed numbers."""
+    """Encode a field that is bytes, text, a message, or packed numbers."""
     return varint(field_number << 3 | 2) + varint(len(data)) + data
 
 
 def number(field_number: int, value: int) -> bytes:
-    """A field of this number that is a whole number from 0 on, or an enum's."""
+    """Encode a field that is an enum or a whole number that is not negative."""
     return varint(field_number << 3) + varint(value)

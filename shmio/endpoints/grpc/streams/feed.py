@@ -1,4 +1,4 @@
-"""Follows one block: one change scan for each frame, one encoding for each change, whoever listens."""
+"""Follows one block: one change scan per frame, and one encoding per change for all listeners."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from shmio.segment import Block, Event, Frame, Quality
 log = logging.getLogger("shmio.grpc")
 
 TURN_FRAMES = 8
-"""So many are shown before streams have their turn."""
+"""Frames that are delivered before the event loop serves the streams."""
 
 
 class Feed:
     """Delivers the changes of one block's registers to listeners while quality is good.
 
-    On recovery from bad quality every register is delivered again. While it is held, which a block on the instance's
-    clock is in virtual time, nothing is delivered but by :meth:`step`. For the event loop's thread.
+    After bad quality every register is delivered again. In virtual time the feed of a block on
+    the instance's clock is *held*: only :meth:`step` delivers. For the event loop's thread.
     """
 
     def __init__(
@@ -35,16 +35,16 @@ class Feed:
         on_quality: Callable[[str, bool], None],
         virtual_time: VirtualTime | None = None,
     ) -> None:
-        """``writer``: the command queue of this process. ``hold``: virtual time; default: there is none."""
+        """``writer``: this process's command queue. ``virtual_time``: default: time is real."""
         self.block = block
         self.commands = CommandClient(block, writer, wake_ups, self._stamp)
-        """The other direction."""
+        """The way into the block: commands to its source."""
         self.messages = 0
         self._virtual_time = virtual_time or VirtualTime()
         self._held = self._virtual_time.on and block.attributes.stepped
-        self._stepped = False  # since it is held
-        self._shown: Frame | DeliveredImage | None = None  # what listeners have seen; None while quality is bad
-        self._good = False  # as last told
+        self._stepped = False  # whether a step was delivered since the feed is held
+        self._shown: Frame | DeliveredImage | None = None  # delivered last; None: quality is bad
+        self._good = False  # as last reported
         self._loop = asyncio.get_running_loop()
         self._wake_ups = wake_ups
         self._on_quality = on_quality
@@ -53,39 +53,39 @@ class Feed:
         self._free: list[int] = []  # slots
         self._table = ChannelTable.of((), 0)
         self._outdated = False
-        self._owed: dict[Listener, Channel] = {}  # joined while there was no good value
-        _ = block.layout.members("")  # builds what paths are looked up in, before the first client waits for it
+        self._owed: dict[Listener, Channel] = {}  # listeners that wait for a good value
+        _ = block.layout.members("")  # builds the index of paths before the first client needs it
         self._cursor = block.cursor()
         self._following = False
-        self._again = False  # whether the loop is about to look without a bell
+        self._again = False  # whether another look is scheduled
 
     @property
     def alive(self) -> bool:
-        """Whether the block is being followed, as long as there is something to come."""
+        """Whether the block and its events are being followed, or the block has retired."""
         return (self._following or self.block.retired) and self.commands.alive
 
     @property
     def over(self) -> bool:
-        """Whether nothing is left of it: neither does it follow the block, nor has it a stream."""
+        """Whether the feed has ended, has no listeners left, and no commands in flight."""
         return not (self._following or self._channels) and self.commands.over
 
     def start(self) -> None:
-        """Begin to follow the block."""
+        """Start following the block."""
         newest = self.block.latest()
         if self._held:
             self._adopt(newest)
         self._cursor = self.block.cursor(after=newest.number - 1 if newest else 0)
         self._following = True
-        self.commands.start()  # it hears first: what was written before a frame is told before it
+        self.commands.start()  # first: a write is delivered before the frame after it
         self._wake_ups.join(self.block, self._look)
 
     def stop(self) -> None:
-        """Follow it no more."""
+        """Stop following the block."""
         self._end()
         self.commands.stop()
 
     def listen(self, subject: Subject, listener: Listener) -> None:
-        """Join a subject's listeners; the current value is delivered at once, or as soon as it is good."""
+        """Add a listener; it gets the current value at once, or as soon as that is good."""
         channel = self._channels.get(subject)
         if channel is None:
             slot = self._free.pop() if self._free else len(self._channels)
@@ -98,7 +98,7 @@ class Feed:
         self._settle()
 
     def leave(self, subject: Subject, listener: Listener) -> None:
-        """Leave; the last listener takes the channel with it."""
+        """Remove a listener; the channel ends with its last one."""
         self._owed.pop(listener, None)
         channel = self._channels[subject]
         del channel.listeners[listener]
@@ -111,17 +111,17 @@ class Feed:
                 self._loop.call_soon(self._rebuild)
 
     def tell_again(self, subject: Subject) -> None:
-        """Deliver a subject's value again: it has become another one without a frame that shows it."""
+        """Deliver a subject's value again, because it has changed without a new frame."""
         if channel := self._channels.get(subject):
             self._owed |= dict.fromkeys(channel.listeners, channel)
             self._settle()
 
     def hold(self) -> None:
-        """Show nothing any more but by :meth:`step`, if the block is on the instance's clock."""
+        """Deliver only by :meth:`step` from now on, if the block is on the instance's clock."""
         self._held = self.block.attributes.stepped
 
     def release(self) -> None:
-        """Show every frame again, from the newest one on: it may have come after the last step."""
+        """Deliver every frame again, from the newest one on: it may be newer than the last step."""
         if not self._held:
             return
         self._held = self._stepped = False
@@ -131,9 +131,13 @@ class Feed:
         self._settle()
 
     def step(self) -> None:
-        """Show what differs between the values shown last and the newest frame, as of the step that is delivered.
+        """Deliver what a step has changed: the newest frame against the values delivered last.
 
-        The order is that of the block, whoever listens. SegmentError: no frame can be read.
+        The order is that of the block's registers.
+
+        Raises:
+            SegmentError: No frame can be read.
+
         """
         if not self._held:
             return
@@ -155,13 +159,13 @@ class Feed:
                 listener.keep(message)
 
     def _adopt(self, frame: Frame | None) -> None:
-        """Before the first step the first good image is shown as it is."""
+        """Deliver the first good image as it is, if no step was delivered yet."""
         if self._held and not self._stepped and self._shown is None and frame and frame.quality is not Quality.BAD:
             self._shown = DeliveredImage(*self._virtual_time.moment, frame.image, frame.raw)
             self._settle()
 
     def _settle(self) -> None:
-        """Give those who are owed a value the newest one that is shown, if it is good."""
+        """Deliver the current value, if it is good, to the listeners that wait for one."""
         if self._held:
             if self._shown is not None:
                 for listener, channel in list(self._owed.items()):
@@ -179,12 +183,12 @@ class Feed:
         self._owed.clear()
 
     def _turn_bad(self, frame: int) -> None:
-        """Quality is bad from ``frame`` on, for all who have not joined later."""
+        """Have listeners from before ``frame`` drop their values: quality is bad from it on."""
         for channel in self._channels.values():
             for listener in channel.listeners:
                 if listener.since < frame:
                     listener.lose()
-                    listener.since = 0  # it may have lost this very value
+                    listener.since = 0  # it may have dropped this value
 
     def _rebuild(self) -> None:
         self._table = ChannelTable.of(self._channels.values(), len(self._channels) + len(self._free))
@@ -198,9 +202,9 @@ class Feed:
             self._wake_ups.leave(self.block, self._look)
 
     def _look(self) -> None:
-        """Take the frames that have come, a few at a time; if there are none, look at the age of the last one."""
+        """Read new frames, a few at a time; without new frames check the age of the last one."""
         if not self._following:
-            return  # it has left while the bell rang
+            return  # stopped during the wake-up
         if not self._held and self._back_pressure.passes():
             self._wake_ups.rest(self.block, self._look)
         else:
@@ -218,7 +222,7 @@ class Feed:
         self._look()
 
     def _refill(self) -> None:
-        """A stream that was too slow has asked for more: what is newest, though it may have that of others by now."""
+        """Read on, because a busy stream can take more again."""
         if self._following:
             self._read()
             if not self._back_pressure.passes():
@@ -226,9 +230,9 @@ class Feed:
 
     def _follow(self) -> None:
         block = self.block
-        if not self._held:  # else nothing that is shown is read here
+        if not self._held:  # a held feed delivers nothing from here
             self._cursor = self._back_pressure.look(self._cursor)
-        retired = block.retired  # before looking: what was published before the end is still shown
+        retired = block.retired  # before reading: the frames before the end are still delivered
         take = self._regard if self._held else self._take
         for count in range(TURN_FRAMES):
             frame = self._cursor.poll()
@@ -245,12 +249,12 @@ class Feed:
             self._loop.call_soon(self._look_again)
 
     def _take(self, frame: Frame | None) -> None:
-        """Show a frame if it is good, and turn bad if it is not, or none came for too long."""
+        """Deliver a good frame; turn bad if it is not good, or none came for too long."""
         block, shown = self.block, self._shown
         good = frame is not None and block.assess(frame)[0] is not Quality.BAD
-        # Age by the next frame's time, if there is one: it may have been stale while nobody was awake to see it.
+        # Age at the next frame's time, if there is one: the last may have been stale unnoticed.
         until_ns = frame.publish_ns if frame else block.now_ns()
-        known = shown is None or frame is None or frame.number == shown.number + 1  # not if some were passed over
+        known = shown is None or frame is None or frame.number == shown.number + 1  # unknown if frames were skipped
         stale = known and isinstance(shown, Frame) and shown.age_ns(until_ns) > block.stale_ns
         if shown is not None and (stale or (frame is not None and not good)):
             since = shown.number + 1 if frame is None else frame.number
@@ -263,7 +267,7 @@ class Feed:
             self._shown = frame
 
     def _regard(self, frame: Frame | None) -> None:
-        """Tell quality at once also while values wait for a step."""
+        """Report quality at once, even though values wait for a step."""
         if frame is not None:
             self._tell(good=frame.quality is not Quality.BAD)
             self._adopt(frame)
@@ -274,7 +278,7 @@ class Feed:
             self._on_quality(self.block.source, good)
 
     def _show(self, shown: Frame | DeliveredImage | None, frame: Frame) -> None:
-        """Give what has changed since the frame shown before, or everything, to all who have not seen the frame yet."""
+        """Deliver what has changed since ``shown``, or all, to listeners without this frame."""
         for channel in self._changes(shown, frame):
             message = channel.encode(frame)
             if message is None:
@@ -288,7 +292,7 @@ class Feed:
             self._settle()
 
     def _changes(self, shown: Frame | DeliveredImage | None, frame: Frame) -> list[Channel]:
-        """The channels whose bytes have changed since then; all, if nothing was shown."""
+        """Return the channels whose bytes have changed since ``shown``; all, if that is None."""
         slots, scan, apart = self._table
         if shown is None:
             return [channel for channel in slots if channel]
@@ -296,7 +300,7 @@ class Feed:
         return changes + [channel for channel in apart if channel.changed and channel.changed(shown, frame)]
 
     def present(self) -> Frame | DeliveredImage | None:
-        """What would be shown to who listens now; None: nothing good."""
+        """Return what a new listener would get; None: there is no good value."""
         if self._held:
             self._virtual_time.look()
             return self._shown
@@ -304,5 +308,5 @@ class Feed:
         return None if frame is None or self.block.assess(frame)[0] is Quality.BAD else frame
 
     def _stamp(self, event: Event) -> tuple[int, int]:
-        """Number and time of what is told of an event: the frame before it, in virtual time the step before."""
+        """Return an event's number and time: of the frame, in virtual time of the step, before."""
         return self._virtual_time.moment if self._held else Moment(event.frame, event.clock_ns)

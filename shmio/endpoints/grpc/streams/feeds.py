@@ -1,4 +1,4 @@
-"""The feeds of all sources that there are by now: a reload may add sources, end them, or change their layout."""
+"""The feeds of all sources; a reload may add or remove sources, or change their layout."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from shmio.segment import Segment
 
 
 class Feeds(Mapping[str, Feed]):
-    """A feed for each block of a segment, by its source's name; for the event loop's thread."""
+    """One feed for each block of a segment, by source name; for the event loop's thread."""
 
     def __init__(
         self,
@@ -22,9 +22,15 @@ class Feeds(Mapping[str, Feed]):
         on_quality: Callable[[str, bool], None],
         virtual_time: VirtualTime | None = None,
     ) -> None:
-        """``writer``: the command queue of this process. ``on_quality``: told whether a source is good by now.
+        """Start without feeds; see :meth:`start`.
 
-        ``hold``: see :class:`Feed`.
+        Args:
+            segment: The instance's shared memory.
+            writer: The command queue of this process.
+            wake_ups: Wakes the feeds when their blocks have something new.
+            on_quality: Called with a source's name, and whether its quality is good.
+            virtual_time: See :class:`Feed`.
+
         """
         self._segment = segment
         self._generation = -1  # of the segment when it was last read
@@ -47,7 +53,7 @@ class Feeds(Mapping[str, Feed]):
 
     @property
     def messages(self) -> int:
-        """Messages made since the start."""
+        """Number of messages encoded since the start."""
         return self._ended_messages + sum(feed.messages for feed in (*self._feeds.values(), *self._ended))
 
     @property
@@ -56,7 +62,7 @@ class Feeds(Mapping[str, Feed]):
         return all(feed.alive for feed in self._feeds.values())
 
     def start(self) -> None:
-        """Begin to follow all blocks that are not followed yet."""
+        """Start a feed for each block that has none."""
         for source, block in self._segment.blocks.items():
             if source not in self._feeds:
                 feed = self._feeds[source] = Feed(
@@ -66,9 +72,14 @@ class Feeds(Mapping[str, Feed]):
                 feed.start()
 
     async def follow(self) -> list[str]:
-        """Take up what a reload has changed; the sources whose feed is another by now, those that came or went too.
+        """Adopt what a reload has changed.
 
-        FormatError: the segment makes no sense any more.
+        Returns:
+            The sources that were added or removed, or have a new feed.
+
+        Raises:
+            FormatError: The segment is damaged.
+
         """
         self._prune()
         if self._segment.generation == self._generation:
@@ -78,25 +89,25 @@ class Feeds(Mapping[str, Feed]):
         over = [name for name, feed in self._feeds.items() if self._segment.blocks.get(name) is not feed.block]
         for name in over:
             feed = self._feeds.pop(name)
-            self._ended.append(feed)  # it ends by itself, when all is read
+            self._ended.append(feed)  # it ends by itself after its last frame
             self._on_quality(name, False)
         self.start()
         return [name for name in before | self._feeds if before.get(name) is not self._feeds.get(name)]
 
     def _read(self) -> None:
-        """Read what there is by now: for a big layout it takes a second, in which streams of others must not stand."""
-        self._generation = self._segment.generation  # before looking: what changes meanwhile is read the next time
+        """Read the segment's blocks. Runs in a thread, because a large layout takes a second."""
+        self._generation = self._segment.generation  # first: a change during the read is noticed next time
         self._segment.refresh()
         for block in self._segment.blocks.values():
             block.layout.members(""), block.layout.by_path
 
     def _prune(self) -> None:
-        """Forget the feeds of which nothing is left, and with them what they hold of the segment."""
+        """Forget the feeds that are over, and release what they hold of the segment."""
         over = [feed for feed in self._ended if feed.over]
         self._ended_messages += sum(feed.messages for feed in over)
         self._ended = [feed for feed in self._ended if feed not in over]
 
     def stop(self) -> None:
-        """Follow nothing any more."""
+        """Stop all feeds."""
         for feed in (*self._feeds.values(), *self._ended):
             feed.stop()

@@ -1,4 +1,4 @@
-"""What waits between sources and one client's stream, of one topic or of many."""
+"""Queues of one client's stream: states may be conflated, events may not."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from shmio.endpoints.grpc.streams.subject import Subject
 from shmio.segment.events import EVENT_SLOTS
 
 TOPIC_BOUND: Final = 64
-"""Values of one topic that may wait: more than a feed that catches up delivers."""
+"""Bound of one topic's waiting values: more than a feed delivers while it catches up."""
 STATE_BOUND: Final = 4096
-"""When so many values of all topics of a stream wait, it is given only the newest of each."""
+"""When this many values of a stream wait, a new value replaces all of its topic."""
 EVENT_BOUND: Final = 2 * EVENT_SLOTS
-"""Events that may wait in a stream; an inlet that catches up delivers half of it at once."""
+"""Bound of a stream's waiting events: twice what catching up can deliver at once."""
 STEP_BOUND: Final = 16_384
-"""Values that may wait of which none may be left out: what one step changes in all topics of a stream."""
+"""Bound of the values of one step that wait in a stream; none of them may be dropped."""
 STEP_BOUND_BYTES: Final = 64 << 20
 """The same in bytes."""
 
@@ -29,45 +29,48 @@ Finish = Callable[[Any], bytes]
 
 
 class Outbox:
-    """Messages of its lanes in the order in which they came; for the event loop's thread alone, with one reader."""
+    """A stream's waiting messages, in order of arrival, in one lane per topic.
+
+    For the event loop's thread; it has one reader.
+    """
 
     def __init__(self, total: TotalBacklog | None = None) -> None:
         total = total or TotalBacklog()
         self.states, self.events = Backlog(total), Backlog(total)
         self.dropped = 0
         self.failure = ""
-        """Why it ended; empty: it did not fail."""
+        """Why the outbox failed; empty: it did not."""
         self.on_failure: Callable[[], object] | None = None
-        """Called then: the stream itself may wait for its client, who does not read, for ever."""
-        self._waiting: OrderedDict[int, tuple[_Lane, Sized, float]] = OrderedDict()  # and of when it is
+        """Called on failure: the stream itself may wait for ever if its client reads nothing."""
+        self._waiting: OrderedDict[int, tuple[_Lane, Sized, float]] = OrderedDict()  # with its time in s
         self._next = 0
         self._waiter: asyncio.Future[None] | None = None
         self._ended = False
-        self._owed = 0  # messages up to this number are waited for
-        self._taken = 0  # those before this number have left, or were dropped
+        self._owed = 0  # taken() waits for the messages before this number
+        self._taken = 0  # messages before this number were sent or dropped
         self._told: asyncio.Future[None] | None = None
         self._asked = False  # whether the reader waits
         self.losses = LossMonitor()
         self.refills: dict[Callable[[], object], None] = {}
-        """Called, once, as soon as nothing waits: who has more, and waits for that."""
+        """Functions that are called once, as soon as nothing waits."""
 
     @property
     def busy(self) -> bool:
-        """Whether its client takes what there was for it."""
+        """Whether messages wait, or the client is still taking the last one."""
         return bool(self._waiting) or not self._asked
 
     @property
     def behind(self) -> bool:
-        """Whether that is far less than there could be."""
+        """Whether the client loses so many values that it is far behind."""
         return self.losses.behind
 
     def skip(self, frames: int, topics: int) -> None:
-        """So many frames of so many topics were not delivered to it, which is too slow for them."""
+        """Count frames that were not delivered to ``topics`` topics of this slow client."""
         self.dropped += frames
         self.losses.skip(frames * topics)
 
     def add(self, lane: _Lane, message: Sized, at_s: float = 0.0) -> int:
-        """Take a message; its number. ``at_s``: for :meth:`since`."""
+        """Queue a message and return its number. ``at_s``: its time, for :meth:`since`."""
         number = self._next
         self._next = number + 1
         self._waiting[number] = lane, message, at_s
@@ -77,22 +80,22 @@ class Outbox:
         return number
 
     def since(self, number: int) -> float:
-        """Of when one is that waits."""
+        """Return the time of a waiting message, in s."""
         return self._waiting[number][2]
 
     def drop(self, number: int) -> None:
-        """Drop one that waits."""
+        """Drop a waiting message."""
         lane, message, _ = self._waiting.pop(number)
         lane.load.remove(message)
         self.dropped += 1
 
     def clear(self) -> None:
-        """Drop all that waits."""
+        """Drop all waiting messages."""
         for lane, _, _ in list(self._waiting.values()):
             lane.drop()
 
     def close(self) -> None:
-        """Its stream is over: what waits is nobody's, and was not dropped for being too much; nothing is owed."""
+        """Discard what waits, because the stream is over; it does not count as dropped."""
         for lane, message, _ in self._waiting.values():
             lane.load.remove(message)
         self._waiting.clear()
@@ -100,30 +103,30 @@ class Outbox:
         self._tell()
 
     def end(self) -> None:
-        """Have the reader end once it has read what waits."""
+        """Have the reader end after the messages that wait."""
         self._ended = True
         self._wake()
 
     def fail(self, reason: str) -> None:
-        """End at once; what waits is dropped, and all that comes."""
+        """End at once: drop what waits and whatever is added later."""
         failed, self.failure = self.failure, self.failure or reason
         self.clear()
         self.end()
         self._tell()
         if self.on_failure and not failed:
-            asyncio.get_running_loop().call_soon(self.on_failure)  # not while what it leaves is gone through
+            asyncio.get_running_loop().call_soon(self.on_failure)  # later: the caller may iterate over what it leaves
 
     def owe(self) -> None:
-        """What has been added so far is waited for by :meth:`taken`."""
+        """Have :meth:`taken` wait for all messages that were added so far."""
         self._owed = self._next
 
     @property
     def owing(self) -> bool:
-        """Whether its client has not taken all that is waited for."""
+        """Whether the client has yet to take messages that :meth:`taken` waits for."""
         return self._taken < self._owed and not self.failure
 
     async def taken(self) -> None:
-        """Wait until its client has taken all that is owed, or its stream is over."""
+        """Wait until the client has taken all messages up to :meth:`owe`, or the stream is over."""
         while self.owing:
             self._told = asyncio.get_running_loop().create_future()
             try:
@@ -132,14 +135,15 @@ class Outbox:
                 self._told = None
 
     def _tell(self) -> None:
-        """Have :meth:`taken` look."""
+        """Wake :meth:`taken` if nothing is owing any more."""
         if self._told is not None and not self._told.done() and not self.owing:
             self._told.set_result(None)
 
     async def pop(self) -> bytes | None:
-        """The oldest message, waited for; None at the end, from where it begins anew.
+        """Wait for the oldest message and return it; None after :meth:`end`.
 
-        The one given before is with the client then, as far as flow control lets it.
+        Reading may go on after None. A call also means that the client has the message before,
+        as far as flow control allows.
         """
         waiting = self._waiting
         self._taken = next(iter(waiting)) if waiting else self._next
@@ -170,7 +174,7 @@ class Outbox:
 
 
 class _Lane:
-    """One topic's part of an outbox."""
+    """The messages of one topic in an outbox."""
 
     def __init__(self, outbox: Outbox, load: Backlog, finish: Finish) -> None:
         self.load = load
@@ -179,20 +183,20 @@ class _Lane:
         self._numbers: deque[int] = deque()
 
     def take(self, message: Sized) -> bytes:
-        """Its oldest message, which has left the outbox, as it is sent."""
+        """Finish the lane's oldest message, which has left the outbox, and return it."""
         self._numbers.popleft()
         self.load.remove(message)
         return self._finish(message)
 
     def drop(self) -> None:
-        """Drop what waits of it."""
+        """Drop the lane's waiting messages."""
         while self._numbers:
             self._outbox.drop(self._numbers.popleft())
 
     def keep(self, message: Sized) -> None:
-        """Add one of a step's messages, of which none is left out: without room for it the whole outbox fails.
+        """Add a message of a step; without room for it the whole outbox fails.
 
-        The step waits until the client has taken it.
+        The step waits until the client has taken the message.
         """
         if self.load.full(message, STEP_BOUND, STEP_BOUND_BYTES):
             self._outbox.fail(f"{self.load.count} values wait to be read: too many change in one step for this stream")
@@ -207,20 +211,20 @@ class _Lane:
 
 
 class StateLane(_Lane):
-    """For states: every change for a client that keeps up; for one that does not the newest value, the loss is counted.
+    """A lane for states: every change while the client keeps up, otherwise the newest value.
 
-    A client that has fallen behind is not shown the past. It is a feed's listener.
+    Values that are left out are counted. The lane is a feed's listener.
     """
 
     def __init__(self, outbox: Outbox, finish: Finish = bytes) -> None:
-        """``finish``: what a message still lacks when it is sent."""
+        """``finish`` completes a message when it is sent."""
         super().__init__(outbox, outbox.states, finish)
         self.stream = outbox
         self.since = 0
 
     def deliver(self, message: Sized, at_s: float | None = None) -> None:
-        """Add a message, in place of the topic's that wait if they are too many, or too old beside it."""
-        waits = len(self._numbers)  # of a client that keeps up nothing does, and this is all
+        """Add a message; it replaces the topic's messages that are too many or too old."""
+        waits = len(self._numbers)  # nothing, if the client keeps up
         outbox, numbers, now_s = self._outbox, self._numbers, time.monotonic()
         at_s = now_s if at_s is None else at_s
         outbox.losses.offer(now_s)
@@ -233,38 +237,38 @@ class StateLane(_Lane):
         self._add(message, at_s)
 
     def lose(self) -> None:
-        """What waits must not be sent any more."""
+        """Drop what waits, because quality has turned bad."""
         self.drop()
 
     def join(self, feed: Feed, subject: Subject) -> Callable[[], None]:
-        """Listen to what comes out of a feed's source; how to leave again."""
+        """Listen to the values of a feed's source; return the function that leaves."""
         feed.listen(subject, self)
         return partial(feed.leave, subject, self)
 
 
 class EventLane(_Lane):
-    """For events, of which none replaces another: every one of them, or the end, with what waits dropped and counted.
+    """A lane for events: none replaces another, so the outbox fails if one does not fit.
 
-    It is an echo's listener.
+    The lane is a listener of write subscriptions.
     """
 
     def __init__(self, outbox: Outbox, path: str, finish: Finish = bytes) -> None:
-        """``path``: named when the outbox fails. ``finish``: what a message still lacks when it is sent."""
+        """``path`` is named in a failure; ``finish`` completes a message when it is sent."""
         super().__init__(outbox, outbox.events, finish)
         self._path = path
 
     def deliver(self, message: Sized) -> None:
-        """Add a message, or fail if there is no room."""
+        """Add a message; fail if there is no room."""
         if self.load.full(message, EVENT_BOUND):
             self.fail(f"{self.load.count} messages wait to be read: the client is too slow for what is written")
         self._add(message)
 
     def fail(self, reason: str) -> None:
-        """End the whole outbox, what waits included: it is not all there was any more."""
+        """Fail the whole outbox, because events are missing."""
         self._outbox.fail(f"{self._path}: {reason}")
 
     def join(self, feed: Feed, subject: Subject) -> Callable[[], None]:
-        """Listen to what is written to a feed's source; how to leave again."""
+        """Listen to writes to a feed's source; return the function that leaves."""
         write_subscriptions = feed.commands.write_subscriptions
         write_subscriptions.listen(subject, self)
         return partial(write_subscriptions.leave, subject, self)

@@ -1,4 +1,4 @@
-"""What waits between sources and all clients."""
+"""The outboxes of all streams, with their common bound and counters."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from shmio.endpoints.grpc.time.open_streams import OpenStreams
 
 
 class Outboxes:
-    """Those of all open streams, counted."""
+    """The outboxes of all open streams."""
 
     def __init__(self, open_streams: OpenStreams | None = None) -> None:
-        """``audience``: what they are a part of."""
+        """``open_streams`` counts these streams together with those of other services."""
         self._open_streams = OpenStreams() if open_streams is None else open_streams
         self._open: set[Outbox] = set()
         self._dropped = 0
@@ -23,7 +23,7 @@ class Outboxes:
 
     @property
     def waiting_bytes(self) -> int:
-        """Of all messages that wait."""
+        """Size of all waiting messages, in bytes."""
         return self._total.size
 
     def __len__(self) -> int:
@@ -31,12 +31,12 @@ class Outboxes:
 
     @property
     def dropped(self) -> int:
-        """Messages dropped on streams too slow for them, since the start."""
+        """Number of messages dropped since the start because a client was too slow."""
         return self._dropped + sum(outbox.dropped for outbox in self._open)
 
     @contextmanager
     def opened(self) -> Iterator[Outbox]:
-        """One for a stream as long as that is open."""
+        """Give a stream an outbox for as long as the stream is open."""
         outbox = Outbox(self._total)
         self._open.add(outbox)
         self._total.streams += 1
@@ -50,7 +50,10 @@ class Outboxes:
             outbox.close()
 
     async def taken(self, patience_s: float) -> None:
-        """Wait until all clients have taken what they are owed; the streams of those that do not in time end."""
+        """Wait until all clients have taken what they are owed.
+
+        Streams whose clients have not done so within ``patience_s`` fail.
+        """
         owing = [outbox for outbox in self._open if outbox.owing]
         if not owing:
             return

@@ -1,4 +1,4 @@
-"""What somebody may listen to: registers of one block, and how an image of them becomes a message."""
+"""Subjects to listen to: registers of one block, and how their image becomes a message."""
 
 from __future__ import annotations
 
@@ -10,39 +10,47 @@ from shmio.layout.model import Register
 
 
 class BlockImage(Protocol):
-    """An image of a block and its time: a frame, or what is to become one."""
+    """An image of a block with its number and time: a frame, or a future one."""
 
     @property
     def number(self) -> int:
-        """Number of the frame."""
+        """Number of the frame, or of the step."""
 
     @property
     def clock_ns(self) -> int:
-        """The instance's clock."""
+        """Time of the instance's clock, in ns."""
 
     @property
     def image(self) -> bytes:
-        """The block's bytes."""
+        """The block's bytes as consumers see them."""
 
 
 class SourceImage(BlockImage, Protocol):
-    """A frame, with what its source delivered."""
+    """An image together with the bytes that the source delivered."""
 
     @property
     def raw(self) -> bytes:
-        """That, whatever injections show instead."""
+        """The block's bytes as the source delivered them, without injections."""
 
 
 Encode = Callable[[BlockImage], Sized | None]
-"""The message, whose length is in bytes; None where the bytes hold no value."""
+"""Encodes an image as a message, whose ``len`` is in bytes; None: the bytes hold no value."""
 
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """A register, an array's element or a structure as one wire shows it; equal ones are encoded once for all.
+    """A register, an array's element or a structure in the encoding of one service.
 
-    ``wire``: which one. ``path``: canonical, in the block. ``registers``: what it shows. ``changed``: whether two
-    frames differ in it, if it is not what consumers see of the registers.
+    Equal subjects are encoded once for all listeners.
+
+    Attributes:
+        wire: Name of the encoding.
+        path: Canonical path in the block.
+        registers: The registers it shows.
+        encode: Makes a message of an image.
+        changed: Returns whether two images differ in the subject; None: compare the registers
+            as consumers see them.
+
     """
 
     wire: str

@@ -1,4 +1,4 @@
-"""Wakes the event loop when a block has something new: one bell for each block, whoever listens."""
+"""Wakes the event loop when a block has something new: one wake-up per block for all listeners."""
 
 from __future__ import annotations
 
@@ -12,17 +12,20 @@ from shmio.segment.relay import TURN_NS, Relay, WakeSource
 Callback = Callable[[], object]
 
 REST_S: Final = 0.005
-"""So long a bell is not heard when nobody listens to it but those that have time."""
+"""Pause between wake-ups while all listeners are patient."""
 
 
 class WakeUp:
-    """Rings for one word in shared memory, at first too, and now and then. For the event loop's thread."""
+    """Calls its listeners when a word in shared memory has changed.
+
+    Also at the start, and after ``turn_ns`` without a change. For the event loop's thread.
+    """
 
     def __init__(self, word: WakeSource, name: str, turn_ns: int = TURN_NS) -> None:
-        """``turn_ns``: it rings after so long without a ring, too."""
+        """``turn_ns``: the longest time between two calls."""
         self.listeners: dict[Callback, None] = {}  # in the order in which they came
         self.patient: set[Callback] = set()
-        """Those of them that have time for a while."""
+        """Listeners that can wait for a while."""
         self._loop = asyncio.get_running_loop()
         self._relay = Relay(word, name, turn_ns)
         self._resting: asyncio.TimerHandle | None = None
@@ -30,44 +33,44 @@ class WakeUp:
 
     @property
     def alive(self) -> bool:
-        """Whether it rings, or is about to end."""
+        """Whether the thread that waits for the word is running."""
         return self._relay.alive
 
     def mute(self) -> None:
-        """Ring not, whatever happens, until :meth:`unmute`; which rings. Costs nobody anything meanwhile."""
+        """Call no listeners until :meth:`unmute`; then they are called for what they missed."""
         self._loop.remove_reader(self._relay.descriptor)
 
     def unmute(self) -> None:
-        """Ring again."""
+        """Call listeners again."""
         self._loop.add_reader(self._relay.descriptor, self._ring)
 
     def rest(self) -> None:
-        """Ring not for a while, if all listeners have time."""
+        """Pause for ``REST_S``, if all listeners are patient."""
         if self._resting is None and self.patient >= self.listeners.keys():
             self.mute()
             self._resting = self._loop.call_later(REST_S, self._rested)
 
     def _rested(self) -> None:
-        """Ring for what was heard, and left, before."""
+        """Call the listeners after a pause."""
         self.resume()
         for ring in tuple(self.listeners):
             ring()
 
     def resume(self) -> None:
-        """Rest no more."""
+        """End the pause."""
         if self._resting is not None:
             self._resting.cancel()
             self._resting = None
             self.unmute()
 
     def stop(self) -> None:
-        """Ring no more."""
+        """Stop calling listeners, and have the thread end."""
         self.resume()
         self.mute()
         self._relay.stop()
 
     def join(self) -> None:
-        """Wait until nothing of it is left, after :meth:`stop`."""
+        """Wait for the thread's end, after :meth:`stop`."""
         self._relay.join()
 
     def _ring(self) -> None:
@@ -77,55 +80,55 @@ class WakeUp:
 
 
 class WakeUps:
-    """Those of all blocks that are followed; for the event loop's thread."""
+    """The wake-ups of all blocks that are followed; for the event loop's thread."""
 
     def __init__(self) -> None:
         self._wake_ups: dict[int, WakeUp] = {}
         self._stopped: list[WakeUp] = []
 
     def join(self, block: Block, ring: Callback, *, patient: bool = False) -> None:
-        """Have ``ring`` called when there is a frame or an event, and now and then.
+        """Have ``ring`` called when the block has a new frame or event, and periodically.
 
-        ``patient``: if nobody else listens but who :meth:`rest`, it has time, too.
+        ``patient``: the listener can wait while all others :meth:`rest`.
         """
-        bell = self._wake_ups.get(block.section)
-        if bell is None:
-            bell = WakeUp(block.ring, f"bell-{block.source}", min(TURN_NS, block.stale_ns))
-            self._wake_ups[block.section] = bell
-        bell.listeners[ring] = None
+        wake_up = self._wake_ups.get(block.section)
+        if wake_up is None:
+            wake_up = WakeUp(block.ring, f"bell-{block.source}", min(TURN_NS, block.stale_ns))
+            self._wake_ups[block.section] = wake_up
+        wake_up.listeners[ring] = None
         if patient:
-            bell.patient.add(ring)
+            wake_up.patient.add(ring)
         else:
-            bell.resume()
+            wake_up.resume()
 
     def rest(self, block: Block, ring: Callback) -> None:
-        """Have ``ring`` not called for a while; it still is if others listen that have no time."""
-        if bell := self._wake_ups.get(block.section):
-            bell.patient.add(ring)
-            bell.rest()
+        """Mark ``ring`` as patient, so that wake-ups pause if all listeners of the block are."""
+        if wake_up := self._wake_ups.get(block.section):
+            wake_up.patient.add(ring)
+            wake_up.rest()
 
     def resume(self, block: Block, ring: Callback) -> None:
-        """Have it called again."""
-        if bell := self._wake_ups.get(block.section):
-            bell.patient.discard(ring)
-            bell.resume()
+        """Mark ``ring`` as no longer patient."""
+        if wake_up := self._wake_ups.get(block.section):
+            wake_up.patient.discard(ring)
+            wake_up.resume()
 
     def leave(self, block: Block, ring: Callback) -> None:
-        """The last one takes the bell with it."""
-        bell = self._wake_ups.get(block.section)
-        if bell is None:
+        """Remove ``ring``; the wake-up of a block ends with its last listener."""
+        wake_up = self._wake_ups.get(block.section)
+        if wake_up is None:
             return  # all are closed
-        bell.listeners.pop(ring, None)
-        bell.patient.discard(ring)
-        if not bell.listeners:
-            bell.stop()
+        wake_up.listeners.pop(ring, None)
+        wake_up.patient.discard(ring)
+        if not wake_up.listeners:
+            wake_up.stop()
             del self._wake_ups[block.section]
-            self._stopped = [stopped for stopped in self._stopped if stopped.alive] + [bell]
+            self._stopped = [stopped for stopped in self._stopped if stopped.alive] + [wake_up]
 
     def close(self) -> None:
-        """Ring no more, and wait until nothing is left of it."""
-        for bell in self._wake_ups.values():
-            bell.stop()
-        for bell in (*self._wake_ups.values(), *self._stopped):
-            bell.join()
+        """Stop all wake-ups and wait for their threads."""
+        for wake_up in self._wake_ups.values():
+            wake_up.stop()
+        for wake_up in (*self._wake_ups.values(), *self._stopped):
+            wake_up.join()
         self._wake_ups.clear()

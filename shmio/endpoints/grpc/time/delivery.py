@@ -1,4 +1,4 @@
-"""The delivery of a step: everything that it has changed, then its marker, each taken by every stream."""
+"""Delivers a step to all streams: the values that it has changed, then its marker."""
 
 from __future__ import annotations
 
@@ -15,32 +15,36 @@ from shmio.local.time_control import Step
 from shmio.segment.clock import ClockState
 
 PATIENCE_S: Final = 3.0
-"""So long clients have for the values of a step, those of shmio.v1 after the others, and again for its marker; all
-together less than a step's own time-out. A stream that is the only one has so long for both."""
+"""Time that clients have to take a step's values, and again to take its marker.
+
+Clients of shmio.v1 have their turn after the others. The total is less than a step's own
+time-out. A stream that is the only one has this time for values and marker together.
+"""
 
 log = logging.getLogger("shmio.grpc")
 
 
 class StepReceiver(Protocol):
-    """Who has streams of his own."""
+    """A service that delivers steps to its own streams."""
 
     @property
     def streams(self) -> int:
-        """How many there are."""
+        """Number of the service's open streams."""
 
     async def deliver(self, step: Step) -> None:
-        """Send what has changed in a step, then that it is over, and wait until they have it."""
+        """Send what a step has changed, then its marker, and wait until all streams have both."""
 
     def release(self) -> None:
-        """Time is real again: send whatever there is."""
+        """Send values as they come, because time is real again."""
 
 
 class Delivery:
-    """Delivers steps in one order to all streams, whoever has made them; for the event loop's thread.
+    """Delivers steps in order to all streams, whichever program has made them.
 
-    First what was written before, then what has changed in all blocks on the instance's clock, in the segment's order;
-    when all streams have taken that, the marks; when they have taken those, it is over. Within a stream all comes in
-    order anyhow: nothing is waited for before the marks if there is only one.
+    A step's delivery begins with the writes before it. The changed values follow, of all blocks
+    on the instance's clock in the segment's order. When all streams have taken these, they get
+    the step's marker, and when they have taken that, the delivery is over. A single stream is
+    in order anyway, so nothing is awaited before its marker. For the event loop's thread.
     """
 
     def __init__(self, virtual_time: VirtualTime, feeds: Mapping[str, Feed], outboxes: Outboxes) -> None:
@@ -51,14 +55,14 @@ class Delivery:
         self.receivers: list[StepReceiver] = []
 
     def begin(self, moment: Moment) -> None:
-        """Time has become virtual, and this is what was delivered of it."""
+        """Switch to virtual time; ``moment`` counts as delivered."""
         self._virtual_time.on = True
         self._virtual_time.moment = moment
         for feed in self._feeds.values():
             feed.hold()
 
     def end(self) -> None:
-        """Time is real again; while no step is :attr:`busy`."""
+        """Switch back to real time; only while not :attr:`busy`."""
         self._virtual_time.on = False
         for feed in list(self._feeds.values()):
             try:
@@ -69,9 +73,9 @@ class Delivery:
             receiver.release()
 
     async def deliver(self, step: Step, mark: Callable[[], None]) -> bool:
-        """Deliver a step, and ``mark`` it; False if it has been already.
+        """Deliver a step, with its marker by ``mark``; return False if it was delivered already.
 
-        The stream of a client that does not read ends ``PATIENCE_S`` later.
+        The stream of a client that does not read fails after ``PATIENCE_S``.
         """
         async with self._turn:
             if step.number <= self._virtual_time.moment.number:
@@ -87,11 +91,11 @@ class Delivery:
 
     @property
     def busy(self) -> bool:
-        """Whether a step is being delivered."""
+        """Whether a step is being delivered now."""
         return self._turn.locked()
 
     def pass_over(self, step: Step, mark: Callable[[], None]) -> None:
-        """Deliver a step for which there is no stream, unless it has been already; while none is :attr:`busy`."""
+        """Deliver a step without waiting, as no stream is open; only while not :attr:`busy`."""
         if step.number > self._virtual_time.moment.number:
             self._show(step)
             mark()
@@ -109,6 +113,9 @@ class Delivery:
 
 
 def before(state: ClockState) -> Moment:
-    """What is delivered when time is found virtual: on a busy machine its first step may be over, and waits for us."""
+    """Return the moment that counts as delivered when time is first seen to be virtual.
+
+    On a busy machine the first step may have ended already, and still has to be delivered.
+    """
     first = bool(state.dt_ns) and state.step == state.done
     return Moment(state.done - first, state.present_ns - first * state.dt_ns)

@@ -1,4 +1,4 @@
-"""Whether any stream is open that steps are delivered to: only then a step has to wait for this process."""
+"""Counts the streams that steps are delivered to: only if there are any, steps wait for us."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from contextlib import contextmanager
 
 
 class OpenStreams:
-    """The open streams, counted; for the event loop's thread."""
+    """Number of the open streams of all services; for the event loop's thread."""
 
     def __init__(self) -> None:
         self.changed: Callable[[], object] = lambda: None
-        """Called when the first comes, before it is given anything, and when the last is gone."""
+        """Called when the first stream opens, before it gets values, and when the last closes."""
         self._count = 0
 
     def __bool__(self) -> bool:
@@ -19,7 +19,7 @@ class OpenStreams:
 
     @contextmanager
     def joined(self) -> Iterator[None]:
-        """One more, as long as it is open."""
+        """Count a stream for as long as it is open."""
         self._count += 1
         if self._count == 1:
             self.changed()

@@ -1,4 +1,4 @@
-"""The instance's time moved for clients of all services: stepping and playing."""
+"""Moves the instance's time for clients of all services: steps, and plays in real time."""
 
 from __future__ import annotations
 
@@ -24,21 +24,24 @@ from shmio.segment import ProcessSlot, Segment
 from shmio.segment.clock import ClockPage
 
 BRIEF_NS: Final = 500_000
-"""So long the event loop stands still for sources that answer at once: to be told by a thread takes about as long."""
+"""Time that the event loop blocks for sources that answer at once.
+
+A wake-up by a thread takes about as long.
+"""
 
 
 class StepDriver:
-    """What :meth:`Coordinator.step` is to a thread; for the event loop's thread, one step at a time."""
+    """Makes steps as :meth:`Coordinator.step` does, but in an event loop; one step at a time."""
 
     def __init__(self, coordinator: Coordinator, clock: ClockPage, wake_ups: WakeUps) -> None:
         self._coordinator = coordinator
         self._clock = clock
         self._wake_ups = wake_ups
-        self._delivered: WakeUp | None = None  # nobody else delivers steps, as a rule
+        self._delivered: WakeUp | None = None  # as a rule, no other process delivers steps
 
     async def step(self, dt_ns: int | None) -> Step:
-        """Errors as of :meth:`Coordinator.step`; one that is cancelled is broken off."""
-        still_ns = time.monotonic_ns() + BRIEF_NS
+        """Make one step; cancelling aborts it. Raises what :meth:`Coordinator.step` raises."""
+        until_ns = time.monotonic_ns() + BRIEF_NS
         with closing(self._coordinator.stepping(dt_ns)) as stepping:
             while True:
                 try:
@@ -46,27 +49,27 @@ class StepDriver:
                 except StopIteration as over:
                     step: Step = over.value
                     return step
-                if not _brief(wait, still_ns - time.monotonic_ns()):
-                    await self._stay(wait)
+                if not _brief(wait, until_ns - time.monotonic_ns()):
+                    await self._wait(wait)
 
     def stop(self) -> None:
-        """Wait for nobody any more."""
+        """End the wake-ups for deliveries of other processes."""
         if self._delivered is not None:
             self._delivered.stop()
             self._delivered.join()
 
-    async def _stay(self, wait: StepWait) -> None:
-        """Until its bell rings, which it does now and then in any case."""
-        rung = asyncio.get_running_loop().create_future()
+    async def _wait(self, wait: StepWait) -> None:
+        """Wait for the wake-up that the step needs; it also comes periodically."""
+        woken = asyncio.get_running_loop().create_future()
 
         def ring() -> None:
-            if not rung.done():
-                rung.set_result(None)
+            if not woken.done():
+                woken.set_result(None)
 
         leave = self._listen(wait, ring)
         try:
             if wait.seen == (wait.block.ring.doorbell() if wait.block else self._clock.delivered_bell.value()):
-                await rung
+                await woken
         finally:
             leave()
 
@@ -81,27 +84,30 @@ class StepDriver:
 
 
 def _brief(wait: StepWait, rest_ns: int) -> bool:
-    """Wait in the event loop's own thread, at most so long; whether the block's bell has rung."""
+    """Block the event loop for at most ``rest_ns``; return whether the block had something new."""
     if wait.block is None or rest_ns <= 0:
         return False
     return wait.block.ring.wait(wait.seen, min(rest_ns, wait.rest_ns)) != wait.seen
 
 
 LATE_S: Final = 0.5
-"""What is late is caught up with, up to this."""
+"""Most delay that playing catches up with."""
 
 log = logging.getLogger("shmio.grpc")
 
 
 class Player:
-    """For the event loop's thread."""
+    """Plays: makes steps at a multiple of real time. For the event loop's thread."""
 
     def __init__(self, make: Callable[[int | None], Awaitable[object]], step_size_ns: Callable[[], int]) -> None:
-        """``make``: makes a step of so many ns, or of the step size; a ShmioError is logged, and it goes on."""
+        """``make`` makes one step of the given ns, or of the step size if that is None.
+
+        A ShmioError of ``make`` is logged, and playing goes on.
+        """
         self.dt_ns: int | None = None
-        """Of each step; None: the step size."""
+        """Size of each step, in ns; None: the step size."""
         self.rate = 1.0
-        """How many times as fast as real time."""
+        """Speed as a multiple of real time."""
         self._make = make
         self._step_size_ns = step_size_ns
         self._loop = asyncio.get_running_loop()
@@ -110,28 +116,28 @@ class Player:
 
     @property
     def on(self) -> bool:
-        """Whether it plays."""
+        """Whether time is played."""
         return self._task is not None
 
     @property
     def alive(self) -> bool:
-        """Whether it plays if it should."""
+        """Whether the playing task is running, if time is played."""
         return self._task is None or not self._task.done()
 
     def begin(self) -> None:
-        """Play, unless it does."""
+        """Start playing, unless time is played already."""
         if self._task is None:
             self._task = self._loop.create_task(self._play())
 
     async def end(self) -> None:
-        """Play no more; return when the last step is over."""
+        """Stop playing and wait for the end of the last step."""
         task, self._task = self._task, None
         self._woken.set()
         if task is not None:
             await task
 
     async def break_off(self) -> None:
-        """End in the middle of a step; it still counts as on."""
+        """Abort the step in progress and stop; :attr:`on` stays True."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.gather(self._task, return_exceptions=True)
@@ -150,18 +156,18 @@ class Player:
                     log.warning("playing: %s", reason)
             dt_s = (self.dt_ns or self._step_size_ns()) / 1e9
             due_s = max(due_s + dt_s / self.rate, self._loop.time() - LATE_S)
-            with suppress(TimeoutError):  # others have their turn even if it is late
+            with suppress(TimeoutError):  # lets other tasks run even if playing is late
                 await asyncio.wait_for(self._woken.wait(), max(0.0, due_s - self._loop.time()))
 
 
 REST_S: Final = 1.0
-"""Time is given up when nobody has moved it for so long, so that others can."""
+"""Control of time is released after this long without a step, so that others can take it."""
 
 _Result = TypeVar("_Result")
 
 
 class Stepper:
-    """Moves time for clients, one at a time. For the event loop's thread."""
+    """Moves time for clients, one request at a time. For the event loop's thread."""
 
     def __init__(
         self,
@@ -174,28 +180,34 @@ class Stepper:
         publisher: Publisher,
         open_streams: OpenStreams,
     ) -> None:
-        """Arguments as of :class:`Timeline`."""
+        """Create the timeline; ``publisher`` completes a client's writes before its step.
+
+        ``wake_ups`` are those of the feeds. The other arguments are those of :class:`Timeline`.
+        """
         self._segment = segment
         self._publisher = publisher
         self._loop = asyncio.get_running_loop()
         self._coordinator = Coordinator(segment)
         self._driver = StepDriver(self._coordinator, segment.clock, wake_ups)
-        self._turn = asyncio.Lock()  # one moves time
+        self._turn = asyncio.Lock()  # only one task moves time
         self._owns = False
-        self._changing = asyncio.Lock()  # one begins to play, or ends
+        self._changing = asyncio.Lock()  # only one task starts or stops playing
         self._moving: asyncio.Task[Any] | None = None
         self._rest: asyncio.TimerHandle | None = None
-        self._rest_s = 0.0  # when time is given up if nobody has moved it by then
+        self._rest_s = 0.0  # when control of time is released
         self._player = Player(self._make, lambda: segment.clock.read().step_size_ns)
         self._tasks: set[asyncio.Task[Any]] = set()
         self.timeline = Timeline(segment, slot, virtual_time, feeds, outboxes, open_streams, lambda: self._player.dt_ns)
-        """How time stands, whoever moves it."""
+        """The state of time, whichever program moves it."""
 
     async def start(self, predecessor: int = 0) -> None:
-        """Begin to follow time; go on playing if the process before this one, by its pid, did when it died."""
+        """Start following time, and resume playing if the previous process was playing.
+
+        ``predecessor``: pid of the previous process of this endpoint; 0: none.
+        """
         self.timeline.start()
         state = self._segment.clock.told()
-        if state.playing and state.owner == predecessor:  # what another program that died has played stands
+        if state.playing and state.owner == predecessor:  # other programs' playing is not resumed
             try:
                 await self.play(state.dt_ns or None, state.rate)
             except TimeError as error:
@@ -203,42 +215,76 @@ class Stepper:
 
     @property
     def alive(self) -> bool:
-        """Whether time is being followed, and played if it should be."""
+        """Whether time is being followed, and the playing task runs if time is played."""
         return self.timeline.alive and self._player.alive
 
     async def set_step_size(self, dt_ns: int) -> None:
-        """How far a step goes that does not say it itself; takes time over. ValueRangeError, TimeError."""
+        """Set the size of steps that have none of their own; takes control of time.
+
+        Raises:
+            ValueRangeError: The step size is out of range.
+            TimeError: Another program controls time.
+
+        """
         _check(dt_ns)
         await self._do(self._change(partial(self._coordinator.set_step_size, dt_ns)))
 
     async def step(self, dt_ns: int | None = None, peer: str = "") -> Step:
-        """Move time on, by the step size unless it is told; return when all streams have taken the step's marker.
+        """Make a step and return when all streams have taken its marker.
 
-        Before it, what was received on this peer's Publish streams is with its sources. One that was begun is done even
-        if its client is gone, one that waits is not. TimeError: it failed, is not ours, or time plays; ValueRangeError.
+        Values received earlier on the peer's Publish streams reach their sources before the step.
+        A step that has begun is completed even if its client disconnects; a waiting one is not.
+
+        Args:
+            dt_ns: Size in ns; None: the step size.
+            peer: The client, as gRPC names it; empty: do not wait for published values.
+
+        Raises:
+            TimeError: The step failed, another program controls time, or time is played.
+            ValueRangeError: ``dt_ns`` is out of range.
+
         """
         done: asyncio.Future[Step] = self._loop.create_future()
         task = self._spawn(_tell(self._step(dt_ns, peer), done))
         try:
             return await done
         finally:
-            if task is not self._moving:  # it is over, or others would wait for a step that nobody waits for
+            if task is not self._moving:  # do not abort a step in progress
                 task.cancel()
 
     async def play(self, dt_ns: int | None = None, rate: float = 1.0) -> TimeStatus:
-        """Step from now on ``rate`` times as fast as real time; how time stands then. TimeError, ValueRangeError."""
+        """Play at ``rate`` times real time in steps of ``dt_ns``; return the state of time.
+
+        Raises:
+            TimeError: Another program controls time.
+            ValueRangeError: ``dt_ns`` is out of range.
+
+        """
         return await self._do(self._begin_play(dt_ns, rate))
 
     async def pause(self, *, end: bool = False) -> TimeStatus:
-        """Step no more by itself; TimeError. ``end``: tell that it is not alive, until somebody moves time."""
+        """Stop playing and return the state of time.
+
+        Args:
+            end: Report time as not alive until the next step.
+
+        Raises:
+            TimeError: Another program controls time.
+
+        """
         return await self._do(self._end_play(end))
 
     async def release(self) -> TimeStatus:
-        """Have time be real again; TimeError: it is not ours to release, or was never real."""
+        """Return to real time.
+
+        Raises:
+            TimeError: Another program controls time, or the instance has no real time.
+
+        """
         return await self._do(self._end_virtual())
 
     async def stop(self) -> None:
-        """Move nothing more. A successor goes on with what is played."""
+        """Stop moving time. If time was played, the next process resumes playing."""
         if self._rest is not None:
             self._rest.cancel()
         tasks = list(self._tasks)
@@ -253,7 +299,7 @@ class Stepper:
     # ---- moving time ---------------------------------------------------------------------------------------------
 
     async def _do(self, work: Coroutine[Any, Any, _Result]) -> _Result:
-        return await asyncio.shield(self._spawn(work))  # to its end, whoever waits for that
+        return await asyncio.shield(self._spawn(work))  # runs to its end, even if the caller is cancelled
 
     def _spawn(self, work: Coroutine[Any, Any, _Result]) -> asyncio.Task[_Result]:
         task = self._loop.create_task(work)
@@ -270,21 +316,21 @@ class Stepper:
         return await self._make(dt_ns)
 
     async def _make(self, dt_ns: int | None) -> Step:
-        """Make a step, and deliver it."""
+        """Make a step and deliver it."""
         async with self._moved():
             step = await self._driver.step(dt_ns)
             await self.timeline.deliver(step)
             return step
 
     async def _change(self, call: Callable[[], None], *, end: bool = False) -> None:
-        """Have the coordinator change how time is moved."""
+        """Have the coordinator change how time moves."""
         async with self._moved():
             call()
             self.timeline.ended = end
 
     @asynccontextmanager
     async def _moved(self) -> AsyncIterator[None]:
-        """Time is ours, and nobody else's turn."""
+        """Hold control of time, exclusively among this endpoint's clients."""
         async with self._turn:
             self._moving, self.timeline.steered = asyncio.current_task(), True
             try:
@@ -311,7 +357,7 @@ class Stepper:
 
     def _give_up(self) -> None:
         self._rest = None
-        if self._loop.time() < self._rest_s:  # time was moved meanwhile
+        if self._loop.time() < self._rest_s:  # time was moved in between
             self._rest = self._loop.call_at(self._rest_s, self._give_up)
         elif self._owns and not self._player.on and not self._turn.locked():
             self._spawn(self._release())
@@ -350,10 +396,10 @@ class Stepper:
 
 
 async def _tell(work: Coroutine[Any, Any, _Result], done: asyncio.Future[_Result]) -> None:
-    """Do it, whoever waits for what comes of it; who is cancelled meanwhile is not told."""
+    """Await ``work`` and put its result or error into ``done``, unless that is cancelled."""
     try:
         result = await work
-    except Exception as error:  # noqa: BLE001  who waits is told, whatever it is
+    except Exception as error:  # noqa: BLE001  passed on to the waiting task
         if not done.done():
             done.set_exception(error)
     except asyncio.CancelledError:
@@ -365,6 +411,6 @@ async def _tell(work: Coroutine[Any, Any, _Result], done: asyncio.Future[_Result
 
 
 def _check(dt_ns: int | None) -> None:
-    """ValueRangeError: no step goes so far, and nothing has been taken over for it."""
+    """Raise ValueRangeError if a step is out of range, before control of time is taken."""
     if dt_ns is not None:
         check_step(dt_ns)

@@ -1,4 +1,4 @@
-"""The topics of time: the number of each step, and the clock."""
+"""The topics of time: the number of each step, and the simulation time."""
 
 from __future__ import annotations
 
@@ -12,24 +12,27 @@ from shmio.endpoints.grpc.time.virtual_time import Moment, VirtualTime
 
 
 class Listener(Protocol):
-    """One stream; called in the event loop's thread."""
+    """A stream's subscription to a topic of time; called in the event loop's thread."""
 
     def deliver(self, message: Sized) -> None:
-        """Take one message for this stream."""
+        """Take one message."""
 
     def keep(self, message: Sized) -> None:
-        """Take one message of a step: it must not be left out."""
+        """Take one message of a step, which must not be dropped."""
 
 
 Encode = Callable[[TimeTopic, Moment], Sized]
-"""How one wire tells a moment."""
+"""Encodes a moment as a message of one service."""
 
 
 class TimeTopics:
-    """Tells each step to those who listen, and the clock; that in wall time, too, a step's size apart."""
+    """Sends step numbers and simulation time to listeners.
+
+    While time is real, the simulation time is sent once per step size.
+    """
 
     def __init__(self, virtual_time: VirtualTime, now: Callable[[], Moment], tick_s: Callable[[], float]) -> None:
-        """``now``: simulation time at present. ``tick_s``: the step size."""
+        """``now`` returns the present simulation time, ``tick_s`` the step size."""
         self._virtual_time = virtual_time
         self._now = now
         self._tick_s = tick_s
@@ -37,7 +40,10 @@ class TimeTopics:
         self._timer: asyncio.TimerHandle | None = None
 
     def listen(self, topic: TimeTopic, encode: Encode, listener: Listener) -> Callable[[], None]:
-        """Join; the clock is told at once, a step's number only after that step. How to leave again."""
+        """Add a listener and return the function that removes it.
+
+        The simulation time is sent at once, a step's number only after that step.
+        """
         listeners = self._listeners.setdefault((topic, encode), {})
         listeners[listener] = None
         if topic is TimeTopic.CLOCK:
@@ -56,7 +62,7 @@ class TimeTopics:
             del self._listeners[topic, encode]
 
     def tell(self) -> None:
-        """Tell the step that was delivered."""
+        """Send number and time of the step that was delivered."""
         for (topic, encode), listeners in self._listeners.items():
             message = encode(topic, self._virtual_time.moment)
             for listener in listeners:
@@ -67,7 +73,7 @@ class TimeTopics:
             self._timer = asyncio.get_running_loop().call_later(self._tick_s(), self._tick)
 
     def _tick(self) -> None:
-        """Tell the clock while time goes by itself, as long as anybody listens."""
+        """Send the simulation time while time is real, as long as there is a listener."""
         self._timer = None
         if self._virtual_time.on:
             return
@@ -79,12 +85,12 @@ class TimeTopics:
                 self._set_timer()
 
     def resume(self) -> None:
-        """Time goes by itself again."""
+        """Send the simulation time periodically again, because time is real."""
         if any(topic is TimeTopic.CLOCK for topic, _ in self._listeners):
             self._set_timer()
 
     def stop(self) -> None:
-        """Tell nothing any more."""
+        """Stop sending the simulation time periodically."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

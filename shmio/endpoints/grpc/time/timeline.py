@@ -1,4 +1,4 @@
-"""How the instance's time stands for all services: follows it, has each step delivered and told, whoever makes it."""
+"""Follows the instance's time and has each step delivered, whichever program makes it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from shmio.segment.clock import ClockState
 
 
 class Timeline:
-    """For the event loop's thread."""
+    """The instance's time as all services of the endpoint see it; for the event loop's thread."""
 
     def __init__(
         self,
@@ -32,18 +32,27 @@ class Timeline:
         open_streams: OpenStreams,
         play_dt_ns: Callable[[], int | None],
     ) -> None:
-        """``slot``: this process's in the table. ``audience``: while there is none, no step waits for it.
+        """Read the present time; see :meth:`start`.
 
-        ``play_dt_ns``: of each step that this process plays; None: the step size.
+        Args:
+            segment: The instance's shared memory.
+            slot: This process's entry in the process table.
+            virtual_time: Updated here and read by the feeds.
+            feeds: The feeds of all sources.
+            outboxes: The outboxes of all streams.
+            open_streams: While there are none, no step waits for this process.
+            play_dt_ns: Returns the size of the steps that this process plays, in ns; None: the
+                step size.
+
         """
         self.time_topics = TimeTopics(virtual_time, self._now, lambda: self._clock.read().step_size_ns / 1e9)
-        """Tells steps and time."""
+        """Sends step numbers and simulation time to subscribers."""
         self.virtual_time = virtual_time
-        """Whether time is virtual, and what was delivered."""
+        """Whether time is virtual, and the step delivered last."""
         self.steered = False
-        """Whether this process moves time at present, and has its steps delivered by itself."""
+        """Whether this process moves time at present and delivers its own steps."""
         self.ended = False
-        """Whether somebody has said that time goes on no more; until it does."""
+        """Whether a client has said that time goes on no more; reset by the next step."""
         self._clock = segment.clock
         self._slot = slot
         self._open_streams = open_streams
@@ -52,26 +61,26 @@ class Timeline:
         self._delivery = Delivery(virtual_time, feeds, outboxes)
         self._watchers: list[Callable[[TimeStatus], None]] = []
         self._delivering: set[asyncio.Task[Any]] = set()
-        self._page: WakeUp | None = None  # rings when it is written
+        self._page: WakeUp | None = None  # when the clock page is written
         state = self._clock.read()
         if state.virtual:
             self._delivery.begin(Moment(state.done, state.present_ns))
         self._told = self._status(state)[1:]
         self._delivered = state.done
-        self._awaited = False  # whether steps wait for this process
+        self._awaited = False  # whether steps wait for this process's delivery
         open_streams.changed = self._attend
         virtual_time.look = self.look
         self._attend()
 
     def start(self) -> None:
-        """Begin to follow time."""
+        """Start following time."""
         self._page = WakeUp(self._clock.bell, "clock")
         self._page.listeners[self.look] = None
 
     async def stop(self) -> None:
-        """Deliver and tell nothing more."""
+        """Stop following time, and cancel the deliveries in progress."""
         self.time_topics.stop()
-        page, self._page = self._page, None  # who moves time may still give it up, and have it ring again
+        page, self._page = self._page, None  # own() may still be called
         if page is not None:
             page.stop()
             page.join()
@@ -86,36 +95,39 @@ class Timeline:
         return self._page is not None
 
     def own(self, owns: bool) -> None:
-        """Whether this process owns time: nobody but the owner writes the page."""
+        """Note whether this process owns time; its own writes to the clock page need no wake-up."""
         if self._page is not None:
             (self._page.mute if owns else self._page.unmute)()
 
     def add_receiver(self, receiver: StepReceiver) -> None:
-        """Have each step delivered to others, too, before it is over."""
+        """Have each step delivered to ``receiver`` too."""
         self._delivery.receivers.append(receiver)
 
     def watch(self, watcher: Callable[[TimeStatus], None]) -> None:
-        """Have it told of each step and of each change."""
+        """Have ``watcher`` called with each step's status and with each change."""
         self._watchers.append(watcher)
 
     @property
     def status(self) -> TimeStatus:
-        """How time stands."""
+        """The present state of time."""
         return self._status(self.look())
 
     async def deliver(self, step: Step) -> None:
-        """Have all streams take what a step has changed, and its marker, unless they have already."""
+        """Deliver a step's values and marker to all streams, unless they have them already."""
         if await self._delivery.deliver(step, partial(self._mark, step)):
             self._delivered = step.number
             if self._awaited:
                 self._clock.deliver(self._slot.index, step.number)
 
     def look(self) -> ClockState:
-        """Heed what the page says by now; also called now and then, for the death of who plays rings no bell."""
+        """Read the clock page and act on what has changed.
+
+        This is also called periodically, because a player that dies causes no wake-up.
+        """
         state = self._clock.read()
         if state.virtual and not self.virtual_time.on:
             self._delivery.begin(before(state))
-        elif self.virtual_time.on and not state.virtual and not self._delivery.busy:  # else with the next look
+        elif self.virtual_time.on and not state.virtual and not self._delivery.busy:  # else at the next call
             self._end(state)
         if state.virtual and state.done > self.virtual_time.moment.number and not self.steered:
             step = Step(state.done, state.present_ns, state.dt_ns)
@@ -131,15 +143,15 @@ class Timeline:
         return state
 
     def _end(self, state: ClockState) -> None:
-        """Time was released: it goes by itself again."""
+        """Act on the release of time: it is real again."""
         self._delivery.end()
         self.time_topics.resume()
         self._tell(self._status(state), state)
 
     def _attend(self) -> None:
-        """Have steps wait for this process from now on, or no longer."""
+        """Have steps wait for this process while it has open streams."""
         if self._open_streams:
-            self.look()  # it is shown what is over by now, and waited for from the next step on
+            self.look()  # delivers what is over; steps wait from the next one on
             self._awaited = True
             self._clock.deliver(self._slot.index, self._delivered)
         else:

@@ -1,4 +1,4 @@
-"""Virtual time as the endpoint has delivered it: what all feeds and services look at."""
+"""Virtual time as the endpoint has delivered it, shared by all feeds and services."""
 
 from __future__ import annotations
 
@@ -7,14 +7,18 @@ from typing import NamedTuple
 
 
 class Moment(NamedTuple):
-    """A step, by its number, and the simulation time after it, in ns since the instance's start."""
+    """A step's number, and the simulation time after it, in ns since the instance's start."""
 
     number: int
     clock_ns: int
 
 
 class TimeStatus(NamedTuple):
-    """How time stands. ``dt_ns``: of the step that it tells of, or else what a step moves time by at present."""
+    """The state of the instance's time.
+
+    ``dt_ns`` is the size of the step that the status reports, otherwise the present step size.
+    ``alive`` is False after a client has said that time goes on no more.
+    """
 
     clock_ns: int
     dt_ns: int
@@ -23,7 +27,7 @@ class TimeStatus(NamedTuple):
 
 
 class DeliveredImage(NamedTuple):
-    """A picture of a block (``streams.subject``) as a step has left it; ``raw`` as of a frame."""
+    """A block's image after a step; ``raw``: as the source delivered it, without injections."""
 
     number: int
     clock_ns: int
@@ -32,14 +36,14 @@ class DeliveredImage(NamedTuple):
 
 
 class VirtualTime:
-    """Whether time is virtual, and the step that was delivered last.
+    """Whether time is virtual (``on``), and the step that was delivered last (``moment``).
 
-    While it is, what comes out of blocks on the instance's clock is shown step by step. Written in the event loop's
-    thread alone.
+    In virtual time, values of blocks on the instance's clock are delivered step by step.
+    For the event loop's thread.
     """
 
     def __init__(self) -> None:
         self.on = False
         self.look: Callable[[], object] = lambda: None
-        """Take in steps of other programs that nobody has waited for."""
+        """Adopts steps that other programs have made; set by the timeline."""
         self.moment = Moment(0, 0)
