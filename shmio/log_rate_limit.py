@@ -1,4 +1,4 @@
-"""What clients can have logged is rationed: none of them fills the log, whatever it does again and again."""
+"""Limits the rate of log lines that clients can cause, so that no client can fill the log."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from collections.abc import Callable
 from typing import Final
 
 LINES: Final = 20
-"""Most lines of one kind in a turn."""
+"""Most lines of one kind per turn."""
 TURN_S: Final = 10.0
 
 
 class LogRateLimit(logging.Filter):
-    """Lets so many records of one kind, by its text without what is filled in, through in a turn; counts the others.
+    """Limits the records of one kind, by their unformatted text, per turn. Safe for loggers in any thread.
 
-    The first of a later turn tells how many were left out. For loggers that any thread may use.
+    The first record of a later turn says how many were left out.
     """
 
     def __init__(self, clock_s: Callable[[], float] = time.monotonic, *, one_kind: bool = False) -> None:
-        """``one_kind``: all records are; for loggers of others, who fill in their texts themselves."""
+        """Create the filter; with ``one_kind`` all records are of one kind, for foreign loggers."""
         super().__init__()
         self._clock_s = clock_s
         self._one_kind = one_kind
         self._kinds: dict[str, tuple[float, int]] = {}
-        """By kind: when its turn ends, and how many came in it."""
+        """By kind: when its turn ends, and how many records came in it."""
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether it is written."""
+        """Return whether the record is written."""
         now_s, text = self._clock_s(), str(record.msg)
         kind = "" if self._one_kind else text
         until_s, count = self._kinds.get(kind, (0.0, 0))

@@ -1,6 +1,6 @@
-"""Log lines that name process and source, in files that rotate.
+"""Logging: lines that name process and source, in files that rotate.
 
-One line an event, fields in fixed order, extra fields as ``key=value``::
+One line per event, fields in fixed order, extra fields as ``key=value``::
 
     2026-11-21T05:20:01.123456Z INFO    cell[1234] quality good source=cell cycle=1207
 """
@@ -23,7 +23,10 @@ KEPT_FILES = 3
 
 
 class LineFormatter(logging.Formatter):
-    """Formats a record as one line; a traceback follows indented. Control characters are escaped."""
+    """Formats a record as one line; a traceback follows indented.
+
+    Control characters are escaped.
+    """
 
     def __init__(self, process: str, source: str | None) -> None:
         super().__init__()
@@ -31,7 +34,7 @@ class LineFormatter(logging.Formatter):
         self._always = {} if source is None else {"source": source}
 
     def format(self, record: logging.LogRecord) -> str:
-        """One record as text."""
+        """Return a record as text."""
         stamp = datetime.fromtimestamp(record.created, UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
         fields = self._always | getattr(record, "fields", {})
         message = printable(" ".join([record.getMessage(), *(f"{key}={value}" for key, value in fields.items())]))
@@ -42,10 +45,14 @@ class LineFormatter(logging.Formatter):
 
 
 class RotatingLog(logging.handlers.RotatingFileHandler):
-    """A log file that rotates, and takes what the process prints with it if ``streams`` says so."""
+    """A log file that rotates; with ``streams`` standard output and error follow it."""
 
     def __init__(self, file: Path, *, streams: bool, patient: bool) -> None:
-        """``patient``: a file that cannot be opened is tried again with each record; else OSError."""
+        """Open the file.
+
+        With ``patient`` a file that cannot be opened is tried again with each record; otherwise
+        OSError is raised.
+        """
         self._streams = False  # they lead to the file already, if it could be opened
         super().__init__(file, maxBytes=MAX_FILE_BYTES, backupCount=KEPT_FILES - 1, delay=True)
         try:
@@ -56,7 +63,7 @@ class RotatingLog(logging.handlers.RotatingFileHandler):
         self._streams = streams
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a record; into a new file, where somebody removed the old one."""
+        """Write a record; create the file again if somebody removed it."""
         with suppress(OSError):
             if self._removed():
                 Path(self.baseFilename).parent.mkdir(parents=True, exist_ok=True)
@@ -72,7 +79,10 @@ class RotatingLog(logging.handlers.RotatingFileHandler):
         return self.stream is not None and not os.path.samestat(there, os.fstat(self.stream.fileno()))
 
     def _open(self) -> TextIOWrapper:
-        """Whenever a file is begun: the traceback of a dying interpreter must not go to one that nobody will find."""
+        """Open a new file and redirect the streams to it.
+
+        The traceback of a dying interpreter must not go to a removed file.
+        """
         stream = super()._open()
         if self._streams:
             os.dup2(stream.fileno(), 1)
@@ -89,11 +99,22 @@ def setup(
     streams: bool = False,
     patient: bool = False,
 ) -> logging.Logger:
-    """Send this process's records to ``file``, rotated at 5 MB with 3 kept; with ``console`` to standard error too.
+    """Send this process's records to ``file``, rotated at 5 MB with 3 files kept.
 
-    ``source``: named in each line. ``streams``: standard output and error lead to the file already; they are to follow.
-    ``patient``: a file that cannot be written is no error, it is tried again with each record.
-    Returns the logger named ``shmio``. ConfigError when the file cannot be written.
+    Args:
+        file: The log file.
+        process: The process name in each line.
+        source: The source name in each line.
+        console: Whether records go to standard error too.
+        streams: Whether standard output and error lead to the file and must follow it.
+        patient: Whether a file that cannot be written is tried again with each record.
+
+    Returns:
+        The logger named ``shmio``.
+
+    Raises:
+        ConfigError: The file cannot be written.
+
     """
     try:
         with suppress(OSError) if patient else nullcontext():
@@ -117,10 +138,10 @@ def setup(
 
 
 def fields(**values: object) -> dict[str, dict[str, object]]:
-    """Extra fields of a record: ``log.info("connected", extra=fields(pdu=960))``."""
+    """Return extra fields for a record: ``log.info("connected", extra=fields(pdu=960))``."""
     return {"fields": values}
 
 
 def printable(text: str) -> str:
-    """Text from devices and files as one line, without characters that would move a terminal's cursor."""
+    """Return text as one line, without characters that would move a terminal's cursor."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)

@@ -1,4 +1,4 @@
-"""Values and declared injections as messages of ``shmio.v1`` and as Python, or TOML, has them; for both of its ends."""
+"""Converts values and declared injections between Python or TOML and messages of ``shmio.v1``."""
 
 from __future__ import annotations
 
@@ -20,13 +20,25 @@ _OPERATIONS: Final[Mapping[str, Mapping[str, str]]] = {
     "drop": {},
     "flip": {"bits": "bits"},
 }
-"""Each operation's own keys, and their fields in its message; of those with just a value, that is the message."""
+"""Each operation's own keys, with their message fields.
+
+With just a value, the value is the message.
+"""
 _COMMON: Final = ("probability", "start_s", "end_s", "when", "for_s", "times", "seed", "priority")
 _DISTRIBUTIONS: Final = {"uniform": wire.Noise.DISTRIBUTION_UNIFORM, "gaussian": wire.Noise.DISTRIBUTION_GAUSSIAN}
 
 
 def value_to_wire(value: object, path: str) -> wire.Value:
-    """A value of Python or numpy; ValueRangeError: of no kind that goes by wire. ``path``: for the message."""
+    """Convert a Python or numpy value.
+
+    Args:
+        value: The value.
+        path: The register, for error messages.
+
+    Raises:
+        ValueRangeError: Values of this kind cannot be sent.
+
+    """
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, bool):
@@ -47,7 +59,7 @@ def value_to_wire(value: object, path: str) -> wire.Value:
 
 
 def value_from_wire(value: wire.Value, path: str) -> object:
-    """The same as Python has it; ValueRangeError: there is none."""
+    """Convert a message to a Python value; ValueRangeError if it has none."""
     kind = value.WhichOneof("kind")
     if kind is None:
         raise ValueRangeError(f"{path}: no value is given")
@@ -58,9 +70,15 @@ def value_from_wire(value: wire.Value, path: str) -> object:
 
 
 def declaration_to_wire(table: Mapping[str, Any], key: str) -> wire.Declaration:
-    """An ``[[injection]]`` table. ValueRangeError: a key that it cannot have, or a value that cannot be sent.
+    """Convert an ``[[injection]]`` table.
 
-    ``key``: of the table, for the message.
+    Args:
+        table: The table.
+        key: The key of the table, for error messages.
+
+    Raises:
+        ValueRangeError: A key is unknown, or a value cannot be sent.
+
     """
     left = dict(table)
     operation = left.pop("operation", None)
@@ -106,7 +124,16 @@ def _set(part: Any, field: str, value: Any, key: str) -> None:
 
 
 def declaration_from_wire(found: wire.Declaration, key: str) -> dict[str, Any]:
-    """The table, of which nothing is checked. ValueRangeError: a value is missing. ``key``: for the message."""
+    """Convert a message to an ``[[injection]]`` table. Nothing is checked.
+
+    Args:
+        found: The message.
+        key: The key of the table, for error messages.
+
+    Raises:
+        ValueRangeError: A value is missing.
+
+    """
     targets = list(found.targets)
     table: dict[str, Any] = {"name": found.name, "target": targets[0] if len(targets) == 1 else targets}
     operation = found.WhichOneof("operation")

@@ -1,4 +1,4 @@
-"""Real-time priority of a process: it runs before all others of the host that have none or less, sched(7)."""
+"""Real-time priority of a process, sched(7): it runs before processes without one."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from shmio.errors import ConfigError
 
 
 def prioritise(priority: int) -> None:
-    """Give the calling thread, and those that it starts from now on, a priority of SCHED_FIFO.
+    """Give the calling thread, and threads that it starts later, a priority of SCHED_FIFO.
 
-    ConfigError: this user may not have it, with the remedy.
+    Raises:
+        ConfigError: The user may not have it. The message contains the remedy.
+
     """
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
@@ -23,7 +25,7 @@ def prioritise(priority: int) -> None:
 
 
 def check(priority: int) -> None:
-    """Whether a process of this user may have it; ConfigError."""
+    """Check that a process of this user may have the priority; ConfigError if not."""
     refused: list[ConfigError] = []
 
     def attempt() -> None:
@@ -32,7 +34,7 @@ def check(priority: int) -> None:
         except ConfigError as error:
             refused.append(error)
 
-    thread = threading.Thread(target=attempt, name="priority")  # which keeps it: the caller goes on as it is
+    thread = threading.Thread(target=attempt, name="priority")  # a thread of its own: the caller keeps its priority
     thread.start()
     thread.join()
     if refused:

@@ -1,7 +1,8 @@
-"""What every child process does: read its spec, attach, hold its role, log, beat, stop when told.
+"""The common part of all child processes: read the description, attach, take the role, log, beat, stop on request.
 
-A worker's ``__main__`` is one line: ``raise SystemExit(worker.main(run))`` with ``run(worker)`` as its work.
-Exit status: 0 stopped as told; 1 failed, start it again; 2 it can never work as configured.
+A worker's ``__main__`` is one line: ``raise SystemExit(worker.main(run))`` with ``run(worker)`` as
+its work. Exit status: 0 stopped as requested; 1 failed, start it again; 2 it can never work as
+configured.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ MAX_SPEC_BYTES = 1 << 26
 
 
 class Worker:
-    """A child process in its role. Use from the main thread, except ``stopping``."""
+    """A child process in its role. Use it from the main thread, except ``stopping``."""
 
     def __init__(self, spec: dict[str, Any]) -> None:
         self.name: str = spec["name"]
@@ -36,7 +37,7 @@ class Worker:
         self.stopping = threading.Event()
         self._on_stop: Callable[[], object] | None = None
         self._on_reread: Callable[[], object] | None = None
-        self._rereads = False  # told so while there was nothing to call
+        self._rereads = False  # SIGHUP came before there was a function to call
         self.log = self._set_up_log(Path(spec["log_file"]))
         self.segment = Segment.open(spec["instance"], writable=True)
         if self.segment.header.epoch != spec["epoch"]:
@@ -44,7 +45,7 @@ class Worker:
         self.slot = self.segment.processes.find(self.name)
         self._take_role()
         self.before = self.slot.report
-        """What the process before in this role reported last."""
+        """The last report of the previous process in this role."""
         self._install_signal_handlers()
         self._report = Report(os.getpid(), Activity.STARTING, time.monotonic_ns())
         self.slot.report = self._report
@@ -56,18 +57,18 @@ class Worker:
         return logs.setup(file, self.name, source=source, streams=True, patient=True)
 
     def _take_role(self) -> None:
-        """Wait for a predecessor to be gone: the kernel frees its lock at the moment of its death."""
+        """Wait until the previous process is gone: the kernel frees its lock when it dies."""
         deadline = time.monotonic() + ROLE_WAIT_S
         while not self.slot.take():
             if time.monotonic() > deadline:
                 raise SegmentError(f"role {self.name} is still held by pid {self.slot.report.pid}")
             time.sleep(0.02)
-        # Its supervisor may have died meanwhile, and who cleared up after it did not see us: then this is no instance.
+        # Its supervisor may have died meanwhile, and its successor may have removed the segment.
         if not self.segment.shared.current():
             raise SegmentError(f"the segment of instance {self.segment.instance!r} was removed; this process ends")
 
     def running(self) -> None:
-        """Tell that start-up is over."""
+        """Report that start-up is over."""
         self.report(activity=Activity.RUNNING)
         self.log.info("running")
 
@@ -77,7 +78,7 @@ class Worker:
         note: str | None = None,
         activity: Activity | None = None,
     ) -> None:
-        """Write what is given into the process table, and beat."""
+        """Update the process table with the given values, and give a heartbeat."""
         old = self._report
         self._report = Report(
             old.pid,
@@ -91,24 +92,27 @@ class Worker:
         self.slot.beat()
 
     def on_stop(self, call: Callable[[], object]) -> None:
-        """Have ``call`` run once, in a thread of its own, when the process is to stop; at once if it is already."""
+        """Call ``call`` once in a thread of its own when the process is to stop.
+
+        At once if it already is.
+        """
         self._on_stop = call
         if self.stopping.is_set():
             call()
 
     def on_reread(self, call: Callable[[], object]) -> None:
-        """Have ``call`` run in a thread of its own whenever a reload may have changed what it takes while it runs.
+        """Call ``call`` in a thread of its own whenever a reload may have changed the worker's rules.
 
-        At once if one may have since the process began.
+        If that has happened since the process began, it is called at once.
         """
         self._on_reread = call
         if self._rereads:
             call()
 
     def _install_signal_handlers(self) -> None:
-        """Let SIGTERM set ``stopping``, and SIGHUP have it reread; Ctrl-C is the supervisor's.
+        """Make SIGTERM set ``stopping`` and SIGHUP trigger a reread; ignore Ctrl-C.
 
-        The handler itself must touch no lock: the main thread may hold that of the event it would set.
+        The handlers themselves take no lock, because the main thread may hold that of the event.
         """
         reader, writer = os.pipe()
         os.set_blocking(writer, False)
@@ -120,7 +124,7 @@ class Worker:
 
     def _await_signal(self, reader: int) -> None:
         while os.read(reader, 1)[0] != signal.SIGTERM:
-            self._rereads = True  # first, so that it is found by who sets the call meanwhile
+            self._rereads = True  # first, so that a concurrent on_reread() sees it
             if self._on_reread is not None:
                 self._on_reread()
         self.stopping.set()
@@ -129,7 +133,7 @@ class Worker:
 
 
 def main(run: Callable[[Worker], None]) -> int:
-    """Run a worker to its end; the exit status of the process."""
+    """Run a worker to its end; return the exit status of the process."""
     worker = None
     try:
         worker = Worker(_read_spec())
@@ -148,7 +152,7 @@ def main(run: Callable[[Worker], None]) -> int:
 
 
 def _report_failure(worker: Worker | None, message: str) -> None:
-    """Leave the reason where people look: the log and the process table."""
+    """Write the reason to the log and the process table."""
     if worker is None:
         sys.stderr.write(message + "\n")
     else:

@@ -28,14 +28,14 @@ from shmio.worker import BEAT_S, Worker
 if TYPE_CHECKING:
     from shmio.connectors.replay.loop import ReplayLoop
 
-SWITCH_S = 0.0005  # the poll thread is not to wait Python's usual 5 ms for the others
-LAST_WORDS_S = 4.0  # less than a supervisor's patience with a process that is to stop
+SWITCH_S = 0.0005  # Python's default of 5 ms would delay the poll thread too long
+LAST_WORDS_S = 4.0  # less than the supervisor's grace period
 REPLAY_TIMEOUT_S = 1.0
-HANG_MARGIN_S = 30.0  # beyond its time-outs: looking up a host name has none of ours
+HANG_MARGIN_S = 30.0  # added to the time-out: a host name lookup has no time-out here
 
 
 class _LoopHandle(NamedTuple):
-    """A loop, how to stop it, and how long one of its hooks may take."""
+    """A loop with the function that stops it and the time-out of its hooks in s."""
 
     loop: SourceLoop | SteppedLoop | ReplayLoop
     stop: Callable[[], None]
@@ -43,7 +43,10 @@ class _LoopHandle(NamedTuple):
 
 
 def run(worker: Worker) -> None:
-    """Poll and take commands in threads of their own; this one reports. A device that blocks one holds up no other."""
+    """Run polling and commands in two threads, and report from this one.
+
+    A hook that blocks delays neither commands nor reports.
+    """
     sys.setswitchinterval(SWITCH_S)
     part = _loop_of(worker)
     loop = part.loop
@@ -58,7 +61,7 @@ def run(worker: Worker) -> None:
             raise ConnectorError("the poll loop or the commands' thread ended by itself; its traceback is in the log")
         busy_s = _busy_s(loop.counters.busy_since_ns)
         if busy_s > part.timeout_s + HANG_MARGIN_S:
-            continue  # no beat: the supervisor replaces a process whose device call does not return
+            continue  # without a heartbeat the supervisor replaces the process
         counters = loop.counters
         worker.report(
             (
@@ -77,14 +80,14 @@ def run(worker: Worker) -> None:
 
 
 def _loop_of(worker: Worker) -> _LoopHandle:
-    """What runs this source."""
+    """Create the loop that runs this source."""
     segment, name = worker.segment, worker.config["connector"]
     found = registry.load(name)
     options = registry.convert_options(name, worker.config["options"])
     if issubclass(found, Replayed):
         return _replay_loop(worker, options)
     source = found(options, segment.blocks[worker.name].layout)
-    writer = segment.writer(worker.name)  # after its source: one that cannot be as configured has begun nothing
+    writer = segment.writer(worker.name)  # after the source: a configuration error changes nothing
     schedule = Schedule(segment.header.started_ns, writer.block.period_ns)
     owner_of, blocks = partial(_owner_of, segment), partial(_blocks, segment)
     writable, allow = worker.config["writable"], worker.config["allow_nonfinite"]
@@ -111,7 +114,7 @@ def _loop_of(worker: Worker) -> _LoopHandle:
 
 
 def _replay_loop(worker: Worker, options: Any) -> _LoopHandle:
-    """What plays a recording."""
+    """Create the loop that plays a recording."""
     from shmio.connectors.replay.loop import ReplayLoop  # noqa: PLC0415  the other sources read no recordings
     from shmio.connectors.replay.source import Replay  # noqa: PLC0415
     from shmio.connectors.replay.start import begin  # noqa: PLC0415
@@ -137,14 +140,17 @@ def _replay_loop(worker: Worker, options: Any) -> _LoopHandle:
 
 
 def _inputs(source: Computed, writer: BlockWriter, segment: Segment) -> Inputs | None:
-    """What reads a source's connections, on a mapping of its own."""
+    """Create the reader of a source's connections, on its own mapping of the segment.
+
+    None if it has none.
+    """
     own, sources = writer.block.source, segment.blocks
     topics = {path: parse_topic(topic, sources, own) for path, topic in source.connections.items()}
     return Inputs(Segment.open(segment.instance), topics) if topics else None
 
 
 def _owner_of(segment: Segment, writer: int) -> Owner | None:
-    """The process that has a command queue at present."""
+    """Return the process that has a command queue at present."""
     segment.refresh()
     for slot in (*segment.processes, *segment.processes.guests):
         if slot.writer == writer and slot.alive():
@@ -153,7 +159,7 @@ def _owner_of(segment: Segment, writer: int) -> Owner | None:
 
 
 def _blocks(segment: Segment) -> Mapping[str, Block]:
-    """All sources' blocks as of now."""
+    """Return the present blocks of all sources."""
     segment.refresh()
     return segment.blocks
 
@@ -170,7 +176,7 @@ def _busy_s(since_ns: int) -> float:
 
 
 class _Rate:
-    """Polls per 1000 s over the last second or so."""
+    """The rate of polls over about the last second, in polls per 1000 s."""
 
     def __init__(self) -> None:
         self._marks: list[tuple[float, int]] = []

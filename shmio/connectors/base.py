@@ -1,4 +1,7 @@
-"""What a connector is: the hooks that a device's protocol fills in. The loop that calls them is in ``loop``."""
+"""The base class of connectors: the hooks that a device's protocol implements.
+
+``loop`` calls them.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +19,10 @@ from shmio.segment import Provenance
 
 
 class Lost(Enum):
-    """What is known of a write that had no answer when the connection was lost."""
+    """The state of a write that had no answer when the connection was lost."""
 
     UNSENT = "unsent"
-    """Surely not carried out: the device was not given a byte of it."""
+    """Not carried out: none of its bytes was sent to the device."""
     UNKNOWN = "unknown"
 
 
@@ -27,82 +30,140 @@ class WriteLostError(ConnectorError):
     """The connection was lost before all writes had their answers."""
 
     def __init__(self, message: str, outcomes: Sequence[str | Lost]) -> None:
-        """``outcomes``: of each write, as :meth:`Connector.write` returns it, or what is known of it."""
+        """Create the error.
+
+        Args:
+            message: Why the connection was lost.
+            outcomes: For each write, its result as from :meth:`Connector.write`, or what is known
+                of it.
+
+        """
         super().__init__(message)
         self.outcomes = tuple(outcomes)
 
 
 class Connector(ABC):
-    """One device's protocol. All hooks run in one thread; none may block longer than ``timeout_s``.
+    """Base class for the protocol of one device.
 
-    After a hook has raised, the loop calls :meth:`close` and later :meth:`connect` again: a late reply must never be
-    taken for the next one. A connector that asks and waits implements :meth:`read`; one that can have several cycles
-    under way, :meth:`submit`, :meth:`collect` and ``depth``. ConnectorError says why not, in words for the person at
-    the cell.
+    All hooks run in one thread, and none may block longer than ``timeout_s``. After a hook has
+    raised, the loop calls :meth:`close` and later :meth:`connect` again, so that a late reply is
+    never taken for the next one. A connector that asks and waits implements :meth:`read`. One that
+    can have several cycles in flight implements :meth:`submit`, :meth:`collect` and ``depth``. The
+    text of a ConnectorError is for the operator of the cell.
     """
 
     Options: ClassVar[type[msgspec.Struct]]
-    """The connector's own keys of ``[[source]]``; refuses unknown ones."""
+    """The connector's own keys of ``[[source]]``. The struct must refuse unknown keys."""
 
     can_write: ClassVar[bool] = False
     """Whether :meth:`write` is implemented."""
 
     provenance: ClassVar[Provenance] = Provenance.LIVE
-    """Where its values come from."""
+    """The provenance of the values that it reads."""
 
     @abstractmethod
     def __init__(self, options: Any, layout: Layout) -> None:
-        """``options`` is an instance of ``Options``. ConfigError when layout and options do not go together."""
+        """Create the connector without connecting it.
+
+        Args:
+            options: An instance of ``Options``.
+            layout: The layout of the source's block.
+
+        Raises:
+            ConfigError: Layout and options contradict each other.
+
+        """
 
     @property
     @abstractmethod
     def timeout_s(self) -> float:
-        """The longest time that any hook blocks."""
+        """The longest time that any hook blocks, in s."""
 
     @abstractmethod
     def connect(self) -> None:
-        """Reach the device; ConnectorError."""
+        """Open the connection to the device.
+
+        Raises:
+            ConnectorError: The device cannot be reached.
+
+        """
 
     @abstractmethod
     def read(self) -> bytes:
-        """One image of the whole block, ``layout.size`` bytes; ConnectorError, never a part or an old one."""
+        """Read one image of the whole block.
+
+        Returns:
+            ``layout.size`` bytes.
+
+        Raises:
+            ConnectorError: There is no whole, fresh image.
+
+        """
 
     @abstractmethod
     def close(self) -> None:
-        """Drop the connection; allowed at any time, more than once."""
+        """Close the connection. It may be called at any time and more than once."""
 
     def describe(self) -> str:
-        """What was agreed with the device, for the log."""
+        """Return what was negotiated with the device, for the log."""
         return ""
 
     @property
     def doubt(self) -> str:
-        """Why the image just read should not be trusted though it is right, with the remedy; empty if it should."""
+        """Why the last image is uncertain although it was read, with the remedy.
+
+        Empty if it is good.
+        """
         return ""
 
     # -- more than one cycle at a time ---------------------------------------------------------------------------------
 
     @property
     def depth(self) -> int:
-        """Cycles that may be under way at once in this session."""
+        """How many cycles may be in flight at once in this session."""
         return 1
 
     def submit(self) -> None:  # noqa: B027  not every connector can
-        """Ask for an image without waiting for it; ConnectorError."""
+        """Request an image without waiting for it.
 
-    def collect(self, until_ns: int) -> bytes | None:  # noqa: ARG002  who reads and waits has a time-out
-        """The image of the oldest cycle submitted; None if it has not come by ``until_ns`` (CLOCK_MONOTONIC).
+        Raises:
+            ConnectorError: The request cannot be sent.
 
-        ConnectorError: it is wrong, or has not come within the connector's own time-out.
+        """
+
+    def collect(self, until_ns: int) -> bytes | None:  # noqa: ARG002  read() has its own time-out
+        """Wait for the image of the oldest submitted cycle.
+
+        Args:
+            until_ns: When to stop waiting, ns of CLOCK_MONOTONIC.
+
+        Returns:
+            The image, ``layout.size`` bytes; None if it has not come by ``until_ns``.
+
+        Raises:
+            ConnectorError: The answer is wrong, or has not come within the connector's own
+                time-out.
+
         """
         return self.read()
 
     # -- writing -------------------------------------------------------------------------------------------------------
 
     def write(self, writes: Sequence[Write]) -> list[str]:  # noqa: ARG002
-        """Change these bytes and bits in the device; for each "" if it confirmed, else its refusal in words.
+        """Write bytes and bits to the device.
 
-        A write of a bit leaves its neighbours alone; one of bytes may be longer than the protocol takes at once.
-        WriteLostError: the connection is lost, and what became of each; ConnectorError: nothing is known of any.
+        A write of a bit leaves the other bits of its byte alone. A write of bytes may be longer
+        than the protocol takes at once.
+
+        Args:
+            writes: What to write, in this order.
+
+        Returns:
+            For each write "" if the device confirmed it, else why the device refused it.
+
+        Raises:
+            WriteLostError: The connection was lost; the error says what is known of each write.
+            ConnectorError: Nothing is known of any write.
+
         """
         raise ConnectorError("this connector cannot write")

@@ -1,7 +1,8 @@
 """The loop that runs a connector.
 
-It owns time, quality and recovery, so that every connector behaves alike: an absolute schedule, overruns counted, one
-bad frame when quality changes, the connection dropped on any error, back-off, recovery without a restart.
+It owns time, quality and recovery, so that every connector behaves alike: an absolute schedule,
+counted overruns, one bad frame when quality changes, the connection closed after any error,
+back-off, and recovery without a restart.
 """
 
 from __future__ import annotations
@@ -23,19 +24,19 @@ from shmio.errors import ConnectorError
 from shmio.segment import BlockWriter, EventKind, Provenance, Quality, Record
 
 STABLE_NS = 1_000_000_000
-"""A connection that has lasted this long has put its failures behind it."""
+"""A connection that has lasted longer than this resets the back-off."""
 
 _Result = TypeVar("_Result")
 
 
 class Clock(Protocol):
-    """Time as the loop sees it; tests bring their own."""
+    """The loop's view of time; tests provide their own."""
 
     def now_ns(self) -> int:
-        """CLOCK_MONOTONIC."""
+        """Return the time of CLOCK_MONOTONIC in ns."""
 
     def wait_ns(self, duration_ns: int) -> bool:
-        """Wait; True as soon as the loop is to stop."""
+        """Wait for ``duration_ns``; return True as soon as the loop is to stop."""
 
 
 class WallClock:
@@ -45,31 +46,34 @@ class WallClock:
         self._stopped = threading.Event()
 
     def now_ns(self) -> int:
-        """CLOCK_MONOTONIC."""
+        """Return the time of CLOCK_MONOTONIC in ns."""
         return time.monotonic_ns()
 
     def wait_ns(self, duration_ns: int) -> bool:
-        """Wait; True as soon as the loop is to stop."""
+        """Wait for ``duration_ns``; return True as soon as the loop is to stop."""
         return self._stopped.wait(max(0, duration_ns) / 1e9)
 
     def stop(self) -> None:
-        """Make the loop stop; from any thread."""
+        """Stop the loop. Any thread may call it."""
         self._stopped.set()
 
 
 class _Submitted(NamedTuple):
-    """A cycle that the device has been asked for."""
+    """A cycle for which an image was requested from the device."""
 
     cycle: int
     asked_ns: int
-    """On the loop's clock."""
+    """Time of the request on the loop's clock."""
     monotonic_ns: int
     utc_ns: int
-    """The device had what it will answer then, or later; so with ``monotonic_ns``."""
+    """Time of the request in UTC.
+
+    The image in the answer is at least as new as this and ``monotonic_ns``.
+    """
 
 
 class SourceLoop:
-    """Polls one connector on schedule, publishes every frame, and hands on what is to be written."""
+    """Polls one connector on schedule, publishes every frame and carries out writes."""
 
     def __init__(
         self,
@@ -84,7 +88,20 @@ class SourceLoop:
         owner_of: OwnerOf = lambda _: None,
         blocks: Blocks | None = None,
     ) -> None:
-        """``writable``: patterns of what commands may write. The rest: see :class:`CommandProcessor`."""
+        """Create the loop.
+
+        Args:
+            connector: The protocol of the device.
+            writer: The writing side of the source's block.
+            schedule: When cycles are due.
+            clock: The loop's clock.
+            writable: Patterns of the registers that commands may write.
+            allow_nonfinite: See :class:`CommandProcessor`, also for the arguments below.
+            armed: Whether injections may reach the device.
+            owner_of: Finds the process that has a command queue.
+            blocks: Returns the blocks of all sources.
+
+        """
         self._connector = connector
         self._writer = writer
         self._schedule = schedule
@@ -112,14 +129,14 @@ class SourceLoop:
         return self._condition.note
 
     def run(self) -> None:
-        """Poll until the clock says stop; then tell the readers."""
+        """Poll until the clock says stop, then publish the end of the source."""
         try:
             while True:
                 due = self._schedule.next(self._clock.now_ns())
                 self.counters.overruns += due.skipped
                 if self._clock.wait_ns(due.due_ns - self._clock.now_ns()):
                     break
-                if self._clock.now_ns() >= self._schedule.due_ns(due.cycle + 1):  # held up while it waited
+                if self._clock.now_ns() >= self._schedule.due_ns(due.cycle + 1):  # delayed while it waited
                     self.counters.overruns += 1
                 elif not self.poll(due.cycle):
                     break
@@ -131,7 +148,12 @@ class SourceLoop:
             self._writer.event(Record(EventKind.STOPPED))
 
     def poll(self, cycle: int) -> bool:
-        """One cycle: connect if need be, write, ask, publish what comes. False: told to stop while backing off."""
+        """Run one cycle: connect if necessary, write, request an image, publish what comes.
+
+        Returns:
+            False if the loop was told to stop during back-off.
+
+        """
         self._writer.cycle = cycle
         try:
             if self._connected_ns is None:
@@ -141,13 +163,13 @@ class SourceLoop:
                 self._drain()
                 self._call(lambda: self.commands.carry_out(self._connector.write))
             end_ns = self._schedule.due_ns(cycle + 1)
-            self._collect(end_ns, leave=self._connector.depth - 1)  # an answer that is late makes room within the cycle
+            self._collect(end_ns, leave=self._connector.depth - 1)  # late answers make room
             if len(self._under_way) < self._connector.depth:
                 self._under_way.append(self._asked(cycle))
                 self._call(self._connector.submit)
                 self._collect(end_ns)
             else:
-                self.counters.overruns += 1  # the device is behind by all that may be under way
+                self.counters.overruns += 1  # all requests that may be in flight are
         except ConnectorError as error:
             return self._fail(cycle, str(error) or "the connector gave no reason")
         return True
@@ -156,12 +178,12 @@ class SourceLoop:
         return _Submitted(cycle, self._clock.now_ns(), time.monotonic_ns(), time.time_ns())
 
     def _drain(self) -> None:
-        """Publish what was asked for before a write: no frame that follows its event is older than it."""
+        """Publish the images requested before a write, so that no older frame follows the write's event."""
         while self._under_way:
             self._collect(self._clock.now_ns() + round(self._connector.timeout_s * 1e9))
 
     def _collect(self, until_ns: int, leave: int = 0) -> None:
-        """Publish the images that come until then, but for so many that may stay under way."""
+        """Publish the images that come by ``until_ns``; ``leave`` requests may stay in flight."""
         while len(self._under_way) > leave:
             raw = self._call(lambda: self._connector.collect(until_ns))
             if raw is None:
@@ -169,7 +191,7 @@ class SourceLoop:
             asked = self._under_way.popleft()
             took_ns = self._clock.now_ns() - asked.asked_ns
             self.counters.round_trip_us = took_ns // 1000
-            if took_ns > self._writer.block.stale_ns:  # nobody knows when, in a long wait, the device had it
+            if took_ns > self._writer.block.stale_ns:  # the age of the image is unknown
                 limit_ms = self._writer.block.stale_ns / 1e6
                 raise ConnectorError(
                     f"the answer took {took_ns / 1e6:.0f} ms: older than stale_ms ({limit_ms:.0f}) allows"
@@ -186,7 +208,7 @@ class SourceLoop:
             Image(raw, asked.cycle, asked.utc_ns, quality, self._connector.provenance, doubt, asked.monotonic_ns)
         )
         self.counters.polls += 1
-        if not self._accepting:  # not before an image has shown that the block is as its layout says
+        if not self._accepting:  # not before an image has confirmed the layout
             self._accepting = True
             self.commands.open()
         if self._connected_ns is not None and self._clock.now_ns() - self._connected_ns > STABLE_NS:
@@ -212,7 +234,7 @@ class SourceLoop:
         return not stop
 
     def _disconnected(self, cycle: int, reason: str) -> None:
-        """Publish one bad frame for each new reason, with the last bytes known; other measures are none."""
+        """Publish one bad frame for each new reason, with the last known bytes."""
         self.commands.close(reason)
         if self._condition.tell(Quality.BAD, reason, cycle):
             provenance = self._connector.provenance

@@ -13,14 +13,15 @@ from shmio.layout.values.write import Write, apply
 
 
 class Memory(Computed):
-    """``connector = "memory"``: begins with the initial values; what is written to ``/in`` is ``/out`` at once.
+    """``connector = "memory"``: what is written to ``/in`` appears on ``/out`` at once.
 
-    A process that takes the place of another goes on with its values. For programs that publish signals of their own:
-    a remote simulator, an operator's panel, a test.
+    It begins with the initial values of the layout; a restarted process continues with the last
+    values. It serves programs that publish signals of their own: a remote simulator, an operator
+    panel, a test.
     """
 
     class Options(msgspec.Struct, forbid_unknown_fields=True):
-        """It has no keys of its own."""
+        """The connector has no keys of its own."""
 
     prompt = True
 
@@ -28,19 +29,19 @@ class Memory(Computed):
         self._image, _ = initial_frame(layout)
 
     def resume(self, image: bytes) -> None:
-        """Go on with the values of the process before this one."""
+        """Continue with the values of the previous process."""
         self._image[:] = image
 
     def begin(self) -> bytes:
-        """All registers."""
+        """Return all registers."""
         return bytes(self._image)
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Change them; nothing refuses."""
+        """Change registers; every write succeeds."""
         for write in writes:
             apply(write, self._image)
         return [""] * len(writes)
 
     def step(self, time_ns: int, dt_ns: int) -> bytes:  # noqa: ARG002  time changes nothing
-        """All registers."""
+        """Return all registers."""
         return bytes(self._image)

@@ -1,4 +1,4 @@
-"""What a source publishes: its device's images, and what injections make of them."""
+"""Publishes a source's images with its injections applied."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ from shmio.connectors.injection.layers import LayerStack
 from shmio.segment import BlockWriter, Provenance, Quality, Record, Stamp
 
 EXTRA_FRAMES: Final = 4
-"""So many frames a period may come between those of the cycles: rings, which hold 8 s of cycles, must last for all."""
+"""Most frames per period in addition to the cycle's own.
+
+Rings are sized for all of them over 8 s.
+"""
 
 
 class Image(NamedTuple):
-    """An image with all that is told of it; times as in :meth:`BlockWriter.publish`."""
+    """An image of the block with its metadata; times as in :meth:`BlockWriter.publish`."""
 
     raw: bytes
     cycle: int
@@ -25,29 +28,37 @@ class Image(NamedTuple):
     reason: str
     asked_ns: int | None = None
     shown: bytes | None = None
-    """What consumers saw of it when it was recorded, if that was something else than ``raw``."""
+    """The image that consumers saw when it was recorded, if it differed from ``raw``."""
     at: Stamp | None = None
-    """When it is to be published; default: now."""
+    """When to publish the image; default: now."""
 
     @property
     def base(self) -> bytes:
-        """What the injections of this instance are laid over."""
+        """The image to which this instance's injections are applied."""
         return self.raw if self.shown is None else self.shown
 
 
 class Output:
-    """Publishes images, and the last one again when injections have changed; threads take turns at it.
+    """Publishes images, and republishes the last one when injections change.
 
-    Changes that come faster than ``EXTRA_FRAMES`` a period share a frame. What is to be told of them follows it.
+    Several threads may call it; ``turn`` serialises them. Changes that come faster than
+    ``EXTRA_FRAMES`` per period share a frame. Events about a change are published after the frame
+    that shows it.
     """
 
     def __init__(self, writer: BlockWriter, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self.writer = writer
         self.injections = LayerStack(writer.block.layout.size)
-        """To be changed, and :meth:`show` called then, with ``turn`` held."""
+        """The layers of this source.
+
+        Hold ``turn`` while you change them, then call :meth:`show`.
+        """
         self.turn = threading.Lock()
         self.advance: Callable[[Image], Iterable[Record]] | None = None
-        """Called with each next image before it is published; what it returns is told after it."""
+        """Called with each new image before it is published.
+
+        The events that it returns follow the frame.
+        """
         self._now_ns = now_ns
         self._gap_ns = writer.block.period_ns // EXTRA_FRAMES
         self._next_ns = 0
@@ -64,32 +75,38 @@ class Output:
 
     @property
     def raw(self) -> bytes:
-        """The image published last, by the process before this one at first; zeros if there is none."""
+        """The bytes published last, at first by the previous process of the source.
+
+        Zeros if there are none.
+        """
         return bytes(self.writer.block.layout.size) if self._last is None else self._last.raw
 
     @property
     def base(self) -> bytes:
-        """What the injections are laid over: :attr:`raw`, unless a recording has something else."""
+        """The image to which injections are applied: :attr:`raw`, or the recorded one in a replay."""
         return self.raw if self._last is None else self._last.base
 
     @property
     def cycle(self) -> int:
-        """The cycle of that image; -1: there is none."""
+        """The cycle of the image published last; -1 if there is none."""
         return -1 if self._last is None else self._last.cycle
 
     @property
     def source_ns(self) -> int:
-        """When the device had that image, ns since 1970; 0: none has come from it yet."""
+        """When the device had the image published last, ns since 1970.
+
+        0 if none came from it yet.
+        """
         return 0 if self._last is None else self._last.source_ns
 
     @property
     def next_ns(self) -> int:
-        """When the next frame between two cycles may come, on the clock given."""
+        """The earliest time of the next frame between two cycles, ns on the given clock."""
         return self._next_ns
 
     @property
     def patience_ns(self) -> int:
-        """How long changes wait for their frame still, until :meth:`flush`; negative: there are none."""
+        """How long changes still wait for :meth:`flush`, in ns; negative if there are none."""
         return max(0, self._next_ns - self._now_ns()) if self._changed else -1
 
     def publish(self, image: Image) -> None:
@@ -101,19 +118,22 @@ class Output:
             self._publish(image.at)
 
     def resume(self, image: Image) -> None:
-        """Go on from an image that was published already."""
+        """Continue from an image that the previous process has published."""
         with self.turn:
             self._last = image
 
     def show(self, records: Iterable[Record]) -> None:
-        """Have consumers see the injections as they are by now, then tell ``records``; with ``turn`` held."""
+        """Publish the present state of the injections, then ``records``. The caller holds ``turn``.
+
+        If the last frame is too recent, the changes wait for :meth:`flush`.
+        """
         self._owed += records
         self._changed = True
         if self._now_ns() >= self._next_ns:
             self._publish()
 
     def flush(self) -> None:
-        """Show what has waited long enough."""
+        """Publish pending changes once their time has come."""
         with self.turn:
             if self._changed and self._now_ns() >= self._next_ns:
                 self._publish()

@@ -1,6 +1,7 @@
-"""Connectors by name: ours, and those that other packages offer as entry points (group ``shmio.connectors``).
+"""Finds connectors by name: the built-in ones, and entry points of the group ``shmio.connectors``.
 
-Most reach a device; some are computed here, or play a recording, and live on the instance's clock.
+Most connectors reach a device. Others compute their values or play a recording, and follow the
+instance clock.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ BUILT_IN = {
 
 
 def names() -> list[str]:
-    """All names that ``connector = "…"`` may have here."""
+    """Return all valid values of ``connector = "…"``, sorted."""
     return sorted({*BUILT_IN, *(point.name for point in _offered())})
 
 
@@ -43,7 +44,13 @@ def _offered() -> EntryPoints:
 
 
 def load(name: str) -> type[Connector] | type[Computed] | type[Replayed]:
-    """Import a connector by name; ConfigError when there is none, or it cannot be imported."""
+    """Import a connector by name.
+
+    Raises:
+        ConfigError: There is no such connector, it cannot be imported, or it is not a connector
+            class.
+
+    """
     if name in BUILT_IN:
         module, _, attribute = BUILT_IN[name].partition(":")
         found: Any = getattr(importlib.import_module(module), attribute)
@@ -61,14 +68,21 @@ def load(name: str) -> type[Connector] | type[Computed] | type[Replayed]:
 
 
 def options_type(name: str) -> type[msgspec.Struct]:
-    """The type of the connector's own keys."""
+    """Return the type of the connector's own keys."""
     return load(name).Options
 
 
 def convert_options(name: str, options: dict[str, Any], texts: Mapping[str, str] | None = None) -> msgspec.Struct:
-    """Check a source's own keys. ``texts``: more of them as a properties file has them, read as their types.
+    """Check and convert a source's own keys.
 
-    ConfigError begins with the key alone: the caller knows where the keys stand.
+    Args:
+        name: The connector's name.
+        options: The keys as TOML has them.
+        texts: More keys as texts from a properties file, converted to their types.
+
+    Raises:
+        ConfigError: A key is wrong. The message begins with the key, without the place in the file.
+
     """
     for fault in option_faults(name, options, texts or {}):
         raise ConfigError(fault)
@@ -80,7 +94,7 @@ def convert_options(name: str, options: dict[str, Any], texts: Mapping[str, str]
 
 
 def option_faults(name: str, options: Mapping[str, Any], texts: Mapping[str, str]) -> Iterator[str]:
-    """All that is wrong with a source's own keys, each taken by itself; each begins with the key."""
+    """Yield every fault in a source's own keys, checked one by one; each begins with the key."""
     kind = options_type(name)
     read: dict[str, Any] = {}
     for field in msgspec.structs.fields(kind):

@@ -1,4 +1,4 @@
-"""What a source's loop tells of itself: its counters, and each change of its quality."""
+"""The status of a source: its counters, and the log lines and events about its quality."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ log = logging.getLogger("shmio.source")
 
 @dataclass(slots=True)
 class Counters:
-    """What ``status`` shows of a source; one writer, the loop."""
+    """The counters that ``status`` shows of a source. Only the loop writes them."""
 
     polls: int = 0
     overruns: int = 0
@@ -27,10 +27,10 @@ class Counters:
     connects: int = 0
     round_trip_us: int = 0
     busy_since_ns: int = 0
-    """When the hook that runs now was called; 0 between hooks."""
+    """When the running hook was called, ns; 0 between hooks."""
 
     def watch(self, now_ns: Callable[[], int], hook: Callable[[], _Result]) -> _Result:
-        """Call a hook, and let the main thread see since when."""
+        """Call a hook, and record for the main thread when the call began."""
         self.busy_since_ns = now_ns()
         try:
             return hook()
@@ -39,16 +39,27 @@ class Counters:
 
 
 class QualityLog:
-    """A source's quality as last told: in the log and in the block's events, once for each change."""
+    """Reports each change of a source's quality once, in the log and as an event."""
 
     def __init__(self, writer: BlockWriter) -> None:
         self._writer = writer
         self._state: tuple[Quality, str] | None = None  # the reason without its numbers
         self.note = ""
-        """Why quality is not good, for the process table."""
+        """Why quality is not good, for the process table; empty if it is good."""
 
     def tell(self, quality: Quality, reason: str, cycle: int, well: str = "") -> bool:
-        """Log and write down a change of quality or of its reason; was it one? ``well``: for the log, if good."""
+        """Report the quality if it or its reason has changed; numbers in the reason do not count.
+
+        Args:
+            quality: The present quality.
+            reason: Why it is not good; empty if it is.
+            cycle: The present cycle, for the log.
+            well: Text for the log line if quality is good.
+
+        Returns:
+            Whether there was a change.
+
+        """
         self.note = reason
         state = quality, _MEASURES.sub("#", reason)
         if state == self._state:

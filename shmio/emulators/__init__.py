@@ -1,5 +1,5 @@
 """Emulated controllers: processes that play a PLC and its plant, for demonstrations and tests.
 
-``s7`` is the server, ``s7_jobs`` what it answers; ``programs`` names what an emulated controller can run, one
-module each; ``emulator`` puts a server and a program together.
+``s7`` is the server, ``s7_jobs`` answers its jobs; ``programs`` has the programs that an emulated
+controller can run; ``emulator`` combines a server and a program.
 """

@@ -12,7 +12,10 @@ from shmio.worker import BEAT_S, Worker
 
 
 def run(worker: Worker) -> None:
-    """Play until told to stop. The compiled layouts come with the process's description."""
+    """Run the emulator until told to stop.
+
+    The process description contains the compiled layouts.
+    """
     config = worker.config
     first, *others = (Layout.from_json(layout.encode()) for layout in config["layouts"])
     listen = Address.parse(config["listen"])

@@ -1,4 +1,4 @@
-"""An emulated controller: a program that runs in cycles, and a server that lets clients at its block."""
+"""An emulated controller: a cyclic program, and a server that gives clients access to its block."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from shmio.layout.model import Layout
 
 
 class Emulator:
-    """Runs a program on a data block and serves that and others over S7. Use ``with``, or ``start`` and ``stop``, once.
+    """Runs a program on a data block, and serves that block and others over S7. Start and stop it once.
 
-    The program's cycles follow an absolute schedule, so they do not drift; cycles that come too late are left out and
-    counted. Clients read and write between cycles, never within one. A client that stops the emulated CPU stops the
-    program, whose time then stands still, but not the server, as with a real one.
+    The program's cycles follow an absolute schedule, so they do not drift; late cycles are skipped
+    and counted. Clients read and write between cycles, never within one. A client that stops the
+    emulated CPU stops the program and its time, but not the server, as with a real controller.
     """
 
     def __init__(
@@ -38,11 +38,21 @@ class Emulator:
         max_clients: int = 16,
         traits: Traits | None = None,
     ) -> None:
-        """Prepare to serve the block as DB ``db_number``, by default the layout's own.
+        """Prepare the emulator.
 
-        ``others``: blocks that the program leaves alone, served beside it under their own numbers. ``traits``: what
-        the server grants, and what is wrong with it. ConfigError: no such program, the layout does not suit it, a
-        block without a number, or a number twice.
+        Args:
+            layout: The layout of the program's block.
+            program_name: The program to run.
+            listen: The address to listen on.
+            db_number: The block's number; default: the layout's own.
+            others: Blocks without a program, served under their own numbers.
+            max_clients: The most clients at a time.
+            traits: What the server grants, and its faults.
+
+        Raises:
+            ConfigError: There is no such program, the layout does not suit it, or a number is
+                missing or used twice.
+
         """
         self._program = program(program_name, layout)
         self._period_s = self._program.period_ms / 1000
@@ -58,32 +68,35 @@ class Emulator:
 
     @property
     def address(self) -> Address:
-        """Where the server listens; ShmioError unless started."""
+        """The address the server listens on; ShmioError unless started."""
         return self._server.address
 
     @property
     def cycles(self) -> int:
-        """Cycles run."""
+        """The number of cycles run."""
         return self._cycles
 
     @property
     def overruns(self) -> int:
-        """Cycles left out because the one before took too long."""
+        """The number of cycles skipped because the one before took too long."""
         return self._overruns
 
     @property
     def failure(self) -> Exception | None:
-        """What ended the program, if anything did; whoever runs an emulator looks at it now and then."""
+        """The error that ended the program, if any; the runner checks it regularly."""
         return self._failure
 
     def start(self) -> None:
-        """Run the first cycle, listen, and go on in threads; EndpointError if the address cannot be had."""
+        """Run the first cycle, listen, and continue in threads.
+
+        EndpointError if the address is not available.
+        """
         self._step(0)
         self._server.start()
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop listening and running; returns when all threads have ended."""
+        """Stop the server and the program; return when all threads have ended."""
         self._stopping.set()
         self._server.stop()
         if self._thread.ident is not None:

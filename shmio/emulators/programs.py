@@ -1,4 +1,4 @@
-"""What an emulated controller can run."""
+"""The programs that an emulated controller can run."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from shmio.simulation.a50 import A50Cell
 
 
 class A50:
-    """The program of the cell's controller, and the plant."""
+    """The program of the A50 cell's controller, with the plant."""
 
     period_ms = 10
 
     def __init__(self, layout: Layout) -> None:
-        """Find the registers; ConfigError names one that the layout lacks or has as another type."""
+        """Find the registers; ConfigError names a missing register or one of another type."""
         # The printed DB201 has a space for the underscore in some names.
         named = tuple(replace(register, path=register.path.replace(" ", "_")) for register in layout.registers)
         try:
@@ -30,7 +30,7 @@ class A50:
             raise ConfigError(f"program a50: {str(error).removeprefix('layout: ')}") from None
 
     def step(self, time_s: float, frame: bytearray) -> None:
-        """Put axes, inputs and outputs of this time into the frame."""
+        """Put the axes, inputs and outputs of this time into the frame."""
         self._runner.resume(bytes(frame))  # clients write what they please, outputs included
         frame[:] = self._runner.step(round(time_s * 1e9), self.period_ms * 1_000_000)
 
@@ -41,9 +41,9 @@ _STRIDE = 0x9E37_79B9_7F4A_7C15
 
 
 class Counter:
-    """Fills the block with big-endian 64-bit words: the generation (cycles since start), then mixed with the place.
+    """Fills the block with big-endian 64-bit words: the generation (cycles since start), mixed with the place.
 
-    A rest of less than eight bytes holds the first bytes of its word and is checked too.
+    A remainder of less than eight bytes holds the first bytes of its word and is checked too.
     """
 
     period_ms = 1
@@ -59,9 +59,9 @@ class Counter:
 
 
 def generations(frame: bytes | bytearray | memoryview) -> list[int]:
-    """List the distinct generations in a frame that a ``Counter`` wrote, ascending: one if it is of one cycle.
+    """Return the distinct generations in a frame of a ``Counter``, ascending: one if it is of one cycle.
 
-    A byte that no cycle put there shows as a generation far from the others.
+    A byte that no cycle wrote shows as a generation far from the others.
     """
     size = len(frame)
     whole = size // 8 * 8
@@ -83,30 +83,30 @@ def _word(generation: int, place: int) -> bytes:
 
 
 class Idle:
-    """Leaves every register alone: a controller in RUN without a user program."""
+    """Changes no register: a controller in RUN without a user program."""
 
     period_ms = 100
-    """Time between two cycles, which say only that the controller is alive."""
+    """Time between two cycles, which only show that the controller is alive."""
 
     def __init__(self, layout: Layout) -> None:
-        """Suit every layout."""
+        """Accept any layout."""
 
     def step(self, time_s: float, frame: bytearray) -> None:
         """Change nothing."""
 
 
 class Program(Protocol):
-    """A controller's user program, together with the plant it moves."""
+    """A controller's user program, with the plant it controls."""
 
     @property
     def period_ms(self) -> int:
         """Time between two cycles."""
 
     def step(self, time_s: float, frame: bytearray) -> None:
-        """Run the cycle of time ``time_s`` (since the program's start) on the block, in place.
+        """Run the cycle at ``time_s`` after the program's start on the block, in place.
 
-        The same times on the same frames give the same frames. What the program does not drive, it leaves as clients
-        wrote it; it may obey what is written there. ``frame`` keeps its length.
+        The same times on the same frames give the same frames. Registers that the program does not
+        drive keep what clients wrote; the program may read them. ``frame`` keeps its length.
         """
 
 
@@ -115,9 +115,11 @@ PROGRAMS: Mapping[str, Callable[[Layout], Program]] = {"a50": A50, "counter": Co
 
 
 def program(name: str, layout: Layout) -> Program:
-    """Build the program of this name for a block of this layout.
+    """Create the program of this name for a block of this layout.
 
-    ConfigError: no such program, or the layout has not the registers it needs.
+    Raises:
+        ConfigError: There is no such program, or the layout lacks a register.
+
     """
     try:
         build = PROGRAMS[name]

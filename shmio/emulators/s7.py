@@ -51,7 +51,7 @@ _INBOX_SIZE = 8 * _LONGEST_FRAME
 _ANSWERS_AT_ONCE = 8  # then they are sent, whether or not more requests have come
 _SEND_TIMEOUT_S = 5
 _KEEPALIVE = {socket.TCP_KEEPIDLE: 30, socket.TCP_KEEPINTVL: 10, socket.TCP_KEEPCNT: 3}
-"""In s: a client whose host is gone gives its place back within a minute."""
+"""In s: the place of a client whose host is gone is free within a minute."""
 _SERVICES = (b"P_PROGRAM", b"_MODU", b"_GARB")  # start; and what a block that lives in memory alone has done already
 _SERVICE_ARGUMENT = 8  # where, in the parameters, a job for a service has the length of what the service is given
 _MODE_LIST = 0x0424
@@ -65,7 +65,7 @@ _JOIN_TIMEOUT_S = 10
 class S7Server(Server):
     """Serves data blocks to S7 clients on one address. Start it once, stop it once; or use ``with``.
 
-    ``lock`` is held over each job: who changes blocks while holding it changes them between jobs.
+    ``lock`` is held during each job: whoever holds it changes blocks between jobs.
     """
 
     def __init__(self, address: Address, *, max_clients: int = 16, traits: Traits | None = None) -> None:
@@ -78,7 +78,10 @@ class S7Server(Server):
         self._stopping = threading.Event()
 
     def add_block(self, number: int, data: bytearray) -> None:
-        """Serve ``data``, in place, as data block ``number``; ConfigError if the number is taken or none."""
+        """Serve ``data``, in place, as data block ``number``.
+
+        ConfigError if the number is taken or invalid.
+        """
         if not 1 <= number <= 65535:
             raise ConfigError(f"DB{number}: data blocks are numbered 1 to 65535")
         if (S7Area.DB, number) in self.memory_areas:
@@ -88,7 +91,10 @@ class S7Server(Server):
 
     @property
     def address(self) -> Address:
-        """Where the server listens; with port 0 asked for, the port it was given. ShmioError unless started."""
+        """The address it listens on, with the real port if port 0 was asked for.
+
+        ShmioError unless started.
+        """
         if self.server_socket is None:
             raise ShmioError("the S7 server is not started")
         host, port = self.server_socket.getsockname()[:2]
@@ -112,7 +118,7 @@ class S7Server(Server):
         try:
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind(place)
-            listener.listen()  # as many as may be: who is one too many is told so at once
+            listener.listen()  # the largest backlog: a client too many is refused at once
         except OSError as error:
             listener.close()
             taken = ": another program, maybe a running instance, has it" if error.errno == errno.EADDRINUSE else ""
@@ -126,7 +132,10 @@ class S7Server(Server):
         return 0
 
     def stop(self) -> int:
-        """Close all sockets and wait for all threads. ShmioError if one does not end, which would be a defect."""
+        """Close all sockets and wait for all threads.
+
+        ShmioError if one does not end, which would be a defect.
+        """
         if not self.running:
             return 0
         self.running = False
@@ -175,7 +184,7 @@ class S7Server(Server):
                 client.close()
 
     def _admit(self, client: socket.socket) -> None:
-        """Give the client a thread, if there is room."""
+        """Start a thread for the client, if there is room."""
         address = client.getpeername()
         with self.client_lock:
             if self.client_count >= self.max_clients:
@@ -190,7 +199,7 @@ class S7Server(Server):
 
     def _handle_client(self, client_socket: socket.socket, address: tuple[str, int]) -> None:
         try:
-            with contextlib.suppress(OSError):  # gone in the middle: its own business
+            with contextlib.suppress(OSError):  # the client has gone
                 self._serve(client_socket, address)
         finally:
             with self.client_lock:  # waits for _admit to have entered it
@@ -200,7 +209,7 @@ class S7Server(Server):
                 client_socket.close()
 
     def _serve(self, client: socket.socket, address: tuple[str, int]) -> None:
-        """Answer one client until it leaves or breaks the protocol. Uses a fixed amount of memory, whatever comes."""
+        """Answer one client until it leaves or breaks the protocol, with a fixed amount of memory."""
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for option, value in _KEEPALIVE.items():
@@ -241,7 +250,10 @@ class S7Server(Server):
             end = left
 
     def _process_request(self, request_data: bytes, client_address: tuple[str, int]) -> bytes | None:
-        """Let python-snap7 answer what it may of what is no read, write or set-up; refuse the rest."""
+        """Let python-snap7 answer what it may apart from read, write and set-up.
+
+        Refuse the rest.
+        """
         protocol, kind, function = request_data[0], request_data[1], request_data[10] if len(request_data) > 10 else 0
         if protocol != PROTOCOL:  # S7comm-plus, say
             return None
@@ -258,9 +270,10 @@ class S7Server(Server):
         return None
 
     def _get_szl_data(self, szl_id: int, szl_index: int) -> bytes | None:
-        """Tell the operating mode as the reference manual of S7-300/400 has it: one record of 20 bytes.
+        """Return the operating mode as in the reference manual of S7-300/400: one record of 20 bytes.
 
-        The mode before, in the same byte, is not told: Snap7's ``Cli_GetPlcStatus`` takes RUN after STOP for STOP.
+        The previous mode, in the same byte, is left out: Snap7's ``Cli_GetPlcStatus`` takes RUN
+        after STOP for STOP.
         """
         if szl_id != _MODE_LIST:
             found: bytes | None = super()._get_szl_data(szl_id, szl_index)

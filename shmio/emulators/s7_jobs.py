@@ -1,8 +1,9 @@
-"""How an emulated S7 controller answers the jobs a client may ask of it: set-up, read, write. No I/O.
+"""Answers a client's jobs like an S7 controller: set-up, read, write. No I/O.
 
-Names and codes follow Wireshark's S7 dissector; behaviour follows an S7-1500: items fail one by one, each with a return
-code of its own, while a job that is wrong as a whole, or whose answer does not fit the PDU, fails with a header error.
-:class:`Traits` makes it grant less, or refuse as a controller does that is not set up for such clients.
+Names and codes follow Wireshark's S7 dissector, behaviour follows an S7-1500. Items fail one by
+one, each with its own return code. A job that is wrong as a whole, or whose answer does not fit the
+PDU, fails with a header error. :class:`Traits` make it grant less, or refuse like a controller that
+is not set up for such clients.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ _AREAS = {int(area): area for area in S7Area}
 
 
 class Fault(Enum):
-    """What keeps clients from the data."""
+    """A setting that keeps clients from the data."""
 
     PUT_GET_OFF = "PUT/GET is not permitted"
     PROTECTED = "the protection level allows no access"
@@ -58,15 +59,15 @@ class Fault(Enum):
 
 @dataclass(frozen=True)
 class Traits:
-    """How an emulated controller differs from a willing S7-1500."""
+    """How an emulated controller differs from a permissive S7-1500."""
 
     max_pdu_size: int = MAX_PDU_SIZE
     """The largest PDU it grants, in bytes."""
     max_jobs: int = 8
-    """The most jobs it grants to be under way at once."""
+    """The most jobs that it grants to be in flight at once."""
     fault: Fault | None = None
     block_size: int | None = None
-    """Bytes that a data block seems to have at most, as one of an older version; None: all."""
+    """The apparent size of data blocks in bytes, as in an older version; None: the real size."""
 
     def __post_init__(self) -> None:
         if not (100 <= self.max_pdu_size <= MAX_PDU_SIZE and 1 <= self.max_jobs <= MAX_JOBS):
@@ -87,9 +88,10 @@ class _Item(NamedTuple):
 
 
 class Memory:
-    """The areas a client can reach, and the one lock that all access to them takes.
+    """The areas that a client can access, with the one lock for all access.
 
-    A single lock, so that neither an answer nor a write of several items ever meets half a program cycle.
+    The single lock ensures that neither an answer nor a write of several items meets half a program
+    cycle.
     """
 
     def __init__(self, areas: Mapping[tuple[S7Area, int], bytearray]) -> None:
@@ -98,7 +100,7 @@ class Memory:
 
 
 class Jobs:
-    """Answers one client's jobs; holds what was agreed with that client."""
+    """Answers one client's jobs, and holds what was agreed with that client."""
 
     def __init__(self, memory: Memory, traits: Traits) -> None:
         self._memory = memory
@@ -106,7 +108,7 @@ class Jobs:
         self.pdu_size = 0  # until set up, no job fits
 
     def answer(self, pdu: memoryview) -> bytes | None:
-        """Answer one S7 PDU of ten or more bytes; None if it is not a job known here."""
+        """Answer one S7 PDU of ten or more bytes; return None if it is not a known job."""
         protocol, kind, reference, parameter_size, data_size = _JOB.unpack_from(pdu)
         if protocol != PROTOCOL or kind != JOB or len(pdu) < 12:
             return None
@@ -199,7 +201,7 @@ def refusal(reference: int, error: int) -> bytes:
 
 
 def acknowledgement(reference: int, parameters: bytes, data: bytes | bytearray = b"") -> bytes:
-    """Build an answer to a job that is right as a whole."""
+    """Build the answer to a job that succeeded as a whole."""
     return _ANSWER.pack(PROTOCOL, 3, 0, reference, len(parameters), len(data), 0) + parameters + data
 
 

@@ -1,4 +1,7 @@
-"""What a declared injection means: its target, its condition, its operation, when it is active. Pure, no I/O."""
+"""The meaning of a declared injection: target, condition, operation and activation.
+
+Pure, no I/O.
+"""
 
 from shmio.injection.program import Program, compile_program
 

@@ -1,6 +1,7 @@
-"""When a declared injection is active: between two times, while a condition holds, or for a while after it came true.
+"""Decides when a declared injection is active: between two times, while a condition holds, or for some time after.
 
-York's metamodel of tests calls these activation at a fixed time, on a condition, on a condition for a limited time.
+York's metamodel of tests calls these activation at a fixed time, on a condition, and on a condition
+for a limited time.
 """
 
 from __future__ import annotations
@@ -10,19 +11,19 @@ from enum import StrEnum
 
 
 class State(StrEnum):
-    """Where a declared injection is in its life."""
+    """The state of a declared injection."""
 
     WAITING = "waiting"
     ACTIVE = "active"
     OVER = "over"
-    """It will not be active again."""
+    """It cannot become active again."""
     LIFTED = "lifted"
-    """Somebody has lifted it, though the configuration still has it."""
+    """It was lifted, but the configuration still has it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Times in ns on the instance's clock; ``for_ns``: how long an activation lasts; ``times``: the most of them."""
+    """Time limits in ns on the instance clock, per activation, and for their number."""
 
     start_ns: int = 0
     end_ns: int | None = None
@@ -32,7 +33,10 @@ class Window:
 
 @dataclass(slots=True)
 class Activation:
-    """The present state; ``runs`` counts activations, ``cycle`` and ``time_ns`` are those of the last one's begin."""
+    """The activation state.
+
+    ``runs`` counts activations; ``cycle`` and ``time_ns`` are when the last one began.
+    """
 
     window: Window
     state: State = State.WAITING
@@ -40,10 +44,17 @@ class Activation:
     cycle: int = 0
     time_ns: int = 0
     met: bool | None = None
-    """Whether it was to be active when it was looked last; None: nobody has looked yet."""
+    """Whether the condition and the window held at the last cycle; None before the first."""
 
     def advance(self, time_ns: int, cycle: int, *, holds: bool) -> bool:
-        """Look at a cycle, with what its condition is (True without one); whether the state has changed."""
+        """Advance to a cycle; return whether the state has changed.
+
+        Args:
+            time_ns: The instance time of the cycle.
+            cycle: The cycle.
+            holds: Whether the condition holds; True without a condition.
+
+        """
         if self.state in (State.OVER, State.LIFTED):
             return False
         before, window = self.state, self.window
@@ -61,10 +72,10 @@ class Activation:
         return self.state is not before
 
     def _begins(self) -> bool:
-        """Whether one whose condition holds becomes active.
+        """Return whether the injection becomes active, given that its condition holds.
 
-        One that lasts for a while does so where its condition comes true; in a process that goes on for another, which
-        does not know what it was before, not at once.
+        With ``for_ns`` it does when the condition becomes true. A restarted process does not know
+        the earlier value of the condition, so there it does not become active at once.
         """
         if self.window.for_ns is None:
             return True

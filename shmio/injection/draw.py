@@ -1,7 +1,8 @@
-"""Random numbers that follow from a seed and from what they are for, whenever and however often they are drawn.
+"""Random numbers that depend only on a seed and their purpose, not on when or how often they are drawn.
 
-They are counter-based: there is no state that an extra frame or a restarted process could shift. The mixing function
-is that of SplitMix64 (Steele, Lea, Flood: "Fast splittable pseudorandom number generators", OOPSLA 2014).
+They are counter-based: there is no state that an extra frame or a restarted process could shift.
+The mixing function is that of SplitMix64 (Steele, Lea, Flood: "Fast splittable pseudorandom number
+generators", OOPSLA 2014).
 """
 
 from __future__ import annotations
@@ -18,7 +19,10 @@ Words = npt.NDArray[np.uint64]
 Floats = npt.NDArray[np.float64]
 
 FEW: Final = 16
-"""Up to so many numbers Python is faster than numpy; they are the same, but for the last bit of a gaussian."""
+"""Up to this count Python is faster than numpy.
+
+Both give the same numbers except a gaussian's last bit.
+"""
 
 _MASK: Final = (1 << 64) - 1
 _GOLDEN: Final = 0x9E3779B97F4A7C15
@@ -26,7 +30,7 @@ _FIRST, _SECOND = 0xBF58476D1CE4E5B9, 0x94D049BB133111EB
 
 
 class Purpose(IntEnum):
-    """What numbers are for; each has its own."""
+    """The purpose of random numbers; each has its own sequence."""
 
     CHANCE = 0
     VALUE = 1
@@ -34,14 +38,17 @@ class Purpose(IntEnum):
 
 
 class SeededRandom:
-    """The numbers of one injection: of the activation ``run`` and, in it, of the cycle or write ``place``."""
+    """The random numbers of one injection.
+
+    ``run`` is the activation, and ``place`` the cycle or write within it.
+    """
 
     def __init__(self, seed: int, name: str) -> None:
-        """``name`` keeps injections with one seed apart."""
+        """Create the generator; ``name`` separates injections with the same seed."""
         self._key = int.from_bytes(hashlib.sha256(f"{seed}/{name}".encode()).digest()[:8], "little")
 
     def words(self, run: int, place: int, purpose: Purpose, count: int) -> Words:
-        """``count`` words of 64 random bits."""
+        """Return ``count`` random words of 64 bits."""
         if count <= FEW:
             return np.array(self._few(run, place, purpose, count), np.uint64)
         base = self._base(run, place, purpose)
@@ -49,13 +56,13 @@ class SeededRandom:
         return _mix_all(counter * np.uint64(_GOLDEN) + np.full(count, base, np.uint64))
 
     def uniform(self, run: int, place: int, count: int, purpose: Purpose = Purpose.VALUE) -> Floats:
-        """Numbers from 0 to below 1."""
+        """Return ``count`` numbers from 0 to below 1."""
         if count <= FEW:
             return np.array([(word >> 11) * 2.0**-53 for word in self._few(run, place, purpose, count)])
         return (self.words(run, place, purpose, count) >> np.uint64(11)).astype(np.float64) * 2.0**-53
 
     def gaussian(self, run: int, place: int, count: int) -> Floats:
-        """Numbers of mean 0 and standard deviation 1 (Box and Muller, 1958)."""
+        """Return ``count`` numbers of mean 0 and standard deviation 1 (Box and Muller, 1958)."""
         if count <= FEW:
             radii = (1 - (word >> 11) * 2.0**-53 for word in self._few(run, place, Purpose.VALUE, count))
             angles = ((word >> 11) * 2.0**-53 for word in self._few(run, place, Purpose.ANGLE, count))
@@ -74,12 +81,12 @@ class SeededRandom:
         return [_mix_word(base + number * _GOLDEN & _MASK) for number in range(1, count + 1)]
 
     def below(self, limit: int, run: int, place: int, count: int) -> npt.NDArray[np.intp]:
-        """Whole numbers from 0 to below a limit of at most 2^32."""
+        """Return ``count`` whole numbers from 0 to below ``limit``, which is at most 2^32."""
         high = self.words(run, place, Purpose.VALUE, count) >> np.uint64(32)
         return (high * np.uint64(limit) >> np.uint64(32)).astype(np.intp)
 
     def happens(self, probability: float, run: int, place: int) -> bool:
-        """Whether something of this probability does, there."""
+        """Return whether an event of this probability happens there."""
         return probability >= 1 or bool(self.uniform(run, place, 1, Purpose.CHANCE)[0] < probability)
 
 

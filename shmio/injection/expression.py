@@ -67,28 +67,37 @@ _EDGES: Final[dict[str, Callable[[Number, Number], bool]]] = {
 
 _Stack = list[Number]
 _Seen = dict[int, Number]
-"""What each edge saw last, by its place in the program."""
+"""The last value of each edge function, by its place in the program."""
 _Step = Callable[[_Stack, Sequence[Number], _Seen], None]
 
 
 @dataclass
 class Memory:
-    """What the edges of one expression saw last; empty: nothing yet, or not everything was known."""
+    """The last values of an expression's edge functions.
+
+    Empty at first, and after a value was unknown.
+    """
 
     seen: _Seen = field(default_factory=dict)
 
 
 class Expression(NamedTuple):
-    """A program for a stack machine; every part of it is evaluated each time, so that no edge is missed."""
+    """A program for a stack machine.
+
+    Every part is evaluated each time, so that no edge is missed.
+    """
 
     steps: tuple[_Step, ...]
     references: tuple[str, ...]
-    """The registers it reads, as written."""
+    """The registers that it reads, as written."""
 
     def holds(self, values: Sequence[Number | None], memory: Memory) -> bool:
-        """Whether it is true of these values, one for each reference; None: it is not known.
+        """Return whether the expression is true; false if a value is unknown, or on a division by zero.
 
-        An expression of which anything is not known, or that divides by zero, is not true.
+        Args:
+            values: One value for each reference; None if it is unknown.
+            memory: The last values of the edge functions.
+
         """
         known = [value for value in values if value is not None]
         stack: _Stack = []
@@ -104,14 +113,14 @@ class Expression(NamedTuple):
 
 
 def parse(text: str) -> Expression:
-    """Read an expression; ConfigError says where it goes wrong."""
+    """Parse an expression; ConfigError names the place of an error."""
     if len(text) > MAX_LENGTH:
         raise ConfigError(f"a condition is at most {MAX_LENGTH} characters long, this has {len(text)}")
     return _Parser(text).whole()
 
 
 class _Parser:
-    """One pass over the tokens, from the loosest binding to the closest."""
+    """A recursive-descent parser, from the loosest binding to the tightest."""
 
     def __init__(self, text: str) -> None:
         self._text = text

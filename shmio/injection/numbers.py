@@ -1,4 +1,4 @@
-"""The numbers and bits of an image at the places of some registers, all of a type at once."""
+"""Reads and writes the values of some registers in an image, all of one type at once."""
 
 from __future__ import annotations
 
@@ -18,30 +18,33 @@ Bytes = npt.NDArray[np.uint8]
 Values = npt.NDArray[Any]
 
 MAX_ELEMENTS: Final = 4096
-"""Single values in one injection; more would be felt by the loop that polls."""
+"""Most single values of one injection; more would slow the poll loop."""
 
 _REAL_LIMIT: Final = float(np.float32(REAL_MAX))
 
 
 @dataclass(frozen=True)
 class ValueGroup:
-    """All single values of one type. ``first``: number of the first among those of the injection."""
+    """All single values of one type.
+
+    ``first`` is the number of the first among those of the injection.
+    """
 
     element: ElementType
     first: int
     index: npt.NDArray[np.intp]
-    """(n, size) places of their bytes in the block; of bits (n,)."""
+    """Offsets of the values' bytes in the block, (n, size); for bits (n,)."""
     shifts: Bytes
-    """Of bits (n,): which of the byte."""
+    """For bits, the bit number within the byte, (n,)."""
     dtype: np.dtype[Any]
-    """As the controller has it; of kind V if it is no number."""
+    """The type as in the controller; of kind V if it is not a number."""
 
     def __len__(self) -> int:
         return len(self.index)
 
     @cached_property
     def limits(self) -> tuple[Any, Any]:
-        """The least and the greatest number, as the type that is calculated in."""
+        """The least and the greatest number, in the type used for calculations."""
         if self.dtype.kind == "f":
             most = _REAL_LIMIT if self.dtype.itemsize == 4 else float(np.finfo(np.float64).max)
             return -most, most
@@ -49,22 +52,25 @@ class ValueGroup:
         return exact(bounds.min), exact(bounds.max)
 
     def numbers(self, image: Bytes) -> Values:
-        """Their values; those of 64 bits, of which a double would lose some, as long doubles."""
+        """Return the values, 64-bit ones as long doubles because a double would lose digits."""
         exact = np.longdouble if self.dtype.kind in "iu" and self.dtype.itemsize == 8 else np.float64
         return np.ascontiguousarray(image[self.index]).view(self.dtype)[:, 0].astype(exact)
 
     def put_numbers(self, image: Bytes, values: Values) -> None:
-        """Change them; whole numbers are rounded, and what is beyond the type's range is its limit."""
+        """Put numbers into an image, rounded for integers and clamped to the range of the type."""
         least, most = self.limits
         if self.dtype.kind != "f":
             values = np.rint(values)
-            if self.dtype.itemsize == 8:  # its limits are no doubles
+            if self.dtype.itemsize == 8:  # its limits are not exact as doubles
                 values = values.astype(np.longdouble)
         fitting = np.minimum(np.maximum(values, least), most).astype(self.dtype)
         image[self.index] = fitting.view(np.uint8).reshape(self.index.shape)
 
     def put(self, image: Bytes, table: Bytes, choice: npt.NDArray[np.intp]) -> None:
-        """Give each the one of a table's (k, size) values that is chosen (n,) for it; of bits, values are 0 or 1."""
+        """Put values from a table (k, size) into an image, each as ``choice`` (n,) says.
+
+        Bits are 0 or 1.
+        """
         if self.element.base != "BOOL":
             image[self.index] = table[choice]
             return
@@ -78,7 +84,12 @@ class ValueGroup:
 
 
 def places(registers: Iterable[Register], byte_order: ByteOrder) -> list[ValueGroup]:
-    """The single values of registers and arrays, by type. ValueError: there are more than MAX_ELEMENTS."""
+    """Return the single values of registers and arrays, grouped by type.
+
+    Raises:
+        ValueError: There are more than MAX_ELEMENTS.
+
+    """
     found: dict[ElementType, list[tuple[int, int]]] = {}
     count = 0
     for register in registers:
@@ -102,7 +113,7 @@ def places(registers: Iterable[Register], byte_order: ByteOrder) -> list[ValueGr
 
 
 def number_type(element: ElementType, byte_order: ByteOrder) -> np.dtype[Any]:
-    """The numpy type of a number as the controller has it; of kind V: the type is none, or has values that are none."""
+    """Return the numpy type of a number as in the controller; of kind V if it is not a number."""
     plain = "" if element.base == "BOOL" else scalar_codec(element, byte_order).plain
     kind = _NUMPY.get(plain, f"V{element.size}")
     return np.dtype(("<" if byte_order == "little" else ">") + kind)
@@ -113,4 +124,4 @@ _NUMPY: Final = {
 }  # fmt: skip
 
 Change = Callable[[ValueGroup, Values], Values]
-"""From the values of places to what they become."""
+"""Computes new values from the old ones."""

@@ -1,7 +1,7 @@
-"""What an injection makes of the bits it covers: the table of operations, docs/reference/injections.md.
+"""The operations of declared injections: the table in docs/reference/injections.md.
 
-An operation works on images of the whole block, (size,) of uint8. What it holds begins anew with each activation, and
-looking at a cycle twice changes nothing.
+An operation works on images of the whole block, (size,) of uint8. Its state starts anew with each
+activation, and applying it twice in a cycle gives the same result.
 """
 
 from __future__ import annotations
@@ -18,11 +18,14 @@ from shmio.injection.numbers import Bytes, Change, ValueGroup
 
 MAX_DELAY_CYCLES: Final = 10_000
 MAX_DELAY_BYTES: Final = 16_000_000
-"""The most that the images held by one delay take."""
+"""Most memory for the images that one delay holds."""
 
 
 class OperationContext(NamedTuple):
-    """Which image: in the activation ``run`` that of ``place``, its cycles (over ``/in``: its writes) so far."""
+    """Identifies an image.
+
+    ``run`` is the activation, and ``place`` the number of the cycle or write within it.
+    """
 
     run: int
     place: int
@@ -31,20 +34,20 @@ class OperationContext(NamedTuple):
 
 
 class Operation(ABC):
-    """One operation, as it goes on."""
+    """One operation with its state."""
 
     def begin(self) -> None:  # noqa: B027  most hold nothing
-        """An activation begins: forget what was held."""
+        """Forget all state, because an activation begins."""
 
     @abstractmethod
     def apply(self, image: Bytes, at: OperationContext) -> None:
-        """Change the image in place; what is not covered may change, too: the caller takes what is."""
+        """Change the image in place. The caller keeps only the covered bits."""
 
     def passed(self, image: Bytes, at: OperationContext) -> None:  # noqa: B027  most need not know
-        """Told instead of :meth:`apply`: by chance this image stays as it is."""
+        """Called instead of :meth:`apply` if by chance this image stays unchanged."""
 
     def resume(self, image: Bytes) -> None:  # noqa: B027
-        """Go on for a process before this one, which showed this image last."""
+        """Continue for a previous process, which published this image last."""
 
 
 class Fixed(Operation):
@@ -71,7 +74,7 @@ class Arithmetic(Operation):
 
 
 class Noise(Operation):
-    """``noise``: to each number another random one is added."""
+    """``noise``: adds a random number to each number."""
 
     def __init__(self, places: Sequence[ValueGroup], draw: SeededRandom, amplitude: float, *, gaussian: bool) -> None:
         self._places = places
@@ -92,7 +95,7 @@ class Noise(Operation):
 
 
 class RandomRange(Operation):
-    """``random`` from a range, both ends included for whole numbers."""
+    """``random`` from a range; for whole numbers both ends are included."""
 
     def __init__(self, places: Sequence[ValueGroup], draw: SeededRandom, least: float, most: float) -> None:
         self._places = places
@@ -116,7 +119,7 @@ class RandomChoice(Operation):
     """``random`` from a set."""
 
     def __init__(self, tables: Sequence[tuple[ValueGroup, Bytes]], draw: SeededRandom) -> None:
-        """``tables``: places with the values (k, size) to choose from."""
+        """Create it; ``tables`` holds the values (k, size) to choose from for each group."""
         self._tables = tables
         self._draw = draw
 
@@ -128,17 +131,17 @@ class RandomChoice(Operation):
 
 
 class Freeze(Operation):
-    """``freeze``: the first values since the activation are held."""
+    """``freeze``: holds the first values of the activation."""
 
     def __init__(self) -> None:
         self._held: Bytes | None = None
 
     def begin(self) -> None:
-        """Hold what comes next."""
+        """Hold the next values."""
         self._held = None
 
     def resume(self, image: Bytes) -> None:
-        """Hold what that one did."""
+        """Hold the values that the previous process held."""
         self._held = image.copy()
 
     def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: ARG002, D102
@@ -148,9 +151,9 @@ class Freeze(Operation):
 
 
 class Drop(Operation):
-    """``drop`` over ``/out``: the cycle's values are lost, consumers keep those of the cycle before.
+    """``drop`` over ``/out``: the values of a cycle are lost, and consumers keep those of the cycle before.
 
-    Which cycles are lost is decided by who calls; it tells of the others by :meth:`passed`.
+    The caller decides which cycles are lost, and reports the others by :meth:`passed`.
     """
 
     def __init__(self) -> None:
@@ -158,15 +161,15 @@ class Drop(Operation):
         self._passing: tuple[int, Bytes] | None = None
 
     def begin(self) -> None:
-        """What comes next is shown, for there is nothing before it."""
+        """Forget the held values; the next ones are shown because there are none before them."""
         self._held = self._passing = None
 
     def resume(self, image: Bytes) -> None:
-        """Keep what consumers have seen."""
+        """Hold the values that consumers saw last."""
         self._held = image.copy()
 
     def passed(self, image: Bytes, at: OperationContext) -> None:
-        """A cycle that is not lost."""
+        """Take a cycle that is not lost."""
         self._settle(at.cycle)
         self._passing = at.cycle, image.copy()
 
@@ -177,26 +180,33 @@ class Drop(Operation):
         image[:] = self._held
 
     def _settle(self, cycle: int) -> None:
-        """What an earlier cycle has shown is what is kept; of one cycle several images may come."""
+        """Hold what an earlier cycle showed; a cycle may have several images."""
         if self._passing is not None and self._passing[0] != cycle:
             self._held, self._passing = self._passing[1], None
 
 
 class Delay(Operation):
-    """``delay`` over ``/out``: consumers see what was delivered a time, or so many cycles, before.
+    """``delay`` over ``/out``: consumers see what was delivered some time or cycles earlier.
 
     Until that time has passed since the activation they see its first values.
     """
 
     def __init__(self, size: int, delay_ns: int, cycles: int) -> None:
-        """``size``: bytes of an image; of ``delay_ns`` and ``cycles`` the other one is 0."""
+        """Create the delay.
+
+        Args:
+            size: Size of an image in bytes.
+            delay_ns: The delay in ns; 0 if it is in cycles.
+            cycles: The delay in cycles; 0 if it is in ns.
+
+        """
         self.delay_ns = delay_ns
         self.cycles = cycles
         self._most = max(2, MAX_DELAY_BYTES // max(1, size))
         self._line: deque[tuple[int, int, Bytes]] = deque()
 
     def begin(self) -> None:
-        """The line is empty."""
+        """Forget all images."""
         self._line.clear()
 
     def apply(self, image: Bytes, at: OperationContext) -> None:  # noqa: D102
@@ -210,15 +220,18 @@ class Delay(Operation):
         image[:] = self._line[0][2]
 
     def due(self, cycle: int, time_ns: int, at: OperationContext) -> bool:
-        """Whether what came then is to be seen by now."""
+        """Return whether an image of that cycle and time is to be shown by now."""
         return at.cycle - cycle >= self.cycles if self.cycles else at.time_ns - time_ns >= self.delay_ns
 
 
 class Flip(Operation):
-    """``flip``: bits are turned over, the given ones, or a random one of all that are covered."""
+    """``flip``: inverts the given bits, or a random one of all covered bits."""
 
     def __init__(self, mask: Bytes | None, cover: Bytes, draw: SeededRandom) -> None:
-        """``mask``: the bits to turn; None: a random one of ``cover`` in each cycle or write."""
+        """Create it.
+
+        ``mask`` has the bits to invert, or is None for a random bit of ``cover`` each time.
+        """
         self._mask = mask
         self._draw = draw
         self._places = np.flatnonzero(np.unpackbits(cover, bitorder="little"))

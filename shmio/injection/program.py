@@ -1,4 +1,4 @@
-"""From a declaration to what runs: registers found, values encoded, the condition read; or what is wrong with it."""
+"""Compiles declarations: finds their registers, encodes their values and parses their conditions."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ NS: Final = 1_000_000_000
 MAX_REFERENCES: Final = 64
 
 Operate = Callable[[SeededRandom], Operation]
-"""Makes the operation as it begins, with what it draws from."""
+"""Creates the operation with its source of random numbers."""
 
 
 @dataclass(frozen=True)
 class Condition:
-    """An expression, and for each of its references where its value is: source and codec."""
+    """An expression, with the source and the codec of each of its references."""
 
     expression: Expression
     reads: tuple[tuple[str, RegisterCodec], ...]
@@ -58,7 +58,7 @@ NEVER: Final = Condition(parse("false"), ())
 
 @dataclass(frozen=True)
 class Program:
-    """A declared injection, ready to run in its source's process."""
+    """A declared injection, compiled to run in its source's process."""
 
     declaration: Declaration
     source: str
@@ -70,15 +70,22 @@ class Program:
 
     @property
     def foreign(self) -> frozenset[str]:
-        """The other sources whose values its condition reads."""
+        """The other sources whose values the condition reads."""
         reads = self.condition.reads if self.condition else ()
         return frozenset(source for source, _ in reads if source != self.source)
 
 
 def compile_program(declaration: Declaration, layouts: Mapping[str, Layout], periods_ns: Mapping[str, int]) -> Program:
-    """Find everything that a declaration names. ``periods_ns``: of each source.
+    """Compile a declaration: find everything that it names.
 
-    ConfigError: what it says cannot be; the message begins with the key.
+    Args:
+        declaration: The declared injection.
+        layouts: The layout of each source.
+        periods_ns: The period of each source, in ns.
+
+    Raises:
+        ConfigError: The declaration is wrong. The message begins with the key.
+
     """
     texts = [declaration.target] if isinstance(declaration.target, str) else declaration.target
     try:
@@ -98,7 +105,12 @@ def compile_program(declaration: Declaration, layouts: Mapping[str, Layout], per
 
 
 def compile_condition(text: str, layouts: Mapping[str, Layout]) -> Condition:
-    """Read a condition and find its registers; ConfigError, whose message begins with the key ``when``."""
+    """Parse a condition and find its registers.
+
+    Raises:
+        ConfigError: The condition is wrong. The message begins with the key ``when``.
+
+    """
     try:
         expression = parse(text)
         if len(expression.references) > MAX_REFERENCES:
@@ -139,7 +151,10 @@ def _set(declaration: Declaration, target: Target, layout: Layout, _period_ns: i
 
 
 def _encode(value: Any, key: str, register: Register, layout: Layout, image: bytearray) -> None:
-    """Put a value of the configuration into an image; ConfigError: it is none of the register's."""
+    """Put a value of the configuration into an image.
+
+    ConfigError if it does not fit the register.
+    """
     try:
         if isinstance(value, str) and (register.dims or wire_type(register) != "string"):
             try:
@@ -194,7 +209,7 @@ def _random(declaration: Declaration, target: Target, layout: Layout, _period_ns
 
 
 def _table(values: list[Any], element: ElementType, layout: Layout) -> Bytes:
-    """The values encoded for one type, (k, size)."""
+    """Encode the values for one type, (k, size)."""
     register = Register(element.name, element.name, (), 0, 0 if element.base == "BOOL" else None, element.size, 1)
     rows = []
     for index, value in enumerate(values):
@@ -264,7 +279,7 @@ def _places(target: Target, layout: Layout) -> list[ValueGroup]:
 
 
 def _numbers(declaration: Declaration, target: Target, layout: Layout) -> list[ValueGroup]:
-    """The places of numbers; ConfigError: something else is among them."""
+    """Return the values of a target of numbers; ConfigError if it covers something else."""
     for register in target.registers:
         if register.type == "BOOL" or not scalar_codec(register.element).plain:
             kinds = "numbers: REAL, LREAL, " + ", ".join(sorted(INTEGERS)) + ", TIME, LTIME"

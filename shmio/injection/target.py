@@ -1,6 +1,6 @@
-"""What an injection is laid over, and what a condition reads: registers, and parts of them.
+"""Finds the registers that an injection covers and that a condition reads.
 
-A target is a topic's path, parts of registers included, a pattern, a structure or a whole source.
+A target is the path of a topic or a part of a register, a pattern, a structure or a whole source.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from shmio.layout.topic import Direction, look_up, parse_topic
 from shmio.layout.values.write import bits_of, chosen
 
 MAX_REGISTERS: Final = 4096
-"""Registers and elements in one target."""
+"""Most registers and elements in one target."""
 
 
 class Target(NamedTuple):
-    """Registers of one source, in one direction, none of them twice; ``cover``: their bits in the block."""
+    """Distinct registers of one source in one direction. ``cover`` has their bits in the block."""
 
     source: str
     direction: Direction
@@ -27,9 +27,12 @@ class Target(NamedTuple):
 
 
 def resolve(texts: Iterable[str], layouts: Mapping[str, Layout]) -> Target:
-    """The target that these name together; patterns, structures and whole sources are allowed.
+    """Return the target that several texts name together; patterns, structures and sources are allowed.
 
-    PathError: no such register; more than one source or direction; the same bits twice; too much.
+    Raises:
+        PathError: There is no such register, more than one source or direction, an overlap, or too
+            many registers.
+
     """
     found: list[tuple[str, Direction, Register]] = []
     for text in texts:
@@ -57,7 +60,10 @@ def resolve(texts: Iterable[str], layouts: Mapping[str, Layout]) -> Target:
 
 
 def single(text: str, layouts: Mapping[str, Layout]) -> tuple[str, Register]:
-    """The source and the one register, element or part that a text names; PathError."""
+    """Return the source and the single register, element or part that a text names.
+
+    PathError if there is none.
+    """
     topic = parse_topic(text, layouts, _default(layouts))
     if topic.direction == "in":
         raise PathError(f"{text}: a condition reads what comes out of a source; leave out /in")
@@ -72,10 +78,10 @@ def _registers(text: str, layouts: Mapping[str, Layout]) -> Iterator[tuple[str, 
     for register in chosen(layout, topic.path or "**"):
         yield topic.source, direction, register
         count += 1
-        if count > MAX_REGISTERS:  # resolve() says so
+        if count > MAX_REGISTERS:  # resolve() reports it
             return
     if not count:
-        look_up(layout, topic)  # its error tells what is near
+        look_up(layout, topic)  # its error suggests similar names
         raise PathError(f"{text} names no register")
 
 

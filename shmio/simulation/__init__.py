@@ -1,7 +1,8 @@
 """Simulation models: small classes that compute a source's registers step by step. Pure; no I/O, no segment.
 
-A model declares what it reads and what it computes, and says in ``step`` how: docs/how-to/write-a-model.md shows one.
-``ModelRunner`` runs it on the image of a block, ``ServedModel`` for an instance elsewhere.
+A model declares what it reads and computes, and computes it in ``step``: see
+docs/how-to/write-a-model.md. ``ModelRunner`` runs it on the image of a block, ``ServedModel`` for
+an instance elsewhere.
 """
 
 from shmio.simulation.declarations import InOut, Input, Output, Parameter

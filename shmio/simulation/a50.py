@@ -73,19 +73,19 @@ CONVEYING = {10, 150}
 
 
 class Actuator(NamedTuple):
-    """A pneumatic drive: one valve, two limit switches."""
+    """A pneumatic drive with one valve and two limit switches."""
 
     name: str
     travel_s: float
     spans: tuple[tuple[float, float], ...]
-    """Times in a cycle at which the valve opens (the drive extends) and closes (it retracts)."""
+    """Times in a cycle, in s, at which the valve opens and closes; open extends the drive."""
 
     def valve(self, phase_s: float) -> bool:
-        """Whether the valve is open."""
+        """Return whether the valve is open."""
         return any(extend_s <= phase_s < retract_s for extend_s, retract_s in self.spans)
 
     def switches(self, phase_s: float) -> int:
-        """Limit switches: bit 0 extended, bit 1 retracted; neither on the way."""
+        """Return the limit switches: bit 0 extended, bit 1 retracted; neither during travel."""
         travel_s = self.travel_s
         extended = any(extend_s + travel_s <= phase_s < retract_s for extend_s, retract_s in self.spans)
         away = any(extend_s <= phase_s < retract_s + travel_s for extend_s, retract_s in self.spans)
@@ -129,7 +129,10 @@ _AT_UNIT: Pose = (-64.0, -69.0, 117.0, -9.0, 43.0, 74.0)
 
 
 def _carry(begin_s: float, to: tuple[Pose, Pose], away: tuple[Pose, Pose], slow: float) -> list[tuple[float, Pose]]:
-    """Keys of: from home to the part, hold it, to its place, let go, home. ``slow`` stretches the times."""
+    """Return the keys of a transfer: pick up the part, put it down, return home.
+
+    ``slow`` stretches the times.
+    """
     at = ((0, HOME), (1.5, to[0]), (2.3, to[1]), (2.8, to[1]), (3.5, to[0]), (5.2, away[0]), (5.9, away[1]),
           (6.3, away[1]), (7.0, away[0]), (8.0, HOME))  # fmt: skip
     return [(begin_s + time_s * slow, pose) for time_s, pose in at]
@@ -186,7 +189,7 @@ _AXES: Final = {f"Axs{axis}_Pos": "REAL" for axis in range(1, 7)}
 class _CellState(NamedTuple):
     time_s: float
     phase_s: float
-    """Time in the cell's cycle, which stands still on hold."""
+    """Time in the cell's cycle, in s; it stops while the cell is paused."""
     cycles: int
     step: int
     hold: bool
@@ -196,7 +199,10 @@ class _CellState(NamedTuple):
 
 
 class A50Cell(Model):
-    """The cell, its controller's program included: the signals of DB201, on a layout of its own or on ``db201.db``."""
+    """The cell and its controller's program: the signals of DB201.
+
+    It runs on its own layout or on ``db201.db``.
+    """
 
     inputs = InOut("ARRAY[0..999] OF BYTE", path="Inputs", comment="plant to controller")
     outputs = InOut("ARRAY[0..1099] OF BYTE", path="Outputs", comment="controller to plant; orders to the controller")
@@ -207,12 +213,12 @@ class A50Cell(Model):
     robot_850 = Output(_AXES, path="Robot_850", unit="deg")
 
     def start(self) -> None:
-        """Begin a cycle."""
+        """Start a cycle."""
         self._held_s = 0.0
-        self._cell_s: float | None = None  # the cell's own time, which stands still on hold
+        self._cell_s: float | None = None  # the cell's own time, which stops while it is paused
 
     def step(self, time_s: float, dt_s: float) -> None:  # noqa: ARG002  all follows from the time
-        """Put axes, inputs and outputs of this time in their places; what follows them stays as it was written."""
+        """Compute axes, inputs and outputs. The bytes behind them keep what was written."""
         inputs, outputs = self.inputs.commanded, self.outputs.commanded
         hold, opened, closed = _ORDERS.unpack_from(outputs, _OUTPUTS.size)
         hold &= 1
@@ -247,7 +253,7 @@ class A50Cell(Model):
 
 
 def _inputs(now: _CellState) -> bytes:
-    heartbeat = _beat(now.time_s - 0.04)  # comes back after the plant's own delay
+    heartbeat = _beat(now.time_s - 0.04)  # returned after the plant's delay
     phase_s = now.phase_s
     trolley_mm = 3000 * (smooth(phase_s / STEPS[10]) + smooth((phase_s - BEGINS[150]) / STEPS[150]))
     conveying = now.step in CONVEYING and not now.hold
@@ -285,7 +291,7 @@ def _beat(time_s: float) -> bool:
 
 
 def _drive(actuator: Actuator, phase_s: float, opened: int, closed: int) -> tuple[bool, int]:
-    """Valve and limit switches; an order puts the drive at its end at once, for nobody knows when it was given."""
+    """Return valve and limit switches. An order moves the drive to its end at once."""
     if closed:
         return False, 0b10
     if opened:
@@ -298,7 +304,7 @@ def _bits(*flags: bool) -> int:
 
 
 def _load(test_s: float, scale: float) -> tuple[int, int]:
-    """Torque in 0.1 Nm and speed in 1/min of a test unit: run up, hold under a swelling load, run down."""
+    """Return torque in 0.1 Nm and speed in 1/min of a test unit during the test."""
     duration_s = STEPS[80]
     share = smooth(test_s / 2) * smooth((duration_s - test_s) / 2)
     torque_nm = share * (85 + 30 * math.sin(2 * math.pi * test_s / 3))

@@ -1,4 +1,4 @@
-"""What a model declares: its inputs, outputs, registers that are both, and parameters."""
+"""What a model declares: inputs, outputs, in-out registers and parameters."""
 
 from __future__ import annotations
 
@@ -17,15 +17,16 @@ if TYPE_CHECKING:
 
 
 class Declaration:
-    """One thing that a model declares: in the class it is this object, in a model its value.
+    """One declaration of a model. On the class it is this object, on a model its value.
 
-    A single register's value is a bool, int, float or str, as ``shmio.layout.values.scalar`` tabulates; an array's is a
-    tuple, of tuples for several dimensions, but a row of BYTE is bytes. A structure's is a dict of its members' values;
-    setting one changes the members that it names.
+    The value of a single register is a bool, int, float or str, see ``shmio.layout.values.scalar``.
+    An array's is a tuple, of tuples for several dimensions; a one-dimensional array of BYTE is
+    bytes. A structure's is a dict of its members' values; setting it changes the members that are
+    named.
     """
 
     kind: ClassVar[str]
-    """What it is called in messages."""
+    """The name of the kind in messages."""
 
     def __init__(
         self,
@@ -36,12 +37,17 @@ class Declaration:
         unit: str = "",
         comment: str = "",
     ) -> None:
-        """Declare it; what is wrong is said by ModelError when the class is made.
+        """Declare a value. Errors are raised as ModelError when the class is created.
 
-        ``type``: as a tag table has it: ``LREAL``, ``STRING[20]``, ``ARRAY[1..8] OF BOOL``, ``SafetyZone``; or, for a
-        structure of your own, those of its members by name. ``initial``: the value it begins with, default: that of the
-        type; of an array one flat list, of a structure a dict. ``path``: of the register, default: the attribute's
-        name. ``unit`` and ``comment`` go into the layout.
+        Args:
+            type: The type as in a tag table: ``LREAL``, ``STRING[20]``, ``ARRAY[1..8] OF BOOL``,
+                ``SafetyZone``; or the types of a structure's members, by name.
+            initial: The initial value; default: that of the type. For an array a flat list, for a
+                structure a dict.
+            path: The path of the register; default: the attribute's name.
+            unit: The unit, for the layout.
+            comment: The comment, for the layout.
+
         """
         self.type = type
         self.initial = initial
@@ -62,18 +68,21 @@ class Declaration:
 
     @cached_property
     def members(self) -> Mapping[str, str] | None:
-        """The types of a structure's members, by their paths in it; None: it is no structure. ValueRangeError."""
+        """The types of a structure's members, by their paths in it.
+
+        None if it is not a structure.
+        """
         return members(self.type) if isinstance(self.type, str) else self.type
 
     @cached_property
     def paths(self) -> Mapping[str, str]:
-        """The path of each register it stands for, by the member's; of one that is no structure under ``""``."""
+        """The path of each register by its member; a single register is under ``""``."""
         inside = {"": ""} if self.members is None else {member: f"/{member}" for member in self.members}
         return {member: canonical_path(self.path + end) for member, end in inside.items()}
 
     @property
     def tags(self) -> Mapping[str, object]:
-        """The entries of a tag table that it stands for; ValueRangeError: the type is none."""
+        """The entries for a tag table; ValueRangeError for an invalid type."""
         if self.members is None:
             return {self.path: self._tag(self.type, self.initial)}
         initial = self.initial or {}
@@ -87,13 +96,16 @@ class Declaration:
 
 
 class Input(Declaration):
-    """A register that others write, or that a connection fills; the model reads it."""
+    """A register that others write or a connection fills. The model reads it."""
 
     kind = "an input"
 
 
 class Parameter(Declaration):
-    """A value that the configuration may give, under the attribute's name; it is no register, and never changes."""
+    """A constant that the configuration may set under the attribute's name.
+
+    It is not a register.
+    """
 
     kind = "a parameter"
 
@@ -102,7 +114,7 @@ class Parameter(Declaration):
 
 
 class Output(Declaration):
-    """A register that the model computes, and nobody writes. It keeps its value until the model sets another."""
+    """A register that only the model writes. It keeps its value until the model sets another."""
 
     kind = "an output"
 
@@ -111,7 +123,7 @@ class Output(Declaration):
 
 
 class InOut(Declaration):
-    """A register with two ends: what others write to it, and what the model makes of that. See :class:`Ends`."""
+    """A register that others command and the model computes. See :class:`Ends`."""
 
     kind = "an in-out register"
 
@@ -123,7 +135,7 @@ class InOut(Declaration):
 
 
 def place_declarations(model: str, declarations: Iterable[Declaration]) -> Layout:
-    """Place what a model declares as a tag table does; ModelError names the model and all that is wrong."""
+    """Place declarations like a tag table; ModelError names the model and all errors."""
     tags: dict[str, object] = {}
     for declaration in declarations:
         try:

@@ -1,4 +1,4 @@
-"""What went wrong in a model's code, in one line."""
+"""Explains in one line what went wrong in a model's code."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from shmio.logs import printable
 
 
 def explain(error: BaseException, module: str) -> str:
-    """Say what was raised, and at which line: the innermost one of the module, else of all."""
+    """Return what was raised and at which line, preferring a line of the module."""
     if isinstance(error, SyntaxError) and error.filename:
         return _line(f"{error.msg} ({Path(error.filename).name}, line {error.lineno})")
     frames = list(traceback.walk_tb(error.__traceback__))

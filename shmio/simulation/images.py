@@ -1,4 +1,4 @@
-"""The two images of a block whose registers a model computes: what is commanded, and what is shown."""
+"""The two images of a block whose registers a model computes: the commanded and the shown one."""
 
 from __future__ import annotations
 
@@ -14,14 +14,22 @@ from shmio.layout.values.write import Write, apply, covering
 
 
 class Images:
-    """Both images of one block, first with its initial values. The model computes outputs and what in-outs show.
+    """Both images of one block, first with its initial values.
 
-    ``commanded``: what others have written to inputs, to the ``/in`` of in-outs, and to registers that the model does
-    not know. ``shown``: what consumers see.
+    ``commanded`` has what others have written to inputs, to the ``/in`` of in-outs, and to
+    registers unknown to the model. ``shown`` is what consumers see. The model computes outputs and
+    the ``/out`` of in-outs.
     """
 
     def __init__(self, layout: Layout, outputs: Sequence[Register], inouts: Sequence[Register] = ()) -> None:
-        """``outputs``: registers that nobody writes; ``inouts``: those with two ends."""
+        """Create the images.
+
+        Args:
+            layout: The layout of the block.
+            outputs: Registers that nobody but the model writes.
+            inouts: Registers that others command and the model computes.
+
+        """
         initial, _ = initial_frame(layout)
         self.commanded, self.shown = bytearray(initial), initial
         self._outputs = tuple(outputs)
@@ -30,17 +38,20 @@ class Images:
         self._all_computed = not self._given.any()
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Command these bytes and bits; of each "" or why it is refused: the model computes it."""
+        """Command bytes and bits.
+
+        Return for each "" or why it is refused, which is that the model computes it.
+        """
         return [self._write(write) for write in writes]
 
     def resume(self, image: bytes) -> None:
-        """Go on from an image: it is what is shown, and what is commanded. LayoutError: it has another size."""
+        """Continue from an image, as commanded and as shown; LayoutError if its size is wrong."""
         if len(image) != len(self.shown):
             raise LayoutError(f"its block has {len(self.shown)} bytes, the image {len(image)}")
         self.shown[:] = self.commanded[:] = image
 
     def with_given(self, image: bytes | bytearray) -> bytes:
-        """An image with what is commanded of all that the model does not compute."""
+        """Return an image with the commanded values of all that the model does not compute."""
         if self._all_computed:
             return bytes(image)
         return (_array(self.commanded) & self._given | _array(image) & ~self._given).tobytes()

@@ -1,4 +1,4 @@
-"""From ``package.module:Class`` to a model."""
+"""Loads a model's class from ``package.module:Class``."""
 
 from __future__ import annotations
 
@@ -15,9 +15,17 @@ from shmio.simulation.model import Model
 
 
 def load(text: str, folder: str | Path | None = None) -> type[Model]:
-    """Import a model's class. ``folder``: where modules are looked for that are not installed, such as the config's.
+    """Import a model's class.
 
-    ConfigError: the text is not as expected, there is no such module or class, the module fails, or it is no model.
+    Args:
+        text: ``package.module:Class``.
+        folder: Where to look for modules that are not installed, such as the folder of the
+            configuration.
+
+    Raises:
+        ConfigError: The text is malformed, the module or class does not exist or fails, or it is
+            not a model.
+
     """
     name, colon, attribute = text.partition(":")
     if not (colon and attribute.isidentifier() and all(part.isidentifier() for part in name.split("."))):
@@ -42,7 +50,7 @@ def _is_model(value: object) -> TypeGuard[type[Model]]:
 
 def _module(name: str, folder: str | Path | None) -> ModuleType:
     if folder is not None and str(folder) not in sys.path:
-        sys.path.append(str(folder))  # last: no file there takes the place of an installed module
+        sys.path.append(str(folder))  # last, so that no file there hides an installed module
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:

@@ -1,6 +1,6 @@
-"""The loop-back model: what is written to a register comes out of it one step later.
+"""The loop-back model: a value written to a register comes out of it one step later.
 
-Its registers are those that existing clients of SimlogAPI try themselves on.
+Existing clients of SimlogAPI test themselves with these registers.
 """
 
 from __future__ import annotations

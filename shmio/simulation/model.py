@@ -1,4 +1,4 @@
-"""What a model is: a class that says what it reads and computes, and how."""
+"""The base class of models: a class that declares its registers and computes them step by step."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ _OWN: Final = frozenset({"declarations", "random", "start", "step"})
 
 
 class Model(ABC):
-    """Base of all models. A ``ModelRunner`` makes, seeds and steps it; its ``__init__`` is not to be overridden.
+    """Base class of all models. ``ModelRunner`` creates, seeds and steps it; do not override ``__init__``.
 
-    Whatever it computes must follow from its inputs, its parameters, its time and ``random`` alone: no clock, no other
-    source of chance, no thread. Then the same steps with the same inputs and seed give the same bytes.
+    What a model computes must depend only on its inputs, its parameters, its time and ``random``:
+    no clock, no other source of randomness, no thread. Then the same steps with the same inputs and
+    seed give the same bytes.
     """
 
     declarations: ClassVar[Mapping[str, Declaration]] = {}
-    """All that this class and those above it declare, by attribute."""
+    """All declarations of this class and its bases, by attribute."""
 
     random: np.random.Generator
-    """The only source of chance, from the source's seed."""
+    """The only source of randomness, seeded with the source's seed."""
 
     def __init_subclass__(cls, **keywords: Any) -> None:
         """Check the declarations; ModelError names the class and what is wrong with them."""
@@ -45,30 +46,51 @@ class Model(ABC):
 
     @final
     def __init__(self, ports: Mapping[str, Port], ends: Mapping[str, Ends], seed: int) -> None:
-        """``ports``: of inputs, outputs and parameters, by attribute; ``ends``: of in-out registers."""
+        """Create the model. ``ModelRunner`` calls this.
+
+        Args:
+            ports: Inputs, outputs and parameters, by attribute.
+            ends: In-out registers, by attribute.
+            seed: The seed of ``random``.
+
+        """
         self._ports = ports
         self._ends = ends
         self.random = np.random.default_rng(seed)
 
     def start(self) -> None:  # noqa: B027  not every model has something to prepare
-        """Prepare; called once, before the first step, with all declared values at hand.
+        """Prepare the model. Called once before the first step; all declared values are available.
 
-        In a process that takes the place of another, registers are as that one showed them last.
+        In a restarted process the registers have the values that the previous one published last.
         """
 
     @abstractmethod
     def step(self, time_s: float, dt_s: float) -> None:
-        """Compute what is shown at ``time_s``, the time of simulation at the end of a step of ``dt_s``."""
+        """Compute the outputs of one step.
+
+        Args:
+            time_s: The simulation time at the end of the step, in s.
+            dt_s: The length of the step, in s.
+
+        """
 
 
 def declared(model: type[Model], *kinds: type[Declaration]) -> list[Declaration]:
-    """What a model declares of these kinds, in the order in which it does."""
+    """Return the model's declarations of these kinds, in the order of declaration."""
     return [declaration for declaration in model.declarations.values() if isinstance(declaration, kinds)]
 
 
 @lru_cache(maxsize=256)
 def layout_of(model: type[Model]) -> Layout:
-    """The layout of the registers that a model declares, placed as those of a tag table; ModelError: it has none."""
+    """Return the layout of the registers that a model declares, placed like those of a tag table.
+
+    Args:
+        model: The model's class.
+
+    Raises:
+        ModelError: The model declares no register.
+
+    """
     registers = declared(model, Input, Output, InOut)
     if not registers:
         raise ModelError(

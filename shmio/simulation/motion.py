@@ -1,4 +1,4 @@
-"""How axes move: along poses at given times, without jerks, and never quite still."""
+"""The motion of axes: along poses at given times, without jerks, and never quite still."""
 
 from __future__ import annotations
 
@@ -13,21 +13,27 @@ _BREATH_SPREAD_S = 0.31  # between neighbouring axes, so that they do not move i
 
 
 def smooth(u: float) -> float:
-    """Go from 0 to 1 as ``u`` does, at rest at both ends, 1.5 times the mean speed in the middle; clamped outside."""
+    """Return a smooth step from 0 to 1: at rest at both ends, clamped outside."""
     u = min(max(u, 0.0), 1.0)
     return u * u * (3 - 2 * u)
 
 
 class Track:
-    """A cyclic path of several axes: from each key pose to the next, all axes starting and stopping together.
+    """A cyclic path of several axes: from each key pose to the next, all axes start and stop together.
 
-    On top of ``smooth`` comes a slow sine, the play of a servo loop, so that an axis at rest changes its value too.
+    A slow sine on top of ``smooth``, the play of a servo loop, changes the value of an axis at rest
+    too.
     """
 
     def __init__(self, keys: Sequence[tuple[float, Pose]], cycle_s: float, breath: float) -> None:
-        """Take key poses with their times in the cycle in s, in order; the last leads to the first of the next cycle.
+        """Create the track.
 
-        ``breath``: amplitude of the sine, in the unit of the axes.
+        Args:
+            keys: Times in the cycle in s with their key poses, in order; the last leads to the
+                first of the next cycle.
+            cycle_s: The length of the cycle in s.
+            breath: The amplitude of the sine, in the unit of the axes.
+
         """
         first_s, first = keys[0]
         self._cycle_s = cycle_s
@@ -36,7 +42,7 @@ class Track:
         self._breath = breath
 
     def rest(self, time_s: float) -> Pose | None:
-        """Return the key pose the axes rest at, None while they are on their way."""
+        """Return the key pose at which the axes rest; None while they move."""
         index, _ = self._place(time_s)
         return self._poses[index] if self._poses[index] == self._poses[index + 1] else None
 
@@ -50,7 +56,7 @@ class Track:
         )
 
     def _place(self, time_s: float) -> tuple[int, float]:
-        """Return the key just passed, and how far the way to the next has gone, 0 to 1."""
+        """Return the index of the last key, and the progress to the next one, 0 to 1."""
         phase_s = (time_s - self._times[0]) % self._cycle_s + self._times[0]
         index = min(bisect_right(self._times, phase_s), len(self._times) - 1) - 1
         begun_s, ends_s = self._times[index], self._times[index + 1]

@@ -1,4 +1,4 @@
-"""A model's hold on the images of its block."""
+"""Gives a model access to its declared values in the images of its block."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NUMBERS: Final = frozenset({int, float, np.float64})
 
 
 class _Run(NamedTuple):
-    """Numbers without a gap between them. ``values``: which of all they are."""
+    """Adjacent numbers. ``values`` says which of all the numbers they are."""
 
     where: slice
     packing: struct.Struct
@@ -27,17 +27,17 @@ class _Run(NamedTuple):
 
 
 class StructureCodec:
-    """Registers that are single numbers: where each goes is worked out once."""
+    """Reads and writes all registers of a structure at once, if each is a single number."""
 
     def __init__(self, names: Sequence[str], runs: Sequence[_Run]) -> None:
-        """``names``: two or more."""
+        """Create the codec for two or more names."""
         self._names = tuple(names)
         self._runs = tuple(runs)
         self._values = itemgetter(*names)
 
     @classmethod
     def of(cls, registers: Mapping[str, Register], byte_order: ByteOrder) -> StructureCodec | None:
-        """That of these, by their names; None: there are not two, or one is no number."""
+        """Return a codec for two or more registers that are all numbers, else None."""
         codes = [_code(register, byte_order) for register in registers.values()]
         if len(codes) < 2 or not all(codes):
             return None
@@ -45,14 +45,14 @@ class StructureCodec:
         return cls(tuple(registers), list(_runs(list(registers.values()), codes, order)))
 
     def read(self, image: bytearray) -> dict[str, Any]:
-        """All values, by name."""
+        """Return all values, by name."""
         found: list[float] = []
         for run in self._runs:
             found += run.packing.unpack_from(image, run.where.start)
         return dict(zip(self._names, found, strict=True))
 
     def write(self, values: Mapping[str, object], image: bytearray) -> bool:
-        """Put them in; False, and nothing is, unless they are all there and each is a number that fits."""
+        """Write all values; return False and write nothing unless all are numbers that fit."""
         try:
             found: Sequence[object] = self._values(values)
             if len(values) != len(self._names) or not _NUMBERS.issuperset(map(type, found)):
@@ -66,7 +66,7 @@ class StructureCodec:
 
 
 def _code(register: Register, byte_order: ByteOrder) -> str:
-    """That of ``struct``; empty: it is no single number."""
+    """Return the code for ``struct``; empty if the register is not a single number."""
     if register.dims or register.type == "BOOL":
         return ""
     return scalar_codec(register.element, byte_order).plain
@@ -88,23 +88,23 @@ _BYTES: Final = (bytes, bytearray)
 
 
 class Port(Protocol):
-    """One declaration in one image."""
+    """Access to one declaration in one image."""
 
     def read(self) -> Any:
-        """The value in the image."""
+        """Return the value in the image."""
 
     def write(self, value: object) -> None:
-        """Put a value into the image; ValueRangeError."""
+        """Put a value into the image; ValueRangeError if it does not fit."""
 
 
 def port_of(path: str, registers: Mapping[str, Register], byte_order: ByteOrder, image: bytearray) -> Port:
-    """The port of a declaration's registers, by their paths in it: a structure, or one register under ``""``."""
+    """Return the port of a declaration: of a structure, or of the one register under ``""``."""
     ports = {member: RegisterPort(register, byte_order, image) for member, register in registers.items()}
     return ports.get("") or StructurePort(path, ports, StructureCodec.of(registers, byte_order), image)
 
 
 class RegisterPort:
-    """A register, or an array's element."""
+    """Access to a register or an array."""
 
     def __init__(self, register: Register, byte_order: ByteOrder, image: bytearray) -> None:
         self._path = register.path
@@ -114,14 +114,14 @@ class RegisterPort:
         self._is_row = register.type == "BYTE" and len(register.dims) == 1
 
     def read(self) -> Any:
-        """The value; an array as tuples, for setting an element of a list would go nowhere."""
+        """Return the value; an array as tuples, because changing a list would have no effect."""
         if self._is_row:
             return bytes(self._image[self._start : self._stop])
         value = self._codec.decode(self._image)
         return _frozen(value) if isinstance(value, list) else value
 
     def write(self, value: object) -> None:
-        """Put a value into the image, or change nothing; numpy's are as good as Python's."""
+        """Put a Python or numpy value into the image, or change nothing if it does not fit."""
         if self._is_row and isinstance(value, _BYTES) and len(value) == self._stop - self._start:
             self._image[self._start : self._stop] = value
             return
@@ -133,19 +133,19 @@ class RegisterPort:
 
 
 class StructurePort:
-    """A structure's registers."""
+    """Access to the registers of a structure."""
 
     def __init__(
         self, path: str, ports: Mapping[str, RegisterPort], bulk: StructureCodec | None, image: bytearray
     ) -> None:
-        """``bulk``: all of them at once, if that can be."""
+        """Create the port; ``bulk`` reads and writes all members at once, if that is possible."""
         self._path = path
         self._ports = ports
         self._bulk = bulk
         self._image = image
 
     def read(self) -> dict[str, Any]:
-        """All members, by path."""
+        """Return all members, by path."""
         if self._bulk is not None:
             return self._bulk.read(self._image)
         return {path: port.read() for path, port in self._ports.items()}
@@ -162,7 +162,7 @@ class StructurePort:
 
 
 class Ends:
-    """The two ends of an in-out register."""
+    """The commanded and the shown value of an in-out register."""
 
     __slots__ = ("_commanded", "_shown")
 
@@ -172,12 +172,12 @@ class Ends:
 
     @property
     def commanded(self) -> Any:
-        """What was written to it last, its ``/in``; before that its initial value."""
+        """The value written to ``/in`` last; at first the initial value."""
         return self._commanded.read()
 
     @property
     def shown(self) -> Any:
-        """What consumers see, its ``/out``: what the model has set last."""
+        """The value of ``/out`` that consumers see, as the model has set it last."""
         return self._shown.read()
 
     @shown.setter

@@ -21,11 +21,11 @@ NOTHING: Final[Mapping[str, object]] = MappingProxyType({})
 
 
 class ModelRunner:
-    """One model at work. Not for several threads at once.
+    """Runs one model. Not thread-safe.
 
-    It keeps two images of the block: what is commanded, which is what others have written to inputs, to the ``/in`` of
-    in-out registers and to registers that the model does not know; and what is shown. Inputs and unknown registers are
-    shown as they are commanded, from the next step on.
+    It keeps two images of the block. The commanded one has what others have written to inputs, to
+    the ``/in`` of in-out registers, and to registers unknown to the model. The shown one is what
+    consumers see. Inputs and unknown registers show their commanded values from the next step on.
     """
 
     def __init__(
@@ -35,10 +35,19 @@ class ModelRunner:
         parameters: Mapping[str, object] = NOTHING,
         seed: int = 0,
     ) -> None:
-        """``layout``: one that has the declared registers, and maybe more; default: that of the declarations.
+        """Create the model.
 
-        ``parameters``: values by the parameters' names. ConfigError, beginning with the key: the layout has not the
-        registers, there is no such parameter, or its value does not fit.
+        Args:
+            model: The model's class.
+            layout: A layout with at least the declared registers; default: the layout of the
+                declarations.
+            parameters: Values of parameters, by name.
+            seed: The seed of the model's randomness.
+
+        Raises:
+            ConfigError: The layout lacks a register, or a parameter is unknown or does not fit. The
+                message begins with the key.
+
         """
         self.name = f"{model.__module__}:{model.__qualname__}"
         self.layout = layout_of(model) if layout is None else layout
@@ -70,22 +79,36 @@ class ModelRunner:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Paths that :meth:`connect` takes."""
+        """The paths that :meth:`connect` takes."""
         return tuple(self._inputs)
 
     @property
     def image(self) -> bytes:
-        """The whole block as it is shown."""
+        """The shown image of the whole block."""
         return bytes(self._images.shown)
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Command these bytes and bits, for the next step; of each "" or why it is refused: the model computes it."""
+        """Command bytes and bits for the next step.
+
+        Args:
+            writes: What to write, in this order.
+
+        Returns:
+            For each write "" or why it is refused, which is that the model computes the register.
+
+        """
         return self._images.write(writes)
 
     def connect(self, values: Mapping[str, object]) -> None:
-        """Command values of inputs by their paths; an input that is left out keeps what it has.
+        """Command inputs. An input without a value keeps the one it has.
 
-        PathError: there is no such input; ValueRangeError: the value does not fit. Those before it are commanded.
+        Args:
+            values: Values by the inputs' paths.
+
+        Raises:
+            PathError: There is no such input. Inputs before it are commanded.
+            ValueRangeError: The value does not fit. Inputs before it are commanded.
+
         """
         for path, value in values.items():
             port = self._inputs.get(path)
@@ -95,16 +118,33 @@ class ModelRunner:
             port.write(value)
 
     def begin(self) -> bytes:
-        """Start the model, unless it is; return the image before the first step. ModelError: its code failed."""
+        """Start the model unless it is started.
+
+        Returns:
+            The image before the first step.
+
+        Raises:
+            ModelError: The model's code failed.
+
+        """
         if not self._started:
             self._run(self._model.start)
             self._started = True
         return self.image
 
     def step(self, time_ns: int, dt_ns: int) -> bytes:
-        """Compute the image at ``time_ns``, ``dt_ns`` after the one before.
+        """Compute one step.
 
-        ModelError: the model's code failed, and the image is still the one before.
+        Args:
+            time_ns: The simulation time at the end of the step, in ns.
+            dt_ns: The length of the step, in ns.
+
+        Returns:
+            The shown image of the whole block.
+
+        Raises:
+            ModelError: The model's code failed. The image is unchanged.
+
         """
         if not self._started:
             self.begin()
@@ -114,14 +154,19 @@ class ModelRunner:
         return self.image
 
     def resume(self, image: bytes) -> None:
-        """Go on from an image: it is what is shown, and what is commanded. LayoutError: it has another size."""
+        """Continue from an image, as commanded and as shown.
+
+        Raises:
+            LayoutError: The image has another size.
+
+        """
         try:
             self._images.resume(image)
         except LayoutError as error:
             raise LayoutError(f"model {self.name}: {error}") from None
 
     def _run(self, call: Callable[..., None], *arguments: float, instead: bytes | None = None) -> None:
-        """Call the model's code; what it had computed when it failed is not shown."""
+        """Call the model's code. If it fails, the shown image is restored."""
         before = self.image if instead is None else instead
         try:
             call(*arguments)
@@ -130,7 +175,10 @@ class ModelRunner:
             raise ModelError(f"model {self.name}: {explain(error, self._model.__module__)}") from error
 
     def _find(self, model: type[Model], declaration: Declaration) -> dict[str, Register]:
-        """The registers of a declaration, by their paths in it; ConfigError: the layout has none, or others."""
+        """Return the registers of a declaration, by their paths in it.
+
+        ConfigError if the layout lacks one.
+        """
         found: dict[str, Register] = {}
         for member, path in declaration.paths.items():
             own = find(layout_of(model), path)
@@ -147,7 +195,10 @@ class ModelRunner:
 
 
 def _parameters(model: type[Model], given: Mapping[str, object]) -> dict[str, Port]:
-    """What a model's parameters are read from; ConfigError: there is no such one, or the value does not fit."""
+    """Return the ports of a model's parameters.
+
+    ConfigError for an unknown name or a wrong value.
+    """
     layout = place_declarations(model.__qualname__, declared(model, Parameter))
     values, _ = initial_frame(layout)
     ports: dict[str, Port] = {}

@@ -1,4 +1,4 @@
-"""A model that is served to an instance elsewhere: the same class that a source of connector "simulation" runs."""
+"""Runs a model for an instance elsewhere, as connector "simulation" runs it here."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from shmio.simulation.runner import NOTHING, ModelRunner
 
 
 class Inputs(Protocol):
-    """What a model is given, by the registers' paths; None: no value."""
+    """The values of inputs, by the registers' paths; None if there is no value."""
 
     @property
     def changed(self) -> Collection[str]:
-        """Paths of what is new."""
+        """The paths of the values that have changed."""
 
     def __contains__(self, path: object, /) -> bool: ...
 
@@ -25,33 +25,43 @@ class Inputs(Protocol):
 
 
 class Source(Protocol):
-    """What a program that has joined a source knows of it, as ``shmio.client.Simulation`` does."""
+    """A source that a program has joined, such as ``shmio.client.Simulation``."""
 
     @property
     def source(self) -> str:
-        """Its name."""
+        """The name of the source."""
 
     @property
     def inputs(self) -> Inputs:
-        """What it gives."""
+        """The values for the model."""
 
     @property
     def outputs(self) -> Mapping[str, Any]:
-        """What it shows, of what is to be computed."""
+        """The present values of the registers that the model computes."""
 
     @property
     def computed(self) -> bool:
-        """Whether a model has computed that."""
+        """Whether a model has computed the outputs already."""
 
 
 class ServedModel:
-    """Computes a source of connector "remote": :meth:`shmio.client.Client.simulate` takes its ``step`` and ``start``.
+    """Computes a source of connector "remote": :meth:`shmio.client.Client.simulate` takes ``step`` and ``start``.
 
-    It goes on from what the source shows, as a model does whose process takes the place of another.
+    It continues from what the source shows, like a model in a restarted process.
     """
 
     def __init__(self, model: type[Model], parameters: Mapping[str, object] = NOTHING, seed: int = 0) -> None:
-        """ConfigError: there is no such parameter, or its value does not fit."""
+        """Create the model.
+
+        Args:
+            model: The model's class.
+            parameters: Values of parameters, by name.
+            seed: The seed of the model's randomness.
+
+        Raises:
+            ConfigError: A parameter is unknown, or its value does not fit.
+
+        """
         self._runner = ModelRunner(model, None, parameters, seed)
         layout = self._runner.layout
         self._outputs = [
@@ -59,11 +69,19 @@ class ServedModel:
         ]
         self._inputs = frozenset(self._runner.inputs)
         self._begun = False
-        self._new: dict[str, None] = {}  # inputs that are to be given
+        self._new: dict[str, None] = {}  # changed inputs that the model has not seen yet
         self._sent: bytes | None = None
 
     def start(self, joined: Source) -> None:
-        """Take what the source shows; again, when it has been joined again. ModelError: it lacks a register."""
+        """Take the present state of the source, each time it is joined.
+
+        Args:
+            joined: The source.
+
+        Raises:
+            ModelError: The source lacks a register of the model.
+
+        """
         for path in self._runner.inputs:
             if path not in joined.inputs:
                 raise ModelError(self._lacks(path, joined, "gives to its model", "leave it out of outputs"))
@@ -80,12 +98,25 @@ class ServedModel:
             self._runner.resume(bytes(image))
 
     def step(self, time_s: float, dt_s: float, inputs: Inputs) -> dict[str, object]:
-        """Have the model compute; the outputs that differ from before. ModelError: its code failed."""
+        """Have the model compute a step.
+
+        Args:
+            time_s: The simulation time at the end of the step, in s.
+            dt_s: The length of the step, in s.
+            inputs: The values of the inputs.
+
+        Returns:
+            The outputs that have changed, by path.
+
+        Raises:
+            ModelError: The model's code failed.
+
+        """
         self._new.update(dict.fromkeys(path for path in inputs.changed if path in self._inputs))
         self._runner.connect({path: value for path in self._new if (value := inputs[path]) is not None})
         self._new.clear()
         image = self._runner.step(round(time_s * 1e9), round(dt_s * 1e9))
-        self._begun = True  # one that has only failed has computed nothing to go on from
+        self._begun = True  # a failed step computes nothing to continue from
         outputs = dict(self._changes(image))
         self._sent = image
         return outputs

@@ -37,19 +37,20 @@ _MORE: Final = {
     "done": "… and {} more: shmio-supervisor logs supervisor -n 500 has them",
     "problems": "… and {} more: shmio-supervisor logs supervisor -n 500 has them",
 }
-"""What stands for the lines left out, by their key; the first are left out first.
+"""The line that replaces the lines left out, by key, in the order in which they are left out.
 
-``kept`` is not among them: 200 processes at most, with names of at most 40 characters, always have room.
+``kept`` is not among them: 200 processes at most, with names of at most 40 characters, always have
+room.
 """
 
 
 def cut(line: str) -> str:
-    """A line of at most ``LINE_CHARS`` characters."""
+    """Return a line of at most ``LINE_CHARS`` characters."""
     return line if len(line) <= LINE_CHARS else line[: LINE_CHARS - 1] + "…"
 
 
 def cut_lines(text: str, most_chars: int) -> str:
-    """A text of several lines with each of them cut, and the last ones left out and counted if there are too many."""
+    """Return a text with long lines cut; lines beyond ``most_chars`` are counted instead."""
     lines = text.split("\n")
     kept: list[str] = []
     for line in map(cut, lines):
@@ -61,7 +62,7 @@ def cut_lines(text: str, most_chars: int) -> str:
 
 
 def shorten(answer: dict[str, object], most_bytes: int) -> dict[str, object]:
-    """The answer with its lines cut, and the last ones of each kind left out and counted until it fits as JSON."""
+    """Return the answer shortened to fit as JSON; lines left out are counted."""
     short = dict(answer)
     told = {key: [cut(line) for line in lines] for key in _MORE if isinstance(lines := answer.get(key), list)}
     short.update(told)
@@ -75,7 +76,7 @@ def shorten(answer: dict[str, object], most_bytes: int) -> dict[str, object]:
 
 
 def _first(lines: list[str], excess: int, more: str) -> list[str]:
-    """The first lines, ``excess`` bytes less of them, or none."""
+    """Return the first lines, at least ``excess`` bytes shorter."""
     excess += len(msgspec.json.encode(more)) + 8  # the number, and a comma
     count = len(lines)
     while count and excess > 0:
@@ -88,17 +89,17 @@ MAX_REQUEST_BYTES: Final = 4096
 MAX_ANSWER_BYTES: Final = 65536
 MAX_CLIENTS: Final = 8
 REQUEST_S: Final = 2.0
-"""Time that a client has to send its request."""
+"""Time in which a client must send its request."""
 TURN_S: Final = 0.5
-"""How often a waiting client looks whether the supervisor still is."""
+"""How often a waiting client checks that the supervisor is alive."""
 CONNECT_S: Final = 0.05
-"""How often it is tried to connect while too many others wait."""
+"""How often to retry while the supervisor has too many clients."""
 _TOO_MANY: Final = "too many control connections at once"
 _CREDENTIALS: Final = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
 
 class _Request(msgspec.Struct, tag_field="do", forbid_unknown_fields=True):
-    """What all requests have in common."""
+    """Base class of requests."""
 
 
 class Stop(_Request, tag="stop"):
@@ -116,36 +117,42 @@ class Reload(_Request, tag="reload"):
 
 
 class Where(_Request, tag="where"):
-    """Tell which configuration the instance follows, since when (ns since 1970), where it logs, and listens."""
+    """Ask for the configuration in force, when it was read, the log folder and addresses."""
 
 
 Request = Stop | Restart | Reload | Where
 
 
 class Answer:
-    """The way back to the client of one request. Answering a client that has gone does nothing."""
+    """The way to answer the client of one request.
+
+    If the client is gone, answering has no effect.
+    """
 
     def __init__(self, server: ControlServer, client: socket.socket) -> None:
         self._server = server
         self._client = client
 
     def ok(self, **values: object) -> None:
-        """Done. Of lists of lines as many are told as there is room for."""
+        """Answer with success. Lists of lines are shortened to fit."""
         self._server.answer(self._client, shorten({"ok": True, **values}, MAX_ANSWER_BYTES - 1))
 
     def error(self, message: str) -> None:
-        """Not done, and why."""
+        """Answer with an error."""
         self._server.answer(self._client, {"error": cut_lines(message, MAX_ANSWER_BYTES // 8)})
 
 
 class ControlServer:
-    """The supervisor's end, driven by its selector: no call here waits for a client.
+    """The supervisor's end of the control socket, driven by its selector; no call waits for a client.
 
-    Keys registered with the selector have a function without arguments as their data.
+    The data of its selector keys are functions without arguments.
     """
 
     def __init__(self, path: str, selector: selectors.BaseSelector, handle: Callable[[Request, Answer], None]) -> None:
-        """Bind; the caller holds the instance, so a socket that is there is a dead supervisor's. ControlError."""
+        """Bind the socket; ControlError if that fails.
+
+        The caller holds the instance, so an existing socket is a dead supervisor's.
+        """
         self._path = path
         self._selector = selector
         self._handle = handle
@@ -179,7 +186,10 @@ class ControlServer:
             self._selector.register(client, selectors.EVENT_READ, lambda: self._receive(client))
 
     def _has_room(self) -> bool:
-        """Whether one more can be served, if need be in place of who has waited longest without a request."""
+        """Return whether one more client can be served.
+
+        If necessary drop the longest silent one.
+        """
         silent = (client for client, (_, deadline) in self._clients.items() if deadline is not None)
         if len(self._clients) >= MAX_CLIENTS and (longest := next(silent, None)):
             self.answer(longest, {"error": _TOO_MANY})
@@ -218,13 +228,13 @@ class ControlServer:
             self._handle(request, Answer(self, client))
 
     def answer(self, client: socket.socket, message: dict[str, object]) -> None:
-        """Send the answer and close; what the socket's buffer cannot take is lost."""
+        """Send the answer and close. What the socket's buffer cannot take is lost."""
         if client in self._clients:
             _send(client, message)
             self._drop(client)
 
     def expire(self) -> None:
-        """Drop those that have not sent a request in time."""
+        """Drop the clients that have not sent a request in time."""
         now = time.monotonic()
         for client, (_, deadline) in list(self._clients.items()):
             if deadline is not None and now > deadline:
@@ -236,7 +246,10 @@ class ControlServer:
         client.close()
 
     def retire(self) -> None:
-        """Remove the socket, which a successor may then make anew; those who wait can still be answered."""
+        """Remove the socket, so that a successor can create it.
+
+        Waiting clients can still be answered.
+        """
         if self._listener.fileno() < 0:
             return
         self._selector.unregister(self._listener)
@@ -255,10 +268,18 @@ class ControlServer:
 def request(
     path: str, message: Request, timeout_s: float, lost: Callable[[], str | None] = lambda: None
 ) -> dict[str, Any]:
-    """Ask the supervisor at ``path`` and return its answer.
+    """Send a request to the supervisor at ``path`` and return its answer.
 
-    ``lost`` is called now and then while waiting: why there is no point in it, or None.
-    ControlError: no such socket, no answer within ``timeout_s`` or ever, or the supervisor's refusal.
+    Args:
+        path: The control socket.
+        message: The request.
+        timeout_s: Longest time to wait.
+        lost: Called from time to time; returns why waiting is useless, or None.
+
+    Raises:
+        ControlError: There is no such socket, no answer within ``timeout_s``, or the supervisor
+            refuses.
+
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
         deadline = time.monotonic() + timeout_s
@@ -287,7 +308,10 @@ def request(
 
 
 def _connect(client: socket.socket, path: str, deadline: float, lost: Callable[[], str | None]) -> None:
-    """Connect, as soon as there is room among those that wait for the supervisor; TimeoutError, ControlError."""
+    """Connect, as soon as there is room among those that wait for the supervisor.
+
+    TimeoutError, ControlError.
+    """
     while True:
         client.settimeout(max(0.001, deadline - time.monotonic()))
         try:

@@ -1,4 +1,4 @@
-"""The processes of an instance: what ``policy`` decides about them is done here."""
+"""The processes of an instance. It carries out the decisions of ``policy``."""
 
 from __future__ import annotations
 
@@ -20,11 +20,14 @@ from shmio.supervisor.reconcile import CurrentProcess, digest
 from shmio.supervisor.states import PHASES, Action, Event, State
 
 TICK_S: Final = 0.1
-"""How often heartbeats are looked at."""
+"""How often heartbeats are checked."""
 
 
 class Fleet:
-    """All processes of a segment, by name. Selector keys of its own have a function without arguments as their data."""
+    """All processes of a segment, by name.
+
+    The data of its selector keys are functions without arguments.
+    """
 
     def __init__(
         self, segment: Segment, selector: selectors.BaseSelector, limits: Limits, modules: Mapping[str, str]
@@ -43,27 +46,30 @@ class Fleet:
 
     @property
     def names(self) -> list[str]:
-        """Names of all."""
+        """The names of all processes."""
         return list(self._managed)
 
     def named(self, name: str) -> ManagedProcess:
-        """The process of this name; KeyError."""
+        """Return the process of this name; KeyError if there is none."""
         return self._managed[name]
 
     @property
     def ranked(self) -> list[tuple[int, policy.Life]]:
-        """Rank and life of each, in the order of iteration."""
+        """Rank and life of each process, in order of iteration."""
         return [(managed.rank, managed.life) for managed in self]
 
     def present(self) -> dict[str, CurrentProcess]:
-        """What there is, for comparing with a plan. One that can never work as configured is not well."""
+        """Return the present processes for comparison with a plan.
+
+        A process in FATAL is not well.
+        """
         return {
             m.name: CurrentProcess(m.slot.kind, m.slot.digest, m.life.state not in (State.STOPPED, State.FATAL))
             for m in self
         }
 
     def assign(self, job: Job) -> None:
-        """Have a process, of which none lives, run this job from its next start on; a new one gets a slot."""
+        """Set the job for a process that does not run; a new process gets a slot."""
         managed = self._managed.get(job.name)
         if managed is None:
             slot = self._segment.processes.add(ProcessSpec(job.name, job.kind))
@@ -76,7 +82,7 @@ class Fleet:
         self._segment.processes.remove(managed.slot)
 
     def adopt(self, managed: ManagedProcess, child: AdoptedProcess) -> None:
-        """Watch a living process that another supervisor has started."""
+        """Supervise a running process of another supervisor."""
         managed.adopt(child)
         self._watch(managed, child)
 
@@ -85,7 +91,7 @@ class Fleet:
         self._apply_all(policy.to_start(self.ranked), Event.START)
 
     def stop_due(self) -> None:
-        """Stop the processes whose turn has come, when all are to be stopped."""
+        """Stop the processes whose turn has come, when all are to stop."""
         self._apply_all(policy.to_stop(self.ranked), Event.STOP)
 
     def _apply_all(self, indices: list[int], event: Event) -> None:
@@ -94,9 +100,9 @@ class Fleet:
             self.apply(managed[index], event)
 
     def look(self, now_ns: int) -> None:
-        """Look at each heartbeat and at each time that is over."""
-        # If the supervisor itself was held up (host suspended, container paused), so were the others: what it did not
-        # live through does not count against them.
+        """Check all heartbeats and time limits."""
+        # If the supervisor itself was paused (host suspended, container paused), so were the others: that time does
+        # not count against them.
         elapsed_ns = min(now_ns - self._ticked_ns, round(2 * TICK_S * 1e9))
         self._ticked_ns = now_ns
         for managed in self:
@@ -109,10 +115,10 @@ class Fleet:
                 self.apply(managed, event, stale_segment.survivor(dying.pid) if dying else "")
 
     def _evict(self, managed: ManagedProcess) -> None:
-        """Kill a process that holds the role and is not ours.
+        """Kill a process that holds the role but is not ours.
 
-        A dead supervisor had started it in its last moment, and it was not there yet when all was taken over. Its end
-        is not waited for: the loop has others to look after.
+        A dead supervisor started it too late to be seen at the take-over. The loop does not wait
+        for its end.
         """
         pid = managed.slot.report.pid
         if managed.child is None or pid in (0, managed.child.pid, managed.evicted_pid):
@@ -126,7 +132,7 @@ class Fleet:
             managed.evicted_pid = pid
 
     def apply(self, managed: ManagedProcess, event: Event, note: str = "") -> None:
-        """Let something happen to a process, and do what follows from it."""
+        """Apply an event to a process, and carry out the resulting action."""
         before = managed.life
         managed.life, action = policy.step(before, event, time.monotonic_ns(), self._limits, note)
         if managed.life == before:

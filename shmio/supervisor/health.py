@@ -1,4 +1,4 @@
-"""The state of the instance: judged by its processes and sources, and told to everybody who wants to know."""
+"""The state of the instance, derived from its processes and sources, and its publication."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from shmio.supervisor.notify import Notifier
 from shmio.supervisor.states import State
 
 QUALITY_S: Final = 0.5
-"""How often the sources' quality is looked at, once the start is over."""
+"""How often the sources' quality is checked after the start."""
 
 
 class Health:
-    """What the segment, the service manager and the log are told about an instance."""
+    """Publishes the state of an instance to the segment, the service manager and the log."""
 
     def __init__(
         self,
@@ -31,7 +31,7 @@ class Health:
         logs: LogFolder,
         on_state: Callable[[InstanceState], None],
     ) -> None:
-        """``on_state`` is told each new state."""
+        """Create it; ``on_state`` is called with each new state."""
         self._segment = segment
         self._fleet = fleet
         self._notifier = notifier
@@ -42,7 +42,7 @@ class Health:
         self._qualities_ns = 0
 
     def look(self) -> list[Quality | None]:
-        """The quality of each source as of now; None: it has no frame."""
+        """Return the present quality of each source; None for a source without a frame."""
         qualities: list[Quality | None] = []
         for block in self._segment.blocks.values():
             try:
@@ -54,7 +54,7 @@ class Health:
         return qualities
 
     def tell(self, now_ns: int, *, started: bool, stopping: bool) -> None:
-        """Publish the state of the instance, which is the supervisor's heartbeat too."""
+        """Publish the state of the instance. This is the supervisor's heartbeat too."""
         note = self._logs.problem(now_ns)
         state = self._assess(now_ns, note) if started and not stopping else InstanceState.STARTING
         if stopping:
@@ -80,7 +80,7 @@ class Health:
         return assess(well, self._qualities, note)
 
     def _weak(self) -> list[str]:
-        """What makes the instance degraded."""
+        """Return the reasons why the instance is degraded."""
         weak = [f"{m.name} is not running" for m in self._fleet if m.life.state is not State.RUNNING]
         weak += [f"{m.name}: {m.complaint}" for m in self._fleet if m.complaint]
         named = zip(self._segment.blocks, self._qualities, strict=True)

@@ -1,4 +1,4 @@
-"""The folder of the log files: what is wrong with it is told by ``status``, for no log can."""
+"""Watches the folder of the log files. ``status`` shows its problems, because no log can."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Final
 from shmio.config.folder import unwritable
 
 LOOK_S: Final = 5.0
-"""How often it is looked at."""
+"""How often the folder is checked."""
 SILENT_S: Final = 15.0
-"""A disk that has not answered for this long is told."""
+"""A disk that does not answer for this long is a problem."""
 
 
 class LogFolder:
-    """Looks now and then whether the folder can be written; in a thread, for a disk may not answer."""
+    """Checks from time to time whether the folder is writable, in a thread as a disk may hang."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -25,14 +25,14 @@ class LogFolder:
         self._found = ""
 
     def problem(self, now_ns: int) -> str:
-        """What is wrong with it, as was seen last; empty: nothing."""
+        """Return the problem found last; empty if there is none."""
         waited_s = 0.0 if self._begun_ns is None else (now_ns - self._begun_ns) / 1e9
         if self._looking is not None and self._looking.is_alive():
             return f"log_dir: {self._folder}: the disk does not answer" if waited_s > SILENT_S else self._found
         if self._begun_ns is None or waited_s >= LOOK_S:
             self._begun_ns = now_ns
             self._looking = threading.Thread(target=self._look, name="log folder", daemon=True)
-            with suppress(RuntimeError):  # the host has no room for a thread: looked at again later
+            with suppress(RuntimeError):  # the host cannot start a thread now: try again later
                 self._looking.start()
         return self._found
 

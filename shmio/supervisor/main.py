@@ -1,4 +1,7 @@
-"""The supervisor: one thread, one selector; ``fleet`` has the processes, ``reload`` brings them to a plan."""
+"""The supervisor: one thread, one selector.
+
+``fleet`` has the processes, ``reload`` changes them to match a plan.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,7 @@ from shmio.supervisor.takeover import take_over
 
 @contextmanager
 def wake_on_signals(selector: selectors.BaseSelector, on_signal: Callable[[int], None]) -> Iterator[None]:
-    """Have ``on_signal`` called for SIGINT, SIGTERM and SIGHUP from the selector's loop.
+    """Call ``on_signal`` from the selector's loop for SIGINT, SIGTERM and SIGHUP.
 
     SIGHUP counts unless it is ignored, as by nohup.
     """
@@ -68,7 +71,7 @@ def _wake(_number: int, _frame: FrameType | None) -> None:
 START_TICK_S: Final = 0.01
 """How often it is looked while a process starts: its report has no bell to ring."""
 MAX_ADDRESSES: Final = 16
-"""Of more that one process listens on, a request is told these."""
+"""Most listening addresses of a process in an answer."""
 NAME_S: Final = 1.0
 """How often it is made sure that the segment can still be found."""
 
@@ -85,9 +88,16 @@ class Supervisor:
         modules: Mapping[str, str] = MODULES,
         on_state: Callable[[InstanceState], None] = lambda _: None,
     ) -> None:
-        """``replan`` plans the instance anew from what the configuration is by now, for a reload; ShmioError.
+        """Create the supervisor.
 
-        ``on_state`` is told each new state of the instance; the folder of the log files must exist.
+        Args:
+            plan: The instance to run. The folder of the log files must exist.
+            replan: Makes a new plan from the present configuration for a reload; it raises
+                ShmioError.
+            limits: The times by which processes are judged.
+            modules: The Python module of each kind of process.
+            on_state: Called with each new state of the instance.
+
         """
         self._plan = plan
         self._replan = replan
@@ -103,14 +113,19 @@ class Supervisor:
         self._found_ns = 0
         self._adopted: dict[str, int] = {}
         self.history: list[str] = []
-        """What was found of an earlier supervisor, and done about it, a line each."""
+        """What was found of an earlier supervisor and done about it, one line each."""
 
     def run(self) -> None:
-        """Start everything, or take over what a dead supervisor left; watch it; return when all is stopped as asked.
+        """Start everything or take over what a dead supervisor left; return when all was stopped as asked.
 
-        AlreadyRunningError: another supervisor has the instance. SegmentError, ControlError: no room for the segment,
-        no place for the socket. ShmioError: a process could not be started, or the segment was removed, and all is
-        stopped; or the supervisor itself failed, and left what runs to the next one, as a killed one does.
+        Raises:
+            AlreadyRunningError: Another supervisor has the instance.
+            SegmentError: There is no room for the segment.
+            ControlError: There is no place for the control socket.
+            ShmioError: A process could not be started, or the segment was removed, and all is
+                stopped. Or the supervisor itself failed, and its processes continue for the next
+                one.
+
         """
         with ExitStack() as stack:
             stack.callback(self._selector.close)
@@ -131,7 +146,7 @@ class Supervisor:
             self._reloader = Reloader(
                 self._fleet, self._segment, self._notifier, self._plan, self._replan, self._limits
             )
-            if found:  # until all of it is ours, a failure leaves it for the next attempt
+            if found:  # until all is adopted, a failure leaves it for the next attempt
                 for slot, child in found.children:
                     self._fleet.adopt(self._fleet.named(slot.name), child)
                     self._adopted[slot.name] = child.pid
@@ -144,7 +159,7 @@ class Supervisor:
             self._loop()
             self._segment.set_state(os.getpid(), InstanceState.STOPPED)
             self._control.retire()
-            self._segment.unlink()  # before the answers: who asked may start the instance again at once
+            self._segment.unlink()  # before the answers: the client may restart the instance at once
             for answer in self._stop_answers:
                 answer.ok()
             log.info("stopped")
@@ -156,7 +171,7 @@ class Supervisor:
             while not self._tick():
                 for key, _ in self._selector.select(self._pause_s()):
                     key.data()
-        except Exception as error:  # noqa: BLE001 - the last place to tell of it
+        except Exception as error:  # noqa: BLE001 - the last place to report it
             log.exception("the supervisor failed; what runs goes on")
             why = f"the supervisor failed: {brief(error)}"
             raise ShmioError(f"{why}; its processes go on, and shmio-supervisor up takes them over") from None
@@ -177,7 +192,7 @@ class Supervisor:
 
     def _on_signal(self, number: int) -> None:
         log.info("%s", signal.Signals(number).name)
-        if self._stopping and number != signal.SIGHUP:  # shell and kernel send one each
+        if self._stopping and number != signal.SIGHUP:  # shell and kernel may send one each
             self._hasten()
         self._stop()
 
@@ -188,7 +203,7 @@ class Supervisor:
         self._reloader.drop()
 
     def _hasten(self) -> None:
-        """Asked a second time: no more grace."""
+        """Kill what has not stopped, after a second request."""
         log.warning("killing what has not stopped yet")
         for managed in self._fleet:
             self._fleet.apply(managed, Event.HASTEN)
@@ -208,7 +223,7 @@ class Supervisor:
             answer.ok(config=str(plan.config_file), read_ns=read_ns, log_dir=str(plan.log_dir), listen=listen)
 
     def _busy(self) -> str | None:
-        """Why no request that changes something can be taken at present."""
+        """Return why no request that changes something can be taken at present; None if it can."""
         return "the instance is stopping" if self._stopping else self._reloader.busy()
 
     def _restart(self, name: str, answer: Answer) -> None:
@@ -221,7 +236,7 @@ class Supervisor:
             managed = self._fleet.named(name)
             managed.waiting.append(answer)
             self._fleet.apply(managed, Event.RESTART)
-            managed.answer()  # one that is stuck is so before anything is done
+            managed.answer()  # a stuck process is reported at once
 
     def _reload(self, answer: Answer) -> None:
         log.info("asked to reload %s", self._reloader.plan.config_file)
@@ -232,7 +247,7 @@ class Supervisor:
             self._reloader.reload(answer)
 
     def _replaced(self) -> list[str]:
-        """What became of processes that were taken over and are configured otherwise by now, a line each."""
+        """Return which adopted processes were replaced or stopped at once, one line each."""
         lines = []
         for name, pid in self._adopted.items():
             managed = self._fleet.named(name) if name in self._fleet.names else None
@@ -247,7 +262,7 @@ class Supervisor:
         return START_TICK_S if starting else TICK_S
 
     def _tick(self) -> bool:
-        """Look at everything once; True when all is stopped."""
+        """Check everything once; return True when all is stopped."""
         now_ns = time.monotonic_ns()
         self._fleet.look(now_ns)
         self._control.expire()
@@ -269,7 +284,7 @@ class Supervisor:
         return self._stopping and policy.all_gone(self._fleet.ranked)
 
     def _follow_stop(self) -> None:
-        """Tell those who wait for the end when it does not come, and why."""
+        """Answer the clients that wait for the stop if stuck processes prevent it."""
         there = [managed for managed in self._fleet if managed.life.state is not State.STOPPED]
         if there and all(managed.life.stuck for managed in there):
             stuck = "; ".join(f"{managed.name}: {managed.life.note}" for managed in there)
@@ -278,7 +293,7 @@ class Supervisor:
             self._stop_answers.clear()
 
     def _follow_name(self) -> None:
-        """Without its name nobody finds the segment: the instance could not even be stopped."""
+        """Stop if the segment's name is gone: nobody could find or stop the instance any more."""
         if not self._segment.shared.current():
             name = self._segment.shared.name
             self._failure = f"the shared memory {name} was removed while the instance ran: all is stopped"

@@ -1,4 +1,4 @@
-"""A process's slot together with its job, its life and its process, and what the log says about them."""
+"""A supervised process: its slot, job and life, and the log lines about it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ log = logging.getLogger("shmio.supervisor")
 
 
 class ManagedProcess:
-    """A slot, the job that is to run there, its life, and its process while it has one."""
+    """A slot with its job, its life, and its process while there is one."""
 
     def __init__(self, slot: ProcessSlot) -> None:
         self.slot = slot
@@ -26,9 +26,12 @@ class ManagedProcess:
         self.child: ChildProcess | AdoptedProcess | None = None
         self.waiting: list[Answer] = []
         self.evicted_pid = 0
-        """The process last killed for holding the role of this one."""
+        """The process last killed because it held this role."""
         self.complaint = ""
-        """What it reports as wrong though it runs, as of :meth:`listen`; empty: nothing."""
+        """The problem that the running process reports, as of :meth:`listen`.
+
+        Empty if there is none.
+        """
         self._missed = 0
         self._job: Job | None = None
         self._beat_ns = 0
@@ -36,17 +39,17 @@ class ManagedProcess:
 
     @property
     def name(self) -> str:
-        """Name of the process."""
+        """The name of the process."""
         return self.slot.name
 
     @property
     def rank(self) -> int:
-        """Place in the order of start; what this version does not know is stopped last."""
+        """Place in the order of start. Unknown kinds stop last."""
         return rank(self.slot.name, self.slot.kind)
 
     @property
     def job(self) -> Job:
-        """What it runs; there is none for a process that is found and only to be stopped."""
+        """The job it runs; LookupError for a process that was found and is only to be stopped."""
         if self._job is None:
             raise LookupError(f"{self.name} has no job")
         return self._job
@@ -57,9 +60,14 @@ class ManagedProcess:
         self.life = Life()
 
     def keep(self, job: Job) -> bool:
-        """Go on with the same job, as a new plan has it; whether its process is told to take anew rules that there are.
+        """Continue with a job from a new plan.
 
-        What another supervisor has started may have had some: it is told in any case.
+        A process that another supervisor started may have had rules, so it is signalled in any
+        case.
+
+        Returns:
+            Whether the process was signalled to read its rules again.
+
         """
         before, self._job = self._job, job
         known = bool(job.rules or (before and before.rules))
@@ -69,19 +77,19 @@ class ManagedProcess:
         return known
 
     def adopt(self, child: AdoptedProcess) -> None:
-        """Take a process that another supervisor has started and that runs."""
+        """Adopt a running process of another supervisor."""
         told = self.slot.supervised
         self.child = child
         self.life = policy.adopted(told.spawned_ns, told.restarts)
 
     @property
     def ready(self) -> bool:
-        """Whether the present process, not a predecessor, has reported that it runs."""
+        """Whether the present process itself has reported that it runs."""
         report = self.slot.report
         return self.child is not None and report.pid == self.child.pid and report.activity is Activity.RUNNING
 
     def listen(self) -> None:
-        """Take what it reports as wrong; the log tells the end of it, and what was lost by then."""
+        """Read the problem that the process reports; log its end and what was lost."""
         running = self.life.state is State.RUNNING
         complaint = complaint_of(self.slot.kind, self.slot.report.note) if running else ""
         lost = ("dropped", "changes") if self.slot.kind == "mqtt" else ("missed", "frames and events")
@@ -93,7 +101,7 @@ class ManagedProcess:
         self.complaint = complaint
 
     def quiet_ns(self, elapsed_ns: int) -> int:
-        """Time without a heartbeat, as the supervisor has lived through it."""
+        """Return the time without a heartbeat, not counting pauses of the supervisor, in ns."""
         beat_ns = self.slot.heartbeat_ns
         # The first look at a running process starts the count, too.
         fresh = beat_ns != self._beat_ns or self.life.state is not State.RUNNING
@@ -102,7 +110,7 @@ class ManagedProcess:
         return self._quiet_ns
 
     def end_note(self, pid: int, code: int | None) -> str:
-        """Why the process ended, with its own words if it left any."""
+        """Return why the process ended, with its last message if there is one."""
         end = describe_end(code)
         if code is not None and code <= 0:
             return end
@@ -112,7 +120,7 @@ class ManagedProcess:
         return f"{words} ({end})" if words else end
 
     def answer(self) -> None:
-        """Tell those who asked for a restart how it went, if it is over."""
+        """Answer the clients that wait for a restart, if it is over."""
         state = self.life.state
         if self.life.stuck:
             for answer in self.waiting:
@@ -129,7 +137,7 @@ class ManagedProcess:
 
 
 def log_step(managed: ManagedProcess, before: Life, action: Action | None, limits: Limits) -> None:
-    """Tell about one edge of the graph, unless it says nothing."""
+    """Log one change of state, if it is worth a line."""
     name, life = managed.name, managed.life
     if life.stuck:
         if not before.stuck:
@@ -151,5 +159,5 @@ def log_step(managed: ManagedProcess, before: Life, action: Action | None, limit
 
 
 def brief(error: Exception) -> str:
-    """An error that nobody expected, in one line; its traceback is for the log."""
+    """Return an unexpected error in one line. Its traceback belongs into the log."""
     return " ".join(f"{type(error).__name__}: {error}".split())[:300]

@@ -1,4 +1,4 @@
-"""What a service manager is told: readiness, reloads, state, and that the loop goes round (sd_notify(3))."""
+"""Notifies the service manager: readiness, reloads, state, and the watchdog (sd_notify(3))."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ SOCKET, WATCHDOG_USEC, WATCHDOG_PID = NOTIFY_VARIABLES
 
 
 class Notifier:
-    """Speaks to the service manager that the environment names; to nobody if it names none.
+    """Notifies the service manager that the environment names, if any.
 
-    Nothing here fails or waits: an instance runs with or without a service manager that listens.
+    Nothing here fails or blocks: an instance runs with or without a service manager.
     """
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
@@ -25,23 +25,23 @@ class Notifier:
         self._beat_ns = 0
 
     def ready(self) -> None:
-        """The start, or a reload, is over."""
+        """Report that the start or a reload is over."""
         self._send("READY=1")
 
     def reloading(self) -> None:
-        """A reload has begun."""
+        """Report that a reload has begun."""
         self._send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def stopping(self) -> None:
-        """The stop has begun."""
+        """Report that the stop has begun."""
         self._send("STOPPING=1")
 
     def status(self, text: str) -> None:
-        """A line for people."""
+        """Report a line of text for people."""
         self._send("STATUS=" + text.replace("\n", " "))
 
     def beat(self, now_ns: int) -> None:
-        """The loop goes round; told as often as the service manager wants to know."""
+        """Trigger the watchdog, as often as the service manager asks."""
         if self._period_ns and now_ns - self._beat_ns >= self._period_ns:
             self._beat_ns = now_ns
             self._send("WATCHDOG=1")
@@ -55,14 +55,17 @@ class Notifier:
 
 
 def _path(name: str) -> str:
-    """The address of the socket: a path, or an abstract name, which begins with ``@``; empty for others."""
+    """Return the address of the socket: a path, or an abstract name after ``@``.
+
+    Empty for others.
+    """
     if name.startswith("@"):
         return "\0" + name[1:]
     return name if name.startswith("/") else ""
 
 
 def _watchdog_ns(environment: Mapping[str, str]) -> int:
-    """How often the service manager expects to hear; 0: never, or it means another process."""
+    """Return the watchdog period in ns; 0 if there is none, or it is for another process."""
     if environment.get(WATCHDOG_PID, str(os.getpid())) != str(os.getpid()):
         return 0
     text = environment.get(WATCHDOG_USEC, "")

@@ -1,4 +1,7 @@
-"""All decisions of the supervisor, as functions of what is known and the time. No I/O, no clock."""
+"""All decisions of the supervisor, as pure functions of its knowledge and the time.
+
+No I/O, no clock.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from shmio.segment import Quality
 from shmio.supervisor.states import GRAPH, Action, Event, State
 
 REFUSED_STATUS = 2
-"""Exit status by which a worker says that it can never work as configured."""
+"""Exit status of a worker that can never work as configured."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,23 +20,23 @@ class Limits:
     """Times and counts by which processes are judged; times in s."""
 
     start_s: float = 20.0
-    """From its start until it must report that it runs."""
+    """From the start of a process until it must report that it runs."""
     hang_s: float = 5.0
-    """Without a heartbeat while running."""
+    """Longest time without a heartbeat while running."""
     grace_s: float = 5.0
     """From SIGTERM to SIGKILL."""
     kill_s: float = 5.0
-    """From SIGKILL until a process that still is there counts as stuck."""
+    """From SIGKILL until a process that still exists counts as stuck."""
     stable_s: float = 5.0
-    """Running this long, it has put its crashes behind it."""
+    """A process that runs this long is stable: its crashes no longer count."""
     backoff_first_s: float = 0.5
     backoff_most_s: float = 10.0
     start_attempts: int = 3
-    """Crashes of a process that never ran, after which the start of the instance has failed."""
+    """Crashes of a process that never ran after which the start of the instance has failed."""
     settle_s: float = 3.0
-    """Time for the sources' first frames before the instance's start counts as over."""
+    """Longest wait for the sources' first frames before the start of the instance is over."""
     plan_s: float = 60.0
-    """For a reload to read the configuration and all that it names."""
+    """Longest time to read the configuration and all that it names for a reload."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,32 +45,32 @@ class Life:
 
     state: State = State.STOPPED
     due_ns: int | None = None
-    """When the state's time is over."""
+    """When the time limit of the state ends."""
     spawned_ns: int = 0
     ready_ns: int | None = None
-    """Since when it has been running; None before, and again from its next start."""
+    """Since when it has been running; None until it runs after a start."""
     starts: int = 0
     crashes: int = 0
-    """In a row; forgotten once it runs stably."""
+    """Consecutive crashes; reset once it runs stably."""
     ran: bool = False
-    """Whether it has been running at any time."""
+    """Whether it has ever been running."""
     note: str = ""
     """Why it is not running."""
     hang: str = ""
-    """Why it was last killed as one that hangs; its end is told together with this."""
+    """Why it was last killed as hung. The note about its end includes this."""
     killed: bool = False
-    """Whether it was sent SIGKILL, and has not ended yet."""
+    """Whether it was sent SIGKILL and has not ended yet."""
     stuck: bool = False
-    """Whether it should have ended by then: it waits in the kernel."""
+    """Whether it should have ended after SIGKILL but has not: it waits in the kernel."""
 
     @property
     def restarts(self) -> int:
-        """How often it was started again, for whatever reason."""
+        """How often it was started again, for any reason."""
         return max(0, self.starts - 1)
 
 
 def step(life: Life, event: Event, now_ns: int, limits: Limits, note: str = "") -> tuple[Life, Action | None]:
-    """Take one edge of the graph; (what is then known, what is to be done). ``note`` tells how a process ended."""
+    """Apply an event: return the new life and the action. ``note`` says how a process ended."""
     edge = GRAPH[life.state].get(event)
     if edge is None:
         return life, None
@@ -110,7 +113,7 @@ def _note(life: Life, to: State, note: str) -> str:
     if to in (State.BACKOFF, State.FATAL):
         return note
     if to is State.STARTING and life.state is State.BACKOFF:
-        return life.note  # that may have lasted for a moment only; whoever looks is to see why
+        return life.note  # the back-off may have been short; keep its reason visible
     return {State.STOPPING: "stopping", State.RESTARTING: "restarting"}.get(to, "")
 
 
@@ -123,7 +126,7 @@ def _allowed_s(state: State, action: Action | None, crashes: int, limits: Limits
 
 
 def backoff_s(crashes: int, limits: Limits) -> float:
-    """Wait before the next start: none after the first crash, then doubling up to the limit."""
+    """Return the wait before the next start in s: 0 after one crash, then doubling to the limit."""
     if crashes <= 1:
         return 0.0
     doublings = min(crashes - 2, 32)  # beyond that a float could overflow
@@ -131,9 +134,15 @@ def backoff_s(crashes: int, limits: Limits) -> float:
 
 
 def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits) -> Event | None:
-    """What time or the worker's report has brought about, if anything.
+    """Return the event that the time or the worker's report causes, if any.
 
-    ``ready``: it has reported that it runs. ``quiet_ns``: time without a heartbeat.
+    Args:
+        life: The life of the process.
+        now_ns: The time now.
+        ready: Whether it has reported that it runs.
+        quiet_ns: Time without a heartbeat.
+        limits: The limits that apply.
+
     """
     if life.state is State.STARTING and ready:
         return Event.READY
@@ -145,23 +154,23 @@ def due(life: Life, now_ns: int, *, ready: bool, quiet_ns: int, limits: Limits) 
 
 
 def adopted(spawned_ns: int, restarts: int) -> Life:
-    """The life of a process that runs, as far as its former supervisor has told of it."""
+    """Return the life of an adopted process, from its former supervisor's records."""
     return Life(State.RUNNING, spawned_ns=spawned_ns, ready_ns=spawned_ns, starts=restarts + 1, ran=True)
 
 
 def ended(returncode: int | None) -> Event:
-    """What the end of a process means; None: its exit status is not known."""
+    """Return the event for the end of a process; ``returncode`` is None if it is unknown."""
     return Event.REFUSAL if returncode == REFUSED_STATUS else Event.EXIT
 
 
 Ranked = Sequence[tuple[int, Life]]
-"""The rank of each process and its life: a rank starts after those before it and stops before them."""
+"""Rank and life of each process. A rank starts after the lower ones and stops before them."""
 
 
 def to_start(processes: Ranked) -> list[int]:
-    """Indices of the processes whose turn has come: the lowest rank not yet started, once those below had their chance.
+    """Return the indices of the processes to start: the lowest rank not started yet.
 
-    A process that fails does not hold up the others, one that is still at its first start does.
+    A process at its first start holds up higher ranks; one that has failed does not.
     """
     ranks = {rank for rank, life in processes if not life.starts}
     if not ranks or any(life.starts == 1 and life.state is State.STARTING for _, life in processes):
@@ -171,9 +180,9 @@ def to_start(processes: Ranked) -> list[int]:
 
 
 def to_stop(processes: Ranked) -> list[int]:
-    """Indices of the processes whose turn to stop has come: those of the highest rank that is not gone yet.
+    """Return the indices of the processes to stop: those of the highest rank that has not stopped.
 
-    One that is stuck is not waited for.
+    Stuck processes are not waited for.
     """
     there = [rank for rank, life in processes if not (life.state is State.STOPPED or _past_stopping(life))]
     turn = max(there, default=None)
@@ -186,12 +195,12 @@ def _past_stopping(life: Life) -> bool:
 
 
 def all_gone(processes: Ranked) -> bool:
-    """Whether a stop is complete."""
+    """Return whether a stop is complete."""
     return all(life.state is State.STOPPED for _, life in processes)
 
 
 def start_failure(life: Life, limits: Limits) -> str | None:
-    """Why the start of the instance has failed at this process; None when it has not."""
+    """Return why this process makes the start of the instance fail; None if it does not."""
     if life.ran:
         return None
     if life.state is State.FATAL or life.stuck:
@@ -204,10 +213,15 @@ def start_failure(life: Life, limits: Limits) -> str | None:
 def start_over(
     processes: Ranked, qualities: Sequence[Quality | None], since_ns: int, now_ns: int, limits: Limits
 ) -> bool:
-    """Whether the instance's start is over: all processes have run, and the sources have told how they fare.
+    """Return whether the instance's start is over: all processes have run, and all sources have a quality.
 
-    ``qualities``: of the sources, None for one without a frame; those are given ``settle_s`` from ``since_ns``, when
-    the last process became ready.
+    Args:
+        processes: Rank and life of each process.
+        qualities: The quality of each source; None for one without a frame.
+        since_ns: When the last process became ready; sources have ``settle_s`` from then.
+        now_ns: The time now.
+        limits: The limits that apply.
+
     """
     if not all(life.ran for _, life in processes):
         return False

@@ -1,4 +1,4 @@
-"""One process: started by exec or taken over, watched through its pidfd, its end put into words."""
+"""One process, spawned or adopted: watched through its pidfd, its end described in words."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from pathlib import Path
 import shmio
 
 NOTIFY_VARIABLES = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
-"""What a service manager tells its service by, sd_notify(3), sd_watchdog_enabled(3)."""
+"""Variables of the service manager: sd_notify(3), sd_watchdog_enabled(3)."""
 _PACKAGED = ("site-packages", "dist-packages")
 _TAIL_BYTES = 4096
 _STAMP = re.compile(r"^\S+Z [A-Z]+ +\S+\[\d+\] ")  # what begins a line of shmio.logs
 
 
 class ChildProcess:
-    """A running child process in a session of its own, which Ctrl-C at the terminal does not reach."""
+    """A running child process in its own session, which Ctrl-C in the terminal does not reach."""
 
     def __init__(self, popen: subprocess.Popen[bytes], log_file: Path, log_size: int) -> None:
         self._popen = popen
@@ -32,9 +32,9 @@ class ChildProcess:
 
     @classmethod
     def spawn(cls, module: str, description: bytes, log_file: Path) -> ChildProcess:
-        """Start ``python -m module`` with ``description`` as its standard input; OSError when the host cannot.
+        """Start ``python -m module`` with ``description`` as its standard input; OSError if that fails.
 
-        What it prints, such as the traceback of an interpreter that dies, goes to the end of its log file.
+        What it prints, such as the traceback of a dying interpreter, is appended to its log file.
         """
         log = _open_log(log_file)
         try:
@@ -59,25 +59,25 @@ class ChildProcess:
             os.close(log)
 
     def terminate(self) -> None:
-        """Ask it to end."""
+        """Send SIGTERM."""
         self._popen.send_signal(signal.SIGTERM)
 
     def reread(self) -> None:
-        """Have it read anew what it may take while it runs."""
+        """Send SIGHUP: the process reads its rules again."""
         self._popen.send_signal(signal.SIGHUP)
 
     def kill(self) -> None:
-        """End it."""
+        """Send SIGKILL."""
         self._popen.kill()
 
     def reap(self) -> int:
-        """The return code of a process whose pidfd is readable (-n: killed by signal n); the pidfd is closed."""
+        """Return an ended process's exit code (-n: killed by signal n); close its pidfd."""
         code = self._popen.wait()
         os.close(self.pidfd)
         return code
 
     def last_words(self) -> str:
-        """The last line that this process left in its log file; empty when it left none."""
+        """Return the last line that the process left in its log file; empty if there is none."""
         with suppress(OSError), self._log_file.open("rb") as log:
             size = os.fstat(log.fileno()).st_size
             log.seek(max(self._log_size, size - _TAIL_BYTES))
@@ -87,7 +87,7 @@ class ChildProcess:
 
 
 class AdoptedProcess:
-    """A running process that another supervisor has started: not a child of this one, so it has no exit status."""
+    """A running process of another supervisor. It is not a child, so its exit status is unknown."""
 
     def __init__(self, pid: int, pidfd: int) -> None:
         """``pidfd`` is closed by :meth:`reap`."""
@@ -95,15 +95,15 @@ class AdoptedProcess:
         self.pidfd = pidfd
 
     def terminate(self) -> None:
-        """Ask it to end."""
+        """Send SIGTERM."""
         self._send(signal.SIGTERM)
 
     def reread(self) -> None:
-        """Have it read anew what it may take while it runs."""
+        """Send SIGHUP: the process reads its rules again."""
         self._send(signal.SIGHUP)
 
     def kill(self) -> None:
-        """End it."""
+        """Send SIGKILL."""
         self._send(signal.SIGKILL)
 
     def _send(self, sign: signal.Signals) -> None:
@@ -111,17 +111,17 @@ class AdoptedProcess:
             signal.pidfd_send_signal(self.pidfd, sign)
 
     def reap(self) -> None:
-        """Wait for its end."""
+        """Wait for the end of the process, and close its pidfd."""
         select.select([self.pidfd], [], [])
         os.close(self.pidfd)
 
     def last_words(self) -> str:
-        """It is not known where in its log file they would begin."""
+        """Return "": where its lines begin in the log file is unknown."""
         return ""
 
 
 def _open_log(file: Path) -> int:
-    """Open a log file for appending. A controller is read with or without one."""
+    """Open a log file for appending. The process runs without a log if that fails."""
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         return os.open(file, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o666)
@@ -130,7 +130,7 @@ def _open_log(file: Path) -> int:
 
 
 def describe_end(code: int | None) -> str:
-    """A return code in words; None: it is not known."""
+    """Return an exit code in words; ``code`` is None if it is unknown."""
     if code is None:
         return "ended; its exit status is not known, for an earlier supervisor had started it"
     if code >= 0:
@@ -142,10 +142,10 @@ def describe_end(code: int | None) -> str:
 
 
 def child_environment() -> dict[str, str]:
-    """The environment of a child: it must find the shmio that its supervisor is, and no namesakes in this folder.
+    """Return the environment of a child: it imports the supervisor's shmio and no modules of this folder.
 
-    Hence ``-P``, and the folder of a shmio that is not installed (never site-packages, which would then come before
-    the standard library).
+    Hence ``-P``, and the folder of a shmio that is not installed (never site-packages, which would
+    precede the standard library).
     """
     environment = dict(os.environ, PYTHONFAULTHANDLER="1")
     # gRPC prints a line for each bad handshake, which any client may send, into a log that would not even rotate then.

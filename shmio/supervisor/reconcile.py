@@ -1,6 +1,6 @@
-"""What must be done so that an instance becomes as planned, found by comparing it with what is there. No I/O.
+"""Compares an instance with its plan, and returns what must change. No I/O.
 
-One rule for a reload and for taking over what a dead supervisor left: what is as planned already is not touched.
+A reload and a take-over use the same rule: what matches the plan is left alone.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from shmio.segment import Block, BlockSpec
 
 
 class CurrentProcess(NamedTuple):
-    """A process that the instance has. ``well``: it is there and works, or is being brought back."""
+    """A process of the instance. ``well`` says whether it works or is being restarted."""
 
     kind: str
     digest: bytes
@@ -24,7 +24,10 @@ class CurrentProcess(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """What to do, by name: stop, then change the blocks, then start. ``replaced`` ones are stopped and started."""
+    """What to do, by name: stop, then change the blocks, then start.
+
+    ``replaced`` processes stop and start.
+    """
 
     kept: tuple[str, ...]
     started: tuple[str, ...]
@@ -38,14 +41,14 @@ class Changes:
 
 
 def digest(description: bytes) -> bytes:
-    """What a process was started from, for comparing: SHA-256 of its description."""
+    """Return the SHA-256 of a process description, for comparing."""
     return hashlib.sha256(description).digest()
 
 
 def reconcile(plan: Plan, epoch: int, processes: Mapping[str, CurrentProcess], blocks: Iterable[Block]) -> Changes:
-    """Compare a plan with the processes, by name, and the blocks that there are.
+    """Compare a plan with the present processes and blocks.
 
-    A source whose block is replaced is replaced with it: it writes to one block for life.
+    A source is replaced together with its block, because a source process writes to one block only.
     """
     present = {block.source: block for block in blocks}
     add = tuple(spec for spec in plan.blocks if spec.source not in present or not same(spec, present[spec.source]))
@@ -73,7 +76,7 @@ def reconcile(plan: Plan, epoch: int, processes: Mapping[str, CurrentProcess], b
 
 
 def same(spec: BlockSpec, block: Block) -> bool:
-    """Whether a block is as this one would be."""
+    """Return whether a block matches its specification."""
     return (
         block.layout.hash == spec.layout.hash
         and block.ring.slot_count == spec.slots
@@ -83,7 +86,7 @@ def same(spec: BlockSpec, block: Block) -> bool:
 
 
 def refusal(plan: Plan, running: Plan) -> str | None:
-    """Why a running instance cannot become as planned; None if it can."""
+    """Return why a running instance cannot adopt the plan; None if it can."""
     fixed = {
         "instance.name": (running.instance, plan.instance),
         "instance.group": (running.group, plan.group),

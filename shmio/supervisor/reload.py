@@ -1,4 +1,7 @@
-"""Reloads: planned in a thread, so that the supervisor goes on looking after what runs, and carried out by its loop."""
+"""Carries out reloads.
+
+A thread makes the plan, so that supervision continues; the supervisor's loop applies it.
+"""
 
 from __future__ import annotations
 
@@ -23,10 +26,18 @@ SETTLED = (State.RUNNING, State.BACKOFF, State.FATAL, State.STOPPED)
 
 
 class InstanceChange:
-    """Brings an instance to a plan, a step at each call of :meth:`step`; what is as planned already is not touched."""
+    """Changes an instance to match a plan, in steps.
+
+    Whatever matches the plan already is left alone.
+    """
 
     def __init__(self, fleet: Fleet, segment: Segment, plan: Plan) -> None:
-        """Begin. SegmentError: no room for what is new; then nothing has changed."""
+        """Begin the change.
+
+        Raises:
+            SegmentError: There is no room for new processes or blocks. Nothing has changed then.
+
+        """
         self.plan = plan
         present = fleet.present()
         self.changes = reconcile(plan, segment.header.epoch, present, segment.blocks.values())
@@ -37,7 +48,7 @@ class InstanceChange:
         self._stopped = False
         self._injections: list[str] = []
         segment.processes.require(len(self.changes.started) - len(self.changes.stopped))
-        segment.reserve(self.changes.add)  # the last to fail: what it takes is not given back
+        segment.reserve(self.changes.add)  # last, because it cannot be undone
         self._told = [name for name in self.changes.kept if self._fleet.named(name).keep(self._jobs[name])]
 
     @property
@@ -50,7 +61,10 @@ class InstanceChange:
         return [job for job in self.plan.jobs if job.name in names]
 
     def step(self) -> bool:
-        """Do what can be done now; whether the change is over: each new process runs, or has failed once."""
+        """Do what is possible now; return whether the change is over.
+
+        It is over when each new process runs or has failed once.
+        """
         if not self._stopped:
             self._stopped = self._stop()
             if self._stopped:
@@ -65,22 +79,27 @@ class InstanceChange:
 
     @property
     def stuck(self) -> str:
-        """Which processes must end and do not, if that is what is waited for."""
+        """The processes that should have ended but do not, if the change waits for them."""
         leaving = [] if self._stopped else [self._fleet.named(name) for name in self._leaving]
         return "; ".join(f"{managed.name}: {managed.life.note}" for managed in leaving if managed.life.stuck)
 
     def _stop(self) -> bool:
-        """Have all end that must, rank by rank, so that a recorder has the last of a source; whether they have."""
+        """Stop the leaving processes by rank, so that a recorder gets a source's last data.
+
+        Returns:
+            Whether all have ended.
+
+        """
         leaving = [self._fleet.named(name) for name in self._leaving]
         for index in policy.to_stop([(managed.rank, managed.life) for managed in leaving]):
             self._fleet.apply(leaving[index], Event.STOP)
         return policy.all_gone([(managed.rank, managed.life) for managed in leaving])
 
     def _turn(self) -> None:
-        """Between the old and the new."""
+        """Change the blocks and jobs, after the old processes have ended."""
         if self.changes.add or self.changes.retire:
             self._segment.change(self.changes.add, self.changes.retire)
-        for spec in self.plan.blocks:  # new ones have theirs; the others' processes follow without a restart
+        for spec in self.plan.blocks:  # running processes follow without a restart
             self._declare(self._segment.blocks[spec.source], spec.declared)
         for name in self.changes.stopped:
             self._fleet.drop(name)
@@ -98,7 +117,7 @@ class InstanceChange:
                 self._injections.append(f"injection {name}: {what} at {block.source}")
 
     def outcome(self) -> tuple[list[str], list[str]]:
-        """What was done, and what came out badly, a line each."""
+        """Return what was done and which problems there are, one line each."""
         done = [*(f"{name}: stopped" for name in self.changes.stopped), *self._injections]
         done += [f"{name}: told to take its tokens and roles anew" for name in self._told]
         problems = []
@@ -116,7 +135,7 @@ class InstanceChange:
 
 
 class _PendingPlan:
-    """A plan in the making: to compile a big layout takes seconds, and a file system may hang."""
+    """Makes a plan in a thread: a large layout takes seconds to compile, and a file system may hang."""
 
     def __init__(self, replan: Callable[[], Plan], limit_s: float) -> None:
         self.read_ns = time.time_ns()
@@ -139,11 +158,11 @@ class _PendingPlan:
 
     @property
     def late(self) -> bool:
-        """Whether it has had its time. A thread cannot be ended: its result, if there ever is one, is lost."""
+        """Whether its time is over. A late result is ignored, because a thread cannot be ended."""
         return not self.over and time.monotonic() >= self._deadline
 
     def result(self) -> Plan:
-        """The plan, or what went wrong."""
+        """Return the plan, or raise what went wrong."""
         if not self.over:
             raise ShmioError(
                 f"what the configuration names could not be read within {self.limit_s:g} s, and nothing is changed: "
@@ -155,7 +174,7 @@ class _PendingPlan:
 
 
 class Reloader:
-    """The change of an instance that is under way, if any, and the plan that it follows by now."""
+    """Tracks the change that is in progress, if any, and the plan in force."""
 
     def __init__(
         self,
@@ -184,7 +203,7 @@ class Reloader:
         return self._change is not None
 
     def busy(self) -> str | None:
-        """Why nothing else can be changed at present."""
+        """Return why nothing else can be changed at present; None if it can."""
         if self._change is None:
             return None
         if stuck := self._change.stuck:
@@ -192,11 +211,11 @@ class Reloader:
         return "the instance is just being changed: ask again when that is over"
 
     def follow(self) -> None:
-        """Bring what was taken over to the plan. SegmentError: no room."""
+        """Bring what was taken over to the plan; SegmentError if there is no room."""
         self._change = InstanceChange(self._fleet, self._segment, self.plan)
 
     def reload(self, answer: Answer) -> None:
-        """Plan anew, then follow that; refused while another reload is under way."""
+        """Make a new plan and apply it; refused while another reload is in progress."""
         reason = self.busy() or (self._planning and "another reload is just being planned: ask again when it is over")
         if reason:
             answer.error(reason)
@@ -205,13 +224,13 @@ class Reloader:
         self._planning, self._answer = _PendingPlan(self._replan, self._limits.plan_s), answer
 
     def drop(self) -> None:
-        """Give up what is under way, for all is to stop."""
+        """Cancel the change, because everything is to stop."""
         if self._answer is not None:
             self._answer.error("the instance is stopping")
         self._planning = self._change = self._answer = None
 
     def step(self) -> None:
-        """Do what can be done now."""
+        """Do what is possible now."""
         if self._planning is not None and (self._planning.over or self._planning.late):
             planning, self._planning = self._planning, None
             self._begin(planning)
@@ -249,7 +268,7 @@ class Reloader:
         self._tell(lambda answer: answer.ok(**told))
 
     def _tell(self, how: Callable[[Answer], None]) -> None:
-        """Answer who has asked, if nobody has yet."""
+        """Answer the client that asked for the reload, unless it was answered."""
         if self._answer is not None:
             self._notifier.ready()
             how(self._answer)

@@ -1,4 +1,4 @@
-"""Where the control socket of an instance is: in a folder that is its user's alone."""
+"""The path of an instance's control socket, in a folder that only its user can enter."""
 
 from __future__ import annotations
 
@@ -14,10 +14,14 @@ MAX_PATH_BYTES: Final = 107  # sun_path holds 108 with the final zero, unix(7)
 
 
 def socket_path(instance: str) -> str:
-    """Where the control socket of an instance goes; makes the folder, mode 0700.
+    """Return the path of an instance's control socket; create its folder with mode 0700.
 
-    The first that will do of ``$XDG_RUNTIME_DIR/shmio``, ``/run/user/<uid>/shmio``, ``/tmp/shmio-<uid>``. ControlError
-    when none will: not a folder of this user, or the path is too long.
+    It is in the first usable of ``$XDG_RUNTIME_DIR/shmio``, ``/run/user/<uid>/shmio`` and
+    ``/tmp/shmio-<uid>``.
+
+    Raises:
+        ControlError: No folder is usable: it belongs to another user, or the path is too long.
+
     """
     uid = os.getuid()
     given = os.environ.get("XDG_RUNTIME_DIR")
@@ -37,7 +41,10 @@ def socket_path(instance: str) -> str:
 
 
 def _prepare(folder: Path, uid: int) -> str | None:
-    """Make a folder that is this user's alone; why not, otherwise. A symbolic link is never followed."""
+    """Create a folder for this user alone; return why not, or None.
+
+    Symbolic links are not followed.
+    """
     try:
         with suppress(FileExistsError):
             folder.mkdir(mode=0o700)
@@ -54,7 +61,7 @@ def _prepare(folder: Path, uid: int) -> str | None:
 
 
 def remove_socket(path: str) -> None:
-    """Remove a socket; anything else that has the name is left, and bind tells."""
+    """Remove a socket. Anything else of that name stays, and bind reports it."""
     with suppress(FileNotFoundError):
         if stat.S_ISSOCK(os.lstat(path).st_mode):
             Path(path).unlink()

@@ -1,4 +1,4 @@
-"""The states of a supervised process as one graph (docs/reference/process-states.md)."""
+"""The states of a supervised process as a graph (docs/reference/process-states.md)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from shmio.segment import Phase
 
 
 class State(Enum):
-    """Where a process is in its life."""
+    """The state of a process."""
 
     STOPPED = "stopped"
     STARTING = "starting"
@@ -23,7 +23,7 @@ class State(Enum):
 
 
 class Event(Enum):
-    """What can happen to it. ELAPSED: the time that its state allows is over."""
+    """The events of a process. ELAPSED: the time limit of its state is over."""
 
     START = "start"
     READY = "ready"
@@ -37,7 +37,7 @@ class Event(Enum):
 
 
 class Action(Enum):
-    """What the supervisor does about it."""
+    """The actions of the supervisor."""
 
     SPAWN = "spawn"
     TERMINATE = "terminate"
@@ -101,7 +101,7 @@ GRAPH: Final[Mapping[State, Mapping[Event, Edge]]] = {
         Event.HASTEN: (State.STOPPED, None),
     },
 }
-"""Every edge there is; an event that a state does not list changes nothing."""
+"""All edges. An event that a state does not list has no effect."""
 
 PHASES: Final[Mapping[State, Phase]] = {
     State.STOPPED: Phase.STOPPED,
@@ -113,7 +113,7 @@ PHASES: Final[Mapping[State, Phase]] = {
     State.BACKOFF: Phase.BACKOFF,
     State.FATAL: Phase.FATAL,
 }
-"""What others are told: a process on its way somewhere counts as there, its note says more."""
+"""The published phase of each state. A process in transition has the phase it is heading for."""
 
 LIVING: Final = frozenset({State.STARTING, State.RUNNING, State.STOPPING, State.RESTARTING, State.HUNG})
-"""States in which there is an operating-system process."""
+"""The states in which an operating-system process exists."""

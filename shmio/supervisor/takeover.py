@@ -1,4 +1,4 @@
-"""What an earlier supervisor left is taken over: its segment as it is, and its processes as they run."""
+"""Takes over what a dead supervisor left: its segment, and its processes as they run."""
 
 from __future__ import annotations
 
@@ -19,18 +19,28 @@ from shmio.supervisor.socketpath import remove_socket
 
 @dataclass
 class TakenOver:
-    """A segment whose supervisor's lock is ours now, and the processes in it that go on."""
+    """The segment of a dead supervisor, now locked by this one, and its processes that continue."""
 
     segment: Segment
     children: list[tuple[ProcessSlot, AdoptedProcess]] = field(default_factory=list)
 
 
 def take_over(plan: Plan, control: str, limits: Limits) -> tuple[TakenOver | None, list[str]]:
-    """What can be taken over for this plan, if anything; all else is stopped and removed. What was done, a line each.
+    """Take over what suits the plan; stop and remove the rest.
 
-    ``control``: path of the new control socket, to which the segment leads from now on.
-    AlreadyRunningError: a supervisor is alive. SegmentError: no permission, or a process cannot be identified or
-    does not end. WrongInstanceError: what lives was started from another configuration file.
+    Args:
+        plan: The plan of the instance.
+        control: The path of the new control socket, which the segment names from now on.
+        limits: The times by which processes are judged.
+
+    Returns:
+        What was taken over, if anything, and what was done, one line each.
+
+    Raises:
+        AlreadyRunningError: A supervisor is alive.
+        SegmentError: Permission is missing, or a process cannot be identified or does not end.
+        WrongInstanceError: The running processes were started from another configuration file.
+
     """
     shared = stale_segment.claim(plan.instance)
     if shared is None:
@@ -53,10 +63,10 @@ def take_over(plan: Plan, control: str, limits: Limits) -> tuple[TakenOver | Non
 
 
 def _usable_segment(shared: SharedObject, plan: Plan) -> tuple[Segment | None, list[str]]:
-    """The segment, if this plan's instance can go on in it; else why not, if that needs saying."""
+    """Return the segment if the planned instance can continue in it, else why not."""
     try:
         segment = stale_segment.read(shared, plan.instance)
-    except (FormatError, UnfinishedError):  # told by who clears it
+    except (FormatError, UnfinishedError):  # reported when it is cleared
         return None, []
     if not any(slot.alive() for slot in segment.processes):
         return None, []
@@ -81,9 +91,11 @@ def _usable_segment(shared: SharedObject, plan: Plan) -> tuple[Segment | None, l
 def _adopt_or_end(
     segment: Segment, shared: SharedObject, limits: Limits
 ) -> tuple[list[tuple[ProcessSlot, AdoptedProcess]], list[str]]:
-    """The processes that run well; the others are ended.
+    """Adopt the processes that run well, and end the others.
 
-    SegmentError: one cannot be told from a stranger's, or does not end.
+    Raises:
+        SegmentError: A process cannot be identified, or does not end.
+
     """
     living = {slot.name: slot for slot in segment.processes if slot.alive()}
     fit: list[tuple[ProcessSlot, AdoptedProcess]] = []
@@ -121,7 +133,7 @@ def _adopt_or_end(
 
 
 def _unfit_reason(slot: ProcessSlot, limits: Limits) -> str | None:
-    """Why a living process cannot be taken over as it is; None if it can."""
+    """Return why a living process cannot be adopted; None if it can."""
     if slot.report.activity is not Activity.RUNNING:
         return f"was {slot.report.activity.name.lower()}"
     quiet_s = (time.monotonic_ns() - slot.heartbeat_ns) / 1e9

@@ -1,4 +1,7 @@
-"""What waits for a cycle as one batch of writes, and what the batch's outcomes mean for each of the items. No I/O."""
+"""Combines the accepted items of a cycle into one batch of writes, and derives each item's outcome.
+
+No I/O.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from shmio.layout.values.write import Write, apply, merge
 from shmio.segment import Command, EventKind, Record
 
 End = tuple[EventKind, str]
-"""What became of an item, and why."""
+"""The event that ends an item, and its text."""
 
 _Outcome = TypeVar("_Outcome", str, str | Lost)
 
@@ -26,20 +29,20 @@ class Item(NamedTuple):
     command: Command
     place: int
     bits: bytes | None = None
-    """Which of the write's bits are for the device, if injections took others."""
+    """The write's bits that go to the device, if injections took the others."""
     data: bytes | None = None
-    """Its values, if injections have changed some."""
+    """The item's values, if injections have changed some."""
     changed_by: str = ""
-    """The injection that has."""
+    """The injection that changed the values last."""
 
     @property
     def write(self) -> Write:
-        """What it writes."""
+        """The write, with the values that injections have changed."""
         write = self.command.writes[self.place]
         return write if self.data is None else write._replace(data=self.data)
 
     def parts(self) -> list[Write]:
-        """What of it is for the device."""
+        """Return the parts of the write that go to the device."""
         offset, _, data = self.write
         if self.bits is None:
             return [self.write]
@@ -47,12 +50,20 @@ class Item(NamedTuple):
 
 
 def coalesce(items: Sequence[Item], size: int) -> tuple[list[Write], set[int]]:
-    """What has to be written so that the last value of each bit wins, and the places of items that left nothing.
+    """Merge items into writes so that the last value of each bit wins.
 
-    Neighbours are joined within a command only: it is one client's, who wanted all or nothing.
+    Neighbours are joined only within a command, because its client wanted all of it or nothing.
+
+    Args:
+        items: Accepted items, oldest first.
+        size: Size of the block in bytes.
+
+    Returns:
+        The writes, and the indices of items that later ones superseded completely.
+
     """
     taken = bytearray(size)
-    kept: list[tuple[Item, bytes]] = []  # the last first, with the bits that nothing later writes
+    kept: list[tuple[Item, bytes]] = []  # last first, with the bits that no later item writes
     superseded = set()
     for place in reversed(range(len(items))):
         offset, mask, data = items[place].write
@@ -84,10 +95,15 @@ def coalesce(items: Sequence[Item], size: int) -> tuple[list[Write], set[int]]:
 def ends(
     items: Sequence[Item], writes: Sequence[Write], superseded: set[int], outcomes: Sequence[str | Lost], error: str
 ) -> list[End]:
-    """What became of each item.
+    """Return the end of each item.
 
-    ``writes`` and ``superseded``: what :func:`coalesce` made of them; ``outcomes``: of the writes; ``error``: by which
-    some were lost.
+    Args:
+        items: The items of the batch.
+        writes: The writes from :func:`coalesce`.
+        superseded: The superseded indices from :func:`coalesce`.
+        outcomes: The outcome of each write.
+        error: Why some outcomes were lost.
+
     """
     lost = any(isinstance(outcome, Lost) for outcome in outcomes)
     told = _WriteOutcomes((write, outcome) for write, outcome in zip(writes, outcomes, strict=True) if outcome or lost)
@@ -95,7 +111,7 @@ def ends(
     for place, item in enumerate(items):
         if found[place][0] is not EventKind.WRITTEN:
             continue
-        if place in superseded:  # what took its place was written
+        if place in superseded:  # the later write was written
             found[place] = EventKind.WRITTEN, _SUPERSEDED
         elif item.changed_by:
             found[place] = EventKind.WRITTEN, f"with what the injection {item.changed_by!r} made of it"
@@ -103,9 +119,9 @@ def ends(
 
 
 class _WriteOutcomes:
-    """What became of writes, by where they are: thousands may have been refused.
+    """Finds the outcomes of writes by their place in the block; thousands may have been refused.
 
-    Those that were confirmed may be left out unless some were lost.
+    Confirmed writes may be left out unless some were lost.
     """
 
     def __init__(self, told: Iterable[tuple[Write, str | Lost]]) -> None:
@@ -114,17 +130,17 @@ class _WriteOutcomes:
         self._stops = list(accumulate((write.offset + len(write.data) for write, _ in self._told), max))
 
     def about(self, write: Write) -> list[str | Lost]:
-        """What became of those that share bits with this one."""
+        """Return the outcomes of all writes that share bits with this one."""
         first = bisect_right(self._stops, write.offset)
         last = bisect_left(self._starts, write.offset + len(write.data))
         return [outcome for other, outcome in self._told[first:last] if _share_bits(write, other)]
 
 
 def _end(outcomes: Sequence[str | Lost], error: str) -> End:
-    """The end of an item, from those of its writes."""
+    """Return the end of an item from the outcomes of its writes."""
     refusal = next((outcome for outcome in outcomes if outcome and isinstance(outcome, str)), "")
     lost = Lost.UNSENT in outcomes
-    if Lost.UNKNOWN in outcomes or (lost and "" in outcomes):  # done in part: neither written nor surely not
+    if Lost.UNKNOWN in outcomes or (lost and "" in outcomes):  # partly written
         return EventKind.UNKNOWN, f"sent, but not confirmed: {error}"
     if refusal:
         return EventKind.REFUSED, refusal
@@ -138,14 +154,19 @@ def _share_bits(one: Write, other: Write) -> bool:
 
 
 def one_each(outcomes: Sequence[_Outcome], writes: Sequence[Write]) -> Sequence[_Outcome]:
-    """What a connector says became of its writes; ConnectorError: it does not say it of each."""
+    """Check that a connector returned one outcome for each write.
+
+    Raises:
+        ConnectorError: Their numbers differ.
+
+    """
     if len(outcomes) != len(writes):
         raise ConnectorError(f"the connector tells {len(outcomes)} outcomes of {len(writes)} writes")
     return outcomes
 
 
 def records(items: Sequence[Item], ends: Sequence[End]) -> Iterator[Record]:
-    """The events that tell what became of items: one for neighbours in a command that ended alike."""
+    """Yield the events about the ends of items, one for neighbours in a command that ended alike."""
     both = zip(items, ends, strict=True)
     for (_, (kind, text)), group in groupby(both, key=lambda pair: (id(pair[0].command), pair[1])):
         for first, count in _runs([item for item, _ in group]):

@@ -1,4 +1,4 @@
-"""Keeps NaN and infinities from reaching a device: arithmetic in a controller does not expect them."""
+"""Keeps NaN and infinities from reaching a device, whose arithmetic does not expect them."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from shmio.layout.naming import path_at
 from shmio.layout.values.write import Write, cover
 
 _EXPONENTS: Final = {"REAL": b"\x7f\x80\0\0", "LREAL": b"\x7f\xf0\0\0\0\0\0\0"}
-"""The bits of the exponent, the most significant byte first; a number with all of them set is not finite."""
+"""The exponent bits, most significant byte first. A number with all of them set is not finite."""
 
 
 class FiniteCheck:
-    """The REAL and LREAL values of a block that must stay finite: all but those that the configuration names."""
+    """Refuses non-finite values for REAL and LREAL registers without an exemption."""
 
     def __init__(self, layout: Layout, allowed: Iterable[str]) -> None:
-        """``allowed``: patterns of what may be anything."""
+        """Create the check; ``allowed`` are patterns of registers that may take any value."""
         self._layout = layout
         allowed_bits = np.frombuffer(cover(layout, allowed), np.uint8)
         self._exponents = np.zeros(layout.size, np.uint8)
-        self._starts = np.zeros(layout.size, np.int32)  # of each byte of an exponent, where its number begins
+        self._starts = np.zeros(layout.size, np.int32)  # for each exponent byte, the offset of its number
         for register in layout.registers:
             if register.type in _EXPONENTS:
                 self._guard(register, allowed_bits)
@@ -41,10 +41,10 @@ class FiniteCheck:
                 self._starts[starts + at] = starts
 
     def refusal(self, writes: Iterable[Write]) -> str:
-        """Why these are not written: the first value that would not be finite; empty if all are.
+        """Return why these writes are refused, naming the first such register; empty if they are fine.
 
-        Of a number that is written in part, the bits of the exponent must not all be ones either: so no sequence of
-        writes can set them all.
+        A write of a part of a number must not set all exponent bits in that part either. So no
+        sequence of writes can set them all.
         """
         for offset, mask, data in writes:
             stop = offset + len(data)

@@ -1,7 +1,7 @@
-"""Where commands toward a source are taken, judged, and kept until the next cycle carries them out.
+"""Accepts or rejects the commands toward a source, and keeps accepted ones until the next cycle.
 
-They are taken in a thread of its own, so that a device that does not answer delays no decision; the loop's thread
-carries them out, before it reads, so that the next frame shows them.
+A separate thread takes the commands, so that a device that does not answer delays no decision. The
+loop's thread carries them out before it reads, so that the next frame shows them.
 """
 
 from __future__ import annotations
@@ -24,13 +24,16 @@ from shmio.layout.values.write import Write, cover
 from shmio.segment import NO_WRITER, Command, CommandKind, EventKind, Record
 
 MAX_WAITING: Final = 256
-"""Items that wait for the next cycle; what comes beyond stays in its queue. A command alone may have more."""
+"""Most items that wait for a cycle.
+
+A single command may have more; further commands stay in their queue.
+"""
 MAX_WAITING_BLOCKS: Final = 4
-"""The same in bytes, as a multiple of the block's."""
+"""The same limit in bytes, as a multiple of the block's size."""
 FAR_NS: Final = 1 << 62
-"""The deadline of what a delay has held: the next cycle writes it, or nobody does."""
+"""Deadline of a write that a delay held: effectively none."""
 TELL_NS: Final = 1_000_000_000
-"""How often a writer that sends garbage is told."""
+"""Shortest time between two events about garbage from the same writer."""
 
 _UNARMED: Final = "an injection toward a device needs `armed = true` in the source's configuration"
 
@@ -38,7 +41,10 @@ log = logging.getLogger("shmio.source")
 
 
 class CommandProcessor:
-    """Judges the commands of one block. :meth:`run` is for a thread of its own, all else for the loop's."""
+    """Processes the commands of one block.
+
+    A thread of its own calls :meth:`run`; the loop's thread calls the other methods.
+    """
 
     def __init__(
         self,
@@ -52,11 +58,18 @@ class CommandProcessor:
         blocks: Blocks | None = None,
         accepted: Callable[[], None] = lambda: None,
     ) -> None:
-        """``writable``: patterns; None: the device cannot be written at all. ``armed``: injections may reach it.
+        """Create the processor.
 
-        ``allow_nonfinite``: patterns of what may be written NaN and infinities.
-        ``owner_of``: which process has a command queue. ``blocks``: of all sources, for the conditions of declared
-        injections; default: this one. ``accepted``: called when items wait.
+        Args:
+            output: Publishes the source's images and events.
+            writable: Patterns of writable registers; None if the device cannot be written.
+            now_ns: The loop's clock.
+            allow_nonfinite: Patterns of registers that may be written NaN and infinities.
+            armed: Whether injections may reach the device.
+            owner_of: Finds the process that has a command queue.
+            blocks: Returns the blocks of all sources, for conditions; default: this source's alone.
+            accepted: Called when items wait.
+
         """
         self._writer = output.writer
         self._output = output
@@ -71,20 +84,20 @@ class CommandProcessor:
         blocks = blocks or (lambda: {output.writer.block.source: output.writer.block})
         self._injections = InjectionProcessor(output, self._writable, refuse_in, owner_of, blocks)
         self._turn = threading.Lock()
-        self._verdict = threading.Lock()  # held from the word that items are accepted until they wait
+        self._verdict = threading.Lock()  # held while acceptance is published and until the items wait
         self._closed = "the source is not connected yet"
         self._items: list[Item] = []
-        self._held: Command | None = None  # taken from its queue, but there is no room for it before the next cycle
+        self._held: Command | None = None  # taken from its queue, waits for room until the next cycle
         self._garbage_ns: dict[int, int] = {}
         self._stopped = False
 
     def open(self) -> None:
-        """The device is there, and its block is as it should be: accept."""
+        """Start accepting: the device is connected and its block matches the layout."""
         with self._turn:
             self._closed = ""
 
     def close(self, reason: str) -> None:
-        """The device is gone: what waits is not done later, and nothing more is accepted until it is back."""
+        """Stop accepting: the device is gone. Waiting items expire."""
         with self._turn:
             self._closed = f"the source is not connected: {reason}"
             items, self._items = self._items, []
@@ -93,26 +106,26 @@ class CommandProcessor:
         self._make_room()
 
     def settle(self) -> None:
-        """Wait until whatever somebody has been told is accepted is :attr:`waiting`, too."""
+        """Wait until every item whose acceptance was published is in :attr:`waiting`."""
         with self._verdict:
             pass
 
     def release(self, cycle: int) -> None:
-        """Send on what delays over ``/in`` have held for their time; before the cycle carries out what waits."""
+        """Send on the writes whose delay over ``/in`` is over; call it before :meth:`carry_out`."""
         for layer, write in self._injections.declared.release(cycle):
             command = Command(NO_WRITER, layer.id, self._writer.incarnation, FAR_NS, (write,))
             self._accept(command, layer)
 
     @property
     def waiting(self) -> bool:
-        """Whether there is something to carry out."""
+        """Whether items wait to be carried out."""
         return bool(self._items)
 
     def carry_out(self, write: Callable[[Sequence[Write]], list[str]]) -> None:
-        """Write all that waits, each byte and bit once, the last value wins; tell what became of each item.
+        """Write all waiting items in one batch and publish the outcome of each.
 
-        Commands go in the order in which they were accepted. Whatever ``write`` raises is raised, after it has been
-        told of each item what is known.
+        The order of acceptance holds: of two values for a bit the later one is written. Exceptions
+        from ``write`` pass through after the outcomes were published.
         """
         items = self._take(lambda _: True)
         now_ns = self._now_ns()
@@ -149,7 +162,7 @@ class CommandProcessor:
             taken = True
             while taken and not self._stopped:
                 taken = False
-                for writer in range(queues.writers):  # one of each in turn
+                for writer in range(queues.writers):  # round robin
                     taken |= self._take_one(writer)
             self._expire(self._take(lambda item: self._now_ns() > item.command.deadline_ns))
             self._injections.look()
@@ -158,12 +171,12 @@ class CommandProcessor:
                 queues.wait(seen, self._patience_ns())
 
     def stop(self) -> None:
-        """Make :meth:`run` return; from any thread."""
+        """Make :meth:`run` return. Any thread may call it."""
         self._stopped = True
         self._writer.block.commands.wake()
 
     def _take(self, which: Callable[[Item], bool]) -> list[Item]:
-        """Take what waits and is of this kind."""
+        """Remove and return the waiting items that ``which`` selects."""
         with self._turn:
             kinds = [(item, which(item)) for item in self._items]
             self._items = [item for item, wanted in kinds if not wanted]
@@ -173,7 +186,10 @@ class CommandProcessor:
         self._end(items, [(EventKind.EXPIRED, "no cycle came before its deadline")] * len(items))
 
     def _patience_ns(self) -> int:
-        """Until the first deadline of what waits, or until clients are looked after; negative: for ever."""
+        """Return the time until the next deadline or regular check, in ns.
+
+        Negative if there is none.
+        """
         with self._turn:
             deadlines = [item.command.deadline_ns for item in self._items]
         waits = [max(0, min(deadlines) - self._now_ns()) + 1_000_000] if deadlines else []
@@ -181,12 +197,12 @@ class CommandProcessor:
         return min(waits, default=-1)
 
     def _make_room(self) -> None:
-        """What was held for want of room can be judged."""
+        """Wake the command thread so that it judges the held command again."""
         if self._held is not None:
             self._writer.block.commands.wake()
 
     def _take_one(self, writer: int) -> bool:
-        """Judge the oldest command of a writer; whether there was one, and room for it."""
+        """Judge the oldest command of a writer; return whether there was one and room for it."""
         if self._held is not None:
             command, self._held = self._held, None
             return self._judge(command)
@@ -201,7 +217,7 @@ class CommandProcessor:
         return self._judge(command)
 
     def _garbage(self, writer: int, error: ValueError) -> None:
-        """A writer that sends what is no command is told now and then, however much it sends."""
+        """Report a writer that sends malformed commands, at most once per ``TELL_NS``."""
         now_ns = time.monotonic_ns()
         if now_ns - self._garbage_ns.get(writer, -TELL_NS) >= TELL_NS:
             self._garbage_ns[writer] = now_ns
@@ -209,7 +225,7 @@ class CommandProcessor:
             self._writer.event(Record(EventKind.REJECTED, f"not a command: {error}", writer))
 
     def _judge(self, command: Command) -> bool:
-        """Accept or reject; False if there is no room before the next cycle, and the command is held."""
+        """Accept or reject a command; return False if it must wait for room."""
         layer = self._injections.toward_device(command)
         write = command.kind is CommandKind.WRITE or layer is not None
         reason = self._refusal(command)
@@ -238,13 +254,13 @@ class CommandProcessor:
         return True
 
     def _accept(self, command: Command, layer: Layer | None) -> None:
-        """Let a command meet the injections below ``layer``, and have what they leave of it wait for the cycle."""
+        """Apply the injections below ``layer`` to a command, and queue the rest for the cycle."""
         left, taken = divert_command(self._output, command, layer)
         left = [pair for pair in left if not self._made_unfit(pair[0])]
-        self._end(taken, [(EventKind.TAKEN, "")] * len(taken))  # now all that injections get of it has been told
+        self._end(taken, [(EventKind.TAKEN, "")] * len(taken))  # every DIVERTED event was published before
         items = [item for item, _ in left]
         with self._verdict:
-            for item, source in left:  # outside the other lock, which the loop must never wait for long
+            for item, source in left:  # outside the other lock, which the loop takes
                 for part in pieces(EventKind.ACCEPTED, command, item.place, item.parts(), source):
                     self._writer.event(part)
             with self._turn:
@@ -257,7 +273,7 @@ class CommandProcessor:
             self._accepted()
 
     def _made_unfit(self, item: Item) -> bool:
-        """Whether declared injections have made of it what is not written; that is told."""
+        """Return whether injections made the item's value non-finite; if so, refuse it."""
         reason = "" if item.data is None else self._finite.refusal(item.parts())
         if reason:
             self._end([item], [(EventKind.REFUSED, f"the injection {item.changed_by!r} changes it: {reason}")])
@@ -272,7 +288,7 @@ class CommandProcessor:
         return len(items) + len(command.writes) <= MAX_WAITING and size <= self._most_bytes
 
     def _refusal(self, command: Command) -> str:
-        """Why a command is not accepted; empty if it is."""
+        """Return why a command is not accepted; empty if it is."""
         if command.incarnation != self._writer.incarnation:
             return "it was meant for the source's process before this one, which ended: try again"
         late_ns = self._now_ns() - command.deadline_ns
@@ -281,7 +297,7 @@ class CommandProcessor:
         return ""
 
     def _unwritable(self, command: Command) -> str:
-        """Why nothing, or not this, can be written to the device; empty if it can."""
+        """Return why these bytes cannot be written to the device; empty if they can."""
         if self._cannot:
             return self._cannot
         if self._closed:
@@ -296,6 +312,6 @@ class CommandProcessor:
         return self._finite.refusal(command.writes)
 
     def _end(self, items: Sequence[Item], ends: Sequence[End]) -> None:
-        """Tell what became of accepted items: one event for neighbours in a command that ended alike."""
+        """Publish the ends of accepted items, one event for neighbours that ended alike."""
         for record in records(items, ends):
             self._writer.event(record)

@@ -1,6 +1,7 @@
-"""The declared injections of one source: taken up from commands and from the configuration, and looked at each cycle.
+"""The declared injections of one source, from commands and from the configuration; advanced each cycle.
 
-Nothing here waits. What a cycle costs is bounded by what may be declared, and is nothing while nothing is.
+Nothing here blocks. The work per cycle is bounded by the limits on declarations, and is nothing
+without any.
 """
 
 from __future__ import annotations
@@ -31,17 +32,23 @@ from shmio.segment.standing_injections import DeclaredState, StandingInjection
 
 
 class ConditionValues:
-    """Images of sources as of one cycle; each is fetched once, and only if a condition asks for it.
+    """The register values that conditions read, as of one cycle.
 
-    All are what the sources delivered, before any injection, so that none feeds back upon itself. Nothing is known of
-    a source whose quality is bad.
+    Each image is fetched once, and only if a condition needs it. All images are without injections,
+    so that no injection feeds back into its own condition. The values of a source with bad quality
+    are unknown.
     """
 
     def __init__(self, own: str, image: Image, blocks: Mapping[str, Block], before: int | None) -> None:
-        """``own``: the source whose next image this is.
+        """Create the values for one image.
 
-        ``before``: the step that this is, if it is one: of others that take part in it, the image of the step before is
-        read, whoever is faster.
+        Args:
+            own: The source whose next image this is.
+            image: That image.
+            blocks: The blocks of all sources.
+            before: The present step, or None outside steps. Of other sources that take part in the
+                step, the image before it is read, whichever source is faster.
+
         """
         self._blocks = blocks
         self._before = before
@@ -49,7 +56,7 @@ class ConditionValues:
         self._images: dict[str, bytes | None] = {own: image.raw if known else None}
 
     def of(self, program: Program) -> Sequence[Number | None]:
-        """The values that a program's condition reads; None: not known."""
+        """Return the values that the program's condition reads; None for an unknown value."""
         if program.condition is None:
             return ()
         values: list[Number | None] = []
@@ -79,12 +86,12 @@ def _newest(block: Block, before: int | None) -> bytes | None:
 
 
 SEED_BITS: Final = 53
-"""Of a seed that is drawn: any JSON reader keeps it."""
+"""Length of a generated seed in bits; every JSON reader keeps that many exactly."""
 CONFIGURED: Final = Owner(NO_WRITER, 0)
-"""Who lays what the configuration declares."""
+"""The owner of injections that the configuration declares."""
 
 Blocks = Callable[[], Mapping[str, Block]]
-"""All blocks of the instance as of now."""
+"""Returns the present blocks of the instance by source."""
 
 _DECODER: Final = msgspec.json.Decoder(Declaration)
 
@@ -92,7 +99,11 @@ log = logging.getLogger("shmio.source")
 
 
 class DeclaredInjections:
-    """What is declared for one source. :meth:`release` and :meth:`forget` are for the loop's thread."""
+    """The declared injections of one source.
+
+    The loop's thread calls :meth:`release` and :meth:`forget`; the command thread calls the other
+    methods.
+    """
 
     def __init__(self, publisher: LayerPublisher, blocks: Blocks) -> None:
         self._publisher = publisher
@@ -105,7 +116,7 @@ class DeclaredInjections:
 
     @property
     def overload(self) -> str:
-        """Why no write can be taken at present; empty if one can."""
+        """Why no write can be accepted at present; empty if writes can be accepted."""
         full = next((layer for layer in self._layers if layer.full), None)
         return f"the delay of injection {full.name} holds {MAX_HELD} values already" if full else ""
 
@@ -115,12 +126,15 @@ class DeclaredInjections:
         return any(layer.program.foreign for layer in self._layers)
 
     def seen(self, frame: Frame) -> None:
-        """The last frame of the process before this one."""
+        """Take the last frame of the previous process as the present one."""
         time_ns = self._time_ns(frame.cycle) if self._own.playhead is None else frame.clock_ns
         self._publisher.injections.now = CycleImage(frame.cycle, time_ns, frame.raw)
 
     def resume(self, standing: StandingInjection, running: DeclaredState, seen: Bits) -> None:
-        """Go on with one of the process before this one; ``seen``: the image that consumers saw last."""
+        """Resume an injection of the previous process.
+
+        ``seen`` is the image that consumers saw last.
+        """
         owner = Owner(standing.writer, standing.pid)
         try:
             program = self._program(running.declaration)
@@ -132,7 +146,7 @@ class DeclaredInjections:
         self._settle()
 
     def declare(self, command: Command, owner: Owner) -> str:
-        """Lay what a command declares; why not, or empty."""
+        """Apply the injection that a command declares; return why not, or ""."""
         try:
             declaration = _DECODER.decode(b"".join(write.data for write in command.writes))
             for complaint in contradictions(declaration):
@@ -144,7 +158,7 @@ class DeclaredInjections:
         return self._lay(layer, command)
 
     def lift(self, layer: DeclaredLayer, command: Command) -> str:
-        """Lift one of the configuration's, until that changes; why not, or empty."""
+        """Lift an injection of the configuration until that changes; return why not, or ""."""
         if layer.activation.state is State.LIFTED:
             return f"the injection {layer.name} was lifted already"
         with self._output.turn:
@@ -155,9 +169,9 @@ class DeclaredInjections:
         return ""
 
     def follow(self) -> None:
-        """Take over what has changed in the configuration and in other sources."""
+        """Apply the changes of the configuration's declarations."""
         sequence = self._own.declared.sequence
-        if sequence == self._configuration or sequence % 2:  # odd: it is just being written, and a bell follows
+        if sequence == self._configuration or sequence % 2:  # odd: a write is in progress, and a wake-up follows
             return
         self._configuration = sequence
         wanted = {declaration.name: declaration for declaration in self._own.declared.read()}
@@ -171,7 +185,7 @@ class DeclaredInjections:
                 self._lay_configured(declaration)
 
     def settle(self) -> None:
-        """Take notice that layers were laid or lifted."""
+        """Update the list of declared layers after layers were added or lifted."""
         with self._output.turn:
             self._settle()
 
@@ -195,18 +209,21 @@ class DeclaredInjections:
         with self._output.turn:
             if reason := self._publisher.lay(layer):
                 return reason
-            if self._output.advance is None:  # it is looked at from the next cycle on
+            if self._output.advance is None:  # it advances from the next cycle on
                 injections = self._publisher.injections
                 injections.now = injections.now._replace(cycle=self._output.cycle)
             self._settle()
-            for record in _injected_events(
-                layer, command
-            ):  # it changes nothing yet, so there is no frame to be shown before
+            for record in _injected_events(layer, command):  # it changes nothing yet, so no frame must precede them
                 self._output.writer.event(record)
         return ""
 
     def _program(self, declaration: Declaration) -> Program:
-        """ConfigError."""
+        """Compile a declaration.
+
+        Raises:
+            ConfigError: The declaration is wrong or targets another source.
+
+        """
         self._blocks = dict(self._blocks_of())
         layouts = {source: block.layout for source, block in self._blocks.items()}
         periods_ns = {source: block.period_ns for source, block in self._blocks.items()}
@@ -216,7 +233,7 @@ class DeclaredInjections:
         return program
 
     def rebind(self) -> None:
-        """Find the registers of conditions anew in sources that a reload has changed."""
+        """Compile conditions again if a reload has changed the sources that they read."""
         if not self.reads_other_sources:
             return
         blocks = dict(self._blocks_of())
@@ -237,9 +254,10 @@ class DeclaredInjections:
     # -- in the loop's thread ------------------------------------------------------------------------------------------
 
     def _advance(self, image: Image) -> list[Record]:
-        """Look at the next image, with the output's ``turn`` held; the events of what has changed with it.
+        """Advance all layers to the next image, and return the events about what changed.
 
-        Of several in one cycle the first is looked at: how many there are depends on how fast their writers were.
+        The output's ``turn`` is held. Only the first image of a cycle counts, because the number of
+        the others depends on how fast their writers were.
         """
         looked = self._publisher.injections.now.cycle
         time_ns = image.at.clock_ns if image.at else self._time_ns(image.cycle)
@@ -257,7 +275,7 @@ class DeclaredInjections:
         return [*self._publisher.computed(image.base), *turned, *self._lift_finished()]
 
     def _lift_finished(self) -> list[Record]:
-        """Lift what is over, in the cycle in which it comes to that: nobody sees anything else by it."""
+        """Lift the injections that are over, and return the events."""
         over = {layer.id for layer in self._layers if _finished(layer)}
         if not over:
             return []
@@ -266,7 +284,7 @@ class DeclaredInjections:
         return told
 
     def release(self, cycle: int) -> list[tuple[DeclaredLayer, Write]]:
-        """What delays over ``/in`` have held long enough, for the cycle that is about to write."""
+        """Return the writes whose delay over ``/in`` ends before ``cycle`` writes."""
         if not any(layer.held for layer in self._layers):
             return []
         now = CycleImage(cycle, self._time_ns(cycle), b"")
@@ -274,7 +292,7 @@ class DeclaredInjections:
             return [(layer, write) for layer in self._layers for write in layer.due(now)]
 
     def forget(self, reason: str) -> None:
-        """The device is gone: what delays hold is not sent later."""
+        """Discard the writes that delays hold, because the device is gone."""
         if any(layer.held for layer in self._layers):
             with self._output.turn:
                 records = [record for layer in self._layers for record in lost(layer, reason)]
@@ -282,14 +300,14 @@ class DeclaredInjections:
                 self._output.writer.event(record)
 
     def _time_ns(self, cycle: int) -> int:
-        """The instance's clock at a cycle: in wall time as the schedule has it, however punctual the cycle was."""
+        """Return the instance time of a cycle; in wall time as scheduled, not as it really ran."""
         state = self._own.clock.read()
         if state.virtual:
             return state.time_ns
         period_ns = self._own.period_ns
         if self._own.attributes.stepped:
             return (cycle - state.lead(period_ns)) * period_ns
-        return cycle * period_ns + state.offset_ns  # a device's cycles are always those of real time
+        return cycle * period_ns + state.offset_ns  # a device's cycles always follow real time
 
 
 def _seed(declaration: Declaration) -> int:
@@ -297,7 +315,7 @@ def _seed(declaration: Declaration) -> int:
 
 
 def _finished(layer: DeclaredLayer) -> bool:
-    """Whether it can be lifted: those of the configuration stay in the list."""
+    """Return whether the layer can be lifted. Those of the configuration stay listed."""
     return layer.activation.state is State.OVER and not layer.configured and not layer.held
 
 
@@ -307,6 +325,6 @@ def _activation_event(layer: DeclaredLayer) -> Record:
 
 
 def _injected_events(layer: DeclaredLayer, command: Command | None) -> Iterator[Record]:
-    """The events of one that is laid: its declaration with its seed, in parts."""
+    """Return the events of a new injection: its declaration with its seed, in parts."""
     document = msgspec.json.encode(msgspec.structs.replace(layer.program.declaration, seed=layer.seed))
     return in_parts(layer_event(EventKind.INJECTED, layer, layer.name, command), document)

@@ -1,4 +1,4 @@
-"""A declared injection as it runs in its source's process: a layer with an operation in place of a client's values."""
+"""The layer of a declared injection: its values come from an operation instead of a client."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from shmio.segment import NO_WRITER, Direction
 from shmio.segment.standing_injections import DeclaredState
 
 MAX_HELD: Final = 256
-"""Values that a delay over ``/in`` holds before writes are rejected."""
+"""Writes that one delay over ``/in`` holds before further writes are rejected."""
 
 
 class DelayedWrite(NamedTuple):
-    """A write that a delay holds, and when it came."""
+    """A write that a delay holds, with the cycle and the instance time at which it came."""
 
     write: Write
     cycle: int
@@ -33,7 +33,10 @@ class DelayedWrite(NamedTuple):
 
 @dataclass(kw_only=True)
 class DeclaredLayer(Layer):
-    """The layer. ``writes`` counts those that have met it, over ``/in``, since it became active."""
+    """The layer of one declared injection.
+
+    ``writes`` counts writes over ``/in`` in this activation.
+    """
 
     program: Program
     seed: int
@@ -46,33 +49,36 @@ class DeclaredLayer(Layer):
 
     @property
     def given(self) -> bool:
-        """It has no client: its values come from its operation."""
+        """False: no client gives it values."""
         return False
 
     @property
     def active(self) -> bool:
-        """Whether it changes what it covers at present."""
+        """Whether it changes the covered bits at present."""
         return self.activation.state is State.ACTIVE
 
     @property
     def configured(self) -> bool:
-        """Whether it is declared in the configuration."""
+        """Whether the configuration declares it."""
         return self.owner.writer == NO_WRITER
 
     @property
     def full(self) -> bool:
-        """Whether it holds as much as it can."""
+        """Whether its delay holds as many writes as it may."""
         return len(self.held) >= MAX_HELD
 
     @property
     def running(self) -> DeclaredState:
-        """How it is, for all to see."""
+        """Its present state, as published in the segment."""
         now = self.activation
         declaration = self.program.declaration
         return DeclaredState(declaration, now.state.value, self.seed, now.runs, now.cycle, now.time_ns)
 
     def advance(self, now: CycleImage, values: Sequence[Number | None]) -> bool:
-        """Look at the next image, with the values that its condition reads; whether its state has changed."""
+        """Advance to the next image, given the values of its condition.
+
+        Return whether its state changed.
+        """
         condition = self.program.condition
         holds = condition is None or condition.expression.holds(values, self.memory)
         runs = self.activation.runs
@@ -83,7 +89,7 @@ class DeclaredLayer(Layer):
         return changed
 
     def show(self, image: Bits, now: CycleImage) -> None:
-        """Put into an image what the operation makes of the covered bits."""
+        """Apply the operation to the covered bits of an image, in place."""
         at = self._moment(now.cycle - self.activation.cycle, now)
         if not self._happens(at):
             self.operation.passed(image, at)
@@ -93,7 +99,12 @@ class DeclaredLayer(Layer):
         image ^= (image ^ changed) & self.cover
 
     def transform_write(self, write: Write, bits: Bits, now: CycleImage) -> bytes | None:
-        """What becomes of these bits of a write toward the device: changed, lost, or held to be sent later."""
+        """Apply the operation to bits of a write toward the device.
+
+        Returns:
+            The new data; None if the write is dropped, or delayed and sent later.
+
+        """
         at = self._moment(self.writes, now)
         self.writes += 1
         if not self._happens(at):
@@ -111,7 +122,10 @@ class DeclaredLayer(Layer):
         return bytes(old ^ (old ^ image[span]) & bits)
 
     def due(self, now: CycleImage) -> list[Write]:
-        """What it has held long enough; ``now`` is the cycle that is about to write."""
+        """Remove and return the writes whose delay is over.
+
+        ``now`` is the cycle that is about to write.
+        """
         due: list[Write] = []
         if not isinstance(self.operation, Delay):
             return due
@@ -134,7 +148,7 @@ class DeclaredLayer(Layer):
 
 
 def declared(number: int, program: Program, owner: Owner, seed: int, *, keep: bool) -> DeclaredLayer:
-    """A layer that nobody has seen yet."""
+    """Create the layer of a new declared injection."""
     declaration = program.declaration
     draw = SeededRandom(seed, declaration.name)
     return DeclaredLayer(
@@ -155,7 +169,10 @@ def declared(number: int, program: Program, owner: Owner, seed: int, *, keep: bo
 
 
 def resumed(layer: DeclaredLayer, running: DeclaredState, seen: Bits) -> DeclaredLayer:
-    """The layer as the process before this one had it; ``seen``: the image that consumers saw last."""
+    """Restore a layer to the state of the previous process.
+
+    ``seen`` is the image that consumers saw last.
+    """
     state = State(running.state)
     layer.activation = Activation(layer.program.window, state, running.runs, running.cycle, running.time_ns)
     if layer.active and layer.direction is Direction.OUT:

@@ -1,7 +1,7 @@
-"""The injections that stand between a source's device and everybody else: what each covers, what goes where. No I/O.
+"""The layers of a source: which bits each one covers, and what becomes of images and writes. No I/O.
 
-The chain runs from the device outward on ``/out``, toward it on ``/in``: the highest priority is outermost, of equal
-ones the newest.
+Images on ``/out`` pass the layers from the innermost to the outermost, writes on ``/in`` the other
+way. The layer with the highest priority is outermost; of equal priorities the newest.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from shmio.layout.values.write import Write, apply, merge
 from shmio.segment import Direction
 
 MAX_INJECTIONS: Final = 64
-"""At once, on one source."""
+"""Most injections on one source at a time."""
 
 Bits = np.ndarray[Any, np.dtype[np.uint8]]
 
 
 @dataclass(frozen=True)
 class Owner:
-    """Who laid an injection: a command queue, and the process that had it then."""
+    """The owner of an injection: a command queue, and the process that had it at that time."""
 
     writer: int
     pid: int
 
 
 class CycleImage(NamedTuple):
-    """The image published last: its cycle, the instance's clock of that, and what the device delivered."""
+    """The image of a cycle as the device delivered it, with its instance time in ns."""
 
     cycle: int
     time_ns: int
@@ -39,7 +39,10 @@ class CycleImage(NamedTuple):
 
 @dataclass
 class Layer:
-    """One layer. ``cover``: an image of the block in which the bits that it stands over are set."""
+    """One injection as it runs in its source's process.
+
+    ``cover`` is an image of the block in which the covered bits are set.
+    """
 
     id: int
     direction: Direction
@@ -49,53 +52,58 @@ class Layer:
     owner: Owner
     cover: Bits
     values: Bits
-    """What consumers get for the covered bits of ``/out``."""
+    """The values of the covered bits of ``/out`` for consumers."""
 
     @property
     def given(self) -> bool:
-        """Whether it lies over ``/out`` and a client gives it values, who is told those that come from further in."""
+        """Whether it covers ``/out`` and a client gives its values.
+
+        The client is sent the values from further in.
+        """
         return self.direction is Direction.OUT
 
     @property
     def active(self) -> bool:
-        """Whether it changes what it covers at present."""
+        """Whether it changes the covered bits at present."""
         return True
 
-    def show(self, image: Bits, now: CycleImage) -> None:  # noqa: ARG002  what its client gave last holds at any time
-        """Put into an image what consumers get for the covered bits of ``/out``."""
+    def show(self, image: Bits, now: CycleImage) -> None:  # noqa: ARG002  its values do not depend on time
+        """Put the layer's values of ``/out`` into an image, in place."""
         image ^= (image ^ self.values) & self.cover
 
     def transform_write(self, write: Write, bits: Bits, now: CycleImage) -> bytes | None:  # noqa: ARG002
-        """What becomes of these bits of a write toward the device: its data, the same object if unchanged.
+        """Apply the layer to bits of a write toward the device.
 
-        None: they go no further.
+        Returns:
+            The data, the same object if unchanged; None if the write ends here.
+
         """
         return None
 
 
 class DivertedWrite(NamedTuple):
-    """What became of a write on its way to the device."""
+    """The result of passing a write through the layers toward the device."""
 
     met: list[tuple[Layer, list[Write]]]
-    """What came to injections that took it, or made something else of it."""
+    """The layers that took or changed the write, each with the parts that reached it."""
     left: bytes
-    """Which of its bits go to the device,"""
+    """The bits of the write that go to the device."""
     data: bytes
-    """with which values,"""
+    """Their values."""
     by: Layer | None
-    """and the last injection that has changed some of these."""
+    """The last layer that changed some of the values."""
 
 
 @dataclass
 class LayerStack:
-    """All injections of one block of ``size`` bytes; the innermost first."""
+    """All layers of one block of ``size`` bytes, the innermost first."""
 
     size: int
     layers: list[Layer] = field(default_factory=list)
     now: CycleImage = field(default_factory=lambda: CycleImage(-1, 0, b""))
 
     def lay(self, injection: Layer) -> str:
-        """Add a layer; why not, or empty."""
+        """Add a layer; return why not, or ""."""
         if any(layer.id == injection.id for layer in self.layers):
             return f"there is an injection {injection.id} already"
         if len(self.layers) >= MAX_INJECTIONS:
@@ -105,44 +113,53 @@ class LayerStack:
         return ""
 
     def find(self, number: int) -> Layer | None:
-        """The layer of this number."""
+        """Return the layer with this injection number."""
         return next((layer for layer in self.layers if layer.id == number), None)
 
     def lift(self, which: Callable[[Layer], bool]) -> list[Layer]:
-        """Remove layers; those that there were."""
+        """Remove and return the layers that ``which`` selects."""
         lifted = [layer for layer in self.layers if which(layer)]
         self.layers = [layer for layer in self.layers if not which(layer)]
         return lifted
 
     def effective(self, raw: bytes) -> bytes | None:
-        """What consumers see of an image, that of ``now``; None: the image itself."""
+        """Return what consumers see of the image of ``now``.
+
+        None if no active layer covers ``/out``.
+        """
         layers = [layer for layer in self.layers if layer.direction is Direction.OUT and layer.active]
         return self.seen(raw, layers).tobytes() if layers else None
 
     def seen(self, raw: bytes, inner: Iterable[Layer]) -> Bits:
-        """What these layers over ``/out`` make of an image."""
+        """Return an image after these layers over ``/out``."""
         image = np.frombuffer(raw, np.uint8).copy()
         for layer in inner:
             layer.show(image, self.now)
         return image
 
     def before(self, raw: bytes, layer: Layer) -> Bits:
-        """What consumers would see of an image without a layer and those further out."""
+        """Return an image after the layers over ``/out`` that are further in than ``layer``."""
         return self.seen(raw, self.inner(layer))
 
     def inner(self, layer: Layer) -> list[Layer]:
-        """The layers over ``/out`` that are further in than one of them, and change what they cover."""
+        """Return the active layers over ``/out`` that are further in than ``layer``."""
         inner = self.layers[: self.layers.index(layer)]
         return [other for other in inner if other.direction is Direction.OUT and other.active]
 
     def outer(self, layer: Layer) -> list[Layer]:
-        """Those that are further out and that clients give values to; of one over ``/in`` none."""
+        """Return the layers further out to which clients give values.
+
+        None for a layer over ``/in``.
+        """
         if layer.direction is Direction.IN:
             return []
         return [other for other in self.layers[self.layers.index(layer) + 1 :] if other.given]
 
     def inner_values(self, raw: bytes, layer: Layer) -> list[Write]:
-        """What a layer over ``/out`` gets from those further in; the rest of its bits come from the device."""
+        """Return the values that a layer over ``/out`` gets from layers further in.
+
+        Its other bits come from the device.
+        """
         inner = self.inner(layer)
         bits = np.zeros(self.size, np.uint8)
         for other in inner:
@@ -150,9 +167,9 @@ class LayerStack:
         return merge(self.seen(raw, inner).tobytes(), bits.tobytes(), [(0, self.size)] if inner else [])
 
     def onward(self, raw: bytes, layer: Layer, write: Write) -> list[tuple[Layer, list[Write]]]:
-        """What of the values that a layer over ``/out`` gives goes to clients' further out, instead of to consumers.
+        """Return the values of a write to a layer over ``/out`` that go to clients' layers further out.
 
-        It is what those in between make of it.
+        Consumers do not see these values. Layers in between have been applied to them.
         """
         taken: list[tuple[Layer, list[Write]]] = []
         bits = np.full(len(write.data), write.mask or 0xFF, np.uint8)
@@ -166,9 +183,13 @@ class LayerStack:
         return taken
 
     def divert(self, write: Write, above: Layer | None) -> DivertedWrite:
-        """Let a write meet the injections on its way to the device.
+        """Pass a write through the layers toward the device.
 
-        ``above``: the injection whose values these are; only what stands below it, if it still does, is on their way.
+        Args:
+            write: The write.
+            above: The layer that sends the write; only layers below it apply. None for a client's
+                write.
+
         """
         met: list[tuple[Layer, list[Write]]] = []
         by = None
@@ -193,7 +214,7 @@ class LayerStack:
 
 
 def shadow(injection: Layer, writes: Sequence[Write]) -> str:
-    """Give consumers other values for bits that an injection covers; why not, or empty."""
+    """Set values of covered bits of ``/out``; return why not, or ""."""
     if reason := uncovered(injection, writes):
         return reason
     for write in writes:
@@ -202,7 +223,7 @@ def shadow(injection: Layer, writes: Sequence[Write]) -> str:
 
 
 def uncovered(injection: Layer, writes: Iterable[Write]) -> str:
-    """Why values are not an injection's to give; empty if they are."""
+    """Return why the layer may not set these values; empty if it covers them all."""
     for write in writes:
         cover = injection.cover[write.offset : write.offset + len(write.data)]
         if len(cover) < len(write.data) or (~cover & (write.mask or 0xFF)).any():
@@ -212,7 +233,12 @@ def uncovered(injection: Layer, writes: Iterable[Write]) -> str:
 
 
 def covering(size: int, writes: Sequence[Write]) -> Bits:
-    """The bits that the items of an INJECT command set; ValueError: beyond the block."""
+    """Return the bits that the items of an INJECT command cover, as an image of the block.
+
+    Raises:
+        ValueError: An item lies outside the block.
+
+    """
     cover = np.zeros(size, np.uint8)
     for offset, mask, data in writes:
         if offset + len(data) > size:
@@ -222,7 +248,7 @@ def covering(size: int, writes: Sequence[Write]) -> Bits:
 
 
 def parts_of(write: Write, bits: Bits) -> list[Write]:
-    """The part of a write that these of its bits are."""
+    """Return the parts of a write that consist of these bits."""
     return [
         Write(write.offset + part.offset, part.mask, part.data)
         for part in merge(write.data, bits.tobytes(), [(0, len(write.data))])

@@ -1,4 +1,4 @@
-"""Carries out the commands about injections, in the thread that judges commands; lifts those whose client is gone."""
+"""Carries out commands about injections, and lifts injections whose client is gone."""
 
 from __future__ import annotations
 
@@ -19,21 +19,30 @@ from shmio.segment.events import EVENT_SLOTS
 from shmio.segment.standing_injections import StandingInjection
 
 LOOK_NS: Final = 400_000_000
-"""How often it is looked whether the clients are still there: a shadow is to go within a second."""
+"""How often the owners are checked; an injection ends within a second of its client."""
 
 OwnerOf = Callable[[int], Owner | None]
-"""The process that has a command queue at present; None: nobody."""
+"""Returns the process that has a command queue at present, or None."""
 
 
 class InjectionProcessor:
-    """Lays, feeds and lifts the injections of one source."""
+    """Adds, feeds and lifts the injections of one source."""
 
     def __init__(self, output: Output, writable: bytes, refuse_in: str, owner_of: OwnerOf, blocks: Blocks) -> None:
-        """``writable``: the bits that commands may write; ``refuse_in``: why nothing may be laid over ``/in``."""
+        """Create the processor, and resume the injections of the previous process.
+
+        Args:
+            output: Publishes the source's images and events.
+            writable: The bits that commands may write, as an image of the block.
+            refuse_in: Why no injection may cover ``/in``; empty if it may.
+            owner_of: Finds the process that has a command queue.
+            blocks: Returns the blocks of all sources.
+
+        """
         self._output = output
         self._writer = output.writer
         self._owner_of = owner_of
-        self._look_ns = 0  # of CLOCK_MONOTONIC, whatever clock the source has: clients live by that
+        self._look_ns = 0  # of CLOCK_MONOTONIC, independent of the source's clock
         self._publisher = LayerPublisher(output, writable, refuse_in)
         self.declared = DeclaredInjections(self._publisher, blocks)
         self._resume()
@@ -41,25 +50,25 @@ class InjectionProcessor:
 
     @property
     def injections(self) -> LayerStack:
-        """All there are."""
+        """All layers of the source."""
         return self._output.injections
 
     @property
     def patience_ns(self) -> int:
-        """How long until :meth:`look` has something to do; negative: there is nothing to look after."""
+        """Time until :meth:`look` has work, in ns; negative if it has none."""
         if all(layer.keep for layer in self.injections.layers) and not self.declared.reads_other_sources:
             return -1
         return max(0, self._look_ns - time.monotonic_ns())
 
     def toward_device(self, command: Command) -> Layer | None:
-        """The injection over ``/in`` whose values a command carries; None: it carries no such values."""
+        """Return the injection over ``/in`` whose values the command carries, if it does."""
         layer = self.injections.find(command.injection) if command.kind is CommandKind.SHADOW else None
         if layer is None or layer.direction is not Direction.IN or isinstance(layer, DeclaredLayer):
             return None
         return layer
 
     def take(self, command: Command) -> str:
-        """Carry out INJECT, DECLARE, LIFT, or SHADOW for what lies over ``/out``; why not, or empty."""
+        """Carry out INJECT, DECLARE, LIFT, or SHADOW over ``/out``; return why not, or ""."""
         if command.kind in (CommandKind.INJECT, CommandKind.DECLARE):
             owner = self._owner_of(command.writer)
             if owner is None:
@@ -79,9 +88,10 @@ class InjectionProcessor:
         return ""
 
     def look(self) -> None:
-        """Follow the configuration; at most every ``LOOK_NS`` see what others have done.
+        """Follow the configuration, and at most every ``LOOK_NS`` check owners and conditions.
 
-        Lift what nobody keeps and whose client is gone; find anew what conditions read in sources that have changed.
+        Injections without ``keep`` are lifted once their client is gone. Conditions on changed
+        sources are compiled again.
         """
         self.declared.follow()
         if self.patience_ns != 0:
@@ -135,7 +145,10 @@ class InjectionProcessor:
         return ""
 
     def _resume(self) -> None:
-        """Go on with what stood when the source's process before this one ended: consumers see the same values on."""
+        """Resume the injections of the previous process.
+
+        Consumers continue to see the same values.
+        """
         block = self._writer.block
         last = block.latest()
         raw, image = (last.raw, last.image) if last else (bytes(block.layout.size),) * 2
@@ -160,9 +173,9 @@ class InjectionProcessor:
                 layer.values ^= (layer.values ^ self._given(layer, raw)) & hidden
 
     def _given(self, layer: Layer, raw: bytes) -> Bits:
-        """The values that a client has given, where consumers see what injections further out make of them.
+        """Return the values that a client gave, where layers further out hide them from consumers.
 
-        The events know them, as far as the ring goes back.
+        They are taken from the events, as far as these go back.
         """
         values = self.injections.before(raw, layer)
         events = self._writer.block.events

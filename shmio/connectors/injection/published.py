@@ -1,4 +1,4 @@
-"""The injections of one source as all others see them: what stands in the segment, and events when that changes."""
+"""Publishes the injections of one source: the list in the segment, and events about changes."""
 
 from __future__ import annotations
 
@@ -18,28 +18,35 @@ from shmio.segment.events import EVENT_DATA_SIZE
 from shmio.segment.standing_injections import StandingInjection, encode, ranges_of
 
 GROWTH: Final = 64
-"""What an injection may take in the segment beyond what it did when it was laid: its numbers grow."""
+"""Bytes reserved per injection in the segment, because its numbers grow."""
 
 
 class LayerPublisher:
-    """Lays and lifts, whoever asks for it."""
+    """Adds and removes layers, and publishes each change."""
 
     def __init__(self, output: Output, writable: bytes, refuse_in: str) -> None:
-        """``writable``: the bits that commands may write; ``refuse_in``: why nothing may be laid over ``/in``."""
+        """Create the publisher.
+
+        Args:
+            output: Publishes the source's images and events.
+            writable: The bits that commands may write, as an image of the block.
+            refuse_in: Why no injection may cover ``/in``; empty if it may.
+
+        """
         self.output = output
         self._writable = np.frombuffer(writable, np.uint8)
         self._refuse_in = refuse_in
-        self._shown: dict[int, tuple[object, bytes]] = {}  # by number: what it was made from, and the JSON
+        self._shown: dict[int, tuple[object, bytes]] = {}  # by number: the state, and the JSON made from it
         self._ranges: dict[int, tuple[tuple[int, int, int], ...]] = {}
-        self._computed: dict[int, list[Write]] = {}  # by number: what was told last of what declared ones give it
+        self._computed: dict[int, list[Write]] = {}  # by number: the values published last
 
     @property
     def injections(self) -> LayerStack:
-        """All there are."""
+        """All layers of the source."""
         return self.output.injections
 
     def lay(self, layer: Layer) -> str:
-        """Add a layer, with the output's ``turn`` held; why not, or empty."""
+        """Add a layer; return why not, or "". The caller holds the output's ``turn``."""
         if layer.direction is Direction.IN:
             if self._refuse_in:
                 return self._refuse_in
@@ -56,17 +63,17 @@ class LayerPublisher:
         return ""
 
     def restore(self, layer: Layer) -> None:
-        """Go on with a layer of the process before this one, of which everybody knows."""
+        """Add a layer of the previous process, which is published already."""
         self._ranges[layer.id] = ranges_of(layer.cover.tobytes())
         self.injections.lay(layer)
 
     def lift(self, which: Callable[[Layer], bool], reason: str, command: Command | None = None) -> None:
-        """Remove layers and tell why."""
+        """Remove layers, and publish why."""
         with self.output.turn:
             self.output.show(self.removed(which, reason, command))
 
     def removed(self, which: Callable[[Layer], bool], reason: str, command: Command | None = None) -> list[Record]:
-        """Remove layers, with the output's ``turn`` held; the events that tell why."""
+        """Remove layers, and return the events. The caller holds the output's ``turn``."""
         gone = [layer for layer in self.injections.layers if which(layer)]
         above = {other.id for layer in gone for other in self.injections.outer(layer)}
         self.injections.lift(which)
@@ -79,23 +86,23 @@ class LayerPublisher:
         held = [record for layer in gone if isinstance(layer, DeclaredLayer) for record in lost(layer, reason)]
         left = [layer for layer in self.injections.layers if layer.id in above]
         for layer in left:
-            self._computed.pop(layer.id, None)  # they are told now what they get without those that are gone
+            self._computed.pop(layer.id, None)  # published below, without the removed layers
         return [*held, *self.inner_values(left, ends[0]), *ends] if ends else []
 
     def inner_values(self, layers: Iterable[Layer], end: Record) -> Iterator[Record]:
-        """What clients' layers over ``/out`` get by now from those further in.
+        """Yield the values that clients' layers over ``/out`` now get from further in.
 
-        It is told before ``end``, which is why it changed.
+        These events precede ``end``, the event that caused the change.
         """
         for layer in layers:
             told = Record(EventKind.DIVERTED, layer.name, end.writer, end.command, injection=layer.id)
             yield from _parts(told, self.injections.inner_values(self.output.base, layer))
 
     def computed(self, base: bytes) -> Iterator[Record]:
-        """What clients' layers over ``/out`` get by now from declared ones further in, if it has changed.
+        """Yield the changed values that clients' layers over ``/out`` get from declared ones.
 
-        Also when the last of these has become inactive, for then others further in may give them something else.
-        No command brings it: its number is 0, and each event is the item-th of so many items.
+        The events also come when the last such layer has become inactive. No command causes them:
+        their command number is 0, and ``item`` and ``items`` count them.
         """
         for layer in self.injections.layers:
             inner = self.injections.inner(layer) if layer.given else []
@@ -111,7 +118,7 @@ class LayerPublisher:
                 yield from (part._replace(item=item, items=len(parts)) for item, part in enumerate(parts))
 
     def laid(self, layer: Layer, end: Record) -> Iterator[Record]:
-        """The events that a client's layer was laid: which way, over what, for how long."""
+        """Yield the events of a new client's layer: direction, priority, keep and ranges."""
         how = {
             "direction": layer.direction.name.lower(),
             "priority": layer.priority,
@@ -121,9 +128,11 @@ class LayerPublisher:
         return in_parts(end, msgspec.json.encode(how))
 
     def publish(self, growth: int = 0) -> None:
-        """Say in the segment what stands, with the output's ``turn`` held.
+        """Write the list of injections into the segment. The caller holds the output's ``turn``.
 
-        ValueError: it is too much, or would be with so many bytes more.
+        Raises:
+            ValueError: The list is too long, or would be with ``growth`` more bytes.
+
         """
         items = (self._item(layer) for layer in self.injections.layers)
         self.output.writer.block.standing.write(encode(items, growth))
@@ -143,10 +152,12 @@ class LayerPublisher:
 def divert_command(
     output: Output, command: Command, above: Layer | None
 ) -> tuple[list[tuple[Item, Layer | None]], list[Item]]:
-    """Let a command's items meet the injections below ``above``, and tell of what these get.
+    """Pass a command's items through the layers below ``above``, and publish what these take or change.
 
-    What is left for the device, each with the injection whose values these are by now, if one's; and the items of which
-    nothing is left.
+    Returns:
+        The items with bits left for the device, each with the layer that sent or changed it last;
+        and the items of which nothing is left.
+
     """
     left: list[tuple[Item, Layer | None]] = []
     taken: list[Item] = []
@@ -170,7 +181,7 @@ def divert_command(
 
 
 def lost(layer: DeclaredLayer, reason: str) -> Iterator[Record]:
-    """The events of what a delay held and will not send."""
+    """Remove the writes that a delay holds, and yield their EXPIRED events."""
     reason = f"a delay held it: {reason}"
     while layer.held:
         offset, mask, data = layer.held.popleft().write
@@ -180,7 +191,7 @@ def lost(layer: DeclaredLayer, reason: str) -> Iterator[Record]:
 def pieces(
     kind: EventKind, command: Command, place: int, writes: Iterable[Write], layer: Layer | None
 ) -> Iterator[Record]:
-    """Events that tell of parts of an item with their data; several if these are long."""
+    """Yield events with the data of parts of an item; long parts take several."""
     name, number = (layer.name, layer.id) if layer else ("", 0)
     return _parts(Record(kind, name, command.writer, command.id, place, 1, injection=number), writes)
 
@@ -193,11 +204,11 @@ def _parts(told: Record, writes: Iterable[Write]) -> Iterator[Record]:
 
 
 def in_parts(told: Record, document: bytes) -> Iterator[Record]:
-    """The events of an injection that is laid: how, as JSON in parts."""
+    """Yield the events that carry a JSON document in parts."""
     yield from _parts(told, [Write(0, 0, document)])
 
 
 def layer_event(kind: EventKind, layer: Layer, text: str, command: Command | None = None) -> Record:
-    """An event about an injection; with the command that asked for it, if it was not the injection's own."""
+    """Return an event about an injection, caused by ``command`` or else by its owner."""
     writer, number = (layer.owner.writer, layer.id) if command is None else (command.writer, command.id)
     return Record(kind, text, writer, number, 0, 1, injection=layer.id)

@@ -1,4 +1,7 @@
-"""What a source is that this process computes, where another has a device. The loop that runs it is in ``stepped``."""
+"""The base class of sources that are computed instead of read from a device.
+
+``stepped`` runs them.
+"""
 
 from __future__ import annotations
 
@@ -15,62 +18,89 @@ from shmio.segment import BlockWriter
 
 
 class Computed(ABC):
-    """A source that lives on the instance's clock. All hooks run in one thread.
+    """A source that follows the instance clock. All hooks run in one thread.
 
-    A hook that fails raises a ShmioError, in words for the person at the cell; the next cycle tries again.
+    A hook that fails raises a ShmioError with a text for the operator of the cell. The next cycle
+    tries again.
     """
 
     Options: ClassVar[type[msgspec.Struct]]
-    """Its own keys of ``[[source]]``; refuses unknown ones."""
+    """Its own keys of ``[[source]]``. The struct must refuse unknown keys."""
 
     prompt: ClassVar[bool] = False
-    """Whether what is written is shown at once, without waiting for a cycle."""
+    """Whether written values are published at once, without waiting for a cycle."""
 
     timeout_s: float = 1.0
-    """How long a step is to take at most."""
+    """The longest time that a step may take, in s."""
 
     @abstractmethod
     def __init__(self, options: Any, layout: Layout) -> None:
-        """``options`` is an instance of ``Options``. ConfigError when layout and options do not go together."""
+        """Create the source.
+
+        Args:
+            options: An instance of ``Options``.
+            layout: The layout of the source's block.
+
+        Raises:
+            ConfigError: Layout and options contradict each other.
+
+        """
 
     @property
     def connections(self) -> Mapping[str, str]:
-        """The topic that each connected input is read from, by the input's path."""
+        """The topic that each connected input reads, by the input's path."""
         return {}
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Paths of the registers that may be connected."""
+        """The paths of the registers that may be connected."""
         return ()
 
     def connect(self, values: Mapping[str, Value], doubt: str) -> None:  # noqa: B027  not every source has inputs
-        """Values of connected inputs for the next :meth:`step`; one that is left out keeps what it has.
+        """Take the values of connected inputs for the next :meth:`step`.
 
-        ``doubt``: why some are left out.
+        Args:
+            values: Values by path. An input without a value keeps the one it has.
+            doubt: Why values are missing; empty if none are.
+
         """
 
     def attach(self, writer: BlockWriter) -> None:  # noqa: B027  most need nothing of it
-        """Take the writing side of the block; once, before the hooks below. SegmentError."""
+        """Take the writing side of the block; called once, before the hooks below.
+
+        Raises:
+            SegmentError: The block does not fit the source.
+
+        """
 
     @abstractmethod
     def resume(self, image: bytes) -> None:
-        """Go on from the last image that the source's process before this one published; before :meth:`begin`."""
+        """Continue from the last image of the previous process; called before :meth:`begin`."""
 
     @abstractmethod
     def begin(self) -> bytes:
-        """The image before the first step; of a prompt source, as it is now."""
+        """Return the image before the first step; of a prompt source, the present image."""
 
     def news(self) -> bool:
-        """Whether :meth:`begin` has something else to say by now; asked between two steps."""
+        """Return whether :meth:`begin` has a new result; called between two steps."""
         return False
 
     def interrupt(self) -> None:  # noqa: B027  most never wait
-        """Have a step that waits for others end soon; from any thread."""
+        """End a step that waits. Any thread may call it."""
 
     @abstractmethod
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Take these bytes and bits; for each "" or why it is refused."""
+        """Take bytes and bits; return for each "" or why it is refused."""
 
     @abstractmethod
     def step(self, time_ns: int, dt_ns: int) -> bytes:
-        """The image at a time of the instance's clock, ``dt_ns`` after the one before."""
+        """Compute the image at an instance time.
+
+        Args:
+            time_ns: The instance time at the end of the step, in ns.
+            dt_ns: The length of the step, in ns.
+
+        Returns:
+            The image, ``layout.size`` bytes.
+
+        """

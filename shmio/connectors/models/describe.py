@@ -1,7 +1,7 @@
-"""Tells what a model declares, in a process of its own: a model is anybody's code, and may have changed since.
+"""Describes a model in a process of its own, because a model is foreign code and may have changed.
 
-Reads an object of ``options`` and ``layout`` (or null) on standard input, and writes one of ``layout`` and ``inputs``,
-or of ``error``.
+Reads a JSON object with ``options`` and ``layout`` (or null) from standard input, and writes one
+with ``layout`` and ``inputs``, or with ``error``.
 """
 
 from __future__ import annotations
@@ -17,14 +17,17 @@ from shmio.layout.model import Layout
 
 
 class Request(msgspec.Struct):
-    """What to look at. ``layout``: the document of one, if the model is to run on that."""
+    """The model to describe.
+
+    ``layout`` is the JSON document of a layout, if the model is to run on one.
+    """
 
     options: Simulation.Options
     layout: str | None
 
 
 class Answer(msgspec.Struct):
-    """What was found: the block's layout, as a document, and the inputs that can be connected; or what is wrong."""
+    """The block's layout as a document and the inputs that can be connected, or an error."""
 
     layout: str = ""
     inputs: tuple[str, ...] = ()
@@ -32,7 +35,7 @@ class Answer(msgspec.Struct):
 
 
 def main() -> int:
-    """Answer one request; the exit status."""
+    """Answer one request; return the exit status."""
     answer_fd = os.dup(1)
     os.dup2(2, 1)  # what a model prints is no answer
     request = msgspec.json.decode(sys.stdin.buffer.read(), type=Request)

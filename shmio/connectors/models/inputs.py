@@ -1,4 +1,4 @@
-"""Connected inputs: registers of sources, read for a step as they were before it."""
+"""Connected inputs: registers of other sources, read before a step."""
 
 from __future__ import annotations
 
@@ -17,18 +17,27 @@ NO_DATA: Final = "no data yet"
 class Inputs:
     """The connections of one source; for one thread.
 
-    Of a block that takes part in steps the frame before the present step counts, whoever was faster (the method of
-    Jacobi); of any other the newest.
+    From a block that takes part in steps it reads the frame before the present step, whichever
+    source is faster (the Jacobi method). From any other block it reads the newest frame.
     """
 
     def __init__(self, segment: Segment, connections: Mapping[str, Topic]) -> None:
-        """``segment``: for this alone, as it follows reloads; ``connections``: a topic for each input, by its path."""
+        """Create the inputs.
+
+        Args:
+            segment: A segment for this object alone, because it follows reloads.
+            connections: The topic of each input, by the input's path.
+
+        """
         self._segment = segment
         self._connections = connections
         self._found: dict[str, tuple[Block, RegisterCodec]] = {}
 
     def read(self, step: int | None) -> tuple[dict[str, Value], str]:
-        """The good values by their inputs, and why others have none. ``step``: the present one; None: wall time."""
+        """Return the good values by input, and why others are missing.
+
+        ``step`` is None in wall time.
+        """
         if self._segment.refresh():
             self._found = {}
         values: dict[str, Value] = {}
@@ -60,7 +69,7 @@ class Inputs:
 
 
 def _frame(block: Block, step: int | None) -> tuple[Frame | None, str]:
-    """The frame that counts, if it can be trusted, else why not."""
+    """Return the frame to read, or None and why it cannot be trusted."""
     frame = block.latest()
     while frame is not None and step is not None and block.came_with(frame, step):
         frame = block.read(frame.number - 1)

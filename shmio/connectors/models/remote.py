@@ -19,21 +19,22 @@ from shmio.segment.model_channel import ConnectedModel, ModelAnswer, ModelChanne
 from shmio.simulation.images import Images
 
 TURN_NS: Final = 50_000_000
-"""Who waits for an answer looks by itself, too: the bell of a process that dies is silent."""
+"""How often to check the model while waiting: a process that dies causes no wake-up."""
 STOPPED: Final = "the source was stopped"
 
 
 class Remote(Computed):
-    """``connector = "remote"``: asks the model that is connected by Simulate of shmio.v1 for each step.
+    """``connector = "remote"``: asks the model connected by Simulate of shmio.v1 for each step.
 
-    Without one a step fails at once; with one that does not answer, when ``timeout_ms`` are over. Registers that it
-    does not compute are shown as they are commanded or connected, from the next step on.
+    Without a model a step fails at once; with one that does not answer, after ``timeout_ms``.
+    Registers that the model does not compute show what is commanded or connected, from the next
+    step on.
     """
 
     class Options(msgspec.Struct, forbid_unknown_fields=True):
-        """Its keys. ``outputs``, ``inouts``: patterns of registers, at least one; ``timeout_ms`` in real time.
+        """Its keys. ``outputs`` and ``inouts`` are patterns, at least one; ``timeout_ms`` is real time.
 
-        The time-out is less than the 10 s for which a step waits for its sources.
+        The limit of ``timeout_ms`` is below the 10 s that a step waits for its sources.
         """
 
         outputs: list[str] = []
@@ -42,7 +43,12 @@ class Remote(Computed):
         timeout_ms: Annotated[float, msgspec.Meta(gt=0, le=9000)] = 1000.0
 
     def __init__(self, options: Options, layout: Layout) -> None:
-        """ConfigError: nothing is computed, or the layout has no such registers."""
+        """Create the source.
+
+        Raises:
+            ConfigError: Nothing is computed, or the layout has no such registers.
+
+        """
         if not options.outputs and not options.inouts:
             raise ConfigError(
                 'outputs: this key is needed: patterns of the registers that the model computes, such as ["axes/**"]'
@@ -59,21 +65,21 @@ class Remote(Computed):
         self._options = options
         self.timeout_s = options.timeout_ms / 1000
         self._doubt = ""
-        self._told: ConnectedModel | None = None  # who was connected when the source said so last
+        self._told: ConnectedModel | None = None  # the model connected when begin() or step() last looked
         self._stopped = False
 
     @property
     def connections(self) -> Mapping[str, str]:
-        """As configured."""
+        """The connections as configured."""
         return self._options.connections
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """All registers but the outputs."""
+        """The paths of all registers except outputs."""
         return self._inputs
 
     def attach(self, writer: BlockWriter) -> None:
-        """Find the way to the model."""
+        """Find the channel to the model."""
         link = writer.block.model_channel
         if link is None:
             raise SegmentError(f"source {writer.block.source}: its block has no link to a model")
@@ -82,7 +88,7 @@ class Remote(Computed):
         self._link.asked.begin()
 
     def connect(self, values: Mapping[str, Value], doubt: str) -> None:
-        """Command registers that are connected."""
+        """Command the connected registers."""
         self._doubt = doubt
         for path, value in values.items():
             try:
@@ -91,17 +97,22 @@ class Remote(Computed):
                 raise ConnectorError(f"input {path}: {error}") from None
 
     def resume(self, image: bytes) -> None:
-        """Go on from the registers; what else the model knows, it has itself."""
+        """Continue from the registers. The model itself keeps its other state."""
         self._images.resume(image)
 
     def begin(self) -> bytes:
-        """The image as it is; ConnectorError: no model is connected."""
+        """Return the present image.
+
+        Raises:
+            ConnectorError: No model is connected.
+
+        """
         self._told = self._link.model()
         self._connected(self._told)
         return bytes(self._images.shown)
 
     def news(self) -> bool:
-        """Whether another model is connected by now, or none."""
+        """Return whether a model has connected, changed or left."""
         return self._link.model() != self._told
 
     def write(self, writes: Sequence[Write]) -> list[str]:
@@ -109,7 +120,13 @@ class Remote(Computed):
         return self._images.write(writes)
 
     def step(self, time_ns: int, dt_ns: int) -> bytes:
-        """Have the model compute. ConnectorError: there is none, or no answer comes; ModelError: it has failed."""
+        """Have the model compute a step.
+
+        Raises:
+            ConnectorError: There is no model, or it does not answer.
+            ModelError: The model failed.
+
+        """
         self._told = self._link.model()
         model = self._connected(self._told)
         until_ns = time.monotonic_ns() + round(1e9 * self.timeout_s)
@@ -123,7 +140,7 @@ class Remote(Computed):
         return bytes(images.shown)
 
     def interrupt(self) -> None:
-        """Wait for no answer any more."""
+        """End the wait for an answer."""
         self._stopped = True
         self._link.answered.wake()
 
@@ -137,7 +154,7 @@ class Remote(Computed):
         return model
 
     def _await(self, number: int, model: ConnectedModel, until_ns: int) -> ModelAnswer:
-        """The answer to an ask."""
+        """Wait for the answer to a request."""
         link = self._link
         while True:
             seen = link.answered.doorbell()  # before looking

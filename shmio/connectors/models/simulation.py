@@ -18,10 +18,13 @@ from shmio.simulation.runner import ModelRunner
 
 
 class Simulation(Computed):
-    """``connector = "simulation"``: runs one model on the instance's clock."""
+    """``connector = "simulation"``: runs one model on the instance clock."""
 
     class Options(msgspec.Struct, forbid_unknown_fields=True):
-        """Its keys. ``model``: ``package.module:Class``; ``folder``: where modules are that are not installed."""
+        """Its keys.
+
+        ``model``: ``package.module:Class``; ``folder``: where to look for uninstalled modules.
+        """
 
         model: str
         parameters: dict[str, Any] = {}
@@ -30,30 +33,35 @@ class Simulation(Computed):
         folder: str = "."
 
     def __init__(self, options: Options, layout: Layout) -> None:
-        """ConfigError: there is no such model, or its declarations do not go with the layout or the parameters."""
+        """Create the model.
+
+        Raises:
+            ConfigError: There is no such model, or it does not fit the layout or the parameters.
+
+        """
         self._runner = make(options, layout)
         self._connections = options.connections
 
     @property
     def connections(self) -> Mapping[str, str]:
-        """As configured."""
+        """The connections as configured."""
         return self._connections
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """As the model declares them."""
+        """The inputs that the model declares."""
         return self._runner.inputs
 
     def connect(self, values: Mapping[str, Value], doubt: str) -> None:  # noqa: ARG002  no model asks for it
-        """Give values to inputs."""
+        """Set the values of inputs."""
         self._runner.connect(values)
 
     def resume(self, image: bytes) -> None:
-        """Go on from the registers; what else a model knows is gone with its process."""
+        """Continue from the registers. Other state of the model is lost with its process."""
         self._runner.resume(image)
 
     def begin(self) -> bytes:
-        """Start the model."""
+        """Start the model; return its first image."""
         return self._runner.begin()
 
     def write(self, writes: Sequence[Write]) -> list[str]:
@@ -61,12 +69,17 @@ class Simulation(Computed):
         return self._runner.write(writes)
 
     def step(self, time_ns: int, dt_ns: int) -> bytes:
-        """Have the model compute."""
+        """Have the model compute a step."""
         return self._runner.step(time_ns, dt_ns)
 
 
 def make(options: Simulation.Options, layout: Layout | None) -> ModelRunner:
-    """The model behind the options, on a layout or on that of its declarations. ConfigError, beginning with the key."""
+    """Create the model of these options, on a layout or on the one that it declares.
+
+    Raises:
+        ConfigError: The model cannot be created. The message begins with the key.
+
+    """
     try:
         model = load(options.model, options.folder)
         own = layout_of(model) if layout is None else layout

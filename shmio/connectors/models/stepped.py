@@ -1,4 +1,4 @@
-"""The loop that runs what is computed: on its schedule in wall time, step by step in virtual time."""
+"""The loop that runs computed sources: on schedule in wall time, step by step in virtual time."""
 
 from __future__ import annotations
 
@@ -23,20 +23,23 @@ RESTARTED: Final = "its process was started anew within this step; it goes on wi
 
 
 class StepClock(Protocol):
-    """Time and news as the loop sees them; tests bring their own."""
+    """The loop's view of time and wake-ups; tests provide their own."""
 
     def now_ns(self) -> int:
-        """CLOCK_MONOTONIC."""
+        """Return the time of CLOCK_MONOTONIC in ns."""
 
     def wait_ns(self, duration_ns: int | None) -> bool:
-        """Wait for news, at most so long; True as soon as the loop is to stop."""
+        """Wait for a wake-up, at most ``duration_ns``.
+
+        Return True as soon as the loop is to stop.
+        """
 
     def nudge(self) -> None:
-        """There is news; from any thread."""
+        """Wake the loop. Any thread may call it."""
 
 
 class PageClock:
-    """The loop's clock in a live instance; news come by the bell that the clock page has for the process."""
+    """The loop's clock in a live instance. The clock page has a wake-up for each process."""
 
     def __init__(self, page: ClockPage, slot: int) -> None:
         self._bell = page.slot_bell(slot)
@@ -44,32 +47,32 @@ class PageClock:
         self._stopped = False
 
     def now_ns(self) -> int:
-        """CLOCK_MONOTONIC."""
+        """Return the time of CLOCK_MONOTONIC in ns."""
         return time.monotonic_ns()
 
     def wait_ns(self, duration_ns: int | None) -> bool:
-        """Wait for news, at most so long; True as soon as the loop is to stop.
+        """Wait for a wake-up, at most ``duration_ns``; return True as soon as the loop is to stop.
 
-        What rings while the loop looks at the news of one wait ends the next.
+        A wake-up that comes while the loop works ends the next wait.
         """
         if not self._stopped and (duration_ns is None or duration_ns > 0):
             self._seen = self._bell.wait(self._seen, -1 if duration_ns is None else duration_ns)
         return self._stopped
 
     def nudge(self) -> None:
-        """End a wait."""
+        """Wake the loop. Any thread may call it."""
         self._bell.ring()
 
     def stop(self) -> None:
-        """Make the loop stop; from any thread."""
+        """Stop the loop. Any thread may call it."""
         self._stopped = True
         self.nudge()
 
 
 class SteppedLoop:
-    """Runs one source that is computed: publishes its frames, and hands on what is to be written.
+    """Runs one computed source: publishes its frames and carries out writes.
 
-    In virtual time the frame of a step is the answer to it, so there is always one; a bad one says why it failed.
+    In virtual time every step publishes a frame; a bad one says why the step failed.
     """
 
     def __init__(
@@ -85,24 +88,37 @@ class SteppedLoop:
         owner_of: OwnerOf = lambda _: None,
         blocks: Blocks | None = None,
     ) -> None:
-        """``writable``: patterns of what commands may write. ``inputs``: of the source's connections, if it has any."""
+        """Create the loop.
+
+        Args:
+            source: The computed source.
+            writer: The writing side of the source's block.
+            schedule: When cycles are due in wall time.
+            clock: The loop's clock.
+            writable: Patterns of the registers that commands may write.
+            allow_nonfinite: See :class:`CommandProcessor`.
+            inputs: The source's connections, if it has any.
+            owner_of: Finds the process that has a command queue.
+            blocks: Returns the blocks of all sources.
+
+        """
         self._source = source
         source.attach(writer)
         self._writer = writer
         self._page = writer.block.clock
         writer.utc_ns = self._page.utc_ns
         self._from_start = self._schedule = schedule
-        self._basis = ClockState().basis  # what the schedule counts from
+        self._basis = ClockState().basis  # the zero of the schedule
         self._clock = clock
         self._inputs = inputs
         self._output = Output(writer, clock.now_ns)
-        # Whatever is injected here reaches no plant, so that no arming is needed.
+        # Injections here reach no device, so arming is not needed.
         self.commands = CommandProcessor(
             self._output, writable, clock.now_ns, allow_nonfinite=allow_nonfinite, armed=True, owner_of=owner_of,
             blocks=blocks, accepted=clock.nudge,
         )  # fmt: skip
         self._condition = QualityLog(writer)
-        self._handled = 0  # the last step computed, or passed over
+        self._handled = 0  # the last step computed or skipped
         self._time_ns: int | None = None  # the instance's clock at what was computed last
         self._published = False
         self.counters = Counters()
@@ -113,7 +129,7 @@ class SteppedLoop:
         return self._condition.note
 
     def run(self) -> None:
-        """Compute until the clock says stop; then tell the readers."""
+        """Compute until the clock says stop, then publish the end of the source."""
         try:
             self._begin()
             while not (self._live() if self._page.read().virtual else self._free_run()):
@@ -126,7 +142,7 @@ class SteppedLoop:
             self._writer.event(Record(EventKind.STOPPED))
 
     def _begin(self) -> None:
-        """Go on from what the process before this one has left."""
+        """Continue from what the previous process has left."""
         last = self._writer.block.latest()
         if self._output.source_ns:
             self._source.resume(self._output.raw)
@@ -139,7 +155,7 @@ class SteppedLoop:
         self._writer.at_ns = self._page.monotonic_ns(state.time_ns)
         self._time_ns = state.time_ns
         if state.stepping and last is None:
-            self._handled -= 1  # nothing is lost: it takes part
+            self._handled -= 1  # it takes part in the present step
         elif state.stepping and last is not None and last.cycle < state.step:
             self._fail(state.step, RESTARTED)
         else:
@@ -148,7 +164,7 @@ class SteppedLoop:
     # ---- wall time -----------------------------------------------------------------------------------------------
 
     def _free_run(self) -> bool:
-        """Wait for the next cycle of the schedule and compute it; True: told to stop."""
+        """Wait for the next cycle of the schedule and compute it; return True if told to stop."""
         state = self._page.told()
         if state.virtual:
             return False
@@ -171,9 +187,9 @@ class SteppedLoop:
                 return False
         if self._clock.wait_ns(0):
             return True
-        if self._page.told().basis != self._basis:  # looked at after the time: see Coordinator.take_over
+        if self._page.told().basis != self._basis:  # read after the time: see Coordinator.take_over
             return False
-        if now_ns >= self._schedule.due_ns(due.cycle + 1):  # held up while it waited
+        if now_ns >= self._schedule.due_ns(due.cycle + 1):  # this thread was delayed while it waited
             self.counters.overruns += 1
             return False
         period_ns = self._writer.block.period_ns
@@ -182,14 +198,17 @@ class SteppedLoop:
         return False
 
     def _resume(self, state: ClockState) -> None:
-        """Go on with real time, which was released."""
+        """Follow real time again after virtual time was released."""
         self._basis = state.basis
         self._schedule = self._from_start.moved(state.offset_ns, state.lead(self._writer.block.period_ns))
 
     # ---- virtual time --------------------------------------------------------------------------------------------
 
     def _live(self) -> bool:
-        """Do the step that is asked for, or what came between two; else wait. True: told to stop."""
+        """Compute a requested step, or handle what came between two.
+
+        Return True if told to stop.
+        """
         state = self._page.read()
         if not state.virtual:
             return False
@@ -212,13 +231,13 @@ class SteppedLoop:
     # ---- both ----------------------------------------------------------------------------------------------------
 
     def _compute(self, cycle: int, time_ns: int, dt_ns: int) -> None:
-        """One cycle, or one step."""
+        """Compute one cycle or step."""
         self._writer.cycle, self._time_ns = cycle, time_ns
         self._published = False
         self.commands.release(cycle)
         self._carry_out()
         if self._published:
-            return  # a source that shows at once what is written has no more to say
+            return  # a prompt source has published the frame already
         begun_ns, asked_ns = self._clock.now_ns(), self._writer.now_ns()
         try:
             raw, doubt = self.counters.watch(self._clock.now_ns, lambda: self._step(time_ns, dt_ns))
@@ -241,20 +260,20 @@ class SteppedLoop:
         return self._writer.at_ns is not None
 
     def _show(self, cycle: int) -> None:
-        """Publish how the source is without a step."""
+        """Publish the present image without a step."""
         try:
             self._publish(self._source.begin(), self._writer.now_ns())
         except ShmioError as error:
             self._fail(cycle, str(error))
 
     def _carry_out(self) -> None:
-        """Hand over all that was accepted."""
+        """Carry out all accepted commands."""
         self.commands.settle()
         if self.commands.waiting:
             self.commands.carry_out(self._write)
 
     def _write(self, writes: Sequence[Write]) -> list[str]:
-        """Hand over what is to be written; of a prompt source the frame that shows it comes before the outcomes."""
+        """Write to the source. A prompt source publishes a frame before the outcomes."""
         refusals = self._source.write(writes)
         if self._source.prompt:
             self._publish(self._source.begin(), self._writer.now_ns())
@@ -270,12 +289,12 @@ class SteppedLoop:
         self.counters.polls += 1
 
     def _fail(self, cycle: int, reason: str) -> None:
-        """Publish a bad frame with the last image: in virtual time always, else for each new reason."""
+        """Publish a bad frame: in virtual time always, in wall time for each new reason."""
         new = self._condition.tell(Quality.BAD, reason, cycle)
         if new or self._in_virtual_time:
             raw, source_ns = self._output.raw, self._output.source_ns
             self._output.publish(Image(raw, cycle, source_ns, Quality.BAD, Provenance.SIMULATED, reason))
 
     def _utc_ns(self) -> int:
-        """The time of an image: of its step, not of when that was computed."""
+        """Return the UTC time of the present image; in virtual time that of its step."""
         return time.time_ns() if self._writer.at_ns is None else self._page.utc_ns(self._writer.at_ns)

@@ -1,1 +1,1 @@
-"""``connector = "replay"``: a recording takes the place of what it was made of (docs/how-to/replay-a-recording.md)."""
+"""``connector = "replay"``: plays a recording (docs/how-to/replay-a-recording.md)."""

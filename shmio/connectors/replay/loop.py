@@ -1,4 +1,4 @@
-"""The loop that plays a recording: by the clock in wall time, step by step in virtual time, as the playhead says."""
+"""The loop that plays a recording: by the clock in wall time, by steps in virtual time."""
 
 from __future__ import annotations
 
@@ -34,13 +34,27 @@ from shmio.segment.playhead import (
 )
 
 AHEAD_NS: Final = 60_000_000_000
-"""A request may be of a moment that is so far ahead, and of any that has passed: its process may have been held up."""
+"""Most that the moment of a request may lie ahead.
+
+It may lie back any time: the process may have been delayed.
+"""
 
 
 def moved(play: PlayState, ask: MoveRequest, clock_ns: int) -> tuple[PlayState, int | None]:
-    """How it plays from the request's moment on, and the position that is to be shown; None: it goes on where it is.
+    """Apply a request to a play.
 
-    ``clock_ns``: the instance's clock now. ValueRangeError: it cannot be.
+    Args:
+        play: How it plays now.
+        ask: The request.
+        clock_ns: The instance time now, in ns.
+
+    Returns:
+        How it plays from the request's moment on, and the position to show; None if it stays where
+        it is.
+
+    Raises:
+        ValueRangeError: The request cannot be carried out.
+
     """
     if ask.speed is not None and not (math.isfinite(ask.speed) and MIN_SPEED <= ask.speed <= MAX_SPEED):
         raise ValueRangeError(f"a speed is from {MIN_SPEED:g} to {MAX_SPEED:g}, not {ask.speed:g}")
@@ -72,16 +86,27 @@ def moved(play: PlayState, ask: MoveRequest, clock_ns: int) -> tuple[PlayState, 
 
 
 ANY = "any"
-"""In place of a kind: whatever event is told."""
+"""Stands for every kind of event that is replayed."""
 SEARCH_PIECE = 256
-"""So many entries between two looks at what else there is to do."""
+"""Entries that a search reads before other work gets a turn."""
 
 
 class Search:
-    """A search under way, in pieces, so that what plays meanwhile goes on."""
+    """A search that runs in pieces, so that playing continues meanwhile."""
 
     def __init__(self, recorded: RecordedSource, find: FindRequest, end_ns: int, *, keep: bool) -> None:
-        """Up to before ``end_ns``. ``keep``: as consumers see the recording. PathError: no such register or kind."""
+        """Create a search.
+
+        Args:
+            recorded: The recording of the source.
+            find: What to find.
+            end_ns: The position before which the search ends.
+            keep: Whether the recorded injections are shown.
+
+        Raises:
+            PathError: There is no such register or event kind.
+
+        """
         self._end_ns = end_ns
         self._matches = (
             _event_matcher(find.event, keep=keep) if find.event else _change_matcher(recorded, find, keep=keep)
@@ -90,7 +115,7 @@ class Search:
         self._what = f"event {find.event}" if find.event else f"change of {find.path}"
 
     def go_on(self) -> PlayheadAnswer | None:
-        """Look a piece further; None: it is not over yet."""
+        """Read the next piece; return the result, or None if the search is not over."""
         for _ in range(SEARCH_PIECE):
             entry = next(self._entries, None)
             if entry is None or entry.position_ns >= self._end_ns:
@@ -132,13 +157,16 @@ def _change_matcher(recorded: RecordedSource, wanted: FindRequest, *, keep: bool
 
 
 PIECE: Final = 64
-"""So many frames and events between two looks at what else there is to do."""
+"""Frames and events that are played before other work gets a turn."""
 LATE_NS: Final = 10_000_000_000
-"""What is late is caught up with, up to this much of the instance's clock; what is later is left out."""
+"""Most instance time that is caught up on. What is later is skipped."""
 ASK_TURN_NS: Final = 1_000_000
-"""How often it is looked whether a step is over that a request waits for: its end rings nothing here."""
+"""How often to check whether the step that a request waits for is over.
+
+Its end causes no wake-up.
+"""
 BEHIND_NS: Final = 3_000_000_000
-"""What was due before a request is played before it is answered, if that takes no longer; else it is left out."""
+"""What was due before a request is played first if that takes at most this long, else it is skipped."""
 
 Asked = tuple[int, PlayheadRequest | None] | None
 
@@ -146,7 +174,10 @@ log = logging.getLogger("shmio.source")
 
 
 class ReplayLoop:
-    """Plays one source of a recording. In virtual time a step plays what lies in it, which may be nothing."""
+    """Plays one source of a recording.
+
+    In virtual time a step plays what lies in it, which may be nothing.
+    """
 
     def __init__(
         self,
@@ -160,7 +191,20 @@ class ReplayLoop:
         owner_of: OwnerOf = lambda _: None,
         blocks: Blocks | None = None,
     ) -> None:
-        """``writer``: of whose block ``beginning`` tells."""
+        """Create the loop.
+
+        Args:
+            source: The recording to play.
+            writer: The writing side of the source's block.
+            beginning: How to start, from :func:`~shmio.connectors.replay.start.begin` for the same
+                block.
+            clock: The loop's clock.
+            writable: See :class:`CommandProcessor`, also for the arguments below.
+            allow_nonfinite: Patterns of registers that may be written NaN and infinities.
+            owner_of: Finds the process that has a command queue.
+            blocks: Returns the blocks of all sources.
+
+        """
         block = writer.block
         if block.playhead is None:
             raise SegmentError(f"the block of source {block.source} has no playhead")
@@ -171,7 +215,7 @@ class ReplayLoop:
         self._page = block.clock
         self._clock = clock
         self._output = Output(writer, clock.now_ns)
-        # Whatever is injected here reaches no plant, so that no arming is needed.
+        # Injections here reach no device, so arming is not needed.
         self.commands = CommandProcessor(
             self._output, writable, clock.now_ns, allow_nonfinite=allow_nonfinite, armed=True, owner_of=owner_of,
             blocks=blocks, accepted=clock.nudge,
@@ -188,7 +232,7 @@ class ReplayLoop:
         return self._player.note
 
     def run(self) -> None:
-        """Play until the clock says stop; then tell the readers."""
+        """Play until the clock says stop, then publish the end of the source."""
         try:
             self._begin()
             while not self._turn():
@@ -200,13 +244,13 @@ class ReplayLoop:
             self._writer.event(Record(EventKind.STOPPED))
 
     def _begin(self) -> None:
-        """Go on from what the process before this one has published, if there was one."""
+        """Continue behind what the previous process published, if there was one."""
         play, clock_ns = self._play, self._page.read().time_ns
         if self._done_ns is not None:
             reach_ns = play.reach_ns(clock_ns) if play.wraps else play.at_ns(clock_ns)
             # What lies ahead was done before it was moved back, or in the round before.
             self._player.resume(self._done_ns if self._done_ns <= reach_ns else play.position_ns - 1)
-        else:  # who joins others that play is where they are
+        else:  # a source that joins others takes their position
             since_ns = clock_ns if clock_ns - play.anchor_ns > LATE_NS else play.anchor_ns
             self._player.begin(play.at_ns(since_ns), self._stamp)
             if play.over:
@@ -217,15 +261,15 @@ class ReplayLoop:
     # ---- the loop ------------------------------------------------------------------------------------------------
 
     def _turn(self) -> bool:
-        """Play what is due, do what is asked for, then wait for news; True: told to stop."""
-        asked = self._head.asks(self._play.asked)  # before the time is looked at: it tells of a moment before that
+        """Play what is due, answer requests, then wait; return True if told to stop."""
+        asked = self._head.asks(self._play.asked)  # before the time is read: the request is older
         state = self._page.read()
         # In virtual time what is published belongs to the end of the step.
         self._writer.at_ns = self._play.base_ns + self._play.at_ns(state.time_ns) if state.virtual else None
         stepped = state.stepping and state.step != self._play.step
         if stepped and state.step != self._play.begun:
             self._keep(self._play._replace(begun=state.step, head=self._writer.block.ring.head()))
-        # Before anything is played: a request that waited tells of a moment at which this played as it still does.
+        # Before anything is played: until a waiting request's moment the present play applies.
         before_ns = None if state.stepping else self._before_ns(asked, state.time_ns)
         more = before_ns is not None or (not state.stepping and self._listen(asked, state.time_ns))
         clock_ns = state.time_ns if before_ns is None else before_ns
@@ -241,7 +285,7 @@ class ReplayLoop:
         return self._clock.wait_ns(0 if more else ASK_TURN_NS if waits else self._patience_ns(virtual=state.virtual))
 
     def _patience_ns(self, *, virtual: bool) -> int | None:
-        """How long nothing is due; None: until somebody rings."""
+        """Return how long nothing is due, in ns; None to wait for a wake-up."""
         play, next_ns = self._play, self._player.next_ns
         if virtual or play.paused:
             return None
@@ -249,10 +293,10 @@ class ReplayLoop:
         return max(0, play.due_ns(goal_ns) - self._page.present_ns())
 
     def _advance(self, clock_ns: int) -> bool:
-        """Play what is due at a time of the instance's clock, a piece of it; whether there is more."""
+        """Play a piece of what is due at ``clock_ns``; return whether there is more."""
         self._leave_out(clock_ns)
         play = self._play
-        # What lies at the place where it is to pause is played, what lies at the end is not.
+        # The entry at the pause position is played, the one at the end is not.
         target_ns = min(play.reach_ns(clock_ns), play.until_ns, play.end_ns - 1)
         before = self._player.published
         if self._player.play(target_ns, self._stamp, PIECE):
@@ -262,14 +306,14 @@ class ReplayLoop:
         settled = play.settled(clock_ns)
         if settled is play:
             if self._player.stopped and not play.over and (play.paused or self._writer.at_ns is not None):
-                self._show(play.at_ns(clock_ns))  # it stands again, or its time does: no next frame would tell
+                self._show(play.at_ns(clock_ns))  # no next frame would show that it stands
             return False
         if settled.paused:
             over = settled.position_ns >= settled.end_ns
             if over:
                 self._end()
             self._keep(settled._replace(over=over))
-            self._writer.block.ring.wake()  # for who waits until it has come there
+            self._writer.block.ring.wake()  # for clients that wait for this position
             return False
         self._round_before = play
         self._keep(play.next_round())
@@ -280,9 +324,10 @@ class ReplayLoop:
         self._player.end(OVER, self._stamp(self._play.end_ns, self._play.end_ns))
 
     def _leave_out(self, clock_ns: int) -> None:
-        """Go on with the present, in wall time, where what comes next is too late.
+        """Skip to the present, in wall time, if what comes next is too late.
 
-        In a loop that is also what is a round late: nobody could tell it from what is due.
+        In a loop this includes entries that are a whole round late, because nobody could tell them
+        from those due.
         """
         play, next_ns = self._play, self._player.next_ns
         if next_ns is None or play.paused or self._writer.at_ns is not None:
@@ -294,14 +339,14 @@ class ReplayLoop:
             return
         left_out = behind_ns // self._source.recorded.block.period_ns
         self.counters.overruns += left_out
-        if too_late:  # else it is too fast, and would be told all the time
+        if too_late:  # else the speed is too high, and the line would repeat
             log.warning("%d frames were left out: this process was held up for %.1f s", left_out, late_ns / 1e9)
         if play.wraps:
             self._keep(play.settled(clock_ns))
         self._player.show(min(self._play.at_ns(clock_ns), play.end_ns - 1), self._stamp)
 
     def _stamp(self, position_ns: int, clock_ns: int) -> Stamp:
-        """When what is at a position is published; ``clock_ns``: of the recording."""
+        """Return the stamp of a position; ``clock_ns`` is the recorded clock."""
         return stamp(self._play, position_ns, clock_ns)
 
     def _stamp_now(self) -> Stamp:
@@ -318,13 +363,13 @@ class ReplayLoop:
     # ---- what others ask for -------------------------------------------------------------------------------------
 
     def _is_behind(self, clock_ns: int) -> bool:
-        """Whether something was due by a time of the instance's clock that was not played."""
+        """Return whether something that was due at ``clock_ns`` has not been played."""
         play, next_ns = self._play, self._player.next_ns
         due_ns = min(play.reach_ns(clock_ns), play.until_ns, play.end_ns - 1)
         return (next_ns is not None and next_ns <= due_ns) or play.settled(clock_ns) is not play
 
     def _before_ns(self, asked: Asked, clock_ns: int) -> int | None:
-        """The moment of a request that waits, if what was due by then is to be played first, as it is in time."""
+        """Return the moment of a waiting request if what was due by then is to be played first."""
         number, ask = asked or (0, None)
         if not isinstance(ask, MoveRequest) or number != self._play.asked + 1 or ask.position_ns is not None:
             return None
@@ -332,7 +377,10 @@ class ReplayLoop:
         return moment_ns if self._is_behind(moment_ns) and clock_ns - moment_ns < BEHIND_NS else None
 
     def _listen(self, asked: Asked, clock_ns: int) -> bool:
-        """Answer a request, or go on with the search for an answer; whether there is more to do."""
+        """Answer a request, or continue the search for its answer.
+
+        Return whether there is more to do.
+        """
         if asked is None:
             self._search = None
             return False
@@ -344,7 +392,7 @@ class ReplayLoop:
         if not isinstance(ask, MoveRequest):
             found = PlayheadAnswer("the request makes no sense")
         elif missed and ask.clock_ns <= self._play.anchor_ns:
-            found = PlayheadAnswer()  # it is in what others have done
+            found = PlayheadAnswer()  # the others' play includes it
         else:
             found = self._move(ask, clock_ns)
         self._answer(number, found)
@@ -367,11 +415,11 @@ class ReplayLoop:
         return True
 
     def _move(self, ask: MoveRequest, clock_ns: int) -> PlayheadAnswer:
-        """Play otherwise from a moment on."""
+        """Play as requested from the request's moment on."""
         play, behind = self._play, self._is_behind(min(ask.clock_ns, clock_ns + AHEAD_NS))
         before = self._round_before
         if before and before.anchor_ns <= ask.clock_ns < play.anchor_ns:
-            play, behind = play.moved_as(before), True  # asked just before it began anew
+            play, behind = play.moved_as(before), True  # the request came just before the round ended
         was_ns = play.at_ns(clock_ns)
         try:
             play, position_ns = moved(play, ask, clock_ns)
@@ -381,11 +429,11 @@ class ReplayLoop:
         if position_ns is not None:
             self._show(position_ns)
         elif behind or was_ns - play.at_ns(clock_ns) > self._source.recorded.block.stale_ns:
-            self._show(play.at_ns(clock_ns))  # or it is asked late to be where it was long ago
+            self._show(play.at_ns(clock_ns))  # or the request came late
         return PlayheadAnswer()
 
     def _catch_up(self, clock_ns: int) -> None:
-        """Play as others of this recording that have been moved since, for requests were missed."""
+        """Adopt the play of other sources of this recording, because requests were missed."""
         other = as_others(self._source, [head for block in self._blocks().values() if (head := block.playhead)])
         if other is None or other.anchor_ns <= self._play.anchor_ns:
             return
@@ -395,6 +443,6 @@ class ReplayLoop:
             self._end()
 
     def _show(self, position_ns: int) -> None:
-        """Publish what was there at a position, and go on behind it."""
+        """Publish the frame at a position, and continue behind it."""
         self._writer.at_ns = self._play.base_ns + position_ns
         self._player.show(position_ns, self._stamp)

@@ -1,4 +1,4 @@
-"""Publishes what a recording holds of one source: each frame and event with its own times."""
+"""Publishes the recorded frames and events of one source with their own times."""
 
 from __future__ import annotations
 
@@ -31,21 +31,24 @@ _OF_INJECTIONS: Final = frozenset(
 )
 
 StampOf = Callable[[int, int], Stamp]
-"""When what has a position and a clock in the recording is published."""
+"""Returns the stamp of an entry from its position and its recorded clock, both in ns."""
 
 log = logging.getLogger("shmio.source")
 
 
 def is_replayed(event: Event, *, keep: bool) -> bool:
-    """Whether a recorded event is told again; ``keep``: whether the injections of the recording are seen."""
+    """Return whether a recorded event is published.
+
+    ``keep``: whether recorded injections are shown.
+    """
     return event.kind not in _OF_PROCESSES and (keep or not (event.kind in _OF_INJECTIONS or event.injection))
 
 
 class Player:
-    """The place in a recording, and what is published there; for one thread."""
+    """The present place in a recording, and what is published there. For one thread."""
 
     def __init__(self, recorded: RecordedSource, output: Output, *, keep: bool) -> None:
-        """``keep``: whether the injections of the recording are seen."""
+        """Create a player; ``keep`` says whether recorded injections are shown."""
         self._recorded = recorded
         self._output = output
         self._writer: BlockWriter = output.writer
@@ -55,25 +58,25 @@ class Player:
         self.note = ""
         """Why quality is not good; empty if it is."""
         self._bad = False  # as last published
-        self._missing = False  # whether the last frame was of this replay's own making
+        self._missing = False  # whether the last frame was made by this replay
         self.stopped = False
-        """Whether the last frame is that by which the process before this one told its end."""
+        """Whether the last frame is the one that reports the end of the previous process."""
         self.published = 0
 
     @property
     def next_ns(self) -> int | None:
-        """The position of what comes next; None: there is nothing more."""
+        """The position of the next entry; None at the end."""
         return None if self._next is None else self._next.position_ns
 
     def go(self, position_ns: int | None) -> None:
-        """Have what comes at or behind a position be the next; None: all there is."""
+        """Continue with the first entry at or behind a position; None: from the first entry on."""
         self._entries = self._recorded.entries(position_ns)
         self._next = next(self._entries, None)
 
     def begin(self, position_ns: int, stamp: StampOf) -> None:
-        """Have what comes at or behind a position be the next; what is there before it is seen at once.
+        """Publish the frame before a position, then continue with the entries from the position on.
 
-        Where no frame is, that are the events before the first one.
+        Without such a frame it continues with the first entry.
         """
         entry = self._recorded.newest(position_ns - 1)
         if entry is not None:
@@ -81,13 +84,13 @@ class Player:
         self.go(None if entry is None else position_ns)
 
     def again(self, position_ns: int, stale_ns: int, stamp: StampOf) -> None:
-        """Go on at the begin of a loop; where nothing comes soon, what stood at its end stands no longer."""
+        """Continue at the begin of a loop. If no frame follows soon, publish a bad one."""
         if self._recorded.newest(position_ns + stale_ns) is None:
             self.end(NOTHING, stamp(position_ns, position_ns))
         self.go(position_ns)
 
     def resume(self, position_ns: int) -> None:
-        """Go on behind a position, up to which the process before this one has published."""
+        """Continue behind the position up to which the previous process has published."""
         self.go(position_ns + 1)
         entry = self._recorded.newest(position_ns)
         if entry is not None and isinstance(entry.item, Frame):
@@ -98,9 +101,9 @@ class Player:
         self.stopped, self._missing = reason == STOPPED, reason.startswith(OWN_WORDS)
 
     def show(self, position_ns: int, stamp: StampOf) -> None:
-        """Publish the frame that is the newest at a position, and have what comes behind that be the next.
+        """Publish the newest frame at a position, and continue behind it.
 
-        What lies before it is not read.
+        Earlier entries are not read.
         """
         entry = self._recorded.newest(position_ns)
         if entry is None:
@@ -110,7 +113,7 @@ class Player:
         self.go(position_ns + 1)
 
     def play(self, until_ns: int, stamp: StampOf, most: int) -> bool:
-        """Publish what comes up to a position, at most so many; whether there is more."""
+        """Publish up to ``most`` entries until a position; return whether there are more."""
         for _ in range(most):
             if self._next is None or self._next.position_ns > until_ns:
                 return False
@@ -119,12 +122,12 @@ class Player:
         return self._next is not None and self._next.position_ns <= until_ns
 
     def end(self, reason: str, stamp: Stamp) -> None:
-        """No more comes: what was good is so no longer."""
+        """Publish a bad frame, unless the last one was bad."""
         if not self._bad:
             self.fail(reason, stamp)
 
     def fail(self, reason: str, stamp: Stamp) -> None:
-        """Publish the last image as a bad one."""
+        """Publish the last image with bad quality."""
         output = self._output
         image = Image(
             output.raw, max(0, output.cycle), output.source_ns, Quality.BAD, Provenance.REPLAYED, reason,
@@ -166,7 +169,7 @@ class Player:
         self.published += 1
 
     def _happen(self, event: Event, at: Stamp) -> None:
-        """Tell a recorded event again: nobody's, so that no client of now takes it for its own."""
+        """Publish a recorded event without an owner, so that no client takes it for its own."""
         if not is_replayed(event, keep=self._keep):
             return
         record = Record(

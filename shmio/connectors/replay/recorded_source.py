@@ -1,4 +1,4 @@
-"""What a recording holds of one source, by position: a time of the recorded instance's clock, in ns since its start."""
+"""One source in a recording, by position: ns since the start of the recorded instance."""
 
 from __future__ import annotations
 
@@ -16,25 +16,30 @@ log = logging.getLogger("shmio.source")
 
 
 class MissingFrames(NamedTuple):
-    """Frames that are not in the recording."""
+    """Frames that are missing in the recording."""
 
     reason: str
 
 
 class Entry(NamedTuple):
-    """A frame, an event, or where frames are missing."""
+    """A frame, an event, or a gap, with its position."""
 
     position_ns: int
     item: Frame | Event | MissingFrames
 
 
 class RecordedSource:
-    """One source of a recording. Several of its iterators may be under way; for one thread."""
+    """Reads one source of a recording. Several iterators may run at once, in one thread."""
 
     def __init__(self, dump: Dump, damage: list[Damage], block: DumpBlock, utc_ns: int) -> None:
-        """``damage``: what the dump has told of damaged places; ``utc_ns``: of position 0.
+        """Create the reader.
 
-        Of the source's blocks those are played that have the layout of this one.
+        Args:
+            dump: The recording.
+            damage: The list to which the dump adds damaged places.
+            block: A block of the source. Only the source's blocks with the same layout are played.
+            utc_ns: UTC of position 0.
+
         """
         self._dump = dump
         self._damage = damage
@@ -43,7 +48,10 @@ class RecordedSource:
         self._holes = [gap for gap in dump.gaps if gap.source == block.source and gap.what == "frames"]
 
     def entries(self, from_ns: int | None) -> Iterator[Entry]:
-        """All from a position on (None: from the first), in the order in which it happened; damage is a hole."""
+        """Yield the entries from a position on (None: from the first), in their order.
+
+        Damage and gaps are MissingFrames.
+        """
         at_ns = from_ns
         begin_ns = 0 if from_ns is None else max(0, from_ns + self._utc_ns)
         for time_ns, block, item in self._dump.items(self.block.source, begin_ns):
@@ -61,7 +69,10 @@ class RecordedSource:
             at_ns = position_ns
 
     def newest(self, position_ns: int) -> Entry | None:
-        """The last frame at or before a position, or the hole that it lies in; None: there is none before."""
+        """Return the last frame at or before a position, or the gap there.
+
+        None if neither exists.
+        """
         found = self._dump.latest(self.block.source, position_ns + self._utc_ns)
         self._damage.clear()
         last = None
@@ -78,7 +89,10 @@ class RecordedSource:
         return block is not None and block.layout_hash == self.block.layout_hash
 
     def _hole(self, gap: Gap, at_ns: int) -> Entry:
-        """It begins a period after the frame before it, or with the one behind it."""
+        """Return the entry of a gap.
+
+        It begins a period after the last frame, or with the next one.
+        """
         position_ns = gap.after_ns - self._utc_ns + self.block.period_ns if gap.after_ns else at_ns
         if gap.before_ns:
             position_ns = min(position_ns, gap.before_ns - self._utc_ns)

@@ -1,4 +1,4 @@
-"""The files of one recording: which sources can be played, and from when to when."""
+"""The files of one recording: its sources and their times."""
 
 from __future__ import annotations
 
@@ -16,29 +16,32 @@ from shmio.recording.format.damage import Damage
 from shmio.segment.header import MAX_PROCESSES
 
 Moment = float | str
-"""Seconds from a recording's begin, or a date and time."""
+"""Seconds from the begin of a recording, or a date and time."""
 
 MAX_NS: Final = 1 << 61
-"""No time is beyond this: some 70 years."""
+"""Largest valid time, about 70 years."""
 
 MIN_PERIOD_NS: Final = 100_000
 MAX_PERIOD_NS: Final = 3_600_000_000_000
-"""A source's cycle, as a configuration may have it."""
+"""Longest period of a source, as in a configuration."""
 
 log = logging.getLogger("shmio.source")
 
 
 class Span(NamedTuple):
-    """Which part of a recording is played: positions, the second behind it."""
+    """The part of a recording that is played, as positions; the end is exclusive."""
 
     begin_ns: int
     end_ns: int
 
 
 class Recording:
-    """A recording, or several files of one, open for reading. A context manager.
+    """A recording in one or several files, open for reading. A context manager.
 
-    RecordingError: a file cannot be read, is none, holds no frames, or they are of different runs of an instance.
+    Raises:
+        RecordingError: A file cannot be read or is no recording, holds no frames, or the files are
+            of different runs.
+
     """
 
     def __init__(self, files: Sequence[str | Path]) -> None:
@@ -61,7 +64,7 @@ class Recording:
         if not (started.isdecimal() and len(started) < 20):
             raise RecordingError(f"{self._file} does not say when its instance was started: it cannot be played")
         self.utc_ns = int(started)
-        """UTC of position 0: when the instance started that was recorded."""
+        """UTC of position 0: when the recorded instance started."""
         names = self._dump.sources
         if len(names) > MAX_PROCESSES:
             raise RecordingError(
@@ -72,7 +75,7 @@ class Recording:
         if not spans:
             raise RecordingError(f"{self._file} holds no frames: there is nothing to play")
         self.sources = list(spans)
-        """Names of those that have frames."""
+        """The names of the sources that have frames."""
         self.whole = Span(
             min(span.begin_ns for span in spans.values()) - self.utc_ns,
             max(span.end_ns for span in spans.values()) - self.utc_ns,
@@ -86,7 +89,10 @@ class Recording:
             raise RecordingError(f"{self._file} has times that make no sense: it cannot be played")
 
     def _measured(self, name: str) -> Span | None:
-        """From the first frame of a source to a period behind its last one, UTC; None: it has none."""
+        """Return the span of a source's frames in UTC, one period added at the end.
+
+        None without frames.
+        """
         if self._dump.damage:  # then the index need not tell of all that can be read
             first, last = next(self._dump.frames(name), None), self._dump.latest(name)
             return Span(first.time_ns, last.time_ns + last.block.period_ns) if first and last and last.block else None
@@ -101,7 +107,13 @@ class Recording:
         self._damage.append(damage)
 
     def span(self, start: Moment | None, end: Moment | None) -> Span:
-        """What is played. RecordingError, beginning with the key: it is no time, or there is nothing between these."""
+        """Return the part to play.
+
+        Raises:
+            RecordingError: A time is invalid, or nothing lies between the two. The message begins
+                with the key.
+
+        """
         begin_ns = self.whole.begin_ns if start is None else self.moment("start", start)
         end_ns = self.whole.end_ns if end is None else self.moment("end", end)
         span = Span(max(begin_ns, self.whole.begin_ns), min(end_ns, self.whole.end_ns))
@@ -114,7 +126,12 @@ class Recording:
         return span
 
     def moment(self, key: str, text: Moment) -> int:
-        """The position of seconds from the begin, or of a date and time, local unless it says. RecordingError."""
+        """Return the position of a time: seconds from the begin, or a date and time, local without a zone.
+
+        Raises:
+            RecordingError: The text is neither.
+
+        """
         try:
             if not isinstance(text, str):
                 return self.whole.begin_ns + round(text * 1e9)
@@ -125,7 +142,12 @@ class Recording:
             ) from None
 
     def recorded(self, source: str, span: Span) -> RecordedSource:
-        """What there is of a source. RecordingError: nothing, or its layout changes within what is played."""
+        """Return what the recording holds of a source.
+
+        Raises:
+            RecordingError: It holds nothing, or the layout changes within the part to play.
+
+        """
         if source not in self.sources:
             raise RecordingError(
                 f"{self._file} has no frames of a source {source!r}; it has: {', '.join(self.sources)}"

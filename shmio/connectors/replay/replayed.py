@@ -1,4 +1,4 @@
-"""What a source is that plays a recording, where others have a device or compute. What plays it is in ``replay``."""
+"""The base class of sources that play a recording."""
 
 from __future__ import annotations
 
@@ -9,11 +9,20 @@ import msgspec
 
 
 class Replayed(ABC):
-    """A source that has its layout, frames and times from a recording, and lives on the instance's clock."""
+    """A source that has its layout and frames from a recording, and follows the instance clock."""
 
     Options: ClassVar[type[msgspec.Struct]]
-    """Its own keys of ``[[source]]``; refuses unknown ones."""
+    """Its own keys of ``[[source]]``. The struct must refuse unknown keys."""
 
     @abstractmethod
     def __init__(self, options: Any, name: Any) -> None:
-        """``options``: an instance of ``Options``; ``name``: the source's. ConfigError, beginning with the key."""
+        """Open the recording.
+
+        Args:
+            options: An instance of ``Options``.
+            name: The name of the source.
+
+        Raises:
+            ConfigError: The recording cannot be played. The message begins with the key.
+
+        """

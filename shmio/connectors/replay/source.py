@@ -1,4 +1,4 @@
-"""The source of a recording: its keys, and what it takes to play them."""
+"""The replay source: its keys, and its recording."""
 
 from __future__ import annotations
 
@@ -19,10 +19,13 @@ File = Annotated[str, msgspec.Meta(min_length=1)]
 
 
 class Replay(Replayed):
-    """``connector = "replay"``: plays what a recording holds of one source. Nothing is written to any device."""
+    """``connector = "replay"``: plays one source of a recording.
+
+    Nothing is written to any device.
+    """
 
     class Options(msgspec.Struct, forbid_unknown_fields=True):
-        """Its keys. ``own_clock``: frames have the clock of the recording, which is the whole instance's then."""
+        """Its keys. With ``own_clock`` the whole instance has the clock of the recording."""
 
         file: File | Annotated[list[File], msgspec.Meta(min_length=1)]
         source: str | None = None
@@ -35,7 +38,12 @@ class Replay(Replayed):
         own_clock: bool = False
 
     def __init__(self, options: Options, name: str) -> None:
-        """ConfigError: it cannot be played; beginning with the key."""
+        """Open the recording.
+
+        Raises:
+            ConfigError: It cannot be played. The message begins with the key.
+
+        """
         self.options = options
         try:
             self.recording = Recording(files(options))
@@ -49,12 +57,12 @@ class Replay(Replayed):
 
     @property
     def layout(self) -> Layout:
-        """Of the frames."""
+        """The layout of the recorded frames."""
         return self.recorded.block.layout
 
     @property
     def keep(self) -> bool:
-        """Whether the injections of the recording are seen."""
+        """Whether recorded injections are shown."""
         return self.options.injections == "keep"
 
     def close(self) -> None:
@@ -63,12 +71,17 @@ class Replay(Replayed):
 
 
 def files(options: Replay.Options) -> Sequence[str]:
-    """The files of the recording."""
+    """Return the files of the recording."""
     return [options.file] if isinstance(options.file, str) else options.file
 
 
 def chosen(recording: Recording, options: Replay.Options, name: str) -> tuple[Span, RecordedSource]:
-    """What is played of a recording for the source of this name. ConfigError, beginning with the key."""
+    """Return the part to play, and the recorded source.
+
+    Raises:
+        ConfigError: There is nothing to play. The message begins with the key.
+
+    """
     try:
         span = recording.span(options.start, options.end)
     except RecordingError as error:

@@ -1,4 +1,8 @@
-"""How a source begins to play: as its process before did, else as others of its recording do, else as configured."""
+"""Decides how a source starts to play.
+
+It continues what its previous process played, else joins other sources of the same recording, else
+starts as configured.
+"""
 
 from __future__ import annotations
 
@@ -12,9 +16,10 @@ from shmio.segment.playhead import Playhead, PlayState
 
 
 class ReplayStart(NamedTuple):
-    """How a source plays from now on; ``done_ns``: the position up to which the process before has published it.
+    """How a source plays from now on.
 
-    None: there was none that played the same recording.
+    ``done_ns`` is the position up to which the previous process has published the same recording;
+    None if there was none.
     """
 
     play: PlayState
@@ -22,35 +27,41 @@ class ReplayStart(NamedTuple):
 
     @property
     def at(self) -> Stamp:
-        """When the process's start is told: with what comes next, however long it took."""
+        """The stamp of the process's start: that of the next entry, however long the start took."""
         play, done_ns = self
         position_ns = play.begin_ns if done_ns is None else done_ns
         return stamp(play, position_ns, position_ns)
 
 
 def begin(source: Replay, block: Block, started_ns: int, blocks: Iterable[Block]) -> ReplayStart:
-    """Set the playhead of a block, unless it is. ``started_ns``: of the segment; ``blocks``: all there are.
+    """Set the playhead of a block, unless it is set for this recording already.
 
-    SegmentError: the block is none for a replay.
+    Args:
+        source: The recording to play.
+        block: The block of the source.
+        started_ns: When the segment was created.
+        blocks: All blocks of the instance.
+
+    Raises:
+        SegmentError: The block has no playhead.
+
     """
     heads = [other.playhead for other in blocks if other.playhead is not None]
     if block.playhead is None or not heads:
         raise SegmentError(f"the block of source {block.source} has no playhead")
     own = block.playhead.read()
-    if own is not None and _is_of(source, own):  # without the lock: who holds it may wait for this process
+    if own is not None and _is_of(source, own):  # without the lock: its holder may wait for this process
         return ReplayStart(own, _done_ns(block, own))
     with heads[0].held():  # sources that begin at the same time begin together
         others = as_others(source, heads)
         play = _as_configured(source, block, started_ns) if others is None else others
-        play = play._replace(
-            step=0, asked=block.playhead.asked(), answer=""
-        )  # what was asked before was not asked of it
+        play = play._replace(step=0, asked=block.playhead.asked(), answer="")  # earlier requests were for others
         block.playhead.write(play)
         return ReplayStart(play, None)
 
 
 def _done_ns(block: Block, play: PlayState) -> int | None:
-    """The position of the last frame, or of what was told behind it."""
+    """Return the position of the last frame, or of the last event without an owner behind it."""
     last = block.latest()
     if last is None:
         return None
@@ -64,7 +75,10 @@ def _is_of(source: Replay, play: PlayState) -> bool:
 
 
 def as_others(source: Replay, heads: Iterable[Playhead]) -> PlayState | None:
-    """How what plays the same recording plays, as it was moved last; None: nothing does."""
+    """Return the play of the sources of the same recording, as it was moved last.
+
+    None if there are none.
+    """
     plays = [play for head in heads if (play := head.read()) is not None and _is_of(source, play)]
     return max(plays, key=lambda play: play.anchor_ns, default=None)
 
@@ -89,7 +103,7 @@ def _as_configured(source: Replay, block: Block, started_ns: int) -> PlayState:
 
 
 def stamp(play: PlayState, position_ns: int, clock_ns: int) -> Stamp:
-    """When what is at a position is published; ``clock_ns``: of the recording."""
+    """Return the stamp of a position; ``clock_ns`` is the recorded clock."""
     if not play.own_clock:
         clock_ns = play.due_ns(max(position_ns, play.position_ns))
     return Stamp(play.base_ns + position_ns, clock_ns)

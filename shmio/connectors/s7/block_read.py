@@ -1,7 +1,7 @@
-"""Reading a whole block as many requests in flight: the requests, and the image their answers make. No I/O.
+"""Reads a whole block by several requests in flight, and assembles the image. No I/O.
 
-A block that does not fit one PDU takes several reads. Their round trips, one after the other, are where nearly all the
-time of a cycle goes, so as many requests as the controller granted are kept under way (``window``).
+A block that does not fit one PDU takes several reads. Round trips take nearly all the time of a
+cycle. So as many requests as the controller granted are kept in flight (``window``).
 """
 
 from __future__ import annotations
@@ -16,7 +16,10 @@ _REFERENCE = struct.Struct(">H")
 
 
 class BlockRead:
-    """The requests of one block, built once, and the state of one pass over them; used again for later passes."""
+    """The requests for one block, and the state of one pass over them.
+
+    It is reused for later passes.
+    """
 
     def __init__(self, db_number: int, size: int, chunk: int) -> None:
         """Plan reads of at most ``chunk`` bytes."""
@@ -34,24 +37,27 @@ class BlockRead:
         self.begin(0)
 
     def begin(self, deadline_ns: int) -> None:
-        """Start a pass; the client gives it up at ``deadline_ns``."""
+        """Start a pass that must be complete by ``deadline_ns``."""
         self.deadline_ns = deadline_ns
         self.refusal: RefusedError | None = None
-        """Why the controller does not give the block; then there is no image."""
+        """Why the controller refused the block; there is no image then."""
         self.sent = self._answered = 0
 
     @property
     def complete(self) -> bool:
-        """Whether every part of the block has come, or was refused."""
+        """Whether every part of the block has come, or the block was refused."""
         return self._answered == self.count or self.refusal is not None
 
     @property
     def data(self) -> bytes:
-        """A copy of the block; of one pass only if complete, and not refused."""
+        """A copy of the block.
+
+        It is consistent only if the pass is complete and was not refused.
+        """
         return bytes(self._block)
 
     def take(self, count: int, first: int) -> memoryview:
-        """Give the next requests, with the references from ``first`` on (16 bits, wrapping)."""
+        """Return the next requests, with references from ``first`` on (16 bits, wrapping)."""
         size = pdu.READ_REQUEST_SIZE
         begin, self.sent = self.sent, self.sent + count
         for place in range(count):
@@ -60,7 +66,10 @@ class BlockRead:
         return self._requests_view[begin * size : self.sent * size]
 
     def accept(self, index: int, frame: memoryview) -> None:
-        """Take the answer to request ``index``, in whatever order; ConnectorError if it is not exactly one."""
+        """Take the answer to request ``index``, in any order.
+
+        ConnectorError if it does not match.
+        """
         try:
             answer = pdu.parse_read_answer(frame)
             if answer.code != ITEM_OK:

@@ -1,4 +1,4 @@
-"""How long a block really is: jobs that try single bytes all over it, for when its end cannot be read. No I/O."""
+"""Probes how long a block really is when its end cannot be read. No I/O."""
 
 from __future__ import annotations
 
@@ -11,20 +11,23 @@ from shmio.connectors.s7 import pdu
 from shmio.connectors.s7.explain import ITEM_OK
 from shmio.errors import ConnectorError
 
-_MOST_ITEMS = 19  # of one job; its request and its answer then fit the smallest PDU known, 240 bytes
+_MOST_ITEMS = 19  # per job; request and answer fit the smallest known PDU, 240 bytes
 _ITEM_HEAD = struct.Struct(">BBH")
 
 
 class SizeProbe:
-    """Looks for the first byte that cannot be read; each job narrows the range twenty-fold."""
+    """Searches for the first byte that cannot be read.
+
+    Each job narrows the range by a factor of twenty.
+    """
 
     count = 1
 
     def __init__(self, db_number: int, size: int, pdu_size: int) -> None:
-        """Look below ``size``, whose last byte is known not to be there."""
+        """Search below ``size``, whose last byte is known to be missing."""
         self._db_number = db_number
         self._most = max(1, min(_MOST_ITEMS, (pdu_size - 14) // 12))
-        self._low, self._high = 0, size - 1  # the first byte that is missing is among these, both included
+        self._low, self._high = 0, size - 1  # the range of the first missing byte, both ends included
 
     def begin(self) -> None:
         """Plan the next job."""
@@ -35,11 +38,11 @@ class SizeProbe:
 
     @property
     def found(self) -> int | None:
-        """Bytes that can be read; None while another job is needed."""
+        """Number of bytes that can be read; None while another job is needed."""
         return self._low if self._low == self._high else None
 
     def take(self, count: int, first: int) -> bytes:
-        """Give the request."""
+        """Return the request."""
         self.sent = count
         encoder = S7Protocol()
         encoder.sequence = (first - 1) & 0xFFFF
@@ -47,7 +50,7 @@ class SizeProbe:
         return pdu.data_frame(encoder.build_multi_read_request(items))
 
     def accept(self, index: int, frame: memoryview) -> None:  # noqa: ARG002 - there is one request
-        """Take the answer; ConnectorError if it is not one to these items."""
+        """Take the answer; ConnectorError if it does not match these items."""
         readable = parse_readable(frame, len(self._tried))
         for at, good in zip(self._tried, readable, strict=True):
             if not good:
@@ -58,7 +61,10 @@ class SizeProbe:
 
 
 def parse_readable(frame: memoryview, count: int) -> list[bool]:
-    """Check an answer to a read of so many single bytes: which of them could be read. RefusedError: the whole job."""
+    """Return which of ``count`` single bytes could be read.
+
+    RefusedError if the whole job was refused.
+    """
     pdu.check_answer(frame)
     if bytes(frame[pdu.HEADER_END : pdu.HEADER_END + 2]) != bytes((4, count)):
         raise ConnectorError(f"not an answer to a read of {count} items")

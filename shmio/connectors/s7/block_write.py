@@ -1,7 +1,7 @@
-"""A batch of writes as jobs of several items, and what came of each write. No I/O.
+"""Packs a batch of writes into jobs of several items, and collects each write's outcome. No I/O.
 
-Jobs under way at once may be served in any order. So writes that touch the same bits never are: the batch is cut into
-waves, each of which is confirmed before the next is sent. What is in no other's way goes out at once.
+The controller may serve jobs in flight in any order, so writes that touch the same bits are never
+in flight together. The batch is cut into waves, each of which is confirmed before the next is sent.
 
 Nothing is sorted: items fill the jobs in the order of the writes, and jobs are sent in that order.
 """
@@ -22,7 +22,7 @@ from shmio.connectors.s7.explain import ITEM_OK, RefusedError, explain_write
 from shmio.errors import ConnectorError
 from shmio.layout.values.write import Write
 
-MAX_ITEMS = 20  # in one job, as all known controllers take
+MAX_ITEMS = 20  # per job; all known controllers take as many
 JOB_OVERHEAD = 12  # of a request within its PDU: header 10, parameters 2
 ITEM_OVERHEAD = 16  # address 12, head of the value 4
 _WRITE = 0x05
@@ -30,12 +30,15 @@ _ONE_ITEM = slice(12, 24)  # the address in python-snap7's request for one item,
 
 
 def byte_item(db_number: int, start: int, data: bytes) -> tuple[bytes, bytes]:
-    """Encode address and value of bytes."""
+    """Encode the address and value of bytes."""
     return _split(S7Protocol().build_write_request(S7Area.DB, db_number, start, S7WordLen.BYTE, data))
 
 
 def bit_item(db_number: int, start: int, bit: int, value: bool) -> tuple[bytes, bytes]:
-    """Encode address and value of a single bit, which leaves the others of its byte alone."""
+    """Encode the address and value of a single bit.
+
+    The write leaves the other bits of its byte alone.
+    """
     place = 8 * start + bit
     return _split(S7Protocol().build_write_request(S7Area.DB, db_number, place, S7WordLen.BIT, bytes((value,))))
 
@@ -48,7 +51,7 @@ def _split(request: bytes) -> tuple[bytes, bytes]:
 
 
 def write_request(reference: int, items: Sequence[tuple[bytes, bytes]]) -> bytes:
-    """Build a job that writes these items, as ``byte_item`` and ``bit_item`` made them."""
+    """Build a job that writes these items from ``byte_item`` and ``bit_item``."""
     parameters = bytes((_WRITE, len(items))) + b"".join(address for address, _ in items)
     values = b"".join(value + b"\0" * (len(value) & 1) for _, value in items[:-1]) + items[-1][1]
     header = struct.pack(">BBHHHH", 0x32, 1, 0, reference, len(parameters), len(values))
@@ -56,7 +59,7 @@ def write_request(reference: int, items: Sequence[tuple[bytes, bytes]]) -> bytes
 
 
 def parse_write_answer(frame: memoryview, count: int) -> bytes:
-    """Check the answer to a write of ``count`` items; the return code of each. RefusedError: the whole job was."""
+    """Return the codes of ``count`` written items; RefusedError if the whole job was refused."""
     data_length = pdu.check_answer(frame)
     codes = frame[pdu.HEADER_END + 2 :]
     if len(frame) < pdu.HEADER_END + 2 or len(codes) != data_length or frame[pdu.HEADER_END] != _WRITE:
@@ -68,14 +71,14 @@ def parse_write_answer(frame: memoryview, count: int) -> bytes:
 
 class _Item(NamedTuple):
     write: int
-    """Index of the write it is a part of."""
+    """Index of the write that it belongs to."""
     last: int
-    """The last byte it touches."""
+    """The last byte that it touches."""
     encoded: tuple[bytes, bytes]
 
 
 class BlockWrite:
-    """Jobs that may all be under way at once. Says into ``outcomes`` what the controller refused."""
+    """Jobs that may all be in flight at once. It puts refusals into ``outcomes``."""
 
     def __init__(self, db_number: int, pdu_size: int, items: Sequence[_Item], outcomes: list[str]) -> None:
         self._db_number = db_number
@@ -87,11 +90,11 @@ class BlockWrite:
 
     @property
     def complete(self) -> bool:
-        """Whether every job is answered."""
+        """Whether every job was answered."""
         return len(self._answered) == self.count
 
     def take(self, count: int, first: int) -> bytes:
-        """Give the next requests, with the references from ``first`` on (16 bits, wrapping)."""
+        """Return the next requests, with references from ``first`` on (16 bits, wrapping)."""
         begin, self.sent = self.sent, self.sent + count
         return b"".join(
             write_request((first + place) & 0xFFFF, [item.encoded for item in job])
@@ -99,7 +102,7 @@ class BlockWrite:
         )
 
     def accept(self, index: int, frame: memoryview) -> None:
-        """Take the answer to request ``index``; ConnectorError if it is not exactly one."""
+        """Take the answer to request ``index``; ConnectorError if it does not match."""
         job = self._jobs[index]
         try:
             codes = parse_write_answer(frame, len(job))
@@ -113,7 +116,7 @@ class BlockWrite:
         self._answered.add(index)
 
     def unanswered(self) -> Iterator[tuple[int, Lost | None]]:
-        """For each item, the index of its write, and what is known of it if it has no answer."""
+        """Yield the write's index for each item, and what is known of it without an answer."""
         for index, job in enumerate(self._jobs):
             known = None if index in self._answered else Lost.UNKNOWN if index < self.sent else Lost.UNSENT
             for item in job:
@@ -124,7 +127,7 @@ class BlockWrite:
 
 
 def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list[str]) -> Iterator[BlockWrite]:
-    """Cut a batch into waves, in order. ``outcomes``: a text for each write, in which refusals are put down."""
+    """Cut a batch into waves, in order. Refusals go into ``outcomes``, one text per write."""
     wave: list[_Item] = []
     spans: list[tuple[int, int]] = []  # of bits of the block that the wave touches, in order
     for place, write in enumerate(writes):
@@ -139,7 +142,7 @@ def waves(db_number: int, pdu_size: int, writes: Sequence[Write], outcomes: list
 
 
 def ends(outcomes: Sequence[str], begun: Iterable[BlockWrite]) -> list[str | Lost]:
-    """What became of each write of a batch when the session was lost in the last of the waves that were begun."""
+    """Return what is known of each write after the session was lost in a wave of ``begun``."""
     parts: list[set[Lost | None]] = [set() for _ in outcomes]
     for wave in begun:
         for write, known in wave.unanswered():
@@ -150,7 +153,7 @@ def ends(outcomes: Sequence[str], begun: Iterable[BlockWrite]) -> list[str | Los
 def _end(text: str, parts: set[Lost | None]) -> str | Lost:
     if Lost.UNKNOWN in parts:
         return Lost.UNKNOWN
-    if not text and None in parts and Lost.UNSENT in parts:  # done in part: neither written nor surely not
+    if not text and None in parts and Lost.UNSENT in parts:  # partly written
         return Lost.UNKNOWN
     return text if None in parts else Lost.UNSENT
 
@@ -163,7 +166,7 @@ def _span(write: Write) -> tuple[int, int]:
 
 
 def _touches(spans: list[tuple[int, int]], span: tuple[int, int]) -> bool:
-    """Whether a span has a bit in common with any of these, which have none among them."""
+    """Return whether a span overlaps any of these, which are disjoint and sorted."""
     after = bisect_right(spans, span)
     return (after > 0 and spans[after - 1][1] > span[0]) or (after < len(spans) and spans[after][0] < span[1])
 

@@ -1,7 +1,8 @@
-"""A client that reads and writes one data block as fast as the controller answers. For one thread.
+"""An S7 client that reads and writes one data block as fast as the controller answers. For one thread.
 
-``submit`` sends the requests of a read and returns; ``collect`` waits for the image. Between the two, further reads may
-be submitted, up to ``depth``, and writes go out at any time: ``window`` knows whose each answer is.
+``submit`` sends the requests of a read and returns; ``collect`` waits for the image. In between,
+more reads may be submitted, up to ``depth``, and writes may be sent at any time. ``window`` matches
+the answers.
 """
 
 from __future__ import annotations
@@ -23,19 +24,24 @@ from shmio.connectors.s7.window import Operation, Window
 from shmio.errors import ConfigError, ConnectorError
 from shmio.layout.values.write import Write
 
-MAX_DEPTH = 4  # reads under way at once; more would only be older when they come
-LONGEST_WRITE_S = 20  # of a batch, however many jobs it is; ``timeout`` if that is longer
+MAX_DEPTH = 4  # reads in flight at once; with more, images would only be older
+LONGEST_WRITE_S = 20  # limit for a whole batch; ``timeout`` if that is longer
 
 
 class S7Client:
     """Reads and writes one block of one controller.
 
-    After any error the socket is closed: an answer that comes late must never be taken for the next one.
-    ``connect`` may be called again at any time.
+    Any error closes the socket, so that a late answer is never taken for the next one. ``connect``
+    may then be called again.
     """
 
     def __init__(self, options: S7Options, db_number: int, size: int) -> None:
-        """Prepare for bytes 0 to ``size - 1`` of DB ``db_number``; ConfigError if S7 cannot address that."""
+        """Prepare to read ``size`` bytes of DB ``db_number``.
+
+        Raises:
+            ConfigError: S7 cannot address the block.
+
+        """
         if not 1 <= size <= pdu.MAX_BLOCK_SIZE:
             raise ConfigError(f"DB{db_number} of {size} bytes: S7 reads blocks of 1 to {pdu.MAX_BLOCK_SIZE} bytes")
         if not 1 <= db_number <= 65535:
@@ -46,7 +52,7 @@ class S7Client:
         self._timeout_ns = options.timeout * 1_000_000
         self._transport: Transport | None = None
         self._session = pdu.Session(0, 0)
-        # References are never begun again, not even by a reconnect: old answers stay unknown.
+        # A reconnect does not reset the references, so that old answers stay unknown.
         self._window = Window(0, 0)
         self._under_way: deque[BlockRead] = deque()
         self._idle: list[BlockRead] = []
@@ -60,28 +66,30 @@ class S7Client:
 
     @property
     def pdu_size(self) -> int:
-        """Bytes in the largest PDU as granted; 0 before the first session."""
+        """Size of the largest PDU as granted, in bytes; 0 before the first session."""
         return self._session.pdu_size
 
     @property
     def jobs(self) -> int:
-        """Requests kept under way: as granted, capped by ``maxJobs``; 0 before the first session."""
+        """Requests kept in flight: as granted, at most ``maxJobs``; 0 before the first session."""
         return self._session.jobs
 
     @property
     def depth(self) -> int:
-        """Reads that may be under way at once in this session: as many as the jobs suffice for, at least 1."""
+        """Reads that may be in flight at once in this session, at least 1."""
         return max(1, len(self._idle) + len(self._under_way))
 
     @property
     def doubt(self) -> str:
-        """Why what is read may stand still (the PLC is in STOP), in words; empty if nothing is known against it."""
+        """Why values may not change (the PLC is in STOP); empty if there is no reason."""
         return self._mode.doubt
 
     def connect(self) -> None:
-        """Open a session and ask for the operating mode, within ``timeout`` in all (looking up a host name excepted).
+        """Open a session and query the operating mode, within ``timeout`` plus the host name lookup.
 
-        ConnectorError: nobody there, not an S7 controller, session refused.
+        Raises:
+            ConnectorError: No controller answers, it does not speak S7, or it refuses the session.
+
         """
         self.close()
         with CloseOnError(self.close, self.options, opening=True):
@@ -103,9 +111,16 @@ class S7Client:
             self._finish(self._mode, deadline_ns)
 
     def read(self) -> bytes:
-        """Read the whole block, within ``timeout``: ``submit``, then ``collect``, for when nothing is under way.
+        """Read the whole block within ``timeout``; for use while no read is in flight.
 
-        Returns ``size`` bytes as the controller sent them. A read of several PDUs is not one instant of the controller.
+        A read of several PDUs does not show a single instant of the controller.
+
+        Returns:
+            ``size`` bytes as the controller sent them.
+
+        Raises:
+            ConnectorError: See :meth:`collect`.
+
         """
         self.submit()
         image = None
@@ -114,9 +129,11 @@ class S7Client:
         return image
 
     def submit(self) -> None:
-        """Send the requests of one read, without waiting. At most ``depth`` may be under way.
+        """Send the requests of one read without waiting. At most ``depth`` reads may be in flight.
 
-        ConnectorError: no session, or it has just been lost.
+        Raises:
+            ConnectorError: There is no session, or it was lost.
+
         """
         if self._transport is None:
             raise ConnectorError("not connected")
@@ -131,10 +148,18 @@ class S7Client:
             self._flush()
 
     def collect(self, until_ns: int) -> bytes | None:
-        """Wait for the oldest read; None if it is not whole at ``until_ns`` (CLOCK_MONOTONIC).
+        """Wait for the oldest read.
 
-        Returns ``size`` bytes. ConnectorError: no session, no right answer, none within ``timeout`` of its ``submit``,
-        or the controller refuses; then the session is closed.
+        Args:
+            until_ns: When to stop waiting, ns of CLOCK_MONOTONIC.
+
+        Returns:
+            ``size`` bytes; None if the read is not complete by ``until_ns``.
+
+        Raises:
+            ConnectorError: There is no session, a wrong answer, a refusal, or no answer within
+                ``timeout`` of ``submit``. The session is closed then.
+
         """
         if self._transport is None:
             raise ConnectorError("not connected")
@@ -152,12 +177,19 @@ class S7Client:
             return read.data
 
     def write(self, writes: Sequence[Write]) -> list[str]:
-        """Write in this order, while reads may be under way; what the controller refused, in words, for each.
+        """Write in this order; reads may be in flight.
 
-        A text is empty when the controller has confirmed the write. What does not fit one PDU is several jobs, so it is
-        not one instant of the controller, and may be done in part; jobs under way at once it may serve in any order.
-        Each answer must come within ``timeout`` of the one before: a slow controller is not taken for a dead one.
-        WriteLostError: the session is lost, or all of it took longer than LONGEST_WRITE_S and ``timeout``.
+        A batch that does not fit one PDU takes several jobs. It is not atomic and may be done in
+        part, and the controller may serve jobs in flight in any order. Each answer must come within
+        ``timeout`` of the one before.
+
+        Returns:
+            For each write "" if the controller confirmed it, else why it refused it.
+
+        Raises:
+            WriteLostError: The session was lost, or the batch took longer than LONGEST_WRITE_S and
+                ``timeout``.
+
         """
         if self._transport is None:
             raise WriteLostError("not connected", [Lost.UNSENT] * len(writes))
@@ -172,7 +204,7 @@ class S7Client:
                     self._window.add(wave, urgent=True)
                     self._flush()
                     self._finish_wave(wave, end_ns)
-                spent_ns = time.monotonic_ns() - begun_ns  # what waited behind the writes is not late for that
+                spent_ns = time.monotonic_ns() - begun_ns  # the writes delayed these answers
                 self._mode.deadline_ns += spent_ns
                 for read in self._under_way:
                     read.deadline_ns += spent_ns
@@ -193,7 +225,7 @@ class S7Client:
     # -- session -------------------------------------------------------------------------------------------------------
 
     def _use(self, granted: pdu.Session, transport: Transport) -> None:
-        """Build for this session what every read uses again: the requests and a bounded place for the answers."""
+        """Create the requests and buffers that all reads of this session use."""
         jobs = min(granted.jobs, self.options.maxJobs or granted.jobs)
         self._session = pdu.Session(granted.pdu_size, jobs)
         self._window = Window(jobs, self._window.reference)
@@ -206,9 +238,9 @@ class S7Client:
     # -- requests and answers ------------------------------------------------------------------------------------------
 
     def _ask_mode(self) -> None:
-        """Ask for the operating mode, if it is time to, after the requests that wait already. TimeoutError."""
+        """Queue a mode query if one is due; TimeoutError if the answer to the last one is late."""
         now_ns = time.monotonic_ns()
-        if not self._mode.complete:  # after a long period, the answer may wait in the socket
+        if not self._mode.complete:  # after a long period the answer may be in the socket
             self._advance(self._mode, now_ns)
         if self._mode.due(now_ns):
             self._mode.begin(now_ns, now_ns + self._timeout_ns)
@@ -217,7 +249,7 @@ class S7Client:
             raise TimeoutError
 
     def _flush(self) -> None:
-        """Send what may be sent."""
+        """Send the requests that may be sent."""
         assert self._transport is not None  # noqa: S101 - for the type checker
         if self._window.waiting and (requests := self._window.due()):
             try:
@@ -228,7 +260,10 @@ class S7Client:
                 raise
 
     def _advance(self, operation: Operation, until_ns: int) -> bool:
-        """Send and receive until an operation is complete; False if it is not at ``until_ns``."""
+        """Send and receive until the operation is complete.
+
+        Return False if it is not by ``until_ns``.
+        """
         while not operation.complete:
             if self._step(until_ns) is None:
                 return False
@@ -237,7 +272,12 @@ class S7Client:
         return True
 
     def _step(self, until_ns: int) -> int | None:
-        """Receive once, send what may be sent then; how many answers came, None if nothing did until ``until_ns``."""
+        """Receive once, then send what may be sent.
+
+        Returns:
+            The number of answers; None if nothing came until ``until_ns``.
+
+        """
         transport, window = self._transport, self._window
         assert transport is not None  # noqa: S101 - for the type checker
         if not transport.receive(until_ns):
@@ -256,7 +296,7 @@ class S7Client:
             raise TimeoutError
 
     def _finish_wave(self, wave: BlockWrite, end_ns: int) -> None:
-        """Wait for all jobs of a wave, ``timeout`` from answer to answer, no longer than ``end_ns``."""
+        """Wait for all jobs of a wave: ``timeout`` between answers, until ``end_ns`` at most."""
         deadline_ns = time.monotonic_ns() + self._timeout_ns
         while not wave.complete:
             answers = self._step(min(deadline_ns, end_ns))
@@ -272,7 +312,7 @@ class S7Client:
                 )
 
     def _explained(self, refusal: RefusedError, deadline_ns: int) -> RefusedError:
-        """Find out how long the block is, when it is shorter than it should be: the next step depends on it."""
+        """If the block is too short, probe its real length, and return a refusal that names it."""
         if refusal.code != OUT_OF_RANGE:
             return refusal
         probe = SizeProbe(self.db_number, self.size, self.pdu_size)

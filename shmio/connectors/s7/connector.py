@@ -1,4 +1,4 @@
-"""Classic S7 as a connector: one data block of one controller."""
+"""The S7 connector: one data block of one controller."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from shmio.layout.values.write import Write
 
 
 class S7Connector(Connector):
-    """Reads the whole block each cycle. A read of several PDUs is not one instant of the PLC (docs/how-to)."""
+    """Reads the whole block each cycle.
+
+    A read of several PDUs does not show a single instant of the PLC.
+    """
 
     Options = S7Options
     can_write = True
@@ -29,17 +32,17 @@ class S7Connector(Connector):
 
     @property
     def timeout_s(self) -> float:
-        """``timeout``, which connecting and reading have each, or what a batch of writes may take: the longer one."""
+        """The longer of ``timeout`` and the limit for a batch of writes, in s."""
         return self._timeout_s
 
     @property
     def depth(self) -> int:
-        """Reads for which the controller granted jobs enough."""
+        """Reads that may be in flight with the granted jobs."""
         return self._client.depth
 
     @property
     def doubt(self) -> str:
-        """Whether the PLC is in STOP."""
+        """Why values may not change (the PLC is in STOP); empty if there is no reason."""
         return self._client.doubt
 
     def connect(self) -> None:
@@ -47,15 +50,15 @@ class S7Connector(Connector):
         self._client.connect()
 
     def read(self) -> bytes:
-        """The whole block."""
+        """Read the whole block."""
         return self._client.read()
 
     def submit(self) -> None:
-        """Ask for the whole block."""
+        """Request the whole block."""
         self._client.submit()
 
     def collect(self, until_ns: int) -> bytes | None:
-        """The whole block, of the oldest ``submit``."""
+        """Wait for the block of the oldest ``submit``."""
         return self._client.collect(until_ns)
 
     def write(self, writes: Sequence[Write]) -> list[str]:
@@ -67,7 +70,7 @@ class S7Connector(Connector):
         self._client.close()
 
     def describe(self) -> str:
-        """Peer and session, as granted."""
+        """Return peer and session parameters as granted."""
         client = self._client
         granted = f"pdu={client.pdu_size} jobs={client.jobs} depth={client.depth}"
         return f"to {client.options.peer} DB{client.db_number} {granted}"

@@ -1,7 +1,7 @@
-"""What a controller's refusal means, and what to do about it, in words for the person at the cell.
+"""Explains a controller's refusals and their remedies to the operator of the cell.
 
-Which code which family sends when is not in any public standard. What is said here follows reports of users with real
-CPUs; docs/how-to/connect-an-s7-plc.md names them.
+No public standard says which family sends which code when. These texts follow reports of users with
+real CPUs; docs/how-to/connect-an-s7-plc.md names them.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ _ERRORS = {
 
 
 class RefusedError(ConnectorError):
-    """The controller understood the job, and said no.
+    """The controller understood the job and refused it.
 
-    ``code`` is the item's return code; 0 when the job was refused as a whole.
+    ``code`` is the item's return code; 0 when the whole job was refused.
     """
 
     def __init__(self, message: str, code: int = 0) -> None:
@@ -46,7 +46,7 @@ class RefusedError(ConnectorError):
 
 
 def explain_error(error: int) -> str:
-    """Say what the error class and code in an answer's header mean."""
+    """Return what the error class and code in an answer's header mean."""
     if error in _ERRORS:
         return _ERRORS[error].format(where=f"(error 0x{error:04X})")
     known = S7_PROTOCOL_ERROR_CODES.get(error)
@@ -54,7 +54,7 @@ def explain_error(error: int) -> str:
 
 
 def explain_read(code: int, db_number: int, size: int) -> str:
-    """Say what an item's return code means for a read of this block of ``size`` bytes."""
+    """Return what an item's return code means for a read of a block of ``size`` bytes."""
     if code == OUT_OF_RANGE:
         return (
             f"DB{db_number} has no {size} bytes (item code 0x05): the layout is of another version of the block, "
@@ -64,7 +64,7 @@ def explain_read(code: int, db_number: int, size: int) -> str:
 
 
 def explain_size(db_number: int, size: int, found: int) -> str:
-    """Say why a block of ``size`` bytes cannot be read whose first ``found`` bytes can."""
+    """Return why a block of ``size`` bytes cannot be read if only its first ``found`` bytes can."""
     if not found:
         return (
             f"DB{db_number} has no byte that can be addressed (item code 0x05): it is optimized, {_NO_OPTIMIZED}; "
@@ -77,7 +77,7 @@ def explain_size(db_number: int, size: int, found: int) -> str:
 
 
 def explain_write(code: int, db_number: int, last: int) -> str:
-    """Say what an item's return code means for a write up to the byte ``last``."""
+    """Return what an item's return code means for a write up to byte ``last``."""
     if code == OUT_OF_RANGE:
         return (
             f"DB{db_number} has no byte {last} (item code 0x05): the layout is of another version of the block; export "

@@ -1,8 +1,8 @@
-"""The controller's operating mode: one more job about once a second, which says when a PLC is in STOP. No I/O.
+"""Queries the controller's operating mode about once a second, to notice a PLC in STOP. No I/O.
 
-The mode is in SZL W#16#0424: the low half of the record's fourth byte; the high half is the mode before. The numbers
-are those of Siemens, System Software for S7-300/400, A5E00739858, 33.21. Not every controller knows the list; one that
-does not is asked no more, and goes unwatched.
+The mode is in SZL W#16#0424: the low half of the record's fourth byte; the high half is the
+previous mode. The numbers are from Siemens, System Software for S7-300/400, A5E00739858, 33.21. A
+controller that does not know the list is not queried again, and its mode is not watched.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from shmio.connectors.s7.explain import ITEM_OK, RefusedError
 from shmio.errors import ConnectorError
 
 INTERVAL_NS = 1_000_000_000
-_PATIENCE = 2  # connections that may end while the question is open, before it is asked no more
+_PATIENCE = 2  # connections that may end during a query before it is given up
 _SZL = 0x0424
 _USERDATA = 7
 _PARAMETERS = b"\x00\x01\x12\x08\x12\x84\x01"  # three bytes head, eight follow, an answer, of the group SZL, "read SZL"
@@ -32,52 +32,55 @@ _MODES = {
     0xE: "in its self-test: its program does not run yet",
     0xF: "without power",
 }
-"""Modes in which values do not change, in words. RUN is 8; a redundant pair's are 9, and B and C while it couples."""
+"""Modes in which values do not change.
+
+RUN is 8; a redundant pair has 9, and B and C while it couples.
+"""
 
 log = logging.getLogger("shmio.source")
 
 
 class ModeQuery:
-    """Asks for the operating mode, and remembers the answer."""
+    """Queries the operating mode, and keeps the answer."""
 
     count = 1
 
     def __init__(self) -> None:
         self._due_ns = 0
         self.deadline_ns = 0
-        """Until when the answer to an open question must have come."""
+        """When the answer to an open query must have come."""
         self._known = False  # it has answered at least once
         self._failures = 0
         self._supported = True
         self.sent = 0
         self.complete = True
         self.doubt = ""
-        """Why the values may stand still; empty while the program runs, or that is not known."""
+        """Why values may not change; empty while the program runs, or if the mode is unknown."""
 
     def due(self, now_ns: int) -> bool:
-        """Whether to ask now."""
+        """Return whether to send a query now."""
         return self._supported and self.complete and now_ns >= self._due_ns
 
     def overdue(self, now_ns: int) -> bool:
-        """Whether the answer should have come."""
+        """Return whether the answer is late."""
         return not self.complete and now_ns >= self.deadline_ns
 
     def begin(self, now_ns: int, deadline_ns: int) -> None:
-        """Start a question."""
+        """Begin a query."""
         self._due_ns = now_ns + INTERVAL_NS
         self.deadline_ns = deadline_ns
         self.sent = 0
         self.complete = False
 
     def take(self, count: int, first: int) -> bytes:
-        """Give the request."""
+        """Return the request."""
         self.sent = count
         encoder = S7Protocol()
         encoder.sequence = (first - 1) & 0xFFFF
         return pdu.data_frame(encoder.build_read_szl_request(_SZL, 0))
 
     def accept(self, index: int, frame: memoryview) -> None:  # noqa: ARG002 - there is one request
-        """Take the answer; ConnectorError if it is not one."""
+        """Take the answer; ConnectorError if it does not match."""
         self.complete = True
         mode = parse_mode_answer(frame)
         if mode is None:
@@ -88,7 +91,10 @@ class ModeQuery:
         self.doubt = f"the PLC is {words}" if words else ""
 
     def lost(self) -> None:
-        """Note that the connection is gone: what it said is no longer known, nor, if it ends so again, is it asked."""
+        """Forget the mode after a lost connection.
+
+        Stop querying if queries end connections repeatedly.
+        """
         self.doubt = ""
         self._due_ns = 0
         if self.complete:
@@ -105,7 +111,12 @@ class ModeQuery:
 
 
 def parse_mode_answer(frame: memoryview) -> int | None:
-    """Check an answer to the question for SZL 0x0424; the operating mode, None if the controller has none to tell."""
+    """Return the operating mode in an answer to a read of SZL 0x0424; None if the controller has none.
+
+    Raises:
+        ConnectorError: The answer is malformed.
+
+    """
     kind, parameters_size, data_size = pdu.check_envelope(frame)
     if kind != _USERDATA:
         try:

@@ -1,4 +1,7 @@
-"""What the S7 connector can be told; the keys are those of the seed's ``plc.ini`` (D6.5, section 4.2)."""
+"""The options of the S7 connector.
+
+The keys are those of the seed's ``plc.ini`` (D6.5, section 4.2).
+"""
 
 from __future__ import annotations
 
@@ -15,22 +18,28 @@ _CPU_SLOT = {"S7_300": 2, "S7_400": 3, "S7_1200": 1, "S7_1500": 1}
 
 
 class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only=True):
-    """Where the controller is and how to talk to it. ValueError: a host or a model that is none."""
+    """Address of the controller and parameters of the session.
+
+    ValueError for an invalid host or model.
+    """
 
     host: Annotated[str, msgspec.Meta(min_length=1, max_length=253)]
     model: str | None = None
-    """``S7_300``, ``S7_400``, ``S7_1200`` or ``S7_1500``; only the default of ``slot`` depends on it."""
+    """``S7_300``, ``S7_400``, ``S7_1200`` or ``S7_1500``.
+
+    Only the default of ``slot`` depends on it.
+    """
     port: Annotated[int, msgspec.Meta(ge=1, le=65535)] = 102
     rack: Annotated[int, msgspec.Meta(ge=0, le=7)] = 0
     slot: Annotated[int, msgspec.Meta(ge=0, le=31)] | None = None
     timeout: Annotated[int, msgspec.Meta(ge=1, le=600_000)] = 5000
-    """Milliseconds for one whole operation: connecting, or reading the block; and for each answer to a write."""
+    """Milliseconds for connecting, for reading the block, and for each answer to a write."""
     packetSize: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
-    """The most data bytes in one read; what the controller grants bounds it too."""
+    """The most data bytes in one read; the controller's PDU size limits it too."""
     dbNumber: Annotated[int, msgspec.Meta(ge=1, le=65535)] | None = None  # noqa: N815 - a key of plc.ini
     """The data block; the layout's own number if absent."""
     maxJobs: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None  # noqa: N815 - named as its siblings
-    """The most requests under way at once; what the controller grants bounds it too."""
+    """The most requests in flight; the controller's limit applies too."""
 
     def __post_init__(self) -> None:
         if not _is_host(self.host):
@@ -44,7 +53,7 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
 
     @property
     def cpu_slot(self) -> int:
-        """The slot as configured, else the usual one of the model."""
+        """The slot as configured, else the model's usual one."""
         if self.slot is not None:
             return self.slot
         return 1 if self.model is None else _CPU_SLOT[_family(self.model)]
@@ -56,12 +65,12 @@ class S7Options(msgspec.Struct, forbid_unknown_fields=True, frozen=True, kw_only
 
 
 def _family(model: str) -> str:
-    """The model as the table has it: ``s7-1500`` is ``S7_1500``."""
+    """Return the model as the table has it: ``s7-1500`` is ``S7_1500``."""
     return model.strip().upper().replace("-", "_").replace(" ", "_")
 
 
 def _is_host(text: str) -> bool:
-    """Whether it is an IP address (with a zone, for IPv6) or can be a host's name."""
+    """Return whether the text is an IP address (IPv6 with a zone too) or a valid host name."""
     try:
         ipaddress.ip_address(text)
     except ValueError:
@@ -70,7 +79,7 @@ def _is_host(text: str) -> bool:
 
 
 def _is_name(text: str) -> bool:
-    """Whether it can be looked up: no part of it is empty or longer than 63 bytes."""
+    """Return whether the text can be looked up: no label is empty or longer than 63 bytes."""
     try:
         text.encode("idna")
     except UnicodeError:

@@ -1,14 +1,15 @@
-"""The bytes of S7 over ISO-on-TCP: frames, sessions, reads of one item. No I/O.
+"""Encodes and parses S7 over ISO-on-TCP: frames, sessions, reads of one item. No I/O.
 
-A frame is ``TPKT | COTP | S7``: RFC 1006, section 6 (TPKT: version 3, length of the whole), ISO 8073 class 0
-(COTP: CR and CC open, DT carries data), and the S7 job (ROSCTR 1), which a controller answers with Ack-Data (3),
-or with a bare Ack (2) that holds an error. S7 has no public standard; names follow Wireshark's dissector.
+A frame is ``TPKT | COTP | S7``: RFC 1006, section 6 (TPKT: version 3, length of the whole), ISO
+8073 class 0 (COTP: CR and CC open, DT carries data), and the S7 job (ROSCTR 1). A controller
+answers with Ack-Data (3), or with a bare Ack (2) that holds an error. S7 has no public standard;
+names follow Wireshark's dissector.
 
-Requests come from python-snap7's encoders. Its answer parsing is not used: it is many times slower than one
-``struct`` call a frame, and does not hold an answer against what was asked. Nor is its connection: it waits for
-each piece with a time-out of its own, so that a peer that drips bytes is never late.
+Requests come from python-snap7's encoders. Its parsers are not used: they are many times slower
+than one ``struct`` call per frame, and do not compare an answer with its request. Its connection is
+not used either: each piece has a time-out of its own, so a peer that drips bytes is never late.
 
-Every function here raises ConnectorError, and nothing else, on whatever bytes it is given.
+Every parser here raises only ConnectorError, whatever bytes it is given.
 """
 
 from __future__ import annotations
@@ -50,19 +51,19 @@ _BITS, _OCTETS = 0x04, 0x09  # transport sizes: whether an item's length counts 
 
 
 class Session(NamedTuple):
-    """What the controller granted."""
+    """The session parameters that the controller granted."""
 
     pdu_size: int
-    """Bytes of the largest S7 PDU, header included."""
+    """Size of the largest S7 PDU in bytes, header included."""
     jobs: int
-    """Requests that may be under way at once."""
+    """Requests that may be in flight at once."""
 
 
 class ReadAnswer(NamedTuple):
-    """An answer to a read of one item."""
+    """The answer to a read of one item."""
 
     code: int
-    """The item's return code; without ITEM_OK there is no data."""
+    """The item's return code. Only with ITEM_OK is there data."""
     data: memoryview
 
 
@@ -70,7 +71,10 @@ class ReadAnswer(NamedTuple):
 
 
 def frame_length(inbox: memoryview, start: int, longest: int) -> int:
-    """Length in bytes of the frame that begins at ``start``, of which four bytes are there; at most ``longest``."""
+    """Return the length of the frame at ``start`` in bytes, at most ``longest``.
+
+    Four of its bytes are there.
+    """
     version, length = _TPKT.unpack_from(inbox, start)
     if version != 3:
         sent = bytes(inbox[start : start + 8])
@@ -90,7 +94,7 @@ def _frame(payload: bytes) -> bytes:
 
 
 def reference_of(frame: memoryview) -> int:
-    """Tell which request an answer names; what else is wrong with it, its parser finds."""
+    """Return the reference of the request that an answer belongs to. Its parser checks the rest."""
     if len(frame) < USERDATA_END:
         _check_cotp(frame)
         raise ConnectorError(f"answer of {len(frame)} bytes is too short")
@@ -98,7 +102,10 @@ def reference_of(frame: memoryview) -> int:
 
 
 def check_envelope(frame: memoryview) -> tuple[int, int, int]:
-    """Check what all S7 PDUs share; ROSCTR, and the lengths of the parameters and of the data that follow them."""
+    """Check the common header of all S7 PDUs.
+
+    Return ROSCTR and the lengths of parameters and data.
+    """
     if len(frame) < USERDATA_END:
         _check_cotp(frame)
         raise ConnectorError(f"answer of {len(frame)} bytes is too short")
@@ -113,7 +120,10 @@ def check_envelope(frame: memoryview) -> tuple[int, int, int]:
 
 
 def check_answer(frame: memoryview) -> int:
-    """Check all headers of an answer to a job; the length of its data part. RefusedError: it holds an error."""
+    """Check the headers of an answer to a job; return the length of its data.
+
+    RefusedError: it holds an error.
+    """
     kind, parameter_length, data_length = check_envelope(frame)
     if kind not in {_ACK, _ACK_DATA}:
         raise ConnectorError(f"not an answer: ROSCTR {kind}")
@@ -143,14 +153,17 @@ def _check_cotp(frame: memoryview) -> None:
 
 
 def connect_request(rack: int, slot: int) -> bytes:
-    """Build the COTP connection request to a CPU; the called TSAP is (programming device, rack and slot)."""
+    """Build the COTP connection request to a CPU.
+
+    The called TSAP is (programming device, rack and slot).
+    """
     tsaps = struct.pack(">BBH BBBB BBB", 0xC1, 2, 0x0100, 0xC2, 2, 0x01, rack << 5 | slot, 0xC0, 1, _TPDU_SIZE_CODE)
     head = struct.pack(">BBHHB", 6 + len(tsaps), _COTP_CR, 0, 1, 0)
     return _frame(head + tsaps)
 
 
 def parse_connect_confirm(frame: memoryview) -> int:
-    """Check the answer to a connection request; the largest TPDU in bytes."""
+    """Check the answer to a connection request; return the size of the largest TPDU in bytes."""
     if frame[5] == _COTP_DR:
         raise ConnectorError("the controller refused the session")
     if frame[5] != _COTP_CC or len(frame) < 11:
@@ -170,14 +183,14 @@ def parse_connect_confirm(frame: memoryview) -> int:
 
 
 def setup_request(reference: int, jobs: int, pdu_size: int) -> bytes:
-    """Build "setup communication": asks for so many jobs in parallel, and for PDUs of this size in bytes."""
+    """Build "setup communication", which asks for parallel jobs and a PDU size in bytes."""
     encoder = S7Protocol()
     encoder.sequence = (reference - 1) & 0xFFFF
     return data_frame(encoder.build_setup_communication_request(jobs, jobs, pdu_size))
 
 
 def parse_setup_answer(frame: memoryview, reference: int, asked: Session) -> Session:
-    """Check what the controller grants; it is never more than was asked."""
+    """Return what the controller grants, never more than was asked."""
     data_length = check_answer(frame)
     if (answered := reference_of(frame)) != reference:
         raise ConnectorError(f"answer to a request that was not made (reference {answered})")
@@ -193,7 +206,7 @@ def parse_setup_answer(frame: memoryview, reference: int, asked: Session) -> Ses
 
 
 def read_request(db_number: int, start: int, size: int) -> bytes:
-    """Build a read of ``size`` bytes at byte ``start``; the PDU reference is left to the caller to fill in."""
+    """Build a read of ``size`` bytes at byte ``start``. The caller fills in the PDU reference."""
     frame = data_frame(S7Protocol().build_read_request(S7Area.DB, db_number, start, S7WordLen.BYTE, size))
     if len(frame) != READ_REQUEST_SIZE:
         raise AssertionError("python-snap7 encodes read requests in another way than shmio knows")
@@ -201,9 +214,15 @@ def read_request(db_number: int, start: int, size: int) -> bytes:
 
 
 def parse_read_answer(frame: memoryview) -> ReadAnswer:
-    """Check an answer to a read of one item of bytes; ``data`` is a view of the frame. RefusedError: the job was."""
+    """Parse an answer to a read of one item of bytes; ``data`` is a view of the frame.
+
+    Raises:
+        RefusedError: The controller refused the job.
+        ConnectorError: The answer is malformed.
+
+    """
     if len(frame) >= _ITEM_END:
-        # Nearly all answers look like this; what does not is looked at field by field below, to say why.
+        # Nearly all answers look like this; others are parsed by field below, to say what is wrong.
         head, parameter_length, data_length, error, item, bits = _USUAL.unpack_from(frame)
         if (
             head == _USUAL_HEAD

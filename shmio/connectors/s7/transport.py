@@ -1,4 +1,4 @@
-"""The connection to a controller: whole frames over TCP, every wait bounded by a deadline."""
+"""The TCP connection to a controller: whole frames, every wait bounded by a deadline."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ from shmio.errors import ConnectorError
 
 
 class Transport:
-    """One TCP connection. Deadlines are ns of CLOCK_MONOTONIC; ``select`` keeps them to some 0.1 ms."""
+    """One TCP connection.
+
+    Deadlines are ns of CLOCK_MONOTONIC; ``select`` keeps them to about 0.1 ms.
+    """
 
     def __init__(self, host: str, port: int, timeout_ns: int) -> None:
-        """Connect, within ``timeout_ns`` (looking up a host name excepted); OSError if nobody is there."""
+        """Connect within ``timeout_ns``, plus the host name lookup; OSError if nothing answers."""
         places = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
         self.deadline_ns = time.monotonic_ns() + timeout_ns
-        """Until when ``timeout_ns`` lasts."""
+        """When ``timeout_ns`` is over."""
         for attempt, (family, kind, protocol, _, address) in enumerate(places, 1):
             self._socket = socket.socket(family, kind, protocol)
             try:
@@ -36,24 +39,27 @@ class Transport:
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._socket.setblocking(False)
         self.taken = 0
-        """Bytes of the last ``send`` that are on their way, or were when it failed."""
+        """Bytes of the last ``send`` that the kernel has taken, also when it failed."""
         self.reserve(1, 512)  # more than any connection confirm
 
     def reserve(self, frames: int, longest: int) -> None:
-        """Have room for so many frames of at most ``longest`` bytes; what has come must have been taken."""
+        """Reserve room for ``frames`` frames of at most ``longest`` bytes.
+
+        All received frames must be taken.
+        """
         self._longest = longest
         self._inbox = memoryview(bytearray(frames * longest))
         self._start = self._end = 0  # of the bytes received, but not yet taken
 
     @property
     def left(self) -> int:
-        """Bytes received, but not yet taken."""
+        """Number of bytes received but not yet taken."""
         return self._end - self._start
 
     def send(self, data: bytes | memoryview, deadline_ns: int) -> None:
-        """Send all of it. TimeoutError: the peer takes none.
+        """Send all of ``data``; TimeoutError if the peer does not take it in time.
 
-        What it answers meanwhile waits in the kernel: with so few requests under way, it fits there.
+        The kernel buffers the answers that come meanwhile; with so few requests in flight they fit.
         """
         self.taken = 0
         with suppress(BlockingIOError):
@@ -65,9 +71,13 @@ class Transport:
             self.taken += self._socket.send(data[self.taken :])
 
     def receive(self, until_ns: int) -> bool:
-        """Take what the socket has, once there is something; False: nothing came. EOFError: the peer closed.
+        """Receive what the socket has, waiting until ``until_ns``; return False if nothing came.
 
-        Whole frames are to be taken before the next call: what is left is then less than one, so there is always room.
+        Take all whole frames before the next call, so that there is always room.
+
+        Raises:
+            EOFError: The peer closed the connection.
+
         """
         ready, _, _ = select.select((self._socket,), (), (), _left_s(until_ns))
         if not ready:
@@ -83,7 +93,10 @@ class Transport:
         return True
 
     def frame(self) -> memoryview | None:
-        """Take the next frame out of what has come; None if it is not whole yet. Good until the next ``receive``."""
+        """Take the next whole frame; None if there is none.
+
+        It is valid until the next ``receive``.
+        """
         if self._end - self._start < 4:
             return None
         length = pdu.frame_length(self._inbox, self._start, self._longest)
@@ -94,14 +107,14 @@ class Transport:
         return frame
 
     def next_frame(self, deadline_ns: int) -> memoryview:
-        """Wait for a whole frame; TimeoutError."""
+        """Wait for a whole frame; TimeoutError if it does not come in time."""
         while (frame := self.frame()) is None:
             if not self.receive(deadline_ns):
                 raise TimeoutError
         return frame
 
     def close(self) -> None:
-        """Close the socket. In class 0 of the transport protocol, that alone ends the session."""
+        """Close the socket. In class 0 of the transport protocol this ends the session."""
         self._socket.close()
 
 
@@ -110,7 +123,7 @@ def _left_s(until_ns: int) -> float:
 
 
 def named(error: BaseException, options: S7Options, *, opening: bool = False) -> ConnectorError | None:
-    """Say for people what happened to a connection; None if the error is not of a connection."""
+    """Return a ConnectorError that explains a connection's error; None for other errors."""
     peer = options.peer
     if isinstance(error, TimeoutError):
         return ConnectorError(f"no answer within {options.timeout} ms from {peer}")
@@ -132,7 +145,7 @@ def named(error: BaseException, options: S7Options, *, opening: bool = False) ->
 
 
 class CloseOnError:
-    """Closes a connection on any way out of a ``with`` block but the good one, and names the error for people."""
+    """Context manager that closes a connection on any error, and explains the error."""
 
     def __init__(self, close: Callable[[], None], options: S7Options, *, opening: bool = False) -> None:
         self._close = close

@@ -1,7 +1,8 @@
-"""Which requests are under way, and whose each answer is. No I/O.
+"""Tracks which requests are in flight, and matches answers to them. No I/O.
 
-Reads of the block, writes and the question for the operating mode share one connection and the jobs that the controller
-granted. Every request has a reference of its own; an answer is taken by the one that asked, once, or not at all.
+Reads of the block, writes and the mode query share one connection and the jobs that the controller
+granted. Every request has its own reference, and each answer is taken once by the operation that
+asked, or not at all.
 """
 
 from __future__ import annotations
@@ -14,55 +15,61 @@ from shmio.errors import ConnectorError
 
 
 class Operation(Protocol):
-    """Some requests that belong together, and what their answers come to."""
+    """A group of requests with a common result."""
 
     @property
     def count(self) -> int:
-        """Requests in all."""
+        """Number of requests in all."""
 
     sent: int
-    """Requests given by ``take``."""
+    """Number of requests that ``take`` has returned."""
 
     @property
     def complete(self) -> bool:
-        """Whether nothing more is expected."""
+        """Whether no more answers are expected."""
 
     def take(self, count: int, first: int) -> bytes | memoryview:
-        """Give the next ``count`` requests as frames, with the references from ``first`` on (16 bits, wrapping)."""
+        """Return the next ``count`` requests as frames, with references from ``first`` on.
+
+        References have 16 bits and wrap.
+        """
 
     def accept(self, index: int, frame: memoryview) -> None:
-        """Take the answer to the request of this index; ConnectorError if it is not exactly one."""
+        """Take the answer to request ``index``; ConnectorError if it does not match."""
 
 
 class Window:
-    """Keeps at most ``jobs`` requests under way. References count on from ``reference``, wrapping after 65535."""
+    """Keeps at most ``jobs`` requests in flight.
+
+    References count from ``reference`` and wrap after 65535.
+    """
 
     def __init__(self, jobs: int, reference: int) -> None:
         self.jobs = jobs
         self.reference = reference
         self._queue: deque[Operation] = deque()
         self._under_way: dict[int, tuple[Operation, int]] = {}
-        self._given: list[tuple[Operation, int]] = []  # by the last ``due``: whose, from which of its requests on
+        self._given: list[tuple[Operation, int]] = []  # from the last ``due``: operations, each with its first request
 
     @property
     def idle(self) -> bool:
-        """Whether no answer is due."""
+        """Whether no answer is outstanding."""
         return not self._under_way
 
     @property
     def waiting(self) -> bool:
-        """Whether there are requests that are not sent yet."""
+        """Whether requests wait to be sent."""
         return bool(self._queue)
 
     def add(self, operation: Operation, *, urgent: bool = False) -> None:
-        """Have an operation's requests sent, after those of others; ``urgent``: before them."""
+        """Queue the requests of an operation, before all others if ``urgent``."""
         if urgent:
             self._queue.appendleft(operation)
         else:
             self._queue.append(operation)
 
     def due(self) -> bytes | memoryview:
-        """Give what may be sent now; empty if nothing may."""
+        """Return the requests that may be sent now; empty if there are none."""
         parts: list[bytes | memoryview] = []
         self._given.clear()
         while self._queue and (free := self.jobs - len(self._under_way)) > 0:
@@ -78,12 +85,15 @@ class Window:
         return parts[0] if len(parts) == 1 else b"".join(parts)
 
     def take_back(self) -> None:
-        """Know that what ``due`` gave last has not gone out, not a byte of it; the connection is lost."""
+        """Mark the requests that ``due`` returned last as unsent.
+
+        Call it when the connection was lost.
+        """
         for operation, begin in self._given:
             operation.sent = begin
 
     def accept(self, frame: memoryview) -> None:
-        """Hand an answer to the operation that asked; ConnectorError if none did."""
+        """Pass an answer to the operation that asked; ConnectorError if none did."""
         reference = pdu.reference_of(frame)
         owner = self._under_way.pop(reference, None)
         if owner is None:
