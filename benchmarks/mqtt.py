@@ -25,7 +25,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 
 from shmio.config import Address, Mqtt, MqttTopic
 from shmio.endpoints.mqtt.bridge import Bridge
-from shmio.endpoints.mqtt.frames import TURN_FRAMES
+from shmio.endpoints.mqtt.frame_reader import MAX_FRAMES_PER_TURN
 from shmio.layout.model import Layout, Register
 from shmio.segment import BlockSpec, BlockWriter, ProcessSpec, Segment
 from shmio.testing.mosquitto import Mosquitto, missing
@@ -56,7 +56,7 @@ def bridge(made: Segment, address: Address, qos: int) -> Iterator[Bridge]:
         made, made.processes.find("mqtt"), Mqtt(broker="external", host=str(address), prefix="bench", topic=rules)
     )
     try:
-        while not running.link.up or running.outbox.busy or running.link.in_flight:
+        while not running.connection.up or running.outbox.busy or running.connection.in_flight:
             running.turn()
         yield running
     finally:
@@ -87,12 +87,12 @@ def ours(running: Bridge, moving: Moving, duration_s: float) -> Callable[[], flo
     def sample() -> float:
         before, begun_s = running.outbox.sent, time.perf_counter()
         while time.perf_counter() - begun_s < duration_s:
-            for _ in range(TURN_FRAMES):  # as a bridge that is behind finds them: it has to wait for none
+            for _ in range(MAX_FRAMES_PER_TURN):  # as a bridge that is behind finds them: it has to wait for none
                 moving.publish()
             running.turn()
             while running.outbox.busy:
                 running.turn()
-        while running.link.in_flight:
+        while running.connection.in_flight:
             running.turn()
         return (running.outbox.sent - before) / (time.perf_counter() - begun_s)
 

@@ -55,7 +55,7 @@ def cost(made: Segment, address: Address, count: int, way: str, duration_s: floa
     writer.publish(images[0], cycle=1)
     running = Bridge(made, made.processes.find("mqtt"), settings)
     links = 2 if "sparkplug" in WAYS[way] else 1
-    while running.counters[6] < links or running.outbox.busy or running.link.in_flight:
+    while running.counters[6] < links or running.outbox.busy or running.connection.in_flight:
         running.turn()
     frames = 0
 

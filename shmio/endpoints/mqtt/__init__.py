@@ -1,6 +1,10 @@
 """The MQTT endpoint: a bridge to a broker, and our own broker where there is no other.
 
-``feed`` follows one block and marks what changed, ``channel`` makes a topic's payload when its turn comes, ``outbox``
-is what waits for the broker, or is kept while it is away, ``link`` the connection to it, ``commands`` and ``inlet``
-take values the other way, ``steps`` delivers those of virtual time. ``bridge`` has one thread turn all of them.
+``bridge`` runs everything in one thread:
+
+- ``feed`` follows one block and marks the topics that changed; ``channel`` makes a topic's payload.
+- ``outbox`` queues topics and results for the broker; ``backlog`` keeps changes during an outage.
+- ``connection`` connects to the broker; ``topic_guard`` corrects what others publish on our topics.
+- ``commands`` receives commands from the broker; ``command_client`` sends them to a source.
+- ``steps`` delivers the steps of virtual time; ``sparkplug`` publishes the same sources as Sparkplug B.
 """

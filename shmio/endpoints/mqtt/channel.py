@@ -32,7 +32,7 @@ class Message(NamedTuple):
     source_ns: int = 0
 
 
-class Shown(NamedTuple):
+class SourceState(NamedTuple):
     """What a source shows at present: its newest frame, if it has one, and how good that is."""
 
     frame: Frame | None
@@ -40,11 +40,11 @@ class Shown(NamedTuple):
     reason: str
 
 
-class Showing(Protocol):
+class SourceFollower(Protocol):
     """Who follows a source."""
 
     block: Block
-    shown: Shown
+    state: SourceState
 
     @property
     def missed(self) -> int:
@@ -63,17 +63,17 @@ class Channel(Protocol):
 class RegisterChannel:
     """A register, or an array's element, by one of the two kinds of payload."""
 
-    def __init__(self, showing: Showing, register: Register, topic: str, rule: MqttTopic) -> None:
+    def __init__(self, follower: SourceFollower, register: Register, topic: str, rule: MqttTopic) -> None:
         self.register = register
         self.registers = (register,)
         self.topic = topic
         self.json = rule.payload != "text"
         self.limited = rule.deadband > 0 or rule.max_rate_hz is not None
         """Whether not each change is published."""
-        self._showing = showing
+        self._follower = follower
         self._qos, self._retain, self._deadband = rule.qos, rule.retain, rule.deadband
         self._pause_ns = round(1e9 / rule.max_rate_hz) if rule.max_rate_hz else 0
-        self._decode = codec(register, showing.block.layout.byte_order).decode
+        self._decode = codec(register, follower.block.layout.byte_order).decode
         self._to_text = texts(register)
         self._sent: Value = None
         self.due_ns = 0
@@ -89,11 +89,11 @@ class RegisterChannel:
     def message(self, *, late: bool = False) -> Message:
         """As of now; empty while there is no good value, but as JSON, which says so."""
         payload = self._json(late=late) if self.json else self._text()
-        frame = self._showing.shown.frame
+        frame = self._follower.state.frame
         return Message(self.topic, payload, self._qos, self._retain and not late, True, frame.source_ns if frame else 0)
 
     def _text(self) -> bytes:
-        frame, quality, _ = self._showing.shown
+        frame, quality, _ = self._follower.state
         if frame is None or quality is Quality.BAD:
             self._note(None)
             return b""
@@ -103,8 +103,8 @@ class RegisterChannel:
         return self._to_text(value).encode()
 
     def _json(self, *, late: bool) -> bytes:
-        frame, quality, reason = self._showing.shown
-        found = reading(self._showing.block, self.register, frame)
+        frame, quality, reason = self._follower.state
+        found = reading(self._follower.block, self.register, frame)
         if holds_none(found.value):
             quality, reason = Quality.BAD, reason or found.reason
         self._note(None if quality is Quality.BAD else found.value)
@@ -114,7 +114,7 @@ class RegisterChannel:
     def _note(self, value: Value) -> None:
         if self.limited:
             self._sent = value
-            self.due_ns = self._showing.block.now_ns() + self._pause_ns
+            self.due_ns = self._follower.block.now_ns() + self._pause_ns
 
 
 class FramesChannel:
@@ -122,10 +122,10 @@ class FramesChannel:
 
     json = False
 
-    def __init__(self, showing: Showing, topic: str, rule: MqttTopic) -> None:
+    def __init__(self, follower: SourceFollower, topic: str, rule: MqttTopic) -> None:
         self.topic = topic
         self.limited = rule.max_rate_hz is not None
-        self._showing = showing
+        self._follower = follower
         self._qos, self._retain = rule.qos, rule.retain
         self._pause_ns = round(1e9 / rule.max_rate_hz) if rule.max_rate_hz else 0
         self.due_ns = 0
@@ -136,8 +136,8 @@ class FramesChannel:
 
     def message(self, *, late: bool = False) -> Message:
         """As of now; empty while there is no good frame."""
-        frame, quality, _ = self._showing.shown
-        self.due_ns = self._showing.block.now_ns() + self._pause_ns
+        frame, quality, _ = self._follower.state
+        self.due_ns = self._follower.block.now_ns() + self._pause_ns
         payload = b"" if frame is None or quality is Quality.BAD else frame.image
         return Message(self.topic, payload, self._qos, self._retain and not late, True, frame.source_ns if frame else 0)
 
@@ -145,17 +145,17 @@ class FramesChannel:
 class StatusChannel:
     """How a source fares, as JSON."""
 
-    def __init__(self, showing: Showing, topic: str) -> None:
+    def __init__(self, follower: SourceFollower, topic: str) -> None:
         self.topic = topic
-        self._showing = showing
+        self._follower = follower
 
     def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  it is told again when the broker is back
         """As of now."""
-        frame, quality, reason = self._showing.shown
-        return status(self.topic, quality, reason, self._showing.missed, frame)
+        frame, quality, reason = self._follower.state
+        return status(self.topic, quality, reason, self._follower.missed, frame)
 
 
-class Presence:
+class BridgeStatusChannel:
     """Whether the bridge is there: it is, if it says anything."""
 
     def __init__(self, topic: str) -> None:
@@ -166,7 +166,7 @@ class Presence:
         return Message(self.topic, ONLINE, 1, retain=True)
 
 
-class Gone:
+class ClearedTopic:
     """What nothing is published on any more: what the broker remembers of it is deleted."""
 
     def __init__(self, topic: str) -> None:

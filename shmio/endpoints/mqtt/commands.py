@@ -13,7 +13,7 @@ from paho.mqtt.properties import Properties
 
 from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.feed import Feed
-from shmio.endpoints.mqtt.rules import Rules
+from shmio.endpoints.mqtt.topic_rules import TopicRules
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.layout.topic import look_up, parse_topic, shorten
@@ -33,12 +33,12 @@ Answer = Callable[[Message, Properties | None], None]
 log = logging.getLogger("shmio.mqtt")
 
 
-def filters(prefix: str, feeds: Iterable[Feed]) -> list[str]:
+def command_filters(prefix: str, feeds: Iterable[Feed]) -> list[str]:
     """What to subscribe to: paths of each depth that a source has, and nothing that we publish ourselves."""
     return [f"{prefix}/{feed.block.source}/{'+/' * depth}in" for feed in feeds for depth in feed.depths]
 
 
-def outputs(prefix: str, feeds: Iterable[Feed]) -> list[str]:
+def output_filters(prefix: str, feeds: Iterable[Feed]) -> list[str]:
     """Where a bridge before this one may have published these sources: registers, elements, structures, frames."""
     deep = [
         f"{prefix}/{feed.block.source}/{'+/' * depth}out" for feed in feeds for depth in range(max(feed.depths) + 1)
@@ -46,15 +46,15 @@ def outputs(prefix: str, feeds: Iterable[Feed]) -> list[str]:
     return deep + [f"{prefix}/{feed.block.source}/frames" for feed in feeds]
 
 
-def answers(prefix: str, feeds: Iterable[Feed]) -> list[str]:
+def result_filters(prefix: str, feeds: Iterable[Feed]) -> list[str]:
     """Where results go."""
-    return [f"{one}/result" for one in filters(prefix, feeds)] + [f"{prefix}/{REPLIES}/#"]
+    return [f"{one}/result" for one in command_filters(prefix, feeds)] + [f"{prefix}/{REPLIES}/#"]
 
 
-class Commands:
+class CommandReceiver:
     """For the bridge's thread."""
 
-    def __init__(self, prefix: str, rules: Rules, feeds: Mapping[str, Feed], answer: Answer) -> None:
+    def __init__(self, prefix: str, rules: TopicRules, feeds: Mapping[str, Feed], answer: Answer) -> None:
         self.received = 0
         self.refused = 0
         """Those of which nothing was done: retained ones, and those that no source was sent."""
@@ -80,9 +80,9 @@ class Commands:
             return
         try:
             feed, register = self._find(topic.removeprefix(f"{self._prefix}/"))
-            feed.inlet.check(register)  # before its value is read: another one would not do either
+            feed.command_client.check(register)  # before its value is read: another one would not do either
             value = _value(bytes(message.payload), register, json=self._is_json(feed, register))
-            feed.inlet.send(register, value, tell)
+            feed.command_client.send(register, value, tell)
         except (CommandError, PathError, ValueRangeError) as error:
             self.refused += 1
             tell(EventKind.REJECTED, str(error))

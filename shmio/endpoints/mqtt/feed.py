@@ -13,15 +13,15 @@ from shmio.endpoints.mqtt.channel import (
     FramesChannel,
     Message,
     RegisterChannel,
-    Showing,
-    Shown,
+    SourceFollower,
+    SourceState,
     StatusChannel,
     json_payload,
 )
-from shmio.endpoints.mqtt.frames import Frames
-from shmio.endpoints.mqtt.inlet import Inlet
+from shmio.endpoints.mqtt.command_client import CommandClient
+from shmio.endpoints.mqtt.frame_reader import FrameReader
 from shmio.endpoints.mqtt.outbox import Outbox
-from shmio.endpoints.mqtt.rules import Rules
+from shmio.endpoints.mqtt.topic_rules import TopicRules
 from shmio.errors import PathError
 from shmio.layout.model import Layout, Register
 from shmio.layout.topic import decode_segment, find
@@ -41,17 +41,19 @@ class StructureChannel:
 
     json = True
 
-    def __init__(self, showing: Showing, path: str, registers: Sequence[Register], topic: str, rule: MqttTopic) -> None:
+    def __init__(
+        self, follower: SourceFollower, path: str, registers: Sequence[Register], topic: str, rule: MqttTopic
+    ) -> None:
         """``path``: of the structure that the registers are below; empty: the source."""
         self.registers = registers
         self.topic = topic
         self.limited = rule.max_rate_hz is not None
-        self._showing = showing
+        self._follower = follower
         self._qos, self._retain = rule.qos, rule.retain
         self._pause_ns = round(1e9 / rule.max_rate_hz) if rule.max_rate_hz else 0
         depth = path.count("/") + 1 if path else 0
         parts = [(register.path.split("/")[depth:], register) for register in registers]
-        self._value = _members(parts, showing.block.layout)
+        self._value = _members(parts, follower.block.layout)
         self.due_ns = 0
 
     def moved(self, _image: bytes) -> bool:
@@ -60,7 +62,7 @@ class StructureChannel:
 
     def message(self, *, late: bool = False) -> Message:
         """As of now; while it is bad, with the values known last."""
-        block, (frame, quality, reason) = self._showing.block, self._showing.shown
+        block, (frame, quality, reason) = self._follower.block, self._follower.state
         self.due_ns = block.now_ns() + self._pause_ns
         value, provenance = None, Provenance.LIVE
         if frame is not None:
@@ -90,25 +92,25 @@ log = logging.getLogger("shmio.mqtt")
 
 ValueChannel = RegisterChannel | StructureChannel
 
-NO_DATA: Final = Shown(None, Quality.BAD, "no data yet")
+NO_DATA: Final = SourceState(None, Quality.BAD, "no data yet")
 
 
 class Feed:
     """One source: what it shows, and what of that the broker has not been told. For the bridge's thread."""
 
-    def __init__(self, block: Block, rules: Rules, prefix: str, outbox: Outbox, writer: int) -> None:
+    def __init__(self, block: Block, rules: TopicRules, prefix: str, outbox: Outbox, writer: int) -> None:
         """``writer``: the command queue of this process. For a big layout this takes seconds."""
         self.block = block
-        self.shown = NO_DATA
-        self.held = False
+        self.state = NO_DATA
+        self.step_driven = False
         """Whether only steps show anything: it lives on the instance's clock, which is virtual."""
-        self.inlet = Inlet(block, writer)
+        self.command_client = CommandClient(block, writer)
         base = f"{prefix}/{block.source}"
         self.status = StatusChannel(self, f"{base}/status")
         chosen = list(_chosen(block.layout, rules, block.source))
-        self._of = [*self._channels_of(chosen, rules, base)]
+        self._channel_of = [*self._channels_of(chosen, rules, base)]
         """The channel of each register that is published, in the layout's order."""
-        self.channels = list(dict.fromkeys(self._of))
+        self.channels = list(dict.fromkeys(self._channel_of))
         frames = rules.frames(block.source)
         self.frames = FramesChannel(self, f"{base}/frames", frames) if frames else None
         self.depths = _depths(block.layout)
@@ -117,15 +119,15 @@ class Feed:
         self._injected: frozenset[ValueChannel] = frozenset()
         """Those told, or to be told, as injected."""
         self._covered = self._injected
-        self._standing = 0
+        self._injection_sequence = 0
         """Of which sequence of what stands on the block ``_covered`` is."""
         self._scan = ChangeScan([register for register, _ in chosen])
         self._outbox = outbox
-        self._later: dict[ValueChannel | FramesChannel, None] = {}
-        self._coming = Frames(block)
+        self._limited: dict[ValueChannel | FramesChannel, None] = {}
+        self._reader = FrameReader(block)
 
     def _channels_of(
-        self, chosen: Sequence[tuple[Register, MqttTopic]], rules: Rules, base: str
+        self, chosen: Sequence[tuple[Register, MqttTopic]], rules: TopicRules, base: str
     ) -> Iterator[ValueChannel]:
         source = self.block.source
         paths = [rules.structure(source, part.path) if rule.payload == "structure" else None for part, rule in chosen]
@@ -146,61 +148,61 @@ class Feed:
     @property
     def missed(self) -> int:
         """Frames that were not looked at, since the bridge was too slow."""
-        return self._coming.missed
+        return self._reader.missed
 
     @property
-    def over(self) -> bool:
+    def ended(self) -> bool:
         """Whether a reload has ended the block, and all of it has been taken."""
-        return self.block.retired and not self._coming.behind
+        return self.block.retired and not self._reader.behind
 
-    def look(self) -> bool:
+    def poll(self) -> bool:
         """Take frames that have come, a few at a time; whether there are more at once."""
-        if self.held:
+        if self.step_driven:
             return False
-        missed = self._coming.missed
-        for frame in self._coming.come():
-            if self._coming.missed != missed:
-                missed = self._coming.missed
+        missed = self._reader.missed
+        for frame in self._reader.read():
+            if self._reader.missed != missed:
+                missed = self._reader.missed
                 log.warning("source %s: the bridge was too slow: it has missed %d frames", self.block.source, missed)
                 self._outbox.mark(self.status)
             self.take(frame)
             if self._outbox.busy:
                 self._outbox.flush()  # so that each frame's changes are told, as long as the broker takes them
-        if self._coming.behind:
+        if self._reader.behind:
             return True
-        self._age()
+        self._check_age()
         return False
 
     def step(self) -> None:
         """Show what the step that is being delivered has changed, if the block is on the instance's clock."""
-        if self.held and (frame := self.block.latest()):
-            self._coming.go_on_after(frame.number)
+        if self.step_driven and (frame := self.block.latest()):
+            self._reader.resume_after(frame.number)
             self.take(frame)
 
     def take(self, frame: Frame) -> None:
         """Show a frame."""
-        before = self.shown
+        before = self.state
         quality, reason = self.block.assess(frame)
-        self.shown = Shown(frame, quality, reason)
-        if not self._requalify(before):
+        self.state = SourceState(frame, quality, reason)
+        if not self._mark_quality(before):
             if quality is Quality.BAD:
                 return
             old = before.frame
-            changed = self._scan.changed(old.image, frame.image) if old else range(len(self._of))
-            channels = dict.fromkeys(self._of[index] for index in changed)
-            self._outbox.mark_all([one for one in channels if not one.limited or self._may(one, frame)])
+            changed = self._scan.changed(old.image, frame.image) if old else range(len(self._channel_of))
+            channels = dict.fromkeys(self._channel_of[index] for index in changed)
+            self._outbox.mark_all([one for one in channels if not one.limited or self._is_due(one, frame)])
             if self._json and (frame.effective is not None or self._injected):
-                self._tell_injected(frame)
-            if self.frames and self._may(self.frames, frame):
+                self._mark_injected(frame)
+            if self.frames and self._is_due(self.frames, frame):
                 self._outbox.mark(self.frames)
-        if self._later:
-            self.settle()
+        if self._limited:
+            self.mark_due()
 
-    def _tell_injected(self, frame: Frame) -> None:
+    def _mark_injected(self, frame: Frame) -> None:
         """Tell whose value is injected now and was not, or the reverse, also if it is the same value."""
         sequence, before = self.block.standing.sequence, self._injected
-        if sequence != self._standing:
-            self._standing = sequence
+        if sequence != self._injection_sequence:
+            self._injection_sequence = sequence
             over = [one for one in self.block.standing.read() if one.direction == "out"]
             self._covered = frozenset(
                 channel for channel in self._json if any(one.covers(part) for part in channel.registers for one in over)
@@ -208,16 +210,16 @@ class Feed:
         self._injected = frozenset() if frame.effective is None else self._covered
         self._outbox.mark_all(one for one in self._json if (one in before) != (one in self._injected))
 
-    def _age(self) -> None:
+    def _check_age(self) -> None:
         """Turn bad with age."""
-        before = self.shown
+        before = self.state
         if before.frame is not None and before.quality is not Quality.BAD:
-            self.shown = Shown(before.frame, *self.block.assess(before.frame))
-            self._requalify(before)
+            self.state = SourceState(before.frame, *self.block.assess(before.frame))
+            self._mark_quality(before)
 
-    def _requalify(self, before: Shown) -> bool:
+    def _mark_quality(self, before: SourceState) -> bool:
         """Tell a change of quality: whether everything has been marked for that."""
-        now = self.shown
+        now = self.state
         if (before.quality, before.reason) == (now.quality, now.reason) and before is not NO_DATA:
             return False
         self._outbox.mark(self.status)
@@ -229,38 +231,38 @@ class Feed:
 
     def mark_all(self) -> None:
         """Have everything told as it is now."""
-        self._later.clear()
+        self._limited.clear()
         self._outbox.mark_all(self.all())
 
-    def show(self) -> None:
+    def resend(self) -> None:
         """Have the broker be told, or be told again, how everything is."""
-        self._later.clear()
-        self._outbox.show(self.all())
+        self._limited.clear()
+        self._outbox.resend(self.all())
 
     def all(self) -> list[Channel]:
         """All topics of this source."""
         return [self.status, *self.channels, *([self.frames] if self.frames else [])]
 
-    def _may(self, channel: ValueChannel | FramesChannel, frame: Frame) -> bool:
+    def _is_due(self, channel: ValueChannel | FramesChannel, frame: Frame) -> bool:
         """Whether a change of it is told now; or else later, or not at all."""
         if not channel.limited:
             return True
-        if channel in self._later or channel.due_ns > self.block.now_ns():
-            self._later[channel] = None
+        if channel in self._limited or channel.due_ns > self.block.now_ns():
+            self._limited[channel] = None
             return False
         return channel.moved(frame.image)
 
-    def settle(self) -> int | None:
+    def mark_due(self) -> int | None:
         """Mark what may be told again by now; when the next one may, by the source's clock. None: nothing waits."""
-        now_ns, frame = self.block.now_ns(), self.shown.frame
-        for channel in [channel for channel in self._later if channel.due_ns <= now_ns]:
-            del self._later[channel]
+        now_ns, frame = self.block.now_ns(), self.state.frame
+        for channel in [channel for channel in self._limited if channel.due_ns <= now_ns]:
+            del self._limited[channel]
             if frame and channel.moved(frame.image):
                 self._outbox.mark(channel)
-        return min((channel.due_ns for channel in self._later), default=None)
+        return min((channel.due_ns for channel in self._limited), default=None)
 
 
-def _chosen(layout: Layout, rules: Rules, source: str) -> Iterator[tuple[Register, MqttTopic]]:
+def _chosen(layout: Layout, rules: TopicRules, source: str) -> Iterator[tuple[Register, MqttTopic]]:
     """What is published of a block, each with its rule; arrays as a whole, or by their elements; then parts."""
     for register in layout.registers:
         rule = rules.of(source, register.path)

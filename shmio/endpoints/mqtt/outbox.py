@@ -13,14 +13,14 @@ from typing import Final, Protocol
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.properties import Properties
 
+from shmio.endpoints.mqtt.backlog import Backlog
 from shmio.endpoints.mqtt.channel import Channel, Message
-from shmio.endpoints.mqtt.store import Store
 
 OVERHEAD_BYTES: Final = 200
 """Of one message in memory, about, beside its payload."""
 TURN_MESSAGES: Final = 500
 """So many are sent before what else there is to do has its turn."""
-MOST_ANSWERS: Final = 1024
+MAX_RESULTS: Final = 1024
 """Results of commands that wait; beyond that the oldest are dropped."""
 
 
@@ -45,33 +45,33 @@ class Sender(Protocol):
 class Outbox:
     """For the bridge's thread."""
 
-    def __init__(self, link: Sender, results: Sender, backlog_bytes: int) -> None:
-        """``link``: for values; ``results``: for what became of commands."""
-        self._link, self._results = link, results
+    def __init__(self, connection: Sender, results: Sender, backlog_bytes: int) -> None:
+        """``connection``: for values; ``results``: for what became of commands."""
+        self._connection, self._results = connection, results
         self._most = backlog_bytes
-        self._kept: Store[Message] = Store(backlog_bytes)
+        self._backlog: Backlog[Message] = Backlog(backlog_bytes)
         self._waiting: dict[Channel, None] = {}
-        self._answers: deque[tuple[Message, Properties | None]] = deque(maxlen=MOST_ANSWERS)
+        self._results_waiting: deque[tuple[Message, Properties | None]] = deque(maxlen=MAX_RESULTS)
         self.keeping = False
         """Whether changes are kept while there is no connection: it has failed, or there has been one."""
-        self._settling = False
+        self._catching_up = False
         """Whether the broker is being told all that was kept, and then how everything is."""
-        self._room = 0
+        self._catch_up_bytes = 0
         """Bytes up to which changes are kept meanwhile: fewer the more was sent, for else a broker that takes less
         than there is would be told of the past for ever."""
         self.sent = 0
-        self._unanswered = 0
+        self._dropped_results = 0
 
     @property
     def busy(self) -> bool:
         """Whether anything is to be sent."""
-        return bool(self._waiting or self._kept.count or self._answers)
+        return bool(self._waiting or self._backlog.count or self._results_waiting)
 
     @property
-    def able(self) -> bool:
+    def can_send(self) -> bool:
         """Whether :meth:`flush` would send something now."""
-        values, answers = self._waiting or self._kept.count, self._answers
-        return bool((values and self._link.room) or (answers and self._results.room))
+        values, answers = self._waiting or self._backlog.count, self._results_waiting
+        return bool((values and self._connection.room) or (answers and self._results.room))
 
     @property
     def waiting(self) -> int:
@@ -81,59 +81,59 @@ class Outbox:
     @property
     def backlog(self) -> int:
         """Changes that are kept."""
-        return self._kept.count
+        return self._backlog.count
 
     @property
     def dropped(self) -> int:
         """Changes that had no room, and answers."""
-        return self._kept.dropped + self._unanswered
+        return self._backlog.dropped + self._dropped_results
 
     def mark(self, channel: Channel) -> None:
         """Something about it is new. One that waits already keeps its place, and will be sent with what is new.
 
         Until all that was kept has been sent, what is new is kept behind it, if there is room.
         """
-        if self._link.up and not (self._settling and self._kept.bytes < self._room):
+        if self._connection.up and not (self._catching_up and self._backlog.bytes < self._catch_up_bytes):
             self._waiting[channel] = None
-        elif self._settling or self.keeping:
+        elif self._catching_up or self.keeping:
             message = channel.message(late=True)
             if message.keep:
-                self._kept.put(message, _size(message))
-            if self._link.up:  # what is kept is not retained; it may have been shown already
+                self._backlog.put(message, _size(message))
+            if self._connection.up:  # what is kept is not retained; it may have been shown already
                 self._waiting[channel] = None
 
     def mark_all(self, channels: Iterable[Channel]) -> None:
         """Something about all of them is new."""
-        if self._link.up and not self._settling:
+        if self._connection.up and not self._catching_up:
             self._waiting |= dict.fromkeys(channels)
             return
         for channel in channels:
             self.mark(channel)
 
-    def show(self, channels: Iterable[Channel]) -> None:
+    def resend(self, channels: Iterable[Channel]) -> None:
         """Have all of them sent as they are when their turn comes, after what was kept."""
-        if self._link.up:
+        if self._connection.up:
             self._waiting |= dict.fromkeys(channels)
-            if not self._settling:
-                self._settling, self._room = True, self._most
+            if not self._catching_up:
+                self._catching_up, self._catch_up_bytes = True, self._most
 
-    def answer(self, message: Message, properties: Properties | None) -> None:
+    def queue_result(self, message: Message, properties: Properties | None) -> None:
         """Send what became of a command, before values."""
         if self._results.up:
-            self._unanswered += len(self._answers) == MOST_ANSWERS
-            self._answers.append((message, properties))
+            self._dropped_results += len(self._results_waiting) == MAX_RESULTS
+            self._results_waiting.append((message, properties))
 
     def lose(self, unacknowledged: Iterable[Message]) -> None:
         """The connection is gone: keep what it has not taken for certain, and what waited for it."""
         for message in reversed(list(unacknowledged)):
             if message.keep:
-                self._kept.put_back(message._replace(retain=False), _size(message))
+                self._backlog.put_back(message._replace(retain=False), _size(message))
         for channel in self._waiting:
             message = channel.message(late=True)
             if message.keep:
-                self._kept.put(message, _size(message))
+                self._backlog.put(message, _size(message))
         self._waiting.clear()
-        self._settling = False
+        self._catching_up = False
 
     def forget(self, channels: Iterable[Channel]) -> None:
         """A reload has ended what they tell of."""
@@ -143,35 +143,35 @@ class Outbox:
     def flush(self) -> None:
         """Send as long as the connections take it, so many at once, and so many in all by each."""
         if not self._results.up:
-            self._answers.clear()  # they go with their connection
+            self._results_waiting.clear()  # they go with their connection
         self._pass(self._results, self._answered)
-        self._pass(self._link, self._due)
+        self._pass(self._connection, self._due)
 
-    def _pass(self, link: Sender, due: Callable[[], Iterator[tuple[Message, Properties | None]]]) -> None:
+    def _pass(self, connection: Sender, due: Callable[[], Iterator[tuple[Message, Properties | None]]]) -> None:
         rest = TURN_MESSAGES
-        while (room := min(link.room, rest)) > 0:
+        while (room := min(connection.room, rest)) > 0:
             rest -= room
             before = self.sent
             for message, properties in islice(due(), room):
                 self.sent += 1
-                link.send(message, properties)
+                connection.send(message, properties)
             if self.sent == before:
                 return
-            link.push()
+            connection.push()
 
     def _answered(self) -> Iterator[tuple[Message, Properties | None]]:
         """What became of commands."""
-        while self._answers:
-            yield self._answers.popleft()
+        while self._results_waiting:
+            yield self._results_waiting.popleft()
 
     def _due(self) -> Iterator[tuple[Message, Properties | None]]:
         """Values, each as its turn comes: what was kept, then what is new."""
-        while (message := self._kept.pop()) is not None:
-            self._room -= _size(message) // 2
+        while (message := self._backlog.pop()) is not None:
+            self._catch_up_bytes -= _size(message) // 2
             yield message, _time_of(message)
         for channel in list(islice(self._waiting, TURN_MESSAGES)):
             del self._waiting[channel]
-            self._settling = self._settling and bool(self._waiting)
+            self._catching_up = self._catching_up and bool(self._waiting)
             yield channel.message(), None
 
 

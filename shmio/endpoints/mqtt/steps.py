@@ -10,7 +10,7 @@ from typing import Final
 import msgspec
 
 from shmio.endpoints.mqtt.channel import Message
-from shmio.endpoints.mqtt.connection.connection import Link
+from shmio.endpoints.mqtt.connection.connection import BrokerConnection
 from shmio.endpoints.mqtt.feed import Feed
 from shmio.endpoints.mqtt.outbox import Outbox
 from shmio.segment.clock import ClockPage, ClockState
@@ -21,49 +21,49 @@ PATIENCE_S: Final = 3.0
 log = logging.getLogger("shmio.mqtt")
 
 
-class Steps:
+class StepDelivery:
     """For the bridge's thread."""
 
-    def __init__(self, clock: ClockPage, index: int, topic: str, link: Link, outbox: Outbox) -> None:
+    def __init__(self, clock: ClockPage, index: int, topic: str, connection: BrokerConnection, outbox: Outbox) -> None:
         """``index``: of this process's slot."""
-        self._clock, self._index, self._topic, self._link, self._outbox = clock, index, topic, link, outbox
-        self._delivering: Marker | None = None
+        self._clock, self._index, self._topic, self._connection, self._outbox = clock, index, topic, connection, outbox
+        self._delivering: StepMarker | None = None
         self._until_s = 0.0
         self.done = clock.read().done
         """The last step that was delivered."""
         clock.deliver(index, self.done)  # from now on each step waits for it
 
-    def look(self, feeds: Iterable[Feed]) -> None:
+    def poll(self, feeds: Iterable[Feed]) -> None:
         """Begin to deliver a step that is done, or end it; what is held shows nothing but by steps."""
-        state = self._clock.read()
+        now = self._clock.read()
         for feed in feeds:
-            feed.held = state.virtual and feed.block.attributes.stepped and feed.shown.frame is not None
+            feed.step_driven = now.virtual and feed.block.attributes.stepped and feed.state.frame is not None
         if self._delivering is None:
-            if not state.virtual or state.done <= self.done:
+            if not now.virtual or now.done <= self.done:
                 return
-            self._begin(state, feeds)
+            self._begin(now, feeds)
         if self._delivering is not None and self._over(self._delivering):
             self.done, self._delivering = self._delivering.number, None
             self._clock.deliver(self._index, self.done)
 
     def _begin(self, state: ClockState, feeds: Iterable[Feed]) -> None:
         for feed in feeds:
-            feed.inlet.look()
+            feed.command_client.poll()
             feed.step()
-        self._delivering = Marker(self._topic, state)
+        self._delivering = StepMarker(self._topic, state)
         self._until_s = time.monotonic() + PATIENCE_S
         self._outbox.mark(self._delivering)
         self._outbox.flush()
 
-    def _over(self, marker: Marker) -> bool:
+    def _over(self, marker: StepMarker) -> bool:
         """Whether the broker has it; or is away, so that what changed is kept until it is back."""
-        if not self._link.up:
+        if not self._connection.up:
             return True
-        if marker.sent is not None and not self._link.owes(marker.sent):
+        if marker.sent is not None and not self._connection.is_unacknowledged(marker.sent):
             return True  # a broker acknowledges in the order in which it was sent (MQTT 5.0, section 4.6)
         if time.monotonic() >= self._until_s:
             log.warning("step %d: the broker does not take it", marker.number)
-            self._link.drop(f"it did not take step {marker.number} within {PATIENCE_S:g} s")
+            self._connection.drop(f"it did not take step {marker.number} within {PATIENCE_S:g} s")
             return True
         return False
 
@@ -72,7 +72,7 @@ class Steps:
         self._clock.abstain(self._index)
 
 
-class Marker:
+class StepMarker:
     """Tells on its topic that a step is over."""
 
     def __init__(self, topic: str, state: ClockState) -> None:

@@ -30,7 +30,7 @@ MOST_REST_S: Final = 320.0
 log = logging.getLogger("shmio.mqtt")
 
 
-class Guarded(Protocol):
+class TopicOwner(Protocol):
     """Whose topics they are."""
 
     def watch(self) -> None:
@@ -46,16 +46,16 @@ class Guarded(Protocol):
         """Tell again everything."""
 
 
-class Guard:
+class TopicGuard:
     """For the bridge's thread."""
 
-    def __init__(self, guarded: Guarded, now_s: Callable[[], float] = time.monotonic) -> None:
-        self._guarded, self._now_s = guarded, now_s
+    def __init__(self, owner: TopicOwner, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._owner, self._now_s = owner, now_s
         self._waiting: dict[str, None] = {}
         self._everything = False
         self._pause_s, self._rest_s = FIRST_PAUSE_S, REST_S
         self._due_s = self._until_s = self._second_s = 0.0
-        self._heard = 0
+        self._count = 0
         self._resting = False
 
     def begin(self) -> None:
@@ -63,18 +63,18 @@ class Guard:
         if not self._resting:
             self._waiting.clear()
             self._everything = False
-            self._guarded.watch()
+            self._owner.watch()
 
-    def hear(self, topic: str) -> None:
+    def report(self, topic: str) -> None:
         """Somebody else has published there what is not so."""
         if self._resting:  # it was under way
             return
         now_s = self._now_s()
         if now_s - self._second_s >= 1.0:
-            self._second_s, self._heard = now_s, 0
-        self._heard += 1
-        if self._heard > MOST_HEARD:
-            self._guarded.unwatch()
+            self._second_s, self._count = now_s, 0
+        self._count += 1
+        if self._count > MOST_HEARD:
+            self._owner.unwatch()
             self._waiting.clear()
             if now_s >= self._until_s + CALM_S:
                 self._rest_s = REST_S
@@ -93,7 +93,7 @@ class Guard:
             if now_s < self._until_s:
                 return self._until_s - now_s
             self._resting = False
-            self._guarded.watch()
+            self._owner.watch()
         if not (self._waiting or self._everything):
             return CALM_S
         if now_s < self._due_s:
@@ -109,8 +109,8 @@ class Guard:
         if self._everything:
             self._everything = False
             self._waiting.clear()
-            self._guarded.correct_all()
+            self._owner.correct_all()
             return
         for topic in list(islice(self._waiting, AT_ONCE)):
             del self._waiting[topic]
-            self._guarded.correct(topic)
+            self._owner.correct(topic)

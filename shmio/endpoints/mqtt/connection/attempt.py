@@ -21,7 +21,7 @@ from shmio.endpoints.mqtt.broker.access import BRIDGE, secret_id
 from shmio.endpoints.mqtt.broker.directory import secret_of
 from shmio.endpoints.mqtt.channel import Message
 from shmio.endpoints.mqtt.connection.failure import ended, why
-from shmio.endpoints.mqtt.connection.target import Dialling
+from shmio.endpoints.mqtt.connection.target import ReconnectPolicy
 from shmio.errors import ConfigError
 
 CONNECT_S: Final = 4.0
@@ -48,12 +48,12 @@ class _TlsClient(BrokerClient):
             raise
 
 
-class Attempt:
+class ConnectAttempt:
     """Begins at once, with the broker whose turn it is."""
 
     def __init__(
         self,
-        dialling: Dialling,
+        policy: ReconnectPolicy,
         protocol: MQTTProtocolVersion,
         will: Message | None,
         most: int,
@@ -63,20 +63,20 @@ class Attempt:
 
         ``wake``: called by its thread when it is over, if anybody wants it then.
         """
-        self.target = dialling.next()
+        self.target = policy.next()
         self._begun_s = time.monotonic()
         self.over = False
         """Whether ``client``, ``socket`` and ``problem`` are what has come of it."""
         self.client: BrokerClient | None = None
         self.socket: socket.socket | None = None
         """A connection, on which nothing was read yet."""
-        self.offered = False
+        self.sent = False
         """Whether a broker may have been told who we are, and our will."""
         self.problem = ""
         """Why there is none."""
-        self._dialling, self._protocol, self._will, self._most, self._wake = dialling, protocol, will, most, wake
-        self._handing = threading.Lock()
-        self._unwanted = False
+        self._policy, self._protocol, self._will, self._most, self._wake = policy, protocol, will, most, wake
+        self._lock = threading.Lock()
+        self._abandoned = False
         threading.Thread(target=self._run, name="connect", daemon=True).start()
 
     @property
@@ -86,8 +86,8 @@ class Attempt:
 
     def abandon(self) -> None:
         """Nobody wants it any more: what it makes is closed, and nobody is woken."""
-        with self._handing:
-            self._unwanted = True
+        with self._lock:
+            self._abandoned = True
         if self.over:
             self._close()
 
@@ -97,12 +97,12 @@ class Attempt:
         except ConfigError as error:
             self.problem = str(error)
         except (OSError, ValueError) as error:  # ValueError: a name with an empty part
-            tls = self._dialling.settings.tls is not None
+            tls = self._policy.settings.tls is not None
             self.problem = f"broker {self.target}: {why(error, self.target, tls=tls)}"
         if self.problem:
             self._close()
-        with self._handing:
-            if not self._unwanted:
+        with self._lock:
+            if not self._abandoned:
                 self.over = True
                 self._wake()
                 return
@@ -110,9 +110,9 @@ class Attempt:
 
     def _connect(self) -> None:
         """ConfigError: a file that is needed for it will not do."""
-        settings, target, new = self._dialling.settings, self.target, self._protocol == MQTTv5
+        settings, target, new = self._policy.settings, self.target, self._protocol == MQTTv5
         own = secret_of(target.host) if target.transport == "unix" else None
-        client_id = self._dialling.client_id
+        client_id = self._policy.client_id
         # A client of its own for each attempt: what one has not got rid of is none of the next one's business.
         client = self.client = (BrokerClient if settings.tls is None else _TlsClient)(
             CallbackAPIVersion.VERSION2,
@@ -142,17 +142,17 @@ class Attempt:
             properties.ReceiveMaximum = self._most
             options = {"properties": properties, "clean_start": not settings.session_expiry_s}
         client.connect(target.host, target.port, settings.keep_alive_s, **options)
-        self.offered = True
+        self.sent = True
         self.socket = cast("socket.socket | None", client.socket())
         if self.socket is None:
             self.problem = f"broker {target}: {ended(client.tls_error, up=False, tls=settings.tls is not None)}"
 
     def _close(self) -> None:
         if self.client is not None:
-            hang_up(self.client)
+            close_socket(self.client)
 
 
-def hang_up(client: Client) -> None:
+def close_socket(client: Client) -> None:
     """Close its socket, whatever state it is in."""
     client.on_disconnect = None
     made = client.socket()

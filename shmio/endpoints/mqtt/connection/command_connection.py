@@ -12,12 +12,12 @@ from collections.abc import Callable, Sequence
 
 from shmio.config import Mqtt
 from shmio.endpoints.mqtt.connection.attempt import CONNECT_S
-from shmio.endpoints.mqtt.connection.connection import Link
+from shmio.endpoints.mqtt.connection.connection import BrokerConnection
 from shmio.endpoints.mqtt.connection.limits import FEW_IN_FLIGHT
-from shmio.endpoints.mqtt.connection.target import Dialling, Target
+from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, Target
 
 
-class Intake:
+class CommandConnection:
     """For the bridge's thread."""
 
     def __init__(
@@ -29,59 +29,59 @@ class Intake:
         filters: Callable[[], Sequence[str]],
         answers: Callable[[], Sequence[str]],
     ) -> None:
-        """``selector``, ``wake``: as of :class:`Link`; ``filters``: what is to be subscribed to at present.
+        """``selector``, ``wake``: as of :class:`BrokerConnection`; ``filters``: what is to be subscribed to at present.
 
         ``answers``: where results go.
         """
-        self._dialling = Dialling(settings, client_id, ())
-        self.link = Link(self._dialling, selector, wake, lambda: None, FEW_IN_FLIGHT)
-        self.link.close()
+        self._policy = ReconnectPolicy(settings, client_id, ())
+        self.connection = BrokerConnection(self._policy, selector, wake, lambda: None, FEW_IN_FLIGHT)
+        self.connection.close()
         self._filters, self._answers = filters, answers
         self._at: Target | None = None
-        self._until_s = 0.0
+        self._deadline_s = 0.0
         """When the broker must have answered to what was subscribed to."""
 
     @property
-    def settled(self) -> bool:
+    def ready(self) -> bool:
         """Whether commands come in, or it is known why they do not."""
-        return self.link.subscribed or bool(self.link.problem)
+        return self.connection.subscribed or bool(self.connection.problem)
 
     @property
     def problem(self) -> str:
         """Why they do not, or no results go out; empty: all is well."""
-        return f"commands: {self.link.problem}" if self.link.problem else ""
+        return f"commands: {self.connection.problem}" if self.connection.problem else ""
 
     def turn(self, at: Target | None) -> float:
         """Be where the values go, or nowhere; in how many seconds there is more to do."""
         if at is not self._at:
             self._at = at
-            self.link.close()
+            self.connection.close()
             if at is not None:
-                self._dialling.turn_to(at)
-                self.link.open()
-        rest_s = self.link.turn()
-        if self.link.came_up:
-            self.link.came_up = False
+                self._policy.use_only(at)
+                self.connection.open()
+        rest_s = self.connection.turn()
+        if self.connection.came_up:
+            self.connection.came_up = False
             self.subscribe()
-        if not self.link.up or self.link.subscribed:
+        if not self.connection.up or self.connection.subscribed:
             return rest_s
-        left_s = self._until_s - time.monotonic()
+        left_s = self._deadline_s - time.monotonic()
         if left_s <= 0:  # values wait to hear of it
-            self.link.drop("it does not answer to SUBSCRIBE")
+            self.connection.drop("it does not answer to SUBSCRIBE")
         return max(0.0, min(rest_s, left_s))
 
     def subscribe(self) -> None:
         """Have commands sent for all that there is now."""
-        if self.link.up:
-            self.link.subscribe(self._filters())
+        if self.connection.up:
+            self.connection.subscribe(self._filters())
             self.watch()
-            self.link.push()
-            self._until_s = time.monotonic() + CONNECT_S
+            self.connection.push()
+            self._deadline_s = time.monotonic() + CONNECT_S
 
     def watch(self) -> None:
         """Hear what others publish where results go."""
-        self.link.watch(self._answers())
+        self.connection.watch(self._answers())
 
     def unwatch(self) -> None:
         """Hear it no more."""
-        self.link.unwatch(self._answers())
+        self.connection.unwatch(self._answers())

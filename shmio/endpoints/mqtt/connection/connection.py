@@ -14,11 +14,11 @@ from paho.mqtt.properties import Properties
 from paho.mqtt.reasoncodes import ReasonCode
 
 from shmio.endpoints.mqtt.channel import Message
-from shmio.endpoints.mqtt.connection.attempt import CONNECT_S, SLOW, Attempt, BrokerClient
-from shmio.endpoints.mqtt.connection.failure import Complaints, ended, refusal
+from shmio.endpoints.mqtt.connection.attempt import CONNECT_S, SLOW, BrokerClient, ConnectAttempt
+from shmio.endpoints.mqtt.connection.failure import ConnectionProblems, ended, refusal
 from shmio.endpoints.mqtt.connection.limits import Limits, subscription
-from shmio.endpoints.mqtt.connection.socket_io import Pump
-from shmio.endpoints.mqtt.connection.target import Dialling, Target
+from shmio.endpoints.mqtt.connection.socket_io import SocketIo
+from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, Target
 from shmio.endpoints.mqtt.connection.write_batches import BATCH
 from shmio.layout.topic import shorten
 
@@ -39,12 +39,12 @@ def is_watched(message: MQTTMessage) -> bool:
     return _WATCHED in (vars(message.properties) if message.properties else {}).get("SubscriptionIdentifier", ())
 
 
-class Link:
+class BrokerConnection:
     """For the bridge's thread: it registers its socket with ``selector``, to have ``data`` called when it is ready."""
 
     def __init__(
         self,
-        dialling: Dialling,
+        policy: ReconnectPolicy,
         selector: selectors.BaseSelector,
         wake: Callable[[], object],
         will: Callable[[], Message | None],
@@ -52,43 +52,43 @@ class Link:
     ) -> None:
         """``wake``: any thread has it turned so. ``will``: asked for each CONNECT. ``most``: in flight, each way."""
         self.up = False
-        self.admit: Callable[[], bool] = lambda: True
+        self.is_ready: Callable[[], bool] = lambda: True
         """Asked, from when the broker has let us in, until it says so: whether the connection is ``up`` by now."""
         self.came_up = False
         """Set when a connection has been made; who has greeted it takes it back."""
         self.on_lost: Callable[[list[Message]], None] = lambda _: None
         """Called when a connection is gone, with what it has not taken for certain."""
-        self.complaints = Complaints()
+        self.problems = ConnectionProblems()
         self.connects = 0
         self.subscribed = False
         """Whether the broker has answered to what was subscribed to last."""
-        self._dialling, self._selector, self._wake, self._will, self._most = dialling, selector, wake, will, most
+        self._policy, self._selector, self._wake, self._will, self._most = policy, selector, wake, will, most
         self.on_message: Callable[[MQTTMessage], None] = lambda _: None
         """Called with each message that comes."""
         self._client: BrokerClient | None = None
-        self._pump: Pump | None = None
+        self._socket_io: SocketIo | None = None
         self._target: Target | None = None
-        self._faults: dict[Target | None, str] = {}
+        self._problem_of: dict[Target | None, str] = {}
         """What was wrong with each broker that was tried since the last connection."""
-        self._attempt: Attempt | None = None
+        self._attempt: ConnectAttempt | None = None
         self._protocol = MQTTv5
-        self._until_s: float | None = None
+        self._deadline_s: float | None = None
         """When the broker must have answered."""
         self._retry_s = self._up_s = self._misc_s = 0.0
         self._new_will: Message | None = None  # that no broker was told yet
         self._in_flight: dict[int, Message] = {}
         self._limits = Limits()
-        self._needed = 0  # the subscription to commands
+        self._subscription = 0  # the subscription to commands
 
     @property
     def problem(self) -> str:
         """Why there is no connection, or what the broker refuses; empty: all is well."""
-        return self.complaints.problem
+        return self.problems.problem
 
     @property
     def at(self) -> Target | None:
         """The broker that has let us in."""
-        return None if self._client is None or self._until_s is not None else self._target
+        return None if self._client is None or self._deadline_s is not None else self._target
 
     @property
     def mqtt5(self) -> bool:
@@ -98,7 +98,7 @@ class Link:
     @property
     def room(self) -> int:
         """How many messages it takes now, and does not only put into its memory."""
-        blocked = not self.up or self._pump is None or self._pump.writing
+        blocked = not self.up or self._socket_io is None or self._socket_io.writing
         return 0 if blocked else min(BATCH, self._limits.in_flight - len(self._in_flight))
 
     @property
@@ -117,41 +117,41 @@ class Link:
             if now_s < self._retry_s:
                 return self._retry_s - now_s
             self._new_will = self._new_will or self._will()
-            self._attempt = Attempt(self._dialling, self._protocol, self._new_will, self._most, self._wake)
+            self._attempt = ConnectAttempt(self._policy, self._protocol, self._new_will, self._most, self._wake)
             self._target = self._attempt.target
         if self._client is None:
             if self._attempt is not None and self._attempt.slow:
-                self.complaints.say(f"broker {self._target}: {SLOW}")
+                self.problems.report(f"broker {self._target}: {SLOW}")
             return CONNECT_S
-        if self._until_s is not None:
-            if now_s >= self._until_s:
+        if self._deadline_s is not None:
+            if now_s >= self._deadline_s:
                 self.drop("it does not answer")
         else:
-            if not self.up and self.admit():
-                self.complaints.clear()
-                self._faults.clear()
+            if not self.up and self.is_ready():
+                self.problems.clear()
+                self._problem_of.clear()
                 self.up, self.came_up, self._up_s = True, True, now_s
                 self.connects += 1
             if now_s >= self._misc_s:
                 self._misc_s = now_s + 1.0
                 self._client.loop_misc()
-        return 1.0 if self._pump is None else self._pump.turn()
+        return 1.0 if self._socket_io is None else self._socket_io.turn()
 
-    def _take(self, attempt: Attempt) -> None:
+    def _take(self, attempt: ConnectAttempt) -> None:
         """A connection was made, or was not."""
         self._attempt = None
         client, made = attempt.client, attempt.socket
-        self._new_will = None if attempt.offered else self._new_will
+        self._new_will = None if attempt.sent else self._new_will
         if client is None or made is None:
             self._fail(attempt.problem)
             return
-        self._until_s = time.monotonic() + CONNECT_S
+        self._deadline_s = time.monotonic() + CONNECT_S
         client.on_connect = self._connected
         client.on_disconnect = self._disconnected
         client.on_subscribe = self._subscribed
-        self._client, self._pump = client, Pump(client, made, self._selector, self.drop)
-        client.on_publish = self._pump.counting(self._acknowledged)
-        client.on_message = self._pump.counting(self._come)
+        self._client, self._socket_io = client, SocketIo(client, made, self._selector, self.drop)
+        client.on_publish = self._socket_io.counting(self._acknowledged)
+        client.on_message = self._socket_io.counting(self._received)
 
     # ---- what the broker says ----------------------------------------------------------------------------------------
 
@@ -162,45 +162,47 @@ class Link:
             return
         if code.is_failure:
             if self._protocol == MQTTv5 and str(code) == "Unsupported protocol version":
-                self._step_back()
+                self._fall_back()
             else:
-                self._fail(f"broker {self._target}: {refusal(code, self._dialling)}")
+                self._fail(f"broker {self._target}: {refusal(code, self._policy)}")
             return
-        self._limits = Limits.told(properties, self._most)
-        self._until_s, self._misc_s = None, time.monotonic() + 1.0
+        self._limits = Limits.from_connack(properties, self._most)
+        self._deadline_s, self._misc_s = None, time.monotonic() + 1.0
         version = "5" if self._protocol == MQTTv5 else "3.1.1"
-        log.info("connected to broker %s as %s, MQTT %s", self._target, self._dialling.client_id, version)
+        log.info("connected to broker %s as %s, MQTT %s", self._target, self._policy.client_id, version)
 
     def _disconnected(
         self, client: Client, _data: Any, flags: DisconnectFlags, code: ReasonCode, _properties: Properties | None
     ) -> None:
         if self._client is None or client is not self._client:
             return
-        tls, told = self._dialling.settings.tls is not None, flags.is_disconnect_packet_from_server
+        tls, told = self._policy.settings.tls is not None, flags.is_disconnect_packet_from_server
         why = ended(self._client.tls_error, up=self.at is not None, tls=tls)
-        self.drop(refusal(code, self._dialling) if told else why)
+        self.drop(refusal(code, self._policy) if told else why)
 
     def _acknowledged(
         self, client: Client, _data: Any, mid: int, code: ReasonCode, _properties: Properties | None
     ) -> None:
         message = self._in_flight.pop(mid, None) if client is self._client else None
         if message is not None and code.is_failure:
-            self.complaints.refuse(f"broker {self._target} refuses messages: {code}: {message.topic}")
+            self.problems.message_refused(f"broker {self._target} refuses messages: {code}: {message.topic}")
         else:
-            self.complaints.taken()
+            self.problems.message_accepted()
 
-    def _come(self, client: Client, _data: Any, message: MQTTMessage) -> None:
+    def _received(self, client: Client, _data: Any, message: MQTTMessage) -> None:
         if client is self._client:
             self.on_message(message)
 
     def _subscribed(
         self, client: Client, _data: Any, mid: int, codes: Sequence[ReasonCode], _properties: Properties | None
     ) -> None:
-        if client is not self._client or mid != self._needed:
+        if client is not self._client or mid != self._subscription:
             return
         self.subscribed = True
         if refused := [code for code in codes if code.is_failure]:
-            self.complaints.deaf(f"broker {self._target} does not let us subscribe: no command can come: {refused[0]}")
+            self.problems.subscription_refused(
+                f"broker {self._target} does not let us subscribe: no command can come: {refused[0]}"
+            )
 
     # ---- its end -----------------------------------------------------------------------------------------------------
 
@@ -217,19 +219,19 @@ class Link:
         if self.up:
             lost = list(self._in_flight.values())
             if time.monotonic() - self._up_s >= STABLE_S:
-                self._dialling.forgive()
-            self._fail(self.complaints.lost(problem, self._dialling.client_id))
+                self._policy.reset_failures()
+            self._fail(self.problems.connection_lost(problem, self._policy.client_id))
             self.on_lost(lost)
-        elif self._protocol == MQTTv5 and self._until_s is not None:
-            self._step_back()  # some brokers that do not know version 5 say nothing
+        elif self._protocol == MQTTv5 and self._deadline_s is not None:
+            self._fall_back()  # some brokers that do not know version 5 say nothing
         else:
             self._fail(problem)
 
-    def _step_back(self) -> None:
+    def _fall_back(self) -> None:
         """Try version 3.1.1, with the same broker, at once."""
         self._close()
         self._protocol = MQTTv311
-        self._dialling.repeat()
+        self._policy.retry_same()
         self._retry_s = 0.0
         self._wake()
 
@@ -237,16 +239,18 @@ class Link:
         self._close()
         self._protocol = MQTTv5
         # Of each broker the last one: who looks at the status wants to know about all that are tried in turn.
-        self._faults[self._target] = problem
-        self.complaints.say(shorten("; ".join(self._faults[one] for one in sorted(self._faults, key=str)), MOST_TOLD))
-        self._retry_s = time.monotonic() + self._dialling.wait_s()
+        self._problem_of[self._target] = problem
+        self.problems.report(
+            shorten("; ".join(self._problem_of[one] for one in sorted(self._problem_of, key=str)), MOST_TOLD)
+        )
+        self._retry_s = time.monotonic() + self._policy.wait_s()
 
     def _close(self) -> None:
-        pump, self._pump, self._client = self._pump, None, None
-        self.up, self.came_up, self.subscribed, self._until_s = False, False, False, None
+        socket_io, self._socket_io, self._client = self._socket_io, None, None
+        self.up, self.came_up, self.subscribed, self._deadline_s = False, False, False, None
         self._in_flight = {}
-        if pump is not None:
-            pump.close()
+        if socket_io is not None:
+            socket_io.close()
 
     # ---- what goes out -----------------------------------------------------------------------------------------------
 
@@ -256,21 +260,23 @@ class Link:
         if client is None or not self.up:
             return
         if limits.packet_bytes is not None and not limits.fit(message):
-            self.complaints.refuse(f"broker {self._target} takes {limits.packet_bytes} bytes: {message.topic} has more")
+            self.problems.message_refused(
+                f"broker {self._target} takes {limits.packet_bytes} bytes: {message.topic} has more"
+            )
             return
         qos, retain = message.qos and limits.qos, message.retain and limits.retain
         info = client.publish(message.topic, message.payload, qos, retain, properties if self.mqtt5 else None)
         if qos:
             self._in_flight[info.mid] = message
         else:
-            self.complaints.taken()
+            self.problems.message_accepted()
 
     def push(self) -> None:
         """Have go what is ready."""
-        if self._pump is not None:
-            self._pump.push()
+        if self._socket_io is not None:
+            self._socket_io.push()
 
-    def owes(self, message: Message) -> bool:
+    def is_unacknowledged(self, message: Message) -> bool:
         """Whether this very message was sent, and the broker has not acknowledged it."""
         return any(one is message for one in self._in_flight.values())
 
@@ -286,7 +292,7 @@ class Link:
         new = self._protocol == MQTTv5
         options: Any = subscription(retained=retained) if new else 1
         _, mid = client.subscribe([(one, options) for one in filters])
-        self._needed = self._needed if retained or mid is None else mid
+        self._subscription = self._subscription if retained or mid is None else mid
 
     def watch(self, filters: Sequence[str]) -> None:
         """Ask for what others publish on our own topics from now on; see :func:`is_watched`. With version 5 alone."""
@@ -311,8 +317,8 @@ class Link:
     def open(self) -> None:
         """Connect, after :meth:`close`."""
         self._protocol, self._retry_s = MQTTv5, 0.0
-        self.complaints.clear()
-        self._faults.clear()
+        self.problems.clear()
+        self._problem_of.clear()
 
     def close(self, *, will: bool = False) -> None:
         """Take leave; what was sent before is on its way. ``will``: have the will published, as far as that can be."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 from paho.mqtt.reasoncodes import ReasonCode
 
 if TYPE_CHECKING:
-    from shmio.endpoints.mqtt.connection.target import Dialling, Target
+    from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, Target
 
 # MQTT 5.0, section 2.4; paho gives those of 3.1.1 the same numbers.
 _WHO: Final = frozenset({0x86, 0x87})
@@ -28,7 +28,7 @@ REFUSED_S: Final = 10.0
 log = logging.getLogger("shmio.mqtt")
 
 
-class Complaints:
+class ConnectionProblems:
     """What is wrong with a connection at present, once each in the log."""
 
     def __init__(self) -> None:
@@ -37,16 +37,16 @@ class Complaints:
         self.refused = 0
         """Messages that the broker did not take."""
         self._refused_s = 0.0
-        self._deaf = ""
+        self._subscription_problem = ""
         self._lost_s: deque[float] = deque(maxlen=OFTEN)
 
-    def say(self, problem: str) -> None:
+    def report(self, problem: str) -> None:
         """There is something else wrong now."""
         if problem != self.problem:
             log.warning("%s", problem)
         self.problem = problem
 
-    def lost(self, problem: str, client_id: str) -> str:
+    def connection_lost(self, problem: str, client_id: str) -> str:
         """A connection that had been made is gone; what is to be said of it."""
         self._lost_s.append(time.monotonic())
         if len(self._lost_s) < OFTEN or self._lost_s[-1] - self._lost_s[0] > OFTEN_S:
@@ -55,34 +55,34 @@ class Complaints:
 
     def clear(self) -> None:
         """There is a connection."""
-        self.problem = self._deaf = ""
+        self.problem = self._subscription_problem = ""
 
-    def deaf(self, problem: str) -> None:
+    def subscription_refused(self, problem: str) -> None:
         """By this connection no command can come."""
-        self._deaf = problem
-        self.say(problem)
+        self._subscription_problem = problem
+        self.report(problem)
 
-    def refuse(self, problem: str) -> None:
+    def message_refused(self, problem: str) -> None:
         """A message was not taken."""
         self.refused += 1
         self._refused_s = time.monotonic()
         if not self.problem:  # the first stands for all that follow
-            self.say(problem)
+            self.report(problem)
 
-    def taken(self) -> None:
+    def message_accepted(self) -> None:
         """A message was taken."""
         if self.problem and time.monotonic() >= self._refused_s + REFUSED_S:
-            self.problem = self._deaf
+            self.problem = self._subscription_problem
 
 
-def refusal(code: ReasonCode, dialling: Dialling) -> str:
+def refusal(code: ReasonCode, policy: ReconnectPolicy) -> str:
     """What a broker's code means here."""
     if code.value in _WHO:
         return f"it does not let us in ({code}): check mqtt.username, mqtt.password_file and the broker's own accounts"
     if code.value in _BUSY:
         return f"it takes no more at present ({code})"
     if code.value == _TAKEN_OVER:
-        return f"another client has connected as {dialling.client_id}: give one of them another mqtt.client_id"
+        return f"another client has connected as {policy.client_id}: give one of them another mqtt.client_id"
     return f"it refuses: {code}"
 
 

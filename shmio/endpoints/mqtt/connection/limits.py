@@ -28,15 +28,15 @@ class Limits(NamedTuple):
     """Whether a subscription may have a number, which what comes by it tells."""
 
     @classmethod
-    def told(cls, properties: Properties | None, most: int) -> Limits:
+    def from_connack(cls, properties: Properties | None, most: int) -> Limits:
         """Those of a CONNACK; ``most``: messages without an acknowledgement that we want."""
-        told = vars(properties) if properties is not None else {}
+        given = vars(properties) if properties is not None else {}
         return cls(
-            min(most, told.get("ReceiveMaximum", most)),
-            told.get("MaximumPacketSize"),
-            min(1, told.get("MaximumQoS", 1)),
-            bool(told.get("RetainAvailable", 1)),
-            bool(told.get("SubscriptionIdentifierAvailable", 1)),
+            min(most, given.get("ReceiveMaximum", most)),
+            given.get("MaximumPacketSize"),
+            min(1, given.get("MaximumQoS", 1)),
+            bool(given.get("RetainAvailable", 1)),
+            bool(given.get("SubscriptionIdentifierAvailable", 1)),
         )
 
     def fit(self, message: Message) -> bool:

@@ -12,7 +12,7 @@ from typing import Final
 from paho.mqtt.client import Client
 from paho.mqtt.enums import MQTTErrorCode
 
-from shmio.endpoints.mqtt.connection.attempt import hang_up
+from shmio.endpoints.mqtt.connection.attempt import close_socket
 from shmio.endpoints.mqtt.connection.write_batches import take_over, write
 
 PACKETS: Final = 4
@@ -20,7 +20,7 @@ PACKETS: Final = 4
 acknowledged, which takes hardly any time."""
 
 
-class Pump:
+class SocketIo:
     """For the bridge's thread: ``selector`` has the socket registered, to have ``data`` called when it is ready."""
 
     def __init__(
@@ -35,7 +35,7 @@ class Pump:
         self._socket: socket.socket | None = made
         self.writing = False
         """Whether something waits for room in the socket."""
-        self._heard = 0
+        self._packets = 0
         """Packets that were told of."""
         take_over(client)
         selector.register(made, selectors.EVENT_READ, self._serve)
@@ -44,7 +44,7 @@ class Pump:
         """What the client is to call with each packet that is read."""
 
         def counted(*told: object) -> None:
-            self._heard += 1
+            self._packets += 1
             callback(*told)
 
         return counted
@@ -67,7 +67,7 @@ class Pump:
             with suppress(KeyError, ValueError):
                 self._selector.unregister(self._socket)
             self._socket = None
-        hang_up(self._client)
+        close_socket(self._client)
 
     def _serve(self, events: int) -> None:
         """The socket is ready."""
@@ -83,10 +83,10 @@ class Pump:
 
     def _read(self) -> MQTTErrorCode:
         """Take a few packets: paho by itself takes as many at once as messages of ours wait for acknowledgements."""
-        before, most = -1, self._heard + PACKETS
+        before, most = -1, self._packets + PACKETS
         code = MQTTErrorCode.MQTT_ERR_SUCCESS
-        while not code and before < self._heard < most and self._socket is not None:
-            before = self._heard
+        while not code and before < self._packets < most and self._socket is not None:
+            before = self._packets
             code = self._client.loop_read()
         return code
 

@@ -36,7 +36,7 @@ def targets(settings: Mqtt, own_socket: str) -> list[Target]:
     return [Target(address.host, address.port, "tcp", str(address)) for address in brokers(settings)]
 
 
-class Dialling:
+class ReconnectPolicy:
     """Which broker is tried next, and when."""
 
     def __init__(self, settings: Mqtt, client_id: str, there: Sequence[Target]) -> None:
@@ -51,12 +51,12 @@ class Dialling:
         """How many brokers there are."""
         return len(self._targets)
 
-    def turn_to(self, target: Target) -> None:
+    def use_only(self, target: Target) -> None:
         """From now on this one alone."""
         self._targets = [target]
-        self.forgive()
+        self.reset_failures()
 
-    def repeat(self) -> None:
+    def retry_same(self) -> None:
         """Try the last one again."""
         self._next -= 1
 
@@ -73,6 +73,6 @@ class Dialling:
         # Not all bridges of a plant at once, when their broker is back.
         return wait_s * random.uniform(0.5, 1.5)  # noqa: S311  not a secret
 
-    def forgive(self) -> None:
+    def reset_failures(self) -> None:
         """The failures so far do not count any more."""
         self._failures = 0

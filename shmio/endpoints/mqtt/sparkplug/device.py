@@ -6,8 +6,8 @@ from collections.abc import Iterator, Sequence
 from enum import Enum
 from typing import NamedTuple
 
-from shmio.endpoints.mqtt.frames import Frames
-from shmio.endpoints.mqtt.inlet import Inlet
+from shmio.endpoints.mqtt.command_client import CommandClient
+from shmio.endpoints.mqtt.frame_reader import FrameReader
 from shmio.endpoints.mqtt.sparkplug.metrics import Metric, parts_of
 from shmio.endpoints.mqtt.sparkplug.node import Sample
 from shmio.layout.glob import Glob
@@ -17,7 +17,7 @@ from shmio.segment import Block, Frame, Quality
 from shmio.segment.changed_registers import ChangeScan
 
 
-class Kind(Enum):
+class DeviceEvent(Enum):
     """What has happened to a device."""
 
     BIRTH = "birth"
@@ -25,23 +25,23 @@ class Kind(Enum):
     DEATH = "death"
 
 
-class News(NamedTuple):
+class DeviceChange(NamedTuple):
     """What a frame, or its age, has brought. ``at``: numbers of the metrics that are new."""
 
-    kind: Kind
+    kind: DeviceEvent
     at: Sequence[int] = ()
 
 
 class Device:
     """Follows one block, for the bridge's thread. For a big layout to make one takes seconds."""
 
-    def __init__(self, block: Block, inlet: Inlet, globs: Sequence[Glob], *, elements: bool) -> None:
-        """``inlet``: where commands go. ``globs``: over paths with the source, of what is a metric.
+    def __init__(self, block: Block, command_client: CommandClient, globs: Sequence[Glob], *, elements: bool) -> None:
+        """``command_client``: where commands go. ``globs``: over paths with the source, of what is a metric.
 
         ``elements``: of arrays each element is one.
         """
         self.block = block
-        self.inlet = inlet
+        self.command_client = command_client
         registers = [
             one for one in block.layout.registers if any(g.matches(f"{block.source}/{one.path}") for g in globs)
         ]
@@ -53,30 +53,30 @@ class Device:
         self._decoders = [codec(part, block.layout.byte_order).decode for part in self.parts]
         self._frame: Frame | None = None
         self._quality, self._reason = Quality.BAD, ""
-        self._coming = Frames(block)
+        self._reader = FrameReader(block)
 
-    def named(self, metrics: Sequence[Metric]) -> None:
+    def set_metrics(self, metrics: Sequence[Metric]) -> None:
         """The metrics of its parts, in their order."""
         self._metrics = metrics
 
-    def look(self) -> Iterator[News]:
+    def poll(self) -> Iterator[DeviceChange]:
         """What has come; a few frames at a time."""
-        for frame in self._coming.come():
-            if (news := self._take(frame)) is not None:
-                yield news
+        for frame in self._reader.read():
+            if (change := self._take(frame)) is not None:
+                yield change
         last = self._frame
-        if last is not None and not self.behind and (news := self._take(last)) is not None:  # with age
-            yield news
+        if last is not None and not self.behind and (change := self._take(last)) is not None:  # with age
+            yield change
 
     @property
     def missed(self) -> int:
         """Frames that were not looked at, since the bridge was too slow."""
-        return self._coming.missed
+        return self._reader.missed
 
     @property
     def behind(self) -> int:
         """Frames that wait."""
-        return self._coming.behind
+        return self._reader.behind
 
     def samples(self, at: Sequence[int] | None = None) -> list[Sample]:
         """Metrics as they are now, all or these."""
@@ -89,16 +89,16 @@ class Device:
             for one in (range(len(self.parts)) if at is None else at)
         ]
 
-    def _take(self, frame: Frame) -> News | None:
+    def _take(self, frame: Frame) -> DeviceChange | None:
         old, before = self._frame, (self._quality, self._reason)
         self._frame = frame
         self._quality, self._reason = self.block.assess(frame)
         alive, self.alive = self.alive, self._quality is not Quality.BAD
         if not self.alive:
-            return News(Kind.DEATH) if alive else None
+            return DeviceChange(DeviceEvent.DEATH) if alive else None
         if not alive or old is None:
-            return News(Kind.BIRTH)
+            return DeviceChange(DeviceEvent.BIRTH)
         if before != (self._quality, self._reason):
-            return News(Kind.DATA, range(len(self.parts)))
+            return DeviceChange(DeviceEvent.DATA, range(len(self.parts)))
         changed = self._scan.changed(old.image, frame.image)
-        return News(Kind.DATA, changed) if changed else None
+        return DeviceChange(DeviceEvent.DATA, changed) if changed else None

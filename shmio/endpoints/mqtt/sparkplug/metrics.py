@@ -37,7 +37,7 @@ _COUNT: Final = struct.Struct("<I")  # of bits, before them
 _QUALITY: Final = {Quality.BAD: 0, Quality.UNCERTAIN: 500, Quality.GOOD: 192}  # 6.4.8.1: bad, stale, good
 
 
-class _Kind(NamedTuple):
+class _Datatype(NamedTuple):
     """Data type and field of a single value; data type and element of an array, if there is such."""
 
     datatype: int
@@ -46,28 +46,28 @@ class _Kind(NamedTuple):
     element: str = ""
 
 
-_STRING: Final = _Kind(12, "string_value")
-_KINDS: Final[Mapping[str, _Kind]] = {
-    "BOOL": _Kind(BOOLEAN, "boolean_value", BOOLEANS, "?"),
-    "SINT": _Kind(INT32, "int_value", 22, "<i1"),
-    "INT": _Kind(INT32, "int_value", 23, "<i2"),
-    "DINT": _Kind(INT32, "int_value", 24, "<i4"),
-    "TIME": _Kind(INT32, "int_value", 24, "<i4"),
-    "S5TIME": _Kind(INT32, "int_value", 24, "<i4"),
-    "LINT": _Kind(INT64, "long_value", 25, "<i8"),
-    "LTIME": _Kind(INT64, "long_value", 25, "<i8"),
-    "BYTE": _Kind(5, "int_value", 26, "<u1"),
-    "USINT": _Kind(5, "int_value", 26, "<u1"),
-    "WORD": _Kind(6, "int_value", 27, "<u2"),
-    "UINT": _Kind(6, "int_value", 27, "<u2"),
-    "UDINT": _Kind(INT64, "long_value", 28, "<u4"),
-    "DWORD": _Kind(INT64, "long_value", 28, "<u4"),
-    "TIME_OF_DAY": _Kind(INT64, "long_value", 28, "<u4"),
-    "ULINT": _Kind(8, "long_value", 29, "<u8"),
-    "LWORD": _Kind(8, "long_value", 29, "<u8"),
-    "LTOD": _Kind(8, "long_value", 29, "<u8"),
-    "REAL": _Kind(9, "float_value", 30, "<f4"),
-    "LREAL": _Kind(10, "double_value", 31, "<f8"),
+_STRING: Final = _Datatype(12, "string_value")
+_DATATYPES: Final[Mapping[str, _Datatype]] = {
+    "BOOL": _Datatype(BOOLEAN, "boolean_value", BOOLEANS, "?"),
+    "SINT": _Datatype(INT32, "int_value", 22, "<i1"),
+    "INT": _Datatype(INT32, "int_value", 23, "<i2"),
+    "DINT": _Datatype(INT32, "int_value", 24, "<i4"),
+    "TIME": _Datatype(INT32, "int_value", 24, "<i4"),
+    "S5TIME": _Datatype(INT32, "int_value", 24, "<i4"),
+    "LINT": _Datatype(INT64, "long_value", 25, "<i8"),
+    "LTIME": _Datatype(INT64, "long_value", 25, "<i8"),
+    "BYTE": _Datatype(5, "int_value", 26, "<u1"),
+    "USINT": _Datatype(5, "int_value", 26, "<u1"),
+    "WORD": _Datatype(6, "int_value", 27, "<u2"),
+    "UINT": _Datatype(6, "int_value", 27, "<u2"),
+    "UDINT": _Datatype(INT64, "long_value", 28, "<u4"),
+    "DWORD": _Datatype(INT64, "long_value", 28, "<u4"),
+    "TIME_OF_DAY": _Datatype(INT64, "long_value", 28, "<u4"),
+    "ULINT": _Datatype(8, "long_value", 29, "<u8"),
+    "LWORD": _Datatype(8, "long_value", 29, "<u8"),
+    "LTOD": _Datatype(8, "long_value", 29, "<u8"),
+    "REAL": _Datatype(9, "float_value", 30, "<f4"),
+    "LREAL": _Datatype(10, "double_value", 31, "<f8"),
 }
 _BITS: Final = {INT32: 32, INT64: 64}
 
@@ -76,7 +76,7 @@ class Metric:
     """One metric: a register, or an element of an array. ``alias`` is unique in its edge node."""
 
     def __init__(self, register: Register, alias: int) -> None:
-        kind = _KINDS.get(register.element.base, _STRING)
+        kind = _DATATYPES.get(register.element.base, _STRING)
         self.register = register
         self.name = register.path
         self.alias = alias
@@ -139,13 +139,13 @@ def parts_of(layout: Layout, registers: Iterable[Register], *, single: bool = Fa
     ``single``: of all arrays.
     """
     for register in registers:
-        if register.dims and (single or register.element.base not in _KINDS):
+        if register.dims and (single or register.element.base not in _DATATYPES):
             yield from elements(layout, register)
         else:
             yield register
 
 
-def tell_quality(metric: wire.Metric, quality: Quality, reason: str) -> None:
+def put_quality(metric: wire.Metric, quality: Quality, reason: str) -> None:
     """Put quality and reason with a value; nothing if it is good (6.4.8.1)."""
     if quality is not Quality.GOOD:
         metric.properties.keys.extend(("Quality", "Reason"))

@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 from google.protobuf.message import DecodeError
 
 from shmio.endpoints.mqtt.channel import Message
-from shmio.endpoints.mqtt.sparkplug.metrics import BOOLEAN, INT64, Metric, tell_quality
+from shmio.endpoints.mqtt.sparkplug.metrics import BOOLEAN, INT64, Metric, put_quality
 from shmio.errors import PathError, ValueRangeError
 from shmio.layout.model import Register
 from shmio.segment import Quality
@@ -96,7 +96,7 @@ class EdgeNode:
         """What is published before the node disconnects by itself."""
         self.alive = False
         payload = wire.Payload(timestamp=self._now_ms())
-        self._tell_session(payload)
+        self._put_session(payload)
         return Message(self._topic("NDEATH"), payload.SerializeToString(), 1, retain=False)
 
     def birth(self) -> Message:
@@ -105,7 +105,7 @@ class EdgeNode:
         self._born.clear()
         self._sequence = 0
         payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
-        self._tell_session(payload)
+        self._put_session(payload)
         payload.metrics.add(name=REBIRTH, timestamp=self._now_ms(), datatype=BOOLEAN, boolean_value=False)
         return self._message(payload, "NBIRTH")
 
@@ -138,7 +138,7 @@ class EdgeNode:
         payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
         return self._message(payload, "DDEATH", device)
 
-    def lives(self, device: str) -> bool:
+    def is_born(self, device: str) -> bool:
         """Whether a device was born in this session, and has not died."""
         return device in self._born
 
@@ -191,9 +191,9 @@ class EdgeNode:
     def _fill(self, found: wire.Metric, sample: Sample) -> None:
         found.timestamp = sample.at_ms
         sample.metric.put(found, sample.value)
-        tell_quality(found, sample.quality, sample.reason)
+        put_quality(found, sample.quality, sample.reason)
 
-    def _tell_session(self, payload: wire.Payload) -> None:
+    def _put_session(self, payload: wire.Payload) -> None:
         payload.metrics.add(name="bdSeq", timestamp=self._now_ms(), datatype=INT64, long_value=self._session)
 
     def _message(self, payload: wire.Payload, kind: str, device: str = "") -> Message:

@@ -15,16 +15,16 @@ import msgspec
 from paho.mqtt.client import MQTTMessage
 
 from shmio.config import Mqtt, Sparkplug
+from shmio.endpoints.mqtt.backlog import Backlog
 from shmio.endpoints.mqtt.broker.directory import own_socket
 from shmio.endpoints.mqtt.channel import Message
-from shmio.endpoints.mqtt.connection.connection import Link
+from shmio.endpoints.mqtt.connection.connection import BrokerConnection
 from shmio.endpoints.mqtt.connection.limits import FEW_IN_FLIGHT
-from shmio.endpoints.mqtt.connection.target import Dialling, targets
+from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, targets
 from shmio.endpoints.mqtt.feed import Feed
 from shmio.endpoints.mqtt.outbox import OVERHEAD_BYTES
-from shmio.endpoints.mqtt.sparkplug.device import Device, Kind
+from shmio.endpoints.mqtt.sparkplug.device import Device, DeviceEvent
 from shmio.endpoints.mqtt.sparkplug.node import NAMESPACE, EdgeNode, Sample
-from shmio.endpoints.mqtt.store import Store
 from shmio.errors import CommandError, PathError, ValueRangeError
 from shmio.layout.glob import Glob
 from shmio.layout.model import Register
@@ -37,7 +37,7 @@ ELEMENT_BYTES: Final = 32
 """Of a number in memory, with its place in a list."""
 
 
-class Backlog(Store[list[Sample]]):
+class DeviceBacklog(Backlog[list[Sample]]):
     """Of each device what its frames brought, in order."""
 
     def keep(self, device: str, samples: list[Sample]) -> None:
@@ -78,7 +78,7 @@ class PrimaryHost:
         """There is another connection: each broker has been told at another time."""
         self.online, self._at_ms = None, float("-inf")
 
-    def hear(self, payload: bytes) -> None:
+    def update(self, payload: bytes) -> None:
         """Take in what it says, unless it is older than what it said before: the late will of a session before."""
         try:
             state = msgspec.json.decode(payload, type=_State)
@@ -112,17 +112,17 @@ class Session:
         selector: selectors.BaseSelector,
         wake: Callable[[], object],
     ) -> None:
-        """``selector``, ``wake``: as of :class:`Link`. PathError: a pattern is none."""
+        """``selector``, ``wake``: as of :class:`BrokerConnection`. PathError: a pattern is none."""
         self.node = EdgeNode(sparkplug.group, sparkplug.node or segment.instance, datatypes=sparkplug.datatypes)
         client_id = f"{settings.client_id or f'shmio-{segment.instance}'}-sparkplug"
         # A session begins with its births: the broker is to keep nothing of one before (5.4).
         clean = msgspec.structs.replace(settings, session_expiry_s=0)
-        self._dialling = Dialling(clean, client_id, targets(settings, own_socket(segment)))
-        self.link = Link(self._dialling, selector, wake, self.node.will, FEW_IN_FLIGHT)
-        self.link.on_message = self._command
-        self.link.on_lost = self._lose
+        self._policy = ReconnectPolicy(clean, client_id, targets(settings, own_socket(segment)))
+        self.connection = BrokerConnection(self._policy, selector, wake, self.node.will, FEW_IN_FLIGHT)
+        self.connection.on_message = self._command
+        self.connection.on_lost = self._lose
         self._host = None if sparkplug.primary_host is None else PrimaryHost(sparkplug.primary_host)
-        self._deserted = False
+        self._host_lost = False
         """Whether the host has gone since the births, though it may be back: it knows nothing of them then."""
         self._until_s = 0.0
         """So long the host has to say that it is there; then another broker is tried, if there is one."""
@@ -133,11 +133,11 @@ class Session:
         self._pause_s = 1 / sparkplug.max_rate_hz if sparkplug.max_rate_hz else 0.0
         self._due_s: dict[str, float] = {}
         """When the next data of a device may be told."""
-        self._backlog = Backlog(round(settings.backlog_mb * 1e6))
+        self._backlog = DeviceBacklog(round(settings.backlog_mb * 1e6))
         self._keeping = False
         self._room = 0
         """How many that were kept may be sent in this turn."""
-        self._asked = False
+        self._rebirth_asked = False
         """Whether a host wants the births again. However often it says so: once a turn, when the broker takes them."""
         self._defined = False
         """Whether the node is told of all devices that there are."""
@@ -147,7 +147,7 @@ class Session:
     def counters(self) -> tuple[int, ...]:
         """As those of the bridge."""
         waiting = sum(map(len, self._waiting.values()))
-        refused, connects = self._refused + self.link.complaints.refused, self.link.connects
+        refused, connects = self._refused + self.connection.problems.refused, self.connection.connects
         missed = self._missed + sum(device.missed for device in self._devices.values())
         kept = self._backlog
         return self._sent, self._received, refused, waiting, kept.count, kept.dropped, connects, missed
@@ -155,21 +155,21 @@ class Session:
     @property
     def problem(self) -> str:
         """What is wrong at present; empty: nothing."""
-        problem = self.link.problem
-        if self._host is not None and self.link.up and not self._host.online:
+        problem = self.connection.problem
+        if self._host is not None and self.connection.up and not self._host.online:
             problem = f"the primary host is not there ({self._host.topic}): {self._backlog.count} changes are kept"
         return f"Sparkplug: {problem}" if problem else ""
 
-    def device(self, feed: Feed) -> Device:
+    def new_device(self, feed: Feed) -> Device:
         """What a source is to be; any thread may make it."""
-        return Device(feed.block, feed.inlet, self._globs, elements=self._elements)
+        return Device(feed.block, feed.command_client, self._globs, elements=self._elements)
 
-    def adopt(self, device: Device) -> None:
+    def add_device(self, device: Device) -> None:
         """There is one more."""
         self._devices[device.block.source] = device
         self._defined = False
 
-    def leave(self, source: str) -> None:
+    def remove_device(self, source: str) -> None:
         """There is one less."""
         self._missed += self._devices.pop(source).missed
         self._defined = False
@@ -179,51 +179,51 @@ class Session:
         self._defined = True
         self.node.define({name: device.parts for name, device in self._devices.items()})
         for name, device in self._devices.items():
-            device.named(list(self.node.metrics[name].values()))
+            device.set_metrics(list(self.node.metrics[name].values()))
         self._waiting = {name: {} for name in self._devices}
         self._backlog.clear()  # what is in it has other aliases
-        if self.link.up and self.node.alive:
+        if self.connection.up and self.node.alive:
             self._birth()
 
     def turn(self) -> float:
         """Do what is due; in how many seconds there is more."""
         if not self._defined:
             self._define()
-        if self.link.problem and not self.link.up:
+        if self.connection.problem and not self.connection.up:
             self._keeping = True
-        if self.link.came_up:
-            self.link.came_up, self._keeping = False, True
-            self.link.subscribe(self.node.commands)
+        if self.connection.came_up:
+            self.connection.came_up, self._keeping = False, True
+            self.connection.subscribe(self.node.commands)
             if self._host is not None:
                 self._host.forget()
-                self._deserted = False
-                self.link.subscribe([self._host.topic], retained=True)
+                self._host_lost = False
+                self.connection.subscribe([self._host.topic], retained=True)
                 self._until_s = time.monotonic() + HOST_S
-        if self._host is not None and (self._deserted or not self._host.online):
+        if self._host is not None and (self._host_lost or not self._host.online):
             self._wait_for(self._host)
-        elif self.link.up and (not self.node.alive or (self._asked and self.link.room)):
+        elif self.connection.up and (not self.node.alive or (self._rebirth_asked and self.connection.room)):
             self._birth()
         self._room = TURN_SAMPLES
         for name, device in self._devices.items():
-            for news in device.look():
-                self._tell(name, device, news.kind, news.at)
+            for change in device.poll():
+                self._publish(name, device, change.kind, change.at)
         self._flush()
-        rest_s = self.link.turn()  # behind what it was given, to hear when it takes the rest
-        more = self._room <= 0 or self.link.came_up or any(device.behind for device in self._devices.values())
+        rest_s = self.connection.turn()  # behind what it was given, to hear when it takes the rest
+        more = self._room <= 0 or self.connection.came_up or any(device.behind for device in self._devices.values())
         now_s = time.monotonic()
         due_s = [due_s for name, due_s in self._due_s.items() if due_s > now_s and self._waiting.get(name)]
         return 0.0 if more else min([rest_s, *(one_s - now_s for one_s in due_s)])
 
     def _wait_for(self, host: PrimaryHost) -> None:
         """Die if it has gone; go to where else it may be, and come back."""
-        if not self.link.up:
+        if not self.connection.up:
             return
-        elsewhere = self._dialling.count > 1 and (host.online is False or time.monotonic() >= self._until_s)
+        elsewhere = self._policy.count > 1 and (host.online is False or time.monotonic() >= self._until_s)
         if self.node.alive:
             self._send(self.node.death())
         elif not elsewhere:
             return
-        self.link.drop(f"the primary host is not there ({host.topic})", politely=True)
+        self.connection.drop(f"the primary host is not there ({host.topic})", politely=True)
 
     def close(self) -> None:
         """Say that the node dies, and go.
@@ -231,34 +231,34 @@ class Session:
         With MQTT 5 its will says so, too: the specification demands both (5.5, intentional-disconnect-ndeath, and
         6.4.25, ndeath-will-message-publisher-disconnect-mqtt50), and has hosts ignore the second, for its bdSeq.
         """
-        alive = self.link.up and self.node.alive
+        alive = self.connection.up and self.node.alive
         if alive:
-            self.link.send(self.node.death())
-        self.link.close(will=alive)
+            self.connection.send(self.node.death())
+        self.connection.close(will=alive)
 
     # ---- what goes out -----------------------------------------------------------------------------------------------
 
     def _birth(self) -> None:
-        self._asked = False
+        self._rebirth_asked = False
         self._send(self.node.birth())
         for name, device in self._devices.items():
             if device.alive:
                 self._send(self.node.device_birth(name, device.samples()))
             self._waiting[name].clear()
 
-    def _tell(self, name: str, device: Device, kind: Kind, at: Sequence[int]) -> None:
-        if not (self.link.up and self.node.alive):
-            if self._keeping and kind is not Kind.DEATH:
-                self._keep(name, device, range(len(device.parts)) if kind is Kind.BIRTH else at)
+    def _publish(self, name: str, device: Device, kind: DeviceEvent, at: Sequence[int]) -> None:
+        if not (self.connection.up and self.node.alive):
+            if self._keeping and kind is not DeviceEvent.DEATH:
+                self._keep(name, device, range(len(device.parts)) if kind is DeviceEvent.BIRTH else at)
             return
-        if kind is Kind.DATA:
+        if kind is DeviceEvent.DATA:
             self._waiting[name] |= dict.fromkeys(at)
             self._flush_device(name, device)  # so that each frame's changes are told, as long as the broker takes them
             return
         self._waiting[name].clear()
-        if kind is Kind.BIRTH:
+        if kind is DeviceEvent.BIRTH:
             self._send(self.node.device_birth(name, device.samples()))
-        elif self.node.lives(name):
+        elif self.node.is_born(name):
             self._send(self.node.device_death(name))
 
     def _keep(self, name: str, device: Device, at: Sequence[int]) -> None:
@@ -290,20 +290,20 @@ class Session:
 
     def _flush_device(self, name: str, device: Device) -> None:
         """What has changed, then what was kept, as history; before its birth nobody knows its metrics."""
-        link, waiting = self.link, self._waiting[name]
-        if not self.node.lives(name):
+        connection, waiting = self.connection, self._waiting[name]
+        if not self.node.is_born(name):
             return
-        if waiting and link.room and self._is_due(name):
+        if waiting and connection.room and self._is_due(name):
             self._send(self.node.data(name, device.samples(list(waiting))))
             waiting.clear()
-        while self._room > 0 and link.room and (samples := self._backlog.take(name)):
+        while self._room > 0 and connection.room and (samples := self._backlog.take(name)):
             self._room -= len(samples)
             self._send(self.node.data(name, samples, historical=True))
 
     def _send(self, message: Message) -> None:
         self._sent += 1
-        self.link.send(message)
-        self.link.push()
+        self.connection.send(message)
+        self.connection.push()
 
     # ---- what comes --------------------------------------------------------------------------------------------------
 
@@ -314,8 +314,8 @@ class Session:
             self._refused += 1
             return
         if self._host is not None and topic == self._host.topic:
-            self._host.hear(bytes(message.payload))
-            self._deserted = self._deserted or (self.node.alive and not self._host.online)
+            self._host.update(bytes(message.payload))
+            self._host_lost = self._host_lost or (self.node.alive and not self._host.online)
             return
         self._received += 1
         if message.retain:  # it was there before we were
@@ -327,18 +327,18 @@ class Session:
             self._refuse(str(error))
             return
         if command.rebirth:
-            self._asked = True
+            self._rebirth_asked = True
             return
         device = self._devices[command.device]
         for path, value in command.values.items():
             register = self.node.metrics[command.device][path].register
             try:
-                device.inlet.send(register, value, _Outcome(f"{command.device}/{path}"))
+                device.command_client.send(register, value, _Outcome(f"{command.device}/{path}"))
             except (CommandError, ValueRangeError) as error:
                 self._refuse(str(error))
 
     def _check(self, device: str, register: Register) -> None:
-        self._devices[device].inlet.check(register)
+        self._devices[device].command_client.check(register)
 
     def _refuse(self, why: str) -> None:
         self._refused += 1

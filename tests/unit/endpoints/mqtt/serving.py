@@ -93,7 +93,7 @@ def bridged(segment: Segment) -> Iterator[Running]:
     """A bridge to the broker of this instance."""
     running = Running(segment, Mqtt(listen="127.0.0.1:1", prefix=PREFIX))
     try:
-        running.until(lambda: running.bridge.link.up)
+        running.until(lambda: running.bridge.connection.up)
         yield running
     finally:
         running.stop()

@@ -212,7 +212,7 @@ def test_commands_are_taken_a_few_at_a_time(
     assert slot.take()
     bridge = Bridge(segment, slot, Mqtt(broker="external", host=str(broker.address), prefix=PREFIX))
     try:
-        while not bridge.link.up or bridge.outbox.busy or bridge.link.in_flight:
+        while not bridge.connection.up or bridge.outbox.busy or bridge.connection.in_flight:
             bridge.turn()
         with listening(broker.address, "none") as flooder:
             for _ in range(1000):

@@ -40,7 +40,7 @@ def test_changes_are_kept_while_the_broker_is_away(segment: Segment, broker: Mos
         bridge(segment, proxy.address, topic=rules) as running,
     ):
         listener.until("cell/secret/out")
-        running.until(lambda: not running.bridge.link.in_flight)
+        running.until(lambda: not running.bridge.connection.in_flight)
         proxy.refuse()
         listener.until("status", b"offline")  # its last will
         running.until(lambda: AWAY in running.bridge.problem)
@@ -98,7 +98,7 @@ def test_a_connection_that_is_cut_again_and_again_loses_no_change(
 ) -> None:
     """Under load. What the broker may or may not have had comes once more; nothing comes before what was before it."""
     # A busy host is not to be taken for a broker that is too slow, for which changes are conflated.
-    monkeypatch.setattr("shmio.endpoints.mqtt.frames.CATCH_UP_S", 10.0)
+    monkeypatch.setattr("shmio.endpoints.mqtt.frame_reader.CATCH_UP_S", 10.0)
     broker = make_broker("allow_anonymous true", "max_inflight_messages 10000")
     with (
         FaultProxy(broker.address, framing=None) as proxy,
@@ -109,9 +109,9 @@ def test_a_connection_that_is_cut_again_and_again_loses_no_change(
             for _ in range(20):
                 for _ in range(25):
                     listener.message()
-                connects = running.bridge.link.connects
+                connects = running.bridge.connection.connects
                 proxy.cut(reset=True)
-                running.until(lambda count=connects: running.bridge.link.connects > count)
+                running.until(lambda count=connects: running.bridge.connection.connects > count)
             load.stop()
             listener.until("cell/step/out", str(load.last).encode())
             assert running.bridge.outbox.dropped == 0
@@ -124,13 +124,13 @@ def test_a_broker_that_dies_again_and_again_is_found_again(segment: Segment, bro
     try:
         with bridge(segment, broker.address) as running:
             for _ in range(20):
-                running.until(lambda: running.bridge.link.up)
+                running.until(lambda: running.bridge.connection.up)
                 broker.kill()
                 running.until(lambda: AWAY in running.bridge.problem)
                 broker.start()
             load.stop()
-            running.until(lambda: running.bridge.link.up and not running.bridge.outbox.busy)
-            running.until(lambda: not running.bridge.link.in_flight)
+            running.until(lambda: running.bridge.connection.up and not running.bridge.outbox.busy)
+            running.until(lambda: not running.bridge.connection.in_flight)
             assert running.bridge.outbox.dropped == 0
             with listening(broker.address, f"{PREFIX}/cell/step/out") as listener:
                 assert listener.until("cell/step/out") == str(load.last).encode()
@@ -143,7 +143,7 @@ def test_who_listens_by_another_way_misses_nothing_of_a_broker_that_is_killed_ag
 ) -> None:
     """Under load. The bridge's own way is held up before each kill, so that what it sends then is acknowledged by none:
     what a broker has acknowledged and takes to its grave nobody could send again."""
-    monkeypatch.setattr("shmio.endpoints.mqtt.frames.CATCH_UP_S", 10.0)
+    monkeypatch.setattr("shmio.endpoints.mqtt.frame_reader.CATCH_UP_S", 10.0)
     broker = make_broker("allow_anonymous true", "max_inflight_messages 10000")
     filters = [f"{PREFIX}/{topic}" for topic in ("cell/step/out", "kill")]
     told: list[str] = []
@@ -163,7 +163,7 @@ def test_who_listens_by_another_way_misses_nothing_of_a_broker_that_is_killed_ag
                 told += listener.values("cell/step/out")
                 broker.kill()
                 proxy.refuse()
-                running.until(lambda: not running.bridge.link.up)
+                running.until(lambda: not running.bridge.connection.up)
             broker.start()
             proxy.thaw()
         with listening(broker.address, *filters) as listener:
@@ -193,7 +193,7 @@ def test_more_than_may_be_kept_goes_oldest_first_and_is_counted(segment: Segment
         assert f"{dropped} dropped" in running.bridge.problem
         broker.start()
         running.until(lambda: not running.bridge.problem and not running.bridge.outbox.busy)
-        running.until(lambda: not running.bridge.link.in_flight)
+        running.until(lambda: not running.bridge.connection.in_flight)
         with listening(broker.address, f"{PREFIX}/cell/step/out") as listener:
             assert listener.until("cell/step/out") == b"301"
 
@@ -202,7 +202,7 @@ def test_a_second_broker_takes_the_place_of_the_first(segment: Segment, make_bro
     broker = make_broker()
     segment.writer("cell").publish(image(step=1), cycle=1)
     with reserved_port() as nobody, bridge(segment, [nobody, broker.address]) as running:
-        running.until(lambda: running.bridge.link.up)
+        running.until(lambda: running.bridge.connection.up)
         with listening(broker.address) as listener:
             listener.until("cell/step/out", b"1")
 
@@ -228,7 +228,7 @@ def test_a_wrong_password_is_told_and_the_right_one_heals(
         assert "does not let us in" in running.bridge.problem
         assert "right" not in running.bridge.problem
         secret(tmp_path, "right\n")
-        running.until(lambda: running.bridge.link.up)
+        running.until(lambda: running.bridge.connection.up)
         assert not running.bridge.problem
         with listening(broker.address, username="cell", password="right") as listener:
             listener.until("cell/step/out", b"1")

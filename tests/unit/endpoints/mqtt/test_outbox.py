@@ -5,10 +5,10 @@ from __future__ import annotations
 from paho.mqtt.properties import Properties
 
 from shmio.endpoints.mqtt.channel import Message
-from shmio.endpoints.mqtt.outbox import MOST_ANSWERS, OVERHEAD_BYTES, TURN_MESSAGES, Outbox
+from shmio.endpoints.mqtt.outbox import MAX_RESULTS, OVERHEAD_BYTES, TURN_MESSAGES, Outbox
 
 
-class Link:
+class FakeConnection:
     """Takes ``room`` messages."""
 
     def __init__(self) -> None:
@@ -37,123 +37,123 @@ class Counter:
 
 
 def test_a_topic_that_waits_keeps_its_place_and_has_its_newest_value() -> None:
-    link = Link()
-    outbox, a, b = Outbox(link, link, 10_000), Counter("a"), Counter("b")
-    link.room = 0
+    connection = FakeConnection()
+    outbox, a, b = Outbox(connection, connection, 10_000), Counter("a"), Counter("b")
+    connection.room = 0
     for channel in (a, b, a):
         channel.value += 1
         outbox.mark(channel)
     outbox.flush()
-    assert (link.sent, outbox.waiting) == ([], 2)
-    link.room = 10
+    assert (connection.sent, outbox.waiting) == ([], 2)
+    connection.room = 10
     outbox.flush()
-    assert link.sent == ["a2", "b1"]
+    assert connection.sent == ["a2", "b1"]
 
 
 def test_no_turn_is_longer_than_others_can_wait() -> None:
-    link = Link()
-    outbox = Outbox(link, link, 0)
+    connection = FakeConnection()
+    outbox = Outbox(connection, connection, 0)
     outbox.mark_all(Counter(str(number)) for number in range(2 * TURN_MESSAGES + 1))
     outbox.flush()
-    assert len(link.sent) == TURN_MESSAGES
-    assert outbox.able
+    assert len(connection.sent) == TURN_MESSAGES
+    assert outbox.can_send
     outbox.flush()
     outbox.flush()
-    assert len(link.sent) == 2 * TURN_MESSAGES + 1
-    assert not outbox.able
+    assert len(connection.sent) == 2 * TURN_MESSAGES + 1
+    assert not outbox.can_send
 
 
 def test_nothing_is_kept_before_there_was_anything_to_wait_for() -> None:
-    link = Link()
-    link.up = False
-    outbox = Outbox(link, link, 10_000)
+    connection = FakeConnection()
+    connection.up = False
+    outbox = Outbox(connection, connection, 10_000)
     outbox.mark(Counter("a"))
     assert not outbox.busy
 
 
 def test_what_was_lost_and_what_waited_comes_before_what_is_new() -> None:
-    link = Link()
-    outbox, a, b, status = Outbox(link, link, 10_000), Counter("a"), Counter("b"), Counter("s", keep=False)
+    connection = FakeConnection()
+    outbox, a, b, status = Outbox(connection, connection, 10_000), Counter("a"), Counter("b"), Counter("s", keep=False)
     outbox.keeping = True
-    link.room = 0
+    connection.room = 0
     b.value = 3
     outbox.mark_all([b, status])
-    link.up = False
+    connection.up = False
     outbox.lose([Message("a", b"1", 1, retain=True, keep=True), Message("s", b"1", 1, retain=True)])
     for a.value in (2, 3):
         outbox.mark(a)
-    link.up, link.room = True, 100
-    outbox.show([a, b, status])
+    connection.up, connection.room = True, 100
+    outbox.resend([a, b, status])
     a.value = 4
     outbox.mark(a)  # while what was kept is still on its way
     outbox.flush()
-    assert link.sent == ["a1!", "b3!", "a2!", "a3!", "a4!", "a4", "b3", "s0"]
+    assert connection.sent == ["a1!", "b3!", "a2!", "a3!", "a4!", "a4", "b3", "s0"]
     a.value = 5
     outbox.mark(a)
     outbox.flush()
-    assert link.sent[-1] == "a5"
+    assert connection.sent[-1] == "a5"
 
 
 def test_the_oldest_go_when_there_is_no_room() -> None:
-    link = Link()
-    link.up = False
-    outbox, a = Outbox(link, link, 3 * (OVERHEAD_BYTES + 1)), Counter("a")
+    connection = FakeConnection()
+    connection.up = False
+    outbox, a = Outbox(connection, connection, 3 * (OVERHEAD_BYTES + 1)), Counter("a")
     outbox.keeping = True
     for a.value in range(1, 8):
         outbox.mark(a)
     assert (outbox.backlog, outbox.dropped) == (3, 4)
     outbox.lose([Message("a", b"0", 1, retain=True, keep=True)])  # older than all of them
     assert (outbox.backlog, outbox.dropped) == (3, 5)
-    link.up = True
-    outbox.show([a])
+    connection.up = True
+    outbox.resend([a])
     outbox.flush()
-    assert link.sent == ["a5!", "a6!", "a7!", "a7"]
+    assert connection.sent == ["a5!", "a6!", "a7!", "a7"]
 
 
 def test_a_store_that_is_full_when_the_broker_is_back_makes_place_for_the_newest_value() -> None:
     """What comes then is conflated, not dropped."""
-    link = Link()
-    link.up = False
-    outbox, a = Outbox(link, link, OVERHEAD_BYTES + 1), Counter("a")
+    connection = FakeConnection()
+    connection.up = False
+    outbox, a = Outbox(connection, connection, OVERHEAD_BYTES + 1), Counter("a")
     outbox.keeping = True
     a.value = 1
     outbox.mark(a)
-    link.up = True
-    outbox.show([a])
+    connection.up = True
+    outbox.resend([a])
     for a.value in (2, 3):
         outbox.mark(a)
     outbox.flush()
-    assert (link.sent, outbox.dropped) == (["a1!", "a3"], 0)
+    assert (connection.sent, outbox.dropped) == (["a1!", "a3"], 0)
 
 
 def test_results_are_bounded_and_hold_up_no_value() -> None:
-    values, results = Link(), Link()
+    values, results = FakeConnection(), FakeConnection()
     outbox = Outbox(values, results, 0)
     results.room = 0
     outbox.mark(Counter("a"))
-    for number in range(MOST_ANSWERS + 2):
-        outbox.answer(Message("r", str(number).encode(), 0, retain=True), None)
+    for number in range(MAX_RESULTS + 2):
+        outbox.queue_result(Message("r", str(number).encode(), 0, retain=True), None)
     assert outbox.dropped == 2
     outbox.flush()
     assert values.sent == ["a0"]
     results.room = 1_000_000
-    while outbox.able:
+    while outbox.can_send:
         outbox.flush()
-    assert results.sent == [f"r{number}" for number in range(2, MOST_ANSWERS + 2)]
+    assert results.sent == [f"r{number}" for number in range(2, MAX_RESULTS + 2)]
 
 
 def test_results_and_values_wait_for_their_own_connection() -> None:
-    values, results = Link(), Link()
+    values, results = FakeConnection(), FakeConnection()
     outbox, a = Outbox(values, results, 0), Counter("a")
     values.room = results.room = 0
     outbox.mark(a)
-    outbox.answer(Message("r", b"0", 0, retain=True), None)
+    outbox.queue_result(Message("r", b"0", 0, retain=True), None)
     outbox.flush()
-    assert not outbox.able
+    assert not outbox.can_send
     results.room = 1
     outbox.flush()
     assert (values.sent, results.sent) == ([], ["r0"])
-    outbox.answer(Message("r", b"1", 0, retain=True), None)
+    outbox.queue_result(Message("r", b"1", 0, retain=True), None)
     values.room = 1
     outbox.flush()
     assert (values.sent, results.sent) == (["a0"], ["r0"])
@@ -167,35 +167,35 @@ def test_results_and_values_wait_for_their_own_connection() -> None:
 
 def test_a_broker_that_takes_less_than_there_is_comes_back_to_the_present() -> None:
     """Else what changes while the past is told would be put behind it for ever."""
-    link = Link()
-    link.up = False
-    outbox, topics = Outbox(link, link, 10_000), [Counter(name) for name in "abc"]
+    connection = FakeConnection()
+    connection.up = False
+    outbox, topics = Outbox(connection, connection, 10_000), [Counter(name) for name in "abc"]
     outbox.keeping = True
     outbox.mark_all(topics)
-    link.up, link.room = True, 0
-    outbox.show(topics)
+    connection.up, connection.room = True, 0
+    outbox.resend(topics)
     for number in range(1000):
         for topic in topics:
             topic.value = number
             outbox.mark(topic)
-        link.room = 1
+        connection.room = 1
         outbox.flush()
     assert outbox.backlog == 0
-    assert not any(one.endswith("!") for one in link.sent[-3:])
+    assert not any(one.endswith("!") for one in connection.sent[-3:])
     assert outbox.dropped == 0
 
 
 def test_what_changes_after_it_was_shown_is_shown_again() -> None:
     """What is kept is sent without the retain flag: the broker would go on telling the value before."""
-    link = Link()
-    outbox, a, b = Outbox(link, link, 10_000), Counter("a"), Counter("b")
-    link.room = 1
-    outbox.show([a, b])
+    connection = FakeConnection()
+    outbox, a, b = Outbox(connection, connection, 10_000), Counter("a"), Counter("b")
+    connection.room = 1
+    outbox.resend([a, b])
     outbox.flush()
     a.value = 7
     outbox.mark(a)
-    link.room = 10
+    connection.room = 10
     outbox.flush()
-    assert link.sent[0] == "a0"
-    assert "a7" in link.sent
-    assert "b0" in link.sent
+    assert connection.sent[0] == "a0"
+    assert "a7" in connection.sent
+    assert "b0" in connection.sent

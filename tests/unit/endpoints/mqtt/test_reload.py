@@ -51,7 +51,7 @@ def test_what_a_bridge_before_has_published_by_other_rules_is_forgotten(segment:
     segment.writer("cell").publish(image(step=1), cycle=1)
     before = [MqttTopic(match="cell/inputs", elements=True), MqttTopic(match="cell", payload="frames")]
     with bridge(segment, broker.address, topic=before) as running:
-        running.until(lambda: running.bridge.link.up and not running.bridge.outbox.busy)
+        running.until(lambda: running.bridge.connection.up and not running.bridge.outbox.busy)
     with listening(broker.address) as listener:
         listener.publish("other/step/out", "1", retain=True)
         listener.publish("cell/step/note", "1", retain=True)
@@ -77,7 +77,7 @@ def test_a_source_that_is_removed_is_forgotten(segment: Segment, broker: Mosquit
             listener.until("cell/secret/out", b"0")
             segment.change(retire=["cell"], add=[])
             listener.shown("cell/secret/out", "")
-            running.until(lambda: not running.bridge.outbox.busy and not running.bridge.link.in_flight)
+            running.until(lambda: not running.bridge.outbox.busy and not running.bridge.connection.in_flight)
         with listening(broker.address, f"{PREFIX}/#") as later:
             later.publish("end", "")
             later.until("end")

@@ -128,7 +128,7 @@ def test_a_broker_that_does_not_answer_is_given_up(
 def test_no_step_waits_for_a_bridge_that_has_ended(models: Segment, broker: Mosquitto) -> None:
     with coordinator(models) as time:
         with bridge(models, broker.address) as running:
-            running.until(lambda: running.bridge.link.up)
+            running.until(lambda: running.bridge.connection.up)
             time.step()
         assert time.step().number == 2
 

@@ -13,7 +13,7 @@ from shmio.endpoints.mqtt.topic_guard import (
     MOST_HEARD,
     MOST_PAUSE_S,
     REST_S,
-    Guard,
+    TopicGuard,
 )
 from shmio.segment import Segment
 from shmio.testing.mosquitto import Mosquitto
@@ -51,7 +51,7 @@ def test_two_bridges_of_one_prefix_do_not_answer_each_other_for_ever(
     other = make_segment()
     other.writer("cell").publish(image(step=8), cycle=1)
     with bridge(segment, broker.address) as one, bridge(other, broker.address, client_id="other") as two:
-        two.until(lambda: two.bridge.link.up)
+        two.until(lambda: two.bridge.connection.up)
         with listening(broker.address) as listener:
             for _ in range(2):
                 listener.until("cell/step/out", b"7")
@@ -67,7 +67,7 @@ class Owner:
         self.corrected: list[str] = []
         self.all = 0
         self.watching = 0
-        self.guard = Guard(self, lambda: self.now_s)
+        self.guard = TopicGuard(self, lambda: self.now_s)
         self.guard.begin()
 
     def watch(self) -> None:
@@ -86,7 +86,7 @@ class Owner:
 def test_corrections_become_rarer_as_long_as_others_go_on() -> None:
     owner = Owner()
     for _ in range(100_000):
-        owner.guard.hear("status")
+        owner.guard.report("status")
         owner.now_s += 0.001
         owner.guard.turn()
     assert 20 < len(owner.corrected) < 40
@@ -95,7 +95,7 @@ def test_corrections_become_rarer_as_long_as_others_go_on() -> None:
     owner.guard.turn()
     owner.now_s += (CALM_PAUSES + 1) * MOST_PAUSE_S
     for _ in range(2):
-        owner.guard.hear("status")
+        owner.guard.report("status")
         owner.guard.turn()
         owner.now_s += FIRST_PAUSE_S
     assert owner.corrected[-2:] == ["status", "status"]
@@ -105,11 +105,11 @@ def test_corrections_become_rarer_as_long_as_others_go_on() -> None:
 def test_many_topics_are_corrected_some_at_a_time_and_too_many_by_telling_all() -> None:
     owner = Owner()
     for number in range(AT_ONCE + 1):
-        owner.guard.hear(f"t{number}")
+        owner.guard.report(f"t{number}")
     assert owner.guard.turn() == pytest.approx(FIRST_PAUSE_S)
     assert len(owner.corrected) == AT_ONCE
     for number in range(1500):
-        owner.guard.hear(f"t{number}")
+        owner.guard.report(f"t{number}")
     owner.now_s += FIRST_PAUSE_S
     owner.guard.turn()
     assert (owner.all, len(owner.corrected)) == (1, AT_ONCE)
@@ -120,9 +120,9 @@ def test_a_flood_is_not_listened_to_and_then_everything_is_told_again() -> None:
     rests = []
     for _ in range(3):
         for _ in range(MOST_HEARD + 1):
-            owner.guard.hear("status")
+            owner.guard.report("status")
         assert owner.watching == 0
-        owner.guard.hear("status")
+        owner.guard.report("status")
         owner.guard.begin()
         assert owner.watching == 0, "also by another connection"
         rests.append(owner.guard.turn())

@@ -65,7 +65,7 @@ class Cell:
         with listening(self.address, protocol=4, username="viewer", password="seen") as later:
             later.until("cell/step/out", b"8")
             assert b"forged" not in [payload for _, payload in later.heard]
-        assert self.running.bridge.link.connects == connects
+        assert self.running.bridge.connection.connects == connects
 
 
 Cells = Callable[..., AbstractContextManager[Cell]]

@@ -31,7 +31,7 @@ MOSQUITTO = pytest.mark.skipif(bool(missing()), reason=missing())
 
 def test_clients_see_what_the_bridge_publishes(segment: Segment, address: Address, program: str) -> None:
     with serving(segment, address, program), bridged(segment) as running:
-        assert running.bridge.link.mqtt5 is (program == "mosquitto")
+        assert running.bridge.connection.mqtt5 is (program == "mosquitto")
         with listening(address, protocol=MQTTv311) as listener:
             assert listener.until("cell/step/out") == b"7"
             listener.shown("cell/axis/position/out", "0.0")
@@ -129,13 +129,13 @@ def test_tls_with_certificates_of_both_sides(segment: Segment, address: Address,
     )
     with serving(segment, address, tls={**tls, "ca": str(tmp_path / "ca.pem")}):
         with bridge(segment, address, tls=own) as running:
-            running.until(lambda: running.bridge.link.up and not running.bridge.outbox.busy)
+            running.until(lambda: running.bridge.connection.up and not running.bridge.outbox.busy)
         trustme.CA().cert_pem.write_to_path(tmp_path / "other.pem")
         with bridge(segment, address, tls=MqttTls(ca=str(tmp_path / "other.pem"))) as running:
             running.until(lambda: "its certificate is not to be trusted" in running.bridge.problem)
         with bridge(segment, address, tls=MqttTls(ca=str(tmp_path / "ca.pem"))) as running:
             running.until(lambda: "mqtt.tls.certificate and key" in running.bridge.problem)
-            assert not running.bridge.link.up
+            assert not running.bridge.connection.up
         with bridge(segment, address) as running:
             running.until(lambda: "expects TLS there" in running.bridge.problem)
     with bridge(segment, address, tls=MqttTls(ca=str(tmp_path / "none.pem"))) as running:

@@ -152,7 +152,7 @@ def test_a_way_in_that_is_lost_is_made_anew_and_values_go_on(segment: Segment, b
             rival.connect(broker.address.host, broker.address.port)
             rival.loop_start()
             assert gone.wait(TIMEOUT_S)  # as it has thrown the bridge out, so the bridge throws it out
-            running.until(lambda: running.bridge.intake.link.subscribed)
+            running.until(lambda: running.bridge.command_connection.connection.subscribed)
             listener.publish("cell/step/in", "5")
             assert listener.json("cell/step/in/result")["done"]
             listener.shown("cell/step/out", "5")

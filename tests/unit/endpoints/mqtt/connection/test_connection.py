@@ -12,8 +12,8 @@ import pytest
 
 from shmio.config import Mqtt
 from shmio.endpoints.mqtt.channel import Message
-from shmio.endpoints.mqtt.connection.connection import Link
-from shmio.endpoints.mqtt.connection.target import Dialling, targets
+from shmio.endpoints.mqtt.connection.connection import BrokerConnection
+from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, targets
 
 TIMEOUT_S = 30
 
@@ -34,43 +34,43 @@ def test_a_connection_that_comes_about_after_the_end_is_closed_and_wakes_nobody(
     with socket.create_server(("127.0.0.1", 0)) as server, selectors.DefaultSelector() as selector:
         server.settimeout(TIMEOUT_S)
         settings = Mqtt(broker="external", host=f"127.0.0.1:{server.getsockname()[1]}")
-        dialling = Dialling(settings, "test", targets(settings, ""))
-        link = Link(dialling, selector, woken.set, lambda: Message("will", b"", 1, retain=True), 1)
-        link.turn()
+        policy = ReconnectPolicy(settings, "test", targets(settings, ""))
+        connection = BrokerConnection(policy, selector, woken.set, lambda: Message("will", b"", 1, retain=True), 1)
+        connection.turn()
         assert asked.wait(TIMEOUT_S)
-        link.close()
+        connection.close()
         answered.set()
-        connection, _ = server.accept()
-        with connection:
-            connection.settimeout(TIMEOUT_S)
-            while connection.recv(1000):
+        accepted, _ = server.accept()
+        with accepted:
+            accepted.settimeout(TIMEOUT_S)
+            while accepted.recv(1000):
                 pass
         assert not woken.is_set()
 
 
 class Broker:
-    """The other end of a link, as a test plays it byte by byte. (MQTT 5.0, section 3.)"""
+    """The other end of a connection, as a test plays it byte by byte. (MQTT 5.0, section 3.)"""
 
     def __init__(self, server: socket.socket) -> None:
         self._server = server
         self._selector = selectors.DefaultSelector()
         settings = Mqtt(broker="external", host=f"127.0.0.1:{server.getsockname()[1]}")
-        dialling, will = Dialling(settings, "test", targets(settings, "")), Message("will", b"", 1, retain=True)
-        self.link = Link(dialling, self._selector, lambda: None, lambda: will, 1)
+        policy, will = ReconnectPolicy(settings, "test", targets(settings, "")), Message("will", b"", 1, retain=True)
+        self.connection = BrokerConnection(policy, self._selector, lambda: None, lambda: will, 1)
         self.admit()
 
     def admit(self) -> None:
         """Take a connection."""
-        self.link.turn()
+        self.connection.turn()
         self._socket, _ = self._server.accept()
         self._socket.settimeout(TIMEOUT_S)
         self.hear(0x10)
-        self.say("20 03 00 00 00", lambda: self.link.up)
+        self.say("20 03 00 00 00", lambda: self.connection.up)
 
     def hang_up(self) -> None:
         """End it without a word."""
         self._socket.close()
-        self.turn_until(lambda: not self.link.up)
+        self.turn_until(lambda: not self.connection.up)
 
     def hear(self, kind: int, count: int = 1) -> None:
         """Take so many packets of this kind, and no more."""
@@ -88,7 +88,7 @@ class Broker:
         self._socket.sendall(bytes.fromhex(packet))
 
     def say(self, packet: str, until: Callable[[], bool]) -> None:
-        """Send one, and turn the link until it has brought something about."""
+        """Send one, and turn the connection until it has brought something about."""
         self.put(packet)
         self.turn_until(until)
 
@@ -101,12 +101,12 @@ class Broker:
 
     def turn_until(self, until: Callable[[], bool]) -> None:
         while not until():
-            self.link.turn()
+            self.connection.turn()
             for key, events in self._selector.select(0.1):
                 key.data(events)
 
     def close(self) -> None:
-        self.link.close()
+        self.connection.close()
         self._socket.close()
         self._selector.close()
 
@@ -119,7 +119,7 @@ def test_who_is_thrown_out_again_and_again_is_told_what_may_be_behind_it(monkeyp
         try:
             for losses in range(1, 5):
                 broker.hang_up()
-                assert ("does another client connect as test" in broker.link.problem) is (losses == 4)
+                assert ("does another client connect as test" in broker.connection.problem) is (losses == 4)
                 broker.admit()
         finally:
             broker.close()
@@ -129,33 +129,33 @@ def test_what_a_broker_refuses_is_told_as_long_as_it_does(monkeypatch: pytest.Mo
     """Not only until it takes something else."""
 
     def publish(topic: str) -> None:
-        link.send(Message(topic, b"1", 1, retain=True))
-        link.push()
+        connection.send(Message(topic, b"1", 1, retain=True))
+        connection.push()
         broker.hear(0x30)
 
     with socket.create_server(("127.0.0.1", 0)) as server:
         broker = Broker(server)
-        link = broker.link
+        connection = broker.connection
         try:
             publish("secret")
-            broker.say("40 03 00 01 87", lambda: not link.in_flight)
-            assert link.problem.endswith("refuses messages: Not authorized: secret")
+            broker.say("40 03 00 01 87", lambda: not connection.in_flight)
+            assert connection.problem.endswith("refuses messages: Not authorized: secret")
             publish("open")
-            broker.say("40 02 00 02", lambda: not link.in_flight)
-            assert "secret" in link.problem
+            broker.say("40 02 00 02", lambda: not connection.in_flight)
+            assert "secret" in connection.problem
             monkeypatch.setattr("shmio.endpoints.mqtt.connection.failure.REFUSED_S", 0.0)
             publish("open")
-            broker.say("40 02 00 03", lambda: not link.in_flight)
-            assert not link.problem
-            link.subscribe(["a/in", "b/in"])
-            link.push()
+            broker.say("40 02 00 03", lambda: not connection.in_flight)
+            assert not connection.problem
+            connection.subscribe(["a/in", "b/in"])
+            connection.push()
             broker.hear(0x80)
-            broker.say("90 05 00 04 00 01 87", lambda: bool(link.problem))
+            broker.say("90 05 00 04 00 01 87", lambda: bool(connection.problem))
             told = "does not let us subscribe: no command can come: Not authorized"
-            assert told in link.problem
+            assert told in connection.problem
             publish("open")
-            broker.say("40 02 00 05", lambda: not link.in_flight)
-            assert told in link.problem
+            broker.say("40 02 00 05", lambda: not connection.in_flight)
+            assert told in connection.problem
         finally:
             broker.close()
 
@@ -164,19 +164,19 @@ def test_what_is_sent_goes_when_it_is_pushed_and_is_not_lost_with_the_connection
     lost: list[Message] = []
     with socket.create_server(("127.0.0.1", 0)) as server:
         broker = Broker(server)
-        link = broker.link
-        link.on_lost = lost.extend
+        connection = broker.connection
+        connection.on_lost = lost.extend
         try:
             messages = [Message(f"t{number}", b"1", 1, retain=True) for number in range(5)]
             for message in messages[:3]:
-                link.send(message)
+                connection.send(message)
             broker.silent()
-            link.push()
+            connection.push()
             broker.hear(0x30, 3)
-            broker.say("40 02 00 01", lambda: link.in_flight == 2)
+            broker.say("40 02 00 01", lambda: connection.in_flight == 2)
             for message in messages[3:]:
-                link.send(message)
-            broker.say("e0 00", lambda: not link.up)  # it ends the connection before they go
+                connection.send(message)
+            broker.say("e0 00", lambda: not connection.up)  # it ends the connection before they go
             assert lost == messages[1:]
         finally:
             broker.close()
@@ -185,30 +185,32 @@ def test_what_is_sent_goes_when_it_is_pushed_and_is_not_lost_with_the_connection
 def test_a_broker_that_does_not_read_is_sent_no_more_until_it_does() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         broker = Broker(server)
-        link = broker.link
+        connection = broker.connection
         try:
             sent = 0
-            while link.room:
-                link.send(Message("large", bytes(500_000), 0, retain=False))
-                link.push()
+            while connection.room:
+                connection.send(Message("large", bytes(500_000), 0, retain=False))
+                connection.push()
                 sent += 1
             assert sent > 1
             reading = threading.Thread(target=broker.hear, args=[0x30, sent])
             reading.start()
-            broker.turn_until(lambda: link.room > 0)
+            broker.turn_until(lambda: connection.room > 0)
             reading.join()
         finally:
             broker.close()
 
 
-@pytest.mark.parametrize("leave", [Link.close, lambda link: link.drop("enough", politely=True)])
-def test_a_broker_hears_that_we_leave_though_what_it_sent_last_is_not_read(leave: Callable[[Link], None]) -> None:
+@pytest.mark.parametrize("leave", [BrokerConnection.close, lambda connection: connection.drop("enough", politely=True)])
+def test_a_broker_hears_that_we_leave_though_what_it_sent_last_is_not_read(
+    leave: Callable[[BrokerConnection], None],
+) -> None:
     """Else it would publish the will: who closes a socket with something to read takes back what has not gone."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         broker = Broker(server)
         try:
             broker.put("d0 00" * 100)
-            leave(broker.link)
+            leave(broker.connection)
             broker.hear(0xE0)
         finally:
             broker.close()
@@ -216,8 +218,8 @@ def test_a_broker_hears_that_we_leave_though_what_it_sent_last_is_not_read(leave
 
 def test_our_own_broker_is_tried_again_soon_however_long_it_is_away() -> None:
     own = Mqtt(listen="127.0.0.1:1883")
-    dialling = Dialling(own, "test", targets(own, "/run/own"))
-    assert max(dialling.wait_s() for _ in range(50)) <= 0.75
+    policy = ReconnectPolicy(own, "test", targets(own, "/run/own"))
+    assert max(policy.wait_s() for _ in range(50)) <= 0.75
     external = Mqtt(broker="external", host="127.0.0.1")
-    dialling = Dialling(external, "test", targets(external, ""))
-    assert max(dialling.wait_s() for _ in range(50)) > 5
+    policy = ReconnectPolicy(external, "test", targets(external, ""))
+    assert max(policy.wait_s() for _ in range(50)) > 5

@@ -6,7 +6,7 @@ import sys
 
 from shmio.endpoints.mqtt.sparkplug.metrics import Metric
 from shmio.endpoints.mqtt.sparkplug.node import Sample
-from shmio.endpoints.mqtt.sparkplug.session import Backlog
+from shmio.endpoints.mqtt.sparkplug.session import DeviceBacklog
 from shmio.layout.model import Register
 
 NUMBER = Metric(Register("number", "REAL", (), 0, None, 4, 1), 1)
@@ -15,7 +15,7 @@ MOST_BYTES = 100_000
 
 
 def test_arrays_count_as_large_as_they_are() -> None:
-    backlog = Backlog(MOST_BYTES)
+    backlog = DeviceBacklog(MOST_BYTES)
     kept = []
     for at_ms in range(100):
         sample = Sample(ROW, [at_ms + element / 7 for element in range(1000)], at_ms)
@@ -26,7 +26,7 @@ def test_arrays_count_as_large_as_they_are() -> None:
 
 
 def test_the_oldest_goes_of_whatever_device_it_is() -> None:
-    backlog = Backlog(MOST_BYTES)
+    backlog = DeviceBacklog(MOST_BYTES)
     for at_ms in range(1000):
         backlog.keep("first", [Sample(NUMBER, 0.5, at_ms)])
     full = backlog.count

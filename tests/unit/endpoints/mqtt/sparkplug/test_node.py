@@ -110,19 +110,19 @@ def test_a_device_lives_from_its_birth_to_its_death_or_the_next_session() -> Non
     edge = node()
     edge.will()
     edge.birth()
-    assert not edge.lives("axis")
+    assert not edge.is_born("axis")
     birth = edge.device_birth("axis", [])
-    assert edge.lives("axis")
+    assert edge.is_born("axis")
     assert birth.topic == "spBv1.0/plant/DBIRTH/a50/axis"
     (metric,) = payload(birth).metrics
     assert (metric.name, metric.is_null, metric.timestamp) == ("position", True, NOW_MS)
     assert list(metric.properties.keys) == ["Quality", "Reason"]
     assert metric.properties.values[0].int_value == 0
     assert edge.device_death("axis").topic == "spBv1.0/plant/DDEATH/a50/axis"
-    assert not edge.lives("axis")
+    assert not edge.is_born("axis")
     edge.device_birth("axis", [])
     edge.will()
-    assert not edge.lives("axis")
+    assert not edge.is_born("axis")
 
 
 def test_aliases_are_of_one_metric_each_in_the_whole_node_and_stand_for_names_in_data() -> None:

@@ -16,7 +16,7 @@ Done = Callable[[EventKind, str], None]
 """Called once: what became of a command, and why."""
 
 
-class Inlet:
+class CommandClient:
     """For the bridge's thread."""
 
     def __init__(self, block: Block, writer: int) -> None:
@@ -40,7 +40,7 @@ class Inlet:
             raise CommandError(RETIRED)
         self._pending.add(self._source_writer.submit({register.path: value}), cost, partial(_tell, done))
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Take what has been told; give up what is overdue."""
         retired, missed = self.block.retired, self._events.missed
         while (event := self._events.poll()) is not None:

@@ -8,14 +8,14 @@ from typing import Generic, NamedTuple, TypeVar
 Item = TypeVar("Item")
 
 
-class _Kept(NamedTuple, Generic[Item]):
+class _Entry(NamedTuple, Generic[Item]):
     number: int
     item: Item
     size: int
     changes: int
 
 
-class Store(Generic[Item]):
+class Backlog(Generic[Item]):
     """Rows of items, each in its order; the oldest, of whatever row, go when there is no room."""
 
     def __init__(self, most_bytes: int) -> None:
@@ -25,14 +25,14 @@ class Store(Generic[Item]):
         """Those that had no room."""
         self.bytes = 0
         self._most = most_bytes
-        self._rows: dict[str, deque[_Kept[Item]]] = {}
+        self._rows: dict[str, deque[_Entry[Item]]] = {}
         self._number = 0
         """Of the newest; who has a lower one is older."""
 
     def put(self, item: Item, size: int, *, row: str = "", changes: int = 1) -> None:
         """Keep one that is newer than all others. ``size``: in bytes; ``changes``: how many it tells."""
         self._number += 1
-        self._rows.setdefault(row, deque()).append(_Kept(self._number, item, size, changes))
+        self._rows.setdefault(row, deque()).append(_Entry(self._number, item, size, changes))
         self._add(changes, size)
         while self.bytes > self._most:
             oldest = min((kept for kept in self._rows.values() if kept), key=lambda kept: kept[0].number).popleft()
@@ -45,7 +45,7 @@ class Store(Generic[Item]):
             self.dropped += 1
             return
         row = self._rows.setdefault("", deque())
-        row.appendleft(_Kept(row[0].number - 1 if row else self._number, item, size, 1))
+        row.appendleft(_Entry(row[0].number - 1 if row else self._number, item, size, 1))
         self._add(1, size)
 
     def pop(self, row: str = "") -> Item | None:

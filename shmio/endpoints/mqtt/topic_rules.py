@@ -13,7 +13,7 @@ DEFAULT: Final = MqttTopic(match="**")
 """That of registers that no rule matches."""
 
 
-class Rules:
+class TopicRules:
     """The rules in their order; of several that match the first counts."""
 
     def __init__(self, topics: Sequence[MqttTopic]) -> None:

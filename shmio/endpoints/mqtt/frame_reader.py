@@ -7,13 +7,13 @@ from typing import Final
 
 from shmio.segment import Block, Frame
 
-TURN_FRAMES: Final = 8
+MAX_FRAMES_PER_TURN: Final = 8
 """So many are taken before what else there is to do has its turn."""
 CATCH_UP_S: Final = 3.0
 """Who is further behind than this, or than half of the ring, goes on with the newest frame; skips are counted."""
 
 
-class Frames:
+class FrameReader:
     """Begins with the newest one that there is. For one thread."""
 
     def __init__(self, block: Block) -> None:
@@ -29,13 +29,13 @@ class Frames:
         """How many wait."""
         return self._cursor.behind
 
-    def come(self) -> Iterator[Frame]:
+    def read(self) -> Iterator[Frame]:
         """Those that have come; at most a few."""
         if self._cursor.behind > self._most:
             newest = self._block.ring.head()
             self.missed += newest - 1 - self._cursor.last
-            self.go_on_after(newest - 1)
-        for _ in range(TURN_FRAMES):
+            self.resume_after(newest - 1)
+        for _ in range(MAX_FRAMES_PER_TURN):
             before = self._cursor.missed
             frame = self._cursor.poll()
             self.missed += self._cursor.missed - before
@@ -43,6 +43,6 @@ class Frames:
                 return
             yield frame
 
-    def go_on_after(self, number: int) -> None:
+    def resume_after(self, number: int) -> None:
         """The next one is the one behind this."""
         self._cursor = self._block.cursor(after=number)
