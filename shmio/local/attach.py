@@ -1,6 +1,6 @@
-"""The way in for a local program: attach to an instance, read values by path, follow frames.
+"""Attach to an instance on this host: read values by path, follow frames, write and inject.
 
-Five lines::
+For example::
 
     import shmio
     with shmio.attach("a50") as cell:
@@ -8,8 +8,8 @@ Five lines::
         for view in cell.stream("cell"):
             print(view.cycle, view["Robot_800/Axs1_Pos"], view.missed)
 
-It maps the segment read-only and needs nothing from the instance: no lock, no registration, no server. A program that
-writes, too, takes a guest's place.
+Attaching maps the segment read-only and needs nothing from the instance: no lock, no registration,
+no server. A program that also writes takes one of the process table's guest slots.
 """
 
 from __future__ import annotations
@@ -40,7 +40,14 @@ from shmio.segment.standing_injections import StandingInjection
 
 
 def take_guest_slot(segment: Segment) -> int:
-    """Take a free guest's place for life; the number of its command queue. SegmentError: none is free."""
+    """Take a free guest slot of the process table, for the life of this process.
+
+    Returns:
+        The number of the slot's command queue.
+
+    Raises:
+        SegmentError: No slot is free.
+    """
     places = segment.processes.guests
     for slot in places:
         if slot.writer is not None and slot.take():
@@ -53,7 +60,19 @@ def take_guest_slot(segment: Segment) -> int:
 
 
 def of_one_source(what: str, paths: Collection[str], blocks: Mapping[str, Block]) -> tuple[Block, list[Topic]]:
-    """The block and the topics of paths that must be of one source; PathError. ``what`` they are given for."""
+    """Resolve paths that must all belong to one source.
+
+    Args:
+        what: What the paths are for, such as "write"; used in messages.
+        paths: The paths.
+        blocks: The instance's blocks, by source.
+
+    Returns:
+        The source's block, and a topic for each path.
+
+    Raises:
+        PathError: The paths belong to several sources, or to none.
+    """
     default = next(iter(blocks)) if len(blocks) == 1 else None
     topics = [parse_topic(path, blocks, default) for path in paths]
     for path, topic in zip(paths, topics, strict=True):
@@ -66,11 +85,14 @@ def of_one_source(what: str, paths: Collection[str], blocks: Mapping[str, Block]
 
 
 TURN_S = 1.0
-"""How often a waiting reader looks whether the instance still is."""
+"""How often a waiting reader checks that the instance still runs, in s."""
 
 
 class Attachment(TimeMethods):
-    """A running instance as a local program sees it. Use as a context manager, or :meth:`close`."""
+    """A running instance, attached to by a program on the same host.
+
+    Use it as a context manager, or call :meth:`close`. :func:`attach` creates it.
+    """
 
     def __init__(self, segment: Segment) -> None:
         super().__init__(segment)
@@ -96,11 +118,18 @@ class Attachment(TimeMethods):
 
     @property
     def current(self) -> bool:
-        """Whether the instance still is the one attached to; after a stop, attach anew."""
+        """Whether the attached instance still runs. Once it has stopped, attach again."""
         return self._segment.shared.current()
 
     def block(self, source: str | None = None) -> Block:
-        """A source's block; None is allowed when there is only one source. PathError."""
+        """Return the block of a source.
+
+        Args:
+            source: Name of the source; None if there is only one.
+
+        Raises:
+            PathError: There is no such source, or there are several and none was named.
+        """
         blocks = self._blocks()
         if source is None and len(blocks) == 1:
             return next(iter(blocks.values()))
@@ -109,7 +138,14 @@ class Attachment(TimeMethods):
         return blocks[source]
 
     def resolve(self, path: str) -> tuple[Block, Register]:
-        """Block and register of a topic's path; the source may be left out when there is only one. PathError."""
+        """Find the block and the register that a path names.
+
+        Args:
+            path: Path of a register or element; the source may be omitted if there is only one.
+
+        Raises:
+            PathError: There is no such register, or the path ends in ``/in``.
+        """
         blocks = self._blocks()
         topic = parse_topic(path, blocks, next(iter(blocks)) if len(blocks) == 1 else None)
         if topic.source not in blocks:
@@ -120,19 +156,42 @@ class Attachment(TimeMethods):
         return block, look_up(block.layout, topic)
 
     def read(self, path: str) -> Reading:
-        """A register with quality, reason and age; PathError."""
+        """Read a register, whatever its quality.
+
+        Args:
+            path: Path of a register or element; the source may be omitted if there is only one.
+
+        Returns:
+            The value with its quality, reason, provenance and age.
+
+        Raises:
+            PathError: There is no such register.
+        """
         block, register = self.resolve(path)
         return reading(block, register, block.latest())
 
     def __getitem__(self, path: str) -> Value:
-        """A register's good value; PathError, and QualityError with the reason when there is none."""
+        """Return a register's value, unless its quality is bad.
+
+        Raises:
+            PathError: There is no such register.
+            QualityError: The quality is bad; the message gives the reason.
+        """
         now = self.read(path)
         if now.quality is Quality.BAD:
             raise QualityError(f"{path}: {now.reason}")
         return now.value
 
     def frame(self, source: str | None = None) -> View:
-        """A copy of a source's newest frame; QualityError before it has published its first."""
+        """Return a copy of a source's newest frame.
+
+        Args:
+            source: Name of the source; None if there is only one.
+
+        Raises:
+            PathError: There is no such source.
+            QualityError: The source has not published a frame yet.
+        """
         block = self.block(source)
         frame = block.latest()
         if frame is None:
@@ -140,9 +199,17 @@ class Attachment(TimeMethods):
         return View(block, frame)
 
     def stream(self, source: str | None = None, timeout_s: float | None = None) -> Iterator[View]:
-        """Every frame from this call on, once, in order, gaps counted; ends after ``timeout_s`` without one.
+        """Iterate over the frames that a source publishes from now on: each once, in order.
 
-        NotRunningError when the instance has stopped.
+        A view's ``missed`` counts the frames that were overwritten before they could be read.
+
+        Args:
+            source: Name of the source; None if there is only one.
+            timeout_s: The iterator ends after this time without a frame; None waits forever.
+
+        Raises:
+            PathError: There is no such source.
+            NotRunningError: The instance has stopped, or a reload has removed the source.
         """
         block = self.block(source)
         return self._views(block, block.cursor(), timeout_s)
@@ -162,14 +229,14 @@ class Attachment(TimeMethods):
                 return
 
     def _successor(self, block: Block) -> Block:
-        """The block that a reload has put in the place of a retired one."""
+        """Return the block that replaced a retired one in a reload."""
         successor = self._blocks().get(block.source)
         if successor is None:
             raise NotRunningError(f"source {block.source!r} was removed from instance {self.instance!r} by a reload")
         return successor
 
     def _next(self, block: Block, cursor: Cursor[Entry], timeout_s: float | None) -> Entry | None:
-        """Wait for a frame or an event in turns: a stopped instance rings no bell."""
+        """Wait for a frame or an event, and check in between that the instance has not stopped."""
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
         while True:
             rest_s = TURN_S if deadline_s is None else deadline_s - time.monotonic()
@@ -185,9 +252,21 @@ class Attachment(TimeMethods):
     def wait(
         self, source: str | None = None, *, after: View | None = None, timeout_s: float | None = None
     ) -> View | None:
-        """The newest frame as soon as it is newer than ``after`` (default: than now); None when the time is over.
+        """Wait for a frame that is newer than a given one.
 
-        A frame of the block that a reload has put in the place of ``after``'s is newer.
+        A frame of a block that a reload has put in place of the old one counts as newer.
+
+        Args:
+            source: Name of the source; None if there is only one.
+            after: The frame to be newer than; None: the newest frame at the time of the call.
+            timeout_s: How long to wait; None waits forever.
+
+        Returns:
+            The newest frame, or None if none came in time.
+
+        Raises:
+            PathError: There is no such source.
+            NotRunningError: The instance has stopped, or a reload has removed the source.
         """
         block = self.block(source)
         deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
@@ -204,10 +283,22 @@ class Attachment(TimeMethods):
             cursor = block.cursor(after=0)
 
     def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
-        """Write registers, arrays or elements of one source by their paths, as one command; what became of each.
+        """Write values to one source as one command, and wait for the outcomes.
 
-        The attachment must be ``writable``. All values are accepted by the source or none; what the device says is
-        told for each. PathError, ValueRangeError, CommandError: nothing has been sent.
+        The source accepts all values or none. The attachment must be ``writable``.
+
+        Args:
+            values: Values by path: registers, whole arrays, elements, slices or bits of one source.
+            timeout_s: How long the values may wait for a cycle of the source.
+
+        Returns:
+            The outcome of each value, in the given order.
+
+        Raises:
+            PathError: A path names nothing, or the paths belong to several sources.
+            ValueRangeError: A value does not fit its register.
+            CommandError: A register is not writable, or the source's queue has no room.
+                After any of these errors nothing has been sent.
         """
         block, topics = of_one_source("write", values, self._blocks())
         for path, topic in zip(values, topics, strict=True):
@@ -218,11 +309,25 @@ class Attachment(TimeMethods):
         )
 
     def inject(self, *paths: str, priority: int = 0, keep: bool = False, name: str = "") -> Shadow:
-        """Lay a shadow over registers, elements, structures or patterns of one source, all ``/out`` or all ``/in``.
+        """Inject values into registers of one source, by a shadow laid over them.
 
-        Without a suffix it is over ``/out``. Of several over a register the one of the highest ``priority`` is
-        outermost, of equal ones the newest. With ``keep`` it stays when this program ends, until somebody lifts it. The
-        attachment must be ``writable``. PathError; CommandError: the source refuses, or does not answer.
+        The attachment must be ``writable``.
+
+        Args:
+            paths: Registers, elements, structures or patterns of one source. With the suffix ``/in``
+                the shadow takes what others write; with ``/out``, or without a suffix, it replaces
+                what consumers see. All paths must have the same direction.
+            priority: Of several shadows over a register the one with the highest priority is
+                outermost; of equal ones the newest.
+            keep: Whether the shadow stays when this program ends, until somebody lifts it.
+            name: Name of the injection in events and lists.
+
+        Returns:
+            The shadow; leaving its ``with`` block lifts it.
+
+        Raises:
+            PathError: A path names nothing, or the paths differ in source or direction.
+            CommandError: The source refuses, or does not answer.
         """
         block, topics = of_one_source("injection", paths, self._blocks())
         directions = {topic.direction or "out" for topic in topics}
@@ -237,9 +342,17 @@ class Attachment(TimeMethods):
         return Shadow(source_writer, number, direction, events, partial(self._next, block), keep=keep)
 
     def written(self, *paths: str, timeout_s: float | None = None) -> Iterator[Diversion]:
-        """What is written to registers, structures or patterns of one source from now on, by whomever, in order.
+        """Iterate over the commands that anybody writes to registers of one source from now on.
 
-        Each command when its end is known; it ends after ``timeout_s`` without one. PathError; NotRunningError.
+        Each accepted command is yielded once its outcome is known, in order.
+
+        Args:
+            paths: Registers, structures or patterns of one source.
+            timeout_s: The iterator ends after this time without a command; None waits forever.
+
+        Raises:
+            PathError: A path names nothing, or the paths belong to several sources.
+            NotRunningError: The instance has stopped.
         """
         block, topics = of_one_source("call", paths, self._blocks())
         for path, topic in zip(paths, topics, strict=True):
@@ -249,40 +362,72 @@ class Attachment(TimeMethods):
         return written(block, patterns, block.events.cursor(), partial(self._next, block), timeout_s)
 
     def declare(self, declarations: Sequence[Declaration], *, keep: bool = False) -> list[DeclaredInjection]:
-        """Lay injections that their sources run by themselves, all or none; see docs/reference/injections.md.
+        """Lay declared injections, which their sources run by themselves: all of them or none.
 
-        Each goes when it is over or lifted, or, unless ``keep``, with this program. The attachment must be
-        ``writable``. ConfigError; CommandError: a source refuses, or does not answer.
+        An injection ends when it is over or lifted. The attachment must be ``writable``.
+        See docs/reference/injections.md.
+
+        Args:
+            declarations: What to inject.
+            keep: Whether the injections go on when this program ends.
+
+        Returns:
+            One object for each declaration, with its number and a method to lift it.
+
+        Raises:
+            ConfigError: A declaration is wrong.
+            CommandError: A source refuses, or does not answer.
         """
         return declare(declarations, self._blocks(), self._source_writer, keep=keep)
 
     def injections(self) -> dict[str, tuple[StandingInjection, ...]]:
-        """What stands at present, by source; the innermost first."""
+        """Return the present injections of each source, the innermost first."""
         return {source: block.standing.read() for source, block in self._blocks().items()}
 
     def lift(self, source: str, number: int) -> None:
-        """Lift an injection, whoever laid it. PathError: no such source; CommandError: no such injection."""
+        """Lift an injection, whoever laid it.
+
+        Args:
+            source: Name of the source.
+            number: Number of the injection.
+
+        Raises:
+            PathError: There is no such source.
+            CommandError: There is no such injection, or the source does not answer.
+        """
         self._source_writer(self.block(source)).lift(number)
 
     def lift_all(self) -> list[tuple[str, StandingInjection]]:
-        """Lift all injections of all sources, whoever laid them: (source, injection) of each.
+        """Lift all injections of all sources, whoever laid them.
 
-        All are tried, and at once. CommandError: some still stand, and why.
+        Returns:
+            The source and the injection for each one lifted.
+
+        Raises:
+            CommandError: Some injections could not be lifted; the message gives the reasons.
         """
         standing = [(source, one) for source, ones in self.injections().items() for one in ones if not one.lifted]
         lift_all([(self._source_writer(self.block(source)), one.id) for source, one in standing])
         return standing
 
     def note(self, text: str, source: str | None = None) -> None:
-        """Put a note into a source's events, where it stands between its frames; None: of the first source.
+        """Add a note to a source's events, and so to every recording.
 
-        The attachment must be ``writable``. PathError; ValueRangeError: too long; CommandError: the source's process
-        does not answer.
+        The attachment must be ``writable``.
+
+        Args:
+            text: The note, 1 to 256 bytes in UTF-8.
+            source: Name of the source; None: the first one.
+
+        Raises:
+            PathError: There is no such source.
+            ValueRangeError: The note is empty or too long.
+            CommandError: The source's process does not answer.
         """
         self._source_writer(self.block(source if source is not None else self.sources[0])).note(text)
 
     def _source_writer(self, block: Block) -> SourceWriter:
-        """The source_writer for a block, in the name of one of the guests' places, kept from the first write on."""
+        """Return the writer for a block. The first call takes a guest slot, which is kept."""
         if not self._segment.shared.writable:
             raise CommandError("this attachment only reads: attach with writable=True")
         with self._turn:
@@ -294,7 +439,11 @@ class Attachment(TimeMethods):
             return known
 
     def close(self) -> None:
-        """Detach. TimeError: a step failed while time was played."""
+        """Detach from the instance.
+
+        Raises:
+            TimeError: A step had failed while time was played.
+        """
         try:
             self._time.close()
         finally:
@@ -308,9 +457,16 @@ class Attachment(TimeMethods):
 
 
 def attach(instance: str | None = None, *, writable: bool = False) -> Attachment:
-    """Attach to a running instance, by default the only one; NotRunningError, FormatError, SegmentError.
+    """Attach to a running instance on this host.
 
-    ``writable``: to write registers too, which only the instance's own user can.
+    Args:
+        instance: Name of the instance; None if only one is running.
+        writable: Whether to write, inject and step, too. Only the user who runs the instance can.
+
+    Raises:
+        NotRunningError: The instance is not running, or several are and none was named.
+        FormatError: Another version of shmio made the segment.
+        SegmentError: The segment cannot be opened, for example for want of permission.
     """
     if instance is None:
         running = running_instances()

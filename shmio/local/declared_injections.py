@@ -1,4 +1,4 @@
-"""Declared injections as a program lays them: checked as a whole, then sent to their sources one by one."""
+"""Lay declared injections: check them all, then send each to its source."""
 
 from __future__ import annotations
 
@@ -14,24 +14,36 @@ from shmio.segment.block import Block
 
 
 class DeclaredInjection(NamedTuple):
-    """A declared injection as the program that laid it holds it."""
+    """A declared injection that this program has laid."""
 
     source_writer: SourceWriter
     number: int
-    """By which anybody may lift it."""
+    """Number of the injection; anybody may lift the injection by it."""
     program: Program
 
     def lift(self) -> None:
-        """Lift it. CommandError: it is over, was lifted already, or no answer came."""
+        """Lift the injection.
+
+        Raises:
+            CommandError: It is over, was lifted already, or the source does not answer.
+        """
         self.source_writer.lift(self.number)
 
 
 def check(
     declarations: Sequence[Declaration], blocks: Mapping[str, Block], wanted: Callable[[], bool] = lambda: True
 ) -> list[Program]:
-    """What declarations mean in this instance; ConfigError: the first fault, as ``injection[0].target: …``.
+    """Compile declarations for this instance.
 
-    ``wanted``: asked before each, for many of a large layout take seconds. CommandError: it is not any more.
+    Args:
+        declarations: What to compile.
+        blocks: The instance's blocks, by source.
+        wanted: Called before each declaration; compilation stops when it returns False. Many
+            declarations over a large layout take seconds.
+
+    Raises:
+        ConfigError: The first fault, such as ``injection[0].target: …``.
+        CommandError: ``wanted`` returned False.
     """
     check_declarations(declarations)
     layouts = {source: block.layout for source, block in blocks.items()}
@@ -68,7 +80,6 @@ def declare(
     Raises:
         ConfigError: A declaration is wrong.
         CommandError: A source refuses one, or does not answer.
-
     """
     laid: list[DeclaredInjection] = []
     try:

@@ -1,4 +1,4 @@
-"""An injection as the program that laid it holds it."""
+"""Injections that this program has laid, and the writes that they divert."""
 
 from __future__ import annotations
 
@@ -20,16 +20,23 @@ from shmio.segment.events import Event, EventKind
 from shmio.segment.pending_commands import CommandAssembler, CommandWrites, apply, values
 
 Next = Callable[[Cursor[Event], float | None], Event | None]
-"""The next event of a cursor, waited for so many s; None: there is none, or will be none. NotRunningError."""
+"""Waits at most so many seconds for a cursor's next event. None: no event came, or none will come.
+
+Raises NotRunningError when the instance has stopped."""
 
 
 @dataclass(frozen=True, slots=True)
 class Diversion:
-    """What one command wrote toward a source, or of it what went to an injection.
+    """The values that one command wrote to a source, or the part of them that an injection took.
 
-    ``values``: by path in the block; of what was written in part, its elements or bits. ``writer``, ``command``: whose
-    it was, as in events. ``clock_ns``: when, on the instance's clock; ``utc_ns``: in UTC. ``missed``: events lost
-    between the one before and this one, which may have been about more of the same.
+    Attributes:
+        values: Values by path within the block. For an array or integer that was written in part,
+            its elements or bits.
+        writer: Number of the command queue, as in events.
+        command: The writer's number of the command, as in events.
+        clock_ns: Time of the instance's clock.
+        utc_ns: UTC time.
+        missed: Events lost since the previous diversion, which may have been about further writes.
     """
 
     values: Mapping[str, Value]
@@ -41,9 +48,10 @@ class Diversion:
 
 
 class Shadow:
-    """A shadow over registers of one source. Leaving its ``with`` block lifts it, unless it is to be kept.
+    """An injection over registers of one source, whose values this program gives.
 
-    Until it is given values, consumers go on seeing what they saw; over ``/in``, nothing reaches the device.
+    Until values are given, consumers of ``/out`` see what they saw before; over ``/in``, nothing
+    reaches the device. Leaving the ``with`` block lifts the shadow, unless it was laid with ``keep``.
     """
 
     def __init__(
@@ -56,34 +64,51 @@ class Shadow:
         *,
         keep: bool,
     ) -> None:
-        """``events``: from before it was laid."""
+        """``events``: a cursor from before the shadow was laid."""
         self.source = source_writer.block.source
         self.number = number
-        """By which anybody may lift it, or give values to it."""
+        """Number of the injection; by it anybody may lift the shadow or give values to it."""
         self.direction = direction
         self._source_writer = source_writer
         self._events = events
         self._gathered = CommandAssembler()
         self._missed = 0
-        self._image = bytearray(source_writer.block.layout.size)  # what was diverted so far
+        self._image = bytearray(source_writer.block.layout.size)  # all writes diverted so far
         self._next_event = next_event
         self._keep = keep
 
     def set(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
-        """Give values by path, with or without the source: to consumers, or over ``/in`` toward the device.
+        """Give values: to consumers, or, for a shadow over ``/in``, to the device.
 
-        What became of each: SHADOWED, consumers see it; over ``/in`` as with a write. REJECTED: not covered, or the
-        shadow was lifted. PathError, ValueRangeError, CommandError: nothing has been sent.
+        Args:
+            values: Values by path, with or without the source.
+            timeout_s: How long the values may wait for a cycle of the source.
+
+        Returns:
+            The outcome of each value: SHADOWED when consumers see it, or an outcome as of a write for
+            ``/in``; REJECTED when the shadow does not cover it or was lifted.
+
+        Raises:
+            PathError: A path names nothing.
+            ValueRangeError: A value does not fit its register.
+            CommandError: The source's queue has no room.
+                After any of these errors nothing has been sent.
         """
         paths = {parse_topic(path, (self.source,), self.source).path: value for path, value in values.items()}
         return self._source_writer.shadow(self.number, paths, timeout_s)
 
     def diverted(self, timeout_s: float | None = None) -> Iterator[Diversion]:
-        """What went to this shadow since it was laid: over ``/in`` what others wrote, command by command, in order.
+        """Iterate over what this shadow has taken since it was laid, command by command, in order.
 
-        Over ``/out``: what shadows further from consumers gave; what the source delivers is in the frames. Each is told
-        once, also to a second iterator. It ends when the shadow is lifted, and after ``timeout_s`` without any; None
-        waits for ever. NotRunningError when the instance has stopped.
+        Over ``/in`` these are the writes of others; over ``/out`` the values of shadows further in.
+        What the source itself delivers is in the frames. Each diversion is yielded once, even if
+        there are two iterators. The iterator ends when the shadow is lifted.
+
+        Args:
+            timeout_s: The iterator also ends after this time without a diversion; None waits forever.
+
+        Raises:
+            NotRunningError: The instance has stopped.
         """
         until_s = _deadline(timeout_s)
         while (event := self._next_event(self._events, _rest(until_s))) is not None:
@@ -102,7 +127,11 @@ class Shadow:
         return Diversion(written, event.writer, event.command, event.clock_ns, event.utc_ns, missed)
 
     def lift(self) -> None:
-        """Lift it; consumers see what the source delivers. CommandError: it was lifted already, or no answer came."""
+        """Lift the shadow: consumers see what the source delivers.
+
+        Raises:
+            CommandError: It was lifted already, or the source does not answer.
+        """
         self._source_writer.lift(self.number)
 
     def __enter__(self) -> Self:
@@ -118,9 +147,18 @@ class Shadow:
 def written(
     block: Block, patterns: Iterable[str], events: Cursor[Event], next_event: Next, timeout_s: float | None
 ) -> Iterator[Diversion]:
-    """What a source accepts for what the patterns name, command by command, in order; each when it has its end.
+    """Iterate over the commands that a source accepts for registers, each once its outcome is known.
 
-    It ends after ``timeout_s`` without any. PathError: they name nothing; NotRunningError.
+    Args:
+        block: The source's block.
+        patterns: Patterns of registers.
+        events: A cursor of the block's events.
+        next_event: Waits for the cursor's next event.
+        timeout_s: The iterator ends after this time without a command; None waits forever.
+
+    Raises:
+        PathError: The patterns name no register.
+        NotRunningError: The instance has stopped.
     """
     chosen = list(patterns)
     bits = cover(block.layout, chosen)
@@ -151,7 +189,11 @@ def _written(
 
 
 def lift_all(injections: Iterable[tuple[SourceWriter, int]]) -> None:
-    """Lift all of these; those that are gone by then count as lifted. CommandError: some still stand, and why."""
+    """Lift injections, given by writer and number. One that is already gone counts as lifted.
+
+    Raises:
+        CommandError: Some could not be lifted; the message gives the reasons.
+    """
     asked: list[tuple[SourceWriter, PendingCommand]] = []
     chosen, reasons = list(injections), dict[str, None]()
     for source_writer, number in chosen:

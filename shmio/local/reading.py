@@ -1,4 +1,4 @@
-"""What a local program gets to see: a register's reading, a frame with its layout."""
+"""What a local program reads: the value of a register, and frames with their layout."""
 
 from __future__ import annotations
 
@@ -22,9 +22,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One register as of now. ``value`` is the last one known even while quality is bad; None if there never was one.
+    """The state of one register at the time it was read.
 
-    ``source_time`` is UTC in s, ``age_s`` the time since the frame was published, by its source's clock.
+    Attributes:
+        value: The last known value, even while the quality is bad; None if there never was one.
+        quality: Quality of the value.
+        reason: Why the quality is not good; empty if it is.
+        provenance: Where the value comes from: live, simulated, replayed or injected.
+        source_time: The source's time stamp, UTC in s; None if there never was a value.
+        age_s: Age of the value by the source's clock, in s; None if there never was a frame.
     """
 
     value: Value
@@ -37,13 +43,13 @@ class Reading:
 
 @dataclass(frozen=True)
 class View:
-    """A frame with its layout: a validated copy, which nothing changes any more.
+    """A copy of a frame, with the layout to decode it. It never changes.
 
-    ``missed`` counts the frames lost between the one before in its stream and this one.
+    ``missed`` counts the frames lost between the previous frame of the stream and this one.
     """
 
     block: Block
-    """The one that the frame is of."""
+    """The block that published the frame."""
     frame: Frame
     missed: int = 0
 
@@ -54,12 +60,15 @@ class View:
 
     @property
     def section(self) -> int:
-        """Which of the blocks that its source has had; a reload may give it another, whose frames count from 1."""
+        """Index that tells the blocks of a source apart.
+
+        A reload may replace a source's block; frame numbers then start again at 1.
+        """
         return self.block.section
 
     @property
     def layout(self) -> Layout:
-        """Of the frame's image."""
+        """Layout of the frame's image."""
         return self.block.layout
 
     @property
@@ -69,7 +78,7 @@ class View:
 
     @property
     def quality(self) -> Quality:
-        """Quality as of now: it turns bad with age."""
+        """Quality as of now: a frame turns bad with age."""
         return self.block.assess(self.frame)[0]
 
     @property
@@ -78,14 +87,25 @@ class View:
         return self.block.assess(self.frame)[1]
 
     def __getitem__(self, path: str) -> Value:
-        """The value of a register, or of an array's element, whatever the quality; PathError."""
+        """Return the value of a register or array element that consumers see, whatever its quality.
+
+        Raises:
+            PathError: There is no such register.
+        """
         topic = parse_topic(path, (self.source,), self.source)
         if topic.direction == "in":
             raise PathError(f"{path}: a frame holds what comes out of its source; leave out /in")
         return self._decode(topic.path, self.frame.image)
 
     def original(self, path: str) -> Value:
-        """What the source delivered, whatever injections show instead; PathError."""
+        """Return the value that the source delivered, without injections.
+
+        Args:
+            path: Path of a register or element.
+
+        Raises:
+            PathError: There is no such register.
+        """
         return self._decode(parse_topic(path, (self.source,), self.source).path, self.frame.raw)
 
     def _decode(self, path: str, image: bytes) -> Value:
@@ -93,7 +113,7 @@ class View:
 
     @cached_property
     def array(self) -> np.ndarray[Any, np.dtype[Any]]:
-        """The whole frame decoded: a numpy structured array of shape (1,), one field for each register's path."""
+        """The decoded frame: a numpy structured array of shape (1,), with one field per register path."""
         return _frame_codec(self.layout).decode(self.frame.image)
 
 
@@ -105,7 +125,13 @@ def _frame_codec(layout: Layout) -> FrameCodec:
 
 
 def reading(block: Block, register: Register, frame: Frame | None) -> Reading:
-    """One register of one frame, with what is known about it now."""
+    """Read one register of a frame, and assess its quality as of now.
+
+    Args:
+        block: The frame's block.
+        register: What to read.
+        frame: The frame; None if the source has not published one yet.
+    """
     if frame is None:
         return Reading(None, Quality.BAD, "no data yet", str(Provenance.LIVE), None, None)
     now_ns = block.now_ns()
@@ -120,7 +146,7 @@ def reading(block: Block, register: Register, frame: Frame | None) -> Reading:
 
 
 def injected(block: Block, registers: Sequence[Register], frame: Frame) -> bool:
-    """Whether anything in these registers is injected: some of a frame may be."""
+    """Whether an injection covers any of these registers of a frame."""
     if frame.effective is None:
         return False
     standing = [one for one in block.standing.read() if one.direction == "out"]
@@ -128,5 +154,5 @@ def injected(block: Block, registers: Sequence[Register], frame: Frame) -> bool:
 
 
 def holds_none(value: Value) -> bool:
-    """Whether a value, or an element of it, could not be decoded."""
+    """Whether a value, or an element of an array, could not be decoded."""
     return any(map(holds_none, value)) if isinstance(value, list) else value is None

@@ -1,4 +1,4 @@
-"""Moments of a recording, as people write them."""
+"""Parse times of a recording as users write them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,14 @@ from datetime import datetime
 
 
 def moment_ns(text: str, begin_ns: int) -> int:
-    """UTC in ns of so many seconds from ``begin_ns``, or of a date and time. ValueError: it is neither."""
+    """Parse a time, given in seconds from ``begin_ns`` or as a date and time.
+
+    Returns:
+        UTC in ns.
+
+    Raises:
+        ValueError: The text is neither.
+    """
     try:
         return begin_ns + round(float(text) * 1e9)
     except ValueError:
@@ -16,7 +23,14 @@ def moment_ns(text: str, begin_ns: int) -> int:
 
 
 def date_ns(text: str) -> int:
-    """UTC in ns of a date and time, local unless it says. ValueError: it is none, or of no calendar."""
+    """Parse a date and time in ISO 8601; local time, unless it names a time zone.
+
+    Returns:
+        UTC in ns.
+
+    Raises:
+        ValueError: The text is not a date and time.
+    """
     try:
         return round(datetime.fromisoformat(text).astimezone().timestamp() * 1e6) * 1000
     except OverflowError:

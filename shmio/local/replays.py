@@ -1,4 +1,4 @@
-"""How a local program moves what plays recordings: all sources of one recording together, so that they stay in step."""
+"""Control replays from a local program: the sources of a recording move together, in step."""
 
 from __future__ import annotations
 
@@ -28,18 +28,26 @@ from shmio.segment.playhead import (
 from shmio.segment.segment import Segment
 
 ANSWER_S: Final = 5.0
-"""So long an answer is waited for that needs no search."""
+"""How long to wait for an answer that needs no search."""
 SEARCH_S: Final = 600.0
 TURN_NS: Final = 500_000_000
-"""How often it is looked whether who asks still wants to know."""
+"""How often to check whether the caller has given up."""
 
 
 class ReplayRequest(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What is to change; None and empty: nothing. It pauses at ``until``, once.
+    """A request to change replays. Fields that are None or empty change nothing.
 
-    ``seek``, ``until``: seconds from the begin, or a date and time, local unless it says. ``change``: play to the next
-    change of a register, ``event``: to the next event of a kind, and pause there; with ``jump`` be there at once.
-    ``sources``: only these, and what else plays the same recording.
+    Attributes:
+        paused: Whether to pause.
+        speed: Speed relative to the instance's clock, 0.01 to 1000.
+        seek: Position to go to: seconds from the start, or a date and time (local, unless it names
+            a time zone).
+        until: Position at which to pause once, given as ``seek``.
+        loop: Whether to start again at the end.
+        change: Path of a register: play to its next change, and pause there.
+        event: Kind of event: play to the next one, and pause there.
+        jump: With ``change`` or ``event``: go there at once instead of playing.
+        sources: Only these sources, and others that replay the same recording; empty: all.
     """
 
     paused: bool | None = None
@@ -54,63 +62,105 @@ class ReplayRequest(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def nothing(self) -> bool:
-        """Whether nothing is to change."""
+        """Whether the request changes nothing."""
         return self == ReplayRequest(sources=self.sources)
 
 
 class Replays:
-    """The replays of an instance. Several threads may use it; of programs one at a time."""
+    """The replays of an instance. Several threads may use it, but only one program at a time."""
 
     def __init__(self, segment: Segment) -> None:
-        """``segment``: writable, to do more than look."""
+        """``segment`` must be writable to change anything."""
         self._segment = segment
 
     def status(self, sources: Collection[str] = ()) -> list[Playing]:
-        """How each plays; with ``sources`` only these, and what else plays the same recording.
+        """Return the status of each replay.
 
-        CommandError: none does; PathError: one of them does not.
+        Args:
+            sources: Only these sources, and others that replay the same recording; empty: all.
+
+        Raises:
+            CommandError: The instance replays no recording.
+            PathError: One of the sources replays no recording.
         """
         now_ns = self._segment.clock.present_ns()
         plays = self._chosen(ReplayRequest(sources=tuple(sources)))
         return [_replay_status(source, play, now_ns) for source, play in plays.items()]
 
     def pause(self) -> list[Playing]:
-        """Have all stand where they are."""
+        """Pause all replays; returns their status."""
         return self.change(ReplayRequest(paused=True))
 
     def play(self, speed: float | None = None) -> list[Playing]:
-        """Have all go on; what is over begins anew. ValueRangeError: no such speed."""
+        """Resume all replays; one that has reached its end starts again. Returns their status.
+
+        Args:
+            speed: Speed relative to the instance's clock, 0.01 to 1000; None: as before.
+
+        Raises:
+            ValueRangeError: The speed is out of range.
+        """
         return self.change(ReplayRequest(paused=False, speed=speed))
 
     def speed(self, speed: float) -> list[Playing]:
-        """Play ``speed`` times as fast as the instance's clock, 0.01 to 1000. ValueRangeError."""
+        """Set the speed relative to the instance's clock, 0.01 to 1000. ValueRangeError."""
         return self.change(ReplayRequest(speed=speed))
 
     def seek(self, to: float | str) -> list[Playing]:
-        """Be at a time: seconds from the begin, or a date and time. ValueRangeError: it is not in the recording."""
+        """Go to a position; returns the status.
+
+        Args:
+            to: Seconds from the start, or a date and time.
+
+        Raises:
+            ValueRangeError: The position is not in the recording.
+        """
         return self.change(ReplayRequest(seek=str(to)))
 
     def loop(self, on: bool = True) -> list[Playing]:
-        """Begin anew at the end, or do not."""
+        """Set whether replays start again at the end."""
         return self.change(ReplayRequest(loop=on))
 
     def play_until(self, to: float | str) -> list[Playing]:
-        """Play to a time, and pause there."""
+        """Play to a position, given as in :meth:`seek`, and pause there."""
         return self.change(ReplayRequest(paused=False, until=str(to)))
 
     def to_change(self, path: str, *, jump: bool = False) -> list[Playing]:
-        """Play to the next change of a register, and pause there. PathError; CommandError: there is none."""
+        """Play to the next change of a register, and pause there.
+
+        Args:
+            path: Path of the register.
+            jump: Whether to go there at once.
+
+        Raises:
+            PathError: There is no such register.
+            CommandError: The register does not change any more.
+        """
         return self.change(ReplayRequest(change=path, jump=jump))
 
     def to_event(self, kind: str, *, jump: bool = False) -> list[Playing]:
-        """The same with the next event of a kind, such as ``accepted`` or ``noted``, or ``any``, of any source."""
+        """Play to the next event of a kind, of any source, and pause there.
+
+        Args:
+            kind: Kind of event, such as ``accepted`` or ``noted``, or ``any``.
+            jump: Whether to go there at once.
+
+        Raises:
+            CommandError: There is no such event any more.
+        """
         return self.change(ReplayRequest(event=kind, jump=jump))
 
     def change(self, wanted: ReplayRequest, given_up: Callable[[], bool] = lambda: False) -> list[Playing]:
-        """Do what is wanted; how all play then. ``given_up`` is asked now and then while a recording is searched.
+        """Carry out a request; returns the status of the replays afterwards.
 
-        ValueRangeError: a speed or a time; PathError: a source or a register; CommandError: there is no replay, or it
-        refuses, or does not answer, or it was given up.
+        Args:
+            wanted: The request.
+            given_up: Polled during a search, which ends when it returns True.
+
+        Raises:
+            ValueRangeError: The speed or a position is out of range.
+            PathError: A source or a register does not exist.
+            CommandError: There is no replay, it refuses, does not answer, or the search was given up.
         """
         if not self._segment.shared.writable:
             raise CommandError("this attachment only reads: attach with writable=True")
@@ -141,7 +191,7 @@ class Replays:
         return found
 
     def _chosen(self, wanted: ReplayRequest) -> dict[str, PlayState]:
-        """The sources that are meant, and what plays the same recordings."""
+        """Return the requested sources, and others that replay the same recordings."""
         plays = self._plays()
         for source in wanted.sources:
             if source not in plays:
@@ -150,14 +200,14 @@ class Replays:
         if wanted.change:
             names = [self._register(wanted.change)[0]]
         meant = {_recording(plays[source]) for source in names or plays}
-        if wanted.event and len(meant) > 1:  # whose positions have nothing to do with each other
+        if wanted.event and len(meant) > 1:  # their positions are unrelated
             raise CommandError(
                 f"several recordings are played: name one of the sources of the one that is meant ({', '.join(plays)})"
             )
         return {source: play for source, play in plays.items() if _recording(play) in meant}
 
     def _register(self, path: str) -> tuple[str, str]:
-        """Source and path of a register that is played; PathError."""
+        """Split the path of a replayed register into source and path; PathError."""
         blocks = self._blocks()
         topic = parse_topic(path, self._segment.blocks, next(iter(blocks)) if len(blocks) == 1 else None)
         if topic.source not in blocks:
@@ -167,7 +217,7 @@ class Replays:
 
     @contextmanager
     def _held(self, sources: Collection[str]) -> Iterator[dict[str, Playhead]]:
-        """The playheads of sources, for this program alone."""
+        """Lock the playheads of sources for this program."""
         blocks = self._blocks()
         heads = {source: head for source in blocks if source in sources and (head := blocks[source].playhead)}
         with ExitStack() as stack:
@@ -178,7 +228,7 @@ class Replays:
     # ---- what ------------------------------------------------------------------------------------------------------
 
     def _go_to(self, wanted: ReplayRequest, heads: Mapping[str, Playhead], given_up: Callable[[], bool]) -> None:
-        """Have them stand, look ahead, and go on to what was found."""
+        """Pause, search ahead, and play or jump to what was found."""
         self._move(heads, lambda _, clock_ns: MoveRequest(clock_ns, paused=True))
         searched = dict(heads)
         path = ""
@@ -203,8 +253,8 @@ class Replays:
             self._move(heads, lambda _, now: MoveRequest(now, paused=False, until_ns=at_ns, speed=wanted.speed))
 
     def _move(self, heads: Mapping[str, Playhead], move: Callable[[PlayState, int], MoveRequest]) -> None:
-        """Move all from one moment on."""
-        clock_ns = self._segment.clock.read().time_ns  # behind a step that is under way: until then nobody answers
+        """Move all playheads from the same time of the clock on."""
+        clock_ns = self._segment.clock.read().time_ns  # after the current step, before which no source answers
         asks: dict[str, PlayheadRequest] = {}
         for source, head in heads.items():
             play = head.read()
@@ -221,7 +271,7 @@ class Replays:
         patience_s: float,
         given_up: Callable[[], bool] = lambda: False,
     ) -> dict[str, PlayheadAnswer]:
-        """Ask all at once; their answers."""
+        """Send a request to each playhead, and wait for the answers."""
         numbers = {source: heads[source].ask(ask) for source, ask in asks.items()}
         for slot in self._segment.processes:
             if slot.name in asks:
@@ -260,7 +310,7 @@ def _recording(play: PlayState) -> tuple[int, int, int]:
 
 
 def _move_request(play: PlayState, wanted: ReplayRequest, clock_ns: int) -> MoveRequest:
-    """The same request for one source. ValueRangeError: a time that it does not have."""
+    """Turn a request into one source's move. ValueRangeError: a position is not in the recording."""
     return MoveRequest(
         clock_ns,
         paused=wanted.paused,

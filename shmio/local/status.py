@@ -1,4 +1,4 @@
-"""What ``shmio-supervisor status`` tells: read from the segment alone, so it works whoever is dead."""
+"""Status of an instance, read from its segment alone: it needs no living process."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from shmio.segment.processes import Phase, ProcessSlot
 from shmio.segment.segment import Segment, running_instances
 
 SILENT_S = 5.0
-"""A supervisor without a heartbeat for this long is stopped, or hangs."""
+"""A supervisor without a heartbeat for this long is stopped or hangs."""
 
 
 class ProcessStatus(msgspec.Struct, kw_only=True):
-    """One process. ``uptime_s`` is the time since its last start, 0 when it is not alive; ``pid`` is null then."""
+    """Status of one process. While it is not alive ``uptime_s`` is 0 and ``pid`` is null."""
 
     name: str
     kind: str
@@ -33,9 +33,10 @@ class ProcessStatus(msgspec.Struct, kw_only=True):
 
 
 class SourceStatus(ProcessStatus, kw_only=True):
-    """A source: its process, and the newest frame of its block. ``cycle`` is null before the first.
+    """Status of a source: its process, and the newest frame of its block.
 
-    ``real_time``: steps do not move it, as it has a device.
+    ``cycle`` is null before the first frame. ``real_time``: the source does not use the instance
+    clock, so steps do not move it.
     """
 
     quality: str
@@ -47,17 +48,17 @@ class SourceStatus(ProcessStatus, kw_only=True):
 
 
 class SupervisorStatus(msgspec.Struct):
-    """The supervisor itself."""
+    """Status of the supervisor."""
 
     pid: int
     uptime_s: float
 
 
 class ClockStatus(msgspec.Struct):
-    """The instance's clock. ``mode``: wall or virtual. ``step``: number of the last one that all have finished.
+    """Status of the instance's clock. ``mode``: wall or virtual. ``step``: the last finished step.
 
-    ``note``: whom a step waits for, why the last one failed, or what it did not move; before the first
-    one how real time comes back.
+    ``note`` says which processes a step waits for, why the last one failed, or what it did not move.
+    Before the first step it says how to return to real time.
     """
 
     mode: str
@@ -70,7 +71,10 @@ class ClockStatus(msgspec.Struct):
 
 
 class InstanceStatus(msgspec.Struct):
-    """An instance. ``supervisor`` is null when it is dead, ``segment`` and ``clock`` when there is none."""
+    """Status of an instance.
+
+    ``supervisor`` is null if it is dead; ``segment`` and ``clock`` are null without a segment.
+    """
 
     instance: str | None
     mode: str | None = None
@@ -84,16 +88,22 @@ class InstanceStatus(msgspec.Struct):
 
     @property
     def running(self) -> bool:
-        """Whether anything of it runs."""
+        """Whether any part of the instance runs."""
         return self.state != str(InstanceState.STOPPED)
 
 
 def read_status(instance: str, config: str | None = None, file: Path | None = None) -> InstanceStatus:
-    """The status of an instance, running or not. SegmentError: a segment that may not be read.
+    """Read the status of an instance, whether it runs or not.
 
-    ``file``: the configuration that it must have been started from, if any; WrongInstanceError.
-    ``config``: what a command line has to say to name its configuration, such as ``-c plc.toml``; empty if nothing,
-    None if that is not known.
+    Args:
+        instance: Name of the instance.
+        config: Option that names the configuration on a command line, such as ``-c plc.toml``; empty
+            if none is needed, None if unknown.
+        file: The configuration that the instance must have been started from; None: any.
+
+    Raises:
+        WrongInstanceError: The instance was started from another configuration.
+        SegmentError: The segment cannot be read.
     """
     up = " ".join(("shmio-supervisor up", "-c FILE" if config is None else config)).rstrip()
     down = " ".join(("shmio-supervisor down", f"--instance {instance}" if config is None else config)).rstrip()
@@ -107,9 +117,13 @@ def read_status(instance: str, config: str | None = None, file: Path | None = No
 
 
 def status_of(segment: Segment, remedy: str, asking: str = "") -> InstanceStatus:
-    """The status of an instance whose segment is open. ``remedy``: what to say where its supervisor is dead.
+    """Read the status of an instance from its open segment.
 
-    ``asking``: kind of the process that asks, if it is one of the instance's: nobody sees a lock of his own.
+    Args:
+        segment: The segment.
+        remedy: Advice for the note if the supervisor is dead.
+        asking: Kind of the calling process, if it belongs to the instance: a process cannot see its
+            own lock.
     """
     supervised = segment.supervised
     pid, state = segment.supervisor
@@ -141,7 +155,7 @@ def status_of(segment: Segment, remedy: str, asking: str = "") -> InstanceStatus
 
 
 def clock_status(state: ClockState) -> ClockStatus:
-    """What the clock page says, in the units of a reader."""
+    """Convert the state of the clock page to the units of a status."""
     return ClockStatus(
         str(state.mode), state.present_ns / 1e9, state.done, state.step_size_ns / 1e6, state.playing, state.rate,
         state.note,
@@ -149,7 +163,7 @@ def clock_status(state: ClockState) -> ClockStatus:
 
 
 def supervisor_silence(segment: Segment) -> str | None:
-    """What to say about a living supervisor that shows no sign of life; None if it does."""
+    """Describe a supervisor that lives but has stopped its heartbeat; None if all is well."""
     silent_s = (time.monotonic_ns() - segment.supervisor_heartbeat_ns) / 1e9
     if silent_s < SILENT_S:
         return None
@@ -162,7 +176,7 @@ def supervisor_silence(segment: Segment) -> str | None:
 
 
 def _state(told: InstanceState, processes: list[SourceStatus | ProcessStatus], note: str) -> InstanceState:
-    """The state as told while starting or stopping; else by what is read here, which is newer."""
+    """Return the supervisor's state while it starts or stops; else a newer one, from the processes."""
     if told not in (InstanceState.RUNNING, InstanceState.DEGRADED):
         return told
     running = [p.state == str(Phase.RUNNING) and not complaint(p.kind, p.note) for p in processes]
@@ -170,14 +184,20 @@ def _state(told: InstanceState, processes: list[SourceStatus | ProcessStatus], n
 
 
 def complaint(kind: str, note: str) -> str:
-    """What a running process reports as wrong though it runs: a recorder that is well names its file, ``to FILE``."""
+    """Return the problem that a running process reports; empty if there is none.
+
+    A recorder without a problem reports ``to FILE``.
+    """
     return note if kind in ("mqtt", "grpc") or (kind == "recorder" and not note.startswith("to ")) else ""
 
 
 def assess(running: Sequence[bool], qualities: Sequence[Quality | None], note: str = "") -> InstanceState:
-    """State of an instance after its start: degraded when a process is not running or a source is bad.
+    """Return the state of a started instance: degraded if a process does not run or a source is bad.
 
-    ``running``: of each process, whether it runs without a :func:`complaint`. ``note``: what else is wrong.
+    Args:
+        running: For each process, whether it runs without a :func:`complaint`.
+        qualities: Quality of each source; None: no frame yet.
+        note: Any other problem of the instance.
     """
     healthy = not note and all(running) and not any(q in (None, Quality.BAD) for q in qualities)
     return InstanceState.RUNNING if healthy else InstanceState.DEGRADED
@@ -190,7 +210,7 @@ def _process(
     phase, note = told.phase, told.note
     if not supervised:
         phase = Phase.RUNNING if alive else Phase.STOPPED
-    elif phase is Phase.RUNNING and not alive:  # a supervisor that lives soon says so itself
+    elif phase is Phase.RUNNING and not alive:  # the supervisor has not noticed yet
         phase, note = Phase.STOPPED, "dead"
     counters = slot.counters
     current = alive and report.pid != 0 and report.started_ns >= told.spawned_ns  # not a predecessor's report

@@ -1,4 +1,4 @@
-"""What a step waits for, and what has come of it."""
+"""Answers of sources to a step of time, and the notes about it."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ _STANDS: Final = f"it stands until it is stepped{_REAL}"
 
 
 class StepWait(NamedTuple):
-    """What a step waits for: that a bell differs from ``seen``, or for so long.
+    """A wait within a step: until a doorbell differs from ``seen``, at most ``rest_ns``.
 
-    It is the doorbell of ``block``, which has to answer; if that is None, the bell of those who deliver steps.
+    The doorbell is that of ``block``, whose answer is awaited. If ``block`` is None it is the doorbell
+    of the processes that deliver steps.
     """
 
     block: Block | None
@@ -27,9 +28,9 @@ class StepWait(NamedTuple):
 
 
 def step_answer(block: Block, number: int) -> str | None:
-    """A participant's answer to a step: empty when it is done, why it failed, None as long as there is none."""
+    """Return a block's answer to a step: empty if done, the reason if it failed, None if none came."""
     if block.retired:
-        return ""  # a reload has ended it
+        return ""  # a reload has retired the block
     try:
         if block.playhead is not None:
             play = block.playhead.read()
@@ -43,7 +44,7 @@ def step_answer(block: Block, number: int) -> str | None:
 
 
 def describe_silence(segment: Segment, block: Block, hard_ns: int) -> str:
-    """What is known of a participant that has not answered."""
+    """Describe a source that has not answered a step in time."""
     what = f"{block.source}: no answer within {hard_ns / 1e9:g} s"
     for slot in segment.processes:
         if slot.name == block.source:
@@ -55,19 +56,19 @@ def describe_silence(segment: Segment, block: Block, hard_ns: int) -> str:
 
 
 def take_over_note(participants: Sequence[Block]) -> str:
-    """What is told of time that was real until now."""
+    """Return the clock's note after time was taken over."""
     return _STANDS if participants else f"{_NOBODY}{_REAL}"
 
 
 def unmoved_note(segment: Segment, participants: Sequence[Block]) -> str:
-    """What the next step does not move, though who steps may expect it, and the remedy; empty: it moves all."""
+    """Describe what the next step will not move, with the remedy; empty if it moves everything."""
     if not participants:
         return _NOBODY if segment.clock.stepped else f"{_NOBODY}{_REAL}"
     found: dict[str, list[str]] = {"paused": [], "over": []}
     for block in participants:
         try:
             play = block.playhead.read() if block.playhead is not None else None
-        except SegmentError:  # the step says so
+        except SegmentError:  # the step itself reports it
             continue
         if play is not None and play.paused:
             found["over" if play.over else "paused"].append(block.source)

@@ -1,4 +1,4 @@
-"""Who moves time: takes it over, steps it, and waits until everybody has done the step."""
+"""Take over an instance's time, step it, and wait until every source has done the step."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from shmio.segment.segment import Segment
 MIN_STEP_NS: Final = 1_000
 MAX_STEP_NS: Final = 3_600_000_000_000
 TURN_NS: Final = 100_000_000
-"""Who waits for an owner of time looks by itself, too: the bell of one that dies is silent."""
+"""How often a process that waits for the owner of time polls: an owner that dies rings no bell."""
 MAX_RATE: Final = 1000.0
 DISPATCHERS: Final = frozenset({"grpc", "mqtt", "recorder"})
-"""Kinds of processes that a step may wait for until they have delivered it."""
+"""Kinds of processes whose delivery a step may wait for."""
 
 log = logging.getLogger("shmio.time")
 log.addHandler(logging.NullHandler())  # a program that asks for no log gets none
@@ -32,7 +32,13 @@ log.addHandler(logging.NullHandler())  # a program that asks for no log gets non
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """A step that is done: its number, the instance's clock after it, and by how much it moved it."""
+    """A finished step.
+
+    Attributes:
+        number: Number of the step.
+        time_ns: The instance's clock after the step.
+        dt_ns: Length of the step.
+    """
 
     number: int
     time_ns: int
@@ -42,8 +48,9 @@ class Step:
 class Coordinator:
     """Moves the time of one instance. Several threads may use it; one program at a time owns time.
 
-    A step: the page says which is asked for; each block that lives on the instance's clock publishes its frame for it;
-    then it is ``done``, and is delivered, by this process and by the others that serve remote programs.
+    In a step, the clock page announces the step's number, and each block that uses the instance clock
+    publishes its frame for it. Then the step is ``done``. This process and the others that serve remote
+    programs deliver it.
     """
 
     def __init__(
@@ -54,10 +61,14 @@ class Coordinator:
         hard_s: float = 10.0,
         deliver: Callable[[Step], None] = lambda _: None,
     ) -> None:
-        """``segment`` must be writable; of a process that delivers it is the one by which that holds its role.
+        """Prepare to move time; it is not taken over yet.
 
-        After ``soft_s`` the log and the page tell whom a step waits for, after ``hard_s`` it has failed.
-        ``deliver``: called within :meth:`step` when all have done it.
+        Args:
+            segment: The instance's segment, writable. A process that delivers steps passes the segment
+                object by which it holds its role.
+            soft_s: After this time the log and the clock page say which process a step waits for.
+            hard_s: After this time a step has failed.
+            deliver: Called within :meth:`step` when all sources have done it.
         """
         self._segment = segment
         self._soft_ns = round(soft_s * 1e9)
@@ -68,14 +79,18 @@ class Coordinator:
         self._owns = False
 
     def read(self) -> ClockState:
-        """The clock page as it is now."""
+        """Read the clock page."""
         return self._segment.clock.read()
 
     def take_over(self, patience_s: float = 0.0, *, steps: bool = False) -> None:
-        """From now on only steps move time. TimeError: another living process owns it, and plays, or goes on owning it.
+        """Take over time: from now on only steps move it.
 
-        ``patience_s``: how long to wait for one that does not play. ``steps``: the first one follows at once, so that
-        there is nothing to say of time that stands.
+        Args:
+            patience_s: How long to wait for an owner that does not play.
+            steps: Whether a step follows at once, so that no note about stopped time is needed.
+
+        Raises:
+            TimeError: Another living process owns time, and plays it or does not give it up.
         """
         with self._turn:
             if self._owns:
@@ -88,8 +103,8 @@ class Coordinator:
             note = f"step {state.step} was not finished: who asked for it has ended" if state.stepping else state.note
             state = state._replace(owner=os.getpid(), playing=False, stepping=False, note=note)
             if not state.virtual:
-                # Who free-runs looks at the page before each cycle: none begins after this write, so that none of
-                # theirs is later than the present one, as it is found once more after it.
+                # A free-running source reads the page before each cycle, so none starts a cycle after this
+                # write. The present cycle, determined again afterwards, is therefore the last one.
                 self._write(self._frozen(state))
                 state = self._frozen(state._replace(note="" if steps else take_over_note(self._participants())))
             self._write(state)
@@ -97,9 +112,13 @@ class Coordinator:
                 self._segment.clock.slot_bell(slot.index).ring()
 
     def release(self, patience_s: float = 0.0) -> None:
-        """Have time be real again, from where it stands; it is nobody's then. Nothing, if it is real already.
+        """Return to real time, which goes on from the present virtual time. Nobody owns it then.
 
-        ``patience_s`` as of :meth:`take_over`. TimeError: another living process owns time, or it was never real.
+        Args:
+            patience_s: How long to wait for an owner that does not play.
+
+        Raises:
+            TimeError: Another living process owns time, or time was virtual from the start.
         """
         with self._turn:
             self.check_release()
@@ -108,7 +127,7 @@ class Coordinator:
             clock = self._segment.clock
             state = clock.told()
             if state.virtual:
-                # Each source looks at the page before it publishes: none of theirs is later than this.
+                # Each source reads the page before it publishes, so no frame is later than this.
                 offset_ns = state.time_ns - (time.monotonic_ns() - self._segment.header.started_ns)
                 self._write(
                     state._replace(
@@ -118,12 +137,12 @@ class Coordinator:
                 )  # fmt: skip
             self._segment.shared.unlock(self._lock_byte)
             self._owns = False
-            clock.bell.ring()  # once more: who waits for the lock
+            clock.bell.ring()  # again, for a process that waits for the lock
             for slot in self._segment.processes:
                 clock.slot_bell(slot.index).ring()
 
     def check_release(self) -> None:
-        """TimeError: time cannot be released here, whoever owns it."""
+        """Raise TimeError if time cannot be released here, whoever owns it."""
         if not self._segment.shared.writable:
             raise TimeError("this attachment only reads: attach with writable=True")
         if self._segment.clock.stepped:
@@ -133,9 +152,11 @@ class Coordinator:
             )
 
     def set_step_size(self, dt_ns: int) -> None:
-        """How far a step goes that does not say it itself; takes time over.
+        """Set the default length of a step; takes over time.
 
-        ValueRangeError: not within 1 us and 1 h; TimeError.
+        Raises:
+            ValueRangeError: The length is not within 1 us and 1 h.
+            TimeError: Another process owns time.
         """
         check_step(dt_ns)
         with self._turn:
@@ -143,9 +164,11 @@ class Coordinator:
             self._write(self.read()._replace(step_size_ns=dt_ns))
 
     def set_playing(self, playing: bool, rate: float = 1.0) -> None:
-        """Tell that steps come by themselves, at ``rate`` times real time, or no longer; takes time over.
+        """Announce that the owner plays time at ``rate`` times real time, or no longer; takes over time.
 
-        ValueRangeError: the rate is not above 0, at most 1000; TimeError.
+        Raises:
+            ValueRangeError: The rate is not above 0 and at most 1000.
+            TimeError: Another process owns time.
         """
         if not 0 < rate <= MAX_RATE:
             raise ValueRangeError(f"a rate is above 0, at most {MAX_RATE:g}, not {rate:g}")
@@ -154,11 +177,17 @@ class Coordinator:
             self._write(self.read()._replace(playing=playing, rate=rate))
 
     def step(self, dt_ns: int | None = None) -> Step:
-        """Move time by ``dt_ns`` (default: the step size), and wait until all have done so; takes time over.
+        """Move time by one step, and wait until it is done and delivered; takes over time.
 
-        TimeError: another process owns time, or a participant or a dispatcher has not answered within the hard
-        time-out, or a participant has failed; then the step's number and time are used up. ValueRangeError: not within
-        1 us and 1 h.
+        A step that fails uses up its number and its time.
+
+        Args:
+            dt_ns: Length of the step; None: the step size.
+
+        Raises:
+            TimeError: Another process owns time, a source failed, or a source or a delivering process
+                did not answer within the hard time-out.
+            ValueRangeError: The length is not within 1 us and 1 h.
         """
         with self._turn, closing(self.stepping(dt_ns)) as stepping:
             while True:
@@ -173,9 +202,10 @@ class Coordinator:
                     block.ring.wait(seen, rest_ns)
 
     def stepping(self, dt_ns: int | None = None) -> Generator[StepWait, None, Step]:
-        """:meth:`step` for an event loop: it yields what to wait for, and looks again when it is asked to go on.
+        """Do a step for an event loop: yields what to wait for, and checks again when resumed.
 
-        Whoever does not go on to its end has to close it. Nothing else of this coordinator may be called meanwhile.
+        Close the generator if you do not run it to its end. Call no other method of this coordinator
+        meanwhile.
         """
         self.take_over(steps=True)
         before = self.read()
@@ -187,7 +217,7 @@ class Coordinator:
         asked = before._replace(step=step.number, time_ns=step.time_ns, dt_ns=dt_ns, stepping=True, note="")
         problem = "it was broken off"
         try:
-            self._segment.clock.write(asked, ring=False)  # those who deliver it have time until it is done
+            self._segment.clock.write(asked, ring=False)  # delivering processes need to act only once it is done
             self._ring([block.source for block in participants])
             problem = yield from self._await_frames(step.number, participants, asked)
         finally:
@@ -202,14 +232,14 @@ class Coordinator:
         return step
 
     def close(self) -> None:
-        """Give time up to whoever takes it over next; until then it stands."""
+        """Give up the ownership of time, which stands still until another program takes it over."""
         with self._turn:
             if not self._owns or self._segment.closed:
                 return
             self._write(self.read()._replace(owner=0, playing=False))
             self._segment.shared.unlock(self._lock_byte)
             self._owns = False
-            self._segment.clock.bell.ring()  # once more: who waits for the lock
+            self._segment.clock.bell.ring()  # again, for a process that waits for the lock
 
     def _write(self, state: ClockState) -> None:
         self._segment.clock.write(state)
@@ -229,7 +259,7 @@ class Coordinator:
             bell.wait(seen, min(rest_ns, TURN_NS))
 
     def _frozen(self, state: ClockState) -> ClockState:
-        """Virtual time that goes on from now, and from this state of wall time."""
+        """Return the state of virtual time that continues wall time from now."""
         now_ns = self._segment.clock_ns(time.monotonic_ns()) + state.offset_ns
         step = max([state.step, *(self._cycle(block, state, now_ns) for block in self._participants())])
         return state._replace(mode=ClockMode.VIRTUAL, step=step, done=step, time_ns=now_ns, resumed_ns=0, offset_ns=0)
@@ -240,9 +270,9 @@ class Coordinator:
 
     @staticmethod
     def _cycle(block: Block, state: ClockState, now_ns: int) -> int:
-        """The present cycle of a block that has free-run, or a later one if it has published such.
+        """Return the present cycle of a free-running block, or a later one that it has published.
 
-        One that plays a recording has the recording's cycles, which are no steps.
+        For a block that replays a recording it is 0: the recording's cycles are not steps.
         """
         if block.playhead is not None:
             return 0
@@ -257,7 +287,7 @@ class Coordinator:
     def _await_frames(
         self, number: int, participants: Sequence[Block], asked: ClockState
     ) -> Generator[StepWait, None, str]:
-        """Wait for the frame of each for this step; who has failed or not answered, and why; empty: nobody."""
+        """Wait for each block's frame for a step; returns who failed and why, or an empty string."""
         begun_ns = time.monotonic_ns()
         waiting = list(participants)
         problems: list[str] = []
@@ -285,7 +315,7 @@ class Coordinator:
         return "; ".join(problems)
 
     def _await_delivery(self, number: int) -> Generator[StepWait, None, str]:
-        """Wait until the other dispatchers have delivered a step; who has not, or empty."""
+        """Wait until the other processes have delivered a step; returns who has not, or an empty string."""
         clock, begun_ns, told = self._segment.clock, time.monotonic_ns(), False
         rung = False
         while True:
@@ -303,23 +333,23 @@ class Coordinator:
             if passed_ns >= self._soft_ns and not told:
                 told = True
                 log.warning("step %d waits for its delivery by %s", number, names)
-            # In turns: one that dies rings no bell.
+            # With a time limit: a process that dies rings no bell.
             yield StepWait(None, seen, min(self._soft_ns, self._hard_ns - passed_ns))
 
     def _owes(self, slot: ProcessSlot, number: int) -> bool:
-        """Whether another process delivers steps, lives, and has not delivered this one yet."""
+        """Whether another living process delivers steps and has not delivered this one yet."""
         if slot.kind not in DISPATCHERS:
             return False
         last = self._segment.clock.delivered(slot.index)
         return last is not None and last < number and slot.alive()  # our own lock does not count as one held
 
     def _owner(self, pid: int) -> str:
-        """Who owns time, as far as the page and the process table tell."""
+        """Name the owner of time, by the clock page and the process table."""
         names = [slot.name for slot in self._segment.processes if pid and slot.report.pid == pid and slot.alive()]
         return f"{names[0]} (pid {pid})" if names else f"another program (pid {pid})"
 
 
 def check_step(dt_ns: float) -> None:
-    """ValueRangeError: it is no length of a step."""
+    """Raise ValueRangeError if a step may not have this length."""
     if not MIN_STEP_NS <= dt_ns <= MAX_STEP_NS:
         raise ValueRangeError(f"a step is from 0.001 ms to 3600000 ms (1 h), not {dt_ns / 1e6:g} ms")

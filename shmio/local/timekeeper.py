@@ -1,4 +1,4 @@
-"""How a local program moves an instance's time: step by step, or at a pace."""
+"""Control an instance's time from a local program: step it, play it, release it."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ from shmio.segment.clock import ClockState
 from shmio.segment.segment import Segment
 
 PATIENCE_S: Final = 2.0
-"""So long is waited for a program that owns time to give it up; the gRPC endpoint does when its clients rest."""
+"""How long to wait for the owner of time to give it up; the gRPC endpoint does when its clients are idle."""
 LATE_NS: Final = 500_000_000
-"""What is late is caught up with, up to this."""
+"""Playing catches up with at most this much delay."""
 
 
 class Timekeeper:
-    """Owns time from the first step on until it is closed. For one thread, beside which it plays in one of its own."""
+    """Steps or plays an instance's time, and owns that time from the first step until it is closed.
+
+    Use it from one thread; it plays in a thread of its own.
+    """
 
     def __init__(self, segment: Segment) -> None:
-        """``segment``: writable."""
+        """``segment`` must be writable."""
         self._segment = segment
         self._coordinator = Coordinator(segment)
         self._paused = threading.Event()
@@ -30,14 +33,14 @@ class Timekeeper:
         self._failure: ShmioError | None = None
 
     def step(self, dt_ns: int | None = None) -> Step:
-        """See :meth:`Coordinator.step`. TimeError, too, while time is played."""
+        """Move time by one step, as :meth:`Coordinator.step` does. TimeError: also while time is played."""
         if self._player is not None:
             raise TimeError("time is played: pause it before it can be stepped")
         self._take_over()
         return self._coordinator.step(dt_ns)
 
     def play(self, rate: float = 1.0, dt_ns: int | None = None) -> None:
-        """Step from now on by itself, ``rate`` times as fast as real time. TimeError, ValueRangeError."""
+        """Step in a thread, ``rate`` times as fast as real time. TimeError, ValueRangeError."""
         if dt_ns is not None:
             check_step(dt_ns)
         self.pause()
@@ -47,7 +50,11 @@ class Timekeeper:
         self._player.start()
 
     def pause(self) -> None:
-        """Have time stand; take it over if need be. TimeError, too, of a step that has failed while it was played."""
+        """Stop playing, and take over time if this program does not own it.
+
+        Raises:
+            TimeError: Another program owns time, or a step failed while time was played.
+        """
         self._take_over()
         player, self._player = self._player, None
         if player is not None:
@@ -59,7 +66,7 @@ class Timekeeper:
             raise failure
 
     def release(self) -> None:
-        """Have time be real again. TimeError, also of a step that has failed while it was played."""
+        """Return to real time. TimeError: also if a step failed while time was played."""
         self._check_running()
         self._coordinator.check_release()
         if self._player is not None:
@@ -67,7 +74,7 @@ class Timekeeper:
         self._coordinator.release(PATIENCE_S)
 
     def close(self) -> None:
-        """Stop playing, and give time up."""
+        """Stop playing, and give up the ownership of time."""
         try:
             if self._player is not None:
                 self.pause()
@@ -97,48 +104,75 @@ class Timekeeper:
 
 
 class TimeMethods:
-    """The part of an attachment that has to do with time."""
+    """The methods of an attachment that control time and replays."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._time = Timekeeper(segment)
         self.replay = Replays(segment)
-        """What plays recordings, and moves them; the attachment must be ``writable`` to do more than look."""
+        """The instance's replays. The attachment must be ``writable`` to change them."""
 
     @property
     def clock(self) -> ClockState:
-        """The instance's clock as it is now: wall time, or virtual time with its last step."""
+        """State of the instance's clock: wall time, or virtual time with its last step."""
         return self._segment.clock.read()
 
     def step(self, dt_s: float | None = None) -> Step:
-        """Move time by ``dt_s`` (default: the step size), and wait until all sources on the clock have done so.
+        """Move time by one step, and wait until all sources that use the instance clock have done it.
 
-        From the first call on, of this or :meth:`pause` or :meth:`play`, only steps move time; this program owns it
-        until it detaches, or calls :meth:`release`. The attachment must be ``writable``. TimeError: another program
-        owns time, or the step failed: who did not answer or failed, and why; ValueRangeError: not within 1 us and 1 h.
+        The first call of this method, :meth:`pause` or :meth:`play` takes over time: from then on only
+        steps move it. This program owns time until it detaches or calls :meth:`release`.
+        The attachment must be ``writable``.
+
+        Args:
+            dt_s: Length of the step in s, from 1 us to 1 h; None: the step size.
+
+        Returns:
+            The step that was done.
+
+        Raises:
+            TimeError: Another program owns time, or the step failed; the message says who failed or
+                did not answer.
+            ValueRangeError: The length is not within 1 us and 1 h.
         """
         return self._time.step(_ns(dt_s))
 
     def play(self, rate: float = 1.0, dt_s: float | None = None) -> None:
-        """Step from now on ``rate`` times as fast as real time, until :meth:`pause`. TimeError, ValueRangeError."""
+        """Step time in a thread until :meth:`pause`.
+
+        Args:
+            rate: How many times as fast as real time; above 0, at most 1000.
+            dt_s: Length of a step in s; None: the step size.
+
+        Raises:
+            TimeError: Another program owns time.
+            ValueRangeError: The rate or the length is out of range.
+        """
         self._time.play(rate, _ns(dt_s))
 
     def pause(self) -> None:
-        """Have time stand. TimeError: another program owns it, or a step failed while it was played."""
+        """Stop time until it is stepped or played.
+
+        Raises:
+            TimeError: Another program owns time, or a step failed while time was played.
+        """
         self._time.pause()
 
     def release(self) -> None:
-        """Have time be real again: it goes on from where it stands, and this program owns it no more.
+        """Return to real time, which goes on from the present virtual time.
 
-        Nothing, if it is real. TimeError: another program owns time, it was virtual from the instance's start, or a
-        step failed while it was played.
+        This program gives up the ownership of time. If time is real, nothing happens.
+
+        Raises:
+            TimeError: Another program owns time, time was virtual from the instance's start, or a
+                step failed while time was played.
         """
         self._time.release()
 
 
 def _ns(dt_s: float | None) -> int | None:
-    """The length of a step; ValueRangeError."""
+    """Check the length of a step, and convert it to ns; ValueRangeError."""
     if dt_s is None:
         return None
-    check_step(dt_s * 1e9)  # before it is made a whole number: infinity is none
+    check_step(dt_s * 1e9)  # before rounding, which fails for infinity
     return round(dt_s * 1e9)

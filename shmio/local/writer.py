@@ -1,4 +1,4 @@
-"""A writer's side as programs use it: values by path out, what became of them back."""
+"""Send commands to a source by path, and wait for their outcomes."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ if TYPE_CHECKING:
 
 TIMEOUT_S: Final = 2.0
 MIN_PERIODS: Final = 3
-"""A command may wait for its source so long, or so many cycles if that is longer, unless told otherwise."""
+"""By default a command may wait for TIMEOUT_S or this many cycles, whichever is longer."""
 _MODELS: Final = frozenset({"simulation", "remote"})  # connectors whose sources have registers that nobody writes
 PATIENCE_S: Final = 1.0
-"""What is added for the device's answer to arrive."""
+"""Additional time for the device's answer to arrive."""
 RETIRED: Final = "the source was changed or removed by a reload"
 _UNKNOWN: Final = "; it is not known whether the value was written"
 RESTARTED: Final = f"the source was restarted meanwhile{_UNKNOWN}"
@@ -38,7 +38,13 @@ SILENT: Final = f"the source gave no answer in time{_UNKNOWN}"
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of one value. ``text``: the reason, if there is one to give."""
+    """The outcome of one written value.
+
+    Attributes:
+        path: Path within the source.
+        kind: The event that ended the write.
+        text: The reason, if there is one.
+    """
 
     path: str
     kind: EventKind
@@ -46,24 +52,24 @@ class Outcome:
 
     @property
     def done(self) -> bool:
-        """Whether the device confirmed it or an injection took it in the device's place; of a shadow's, it is seen."""
+        """Whether the device confirmed the value, an injection took it, or consumers see it."""
         return self.kind in DONE
 
 
 @dataclass(slots=True)
 class PendingCommand:
-    """A command under way: its number, and where in the events its outcome will be looked for."""
+    """A command whose outcome is not known yet, with the event cursor that will find it."""
 
     number: int
     paths: tuple[str, ...]
-    """What each item of the command writes; neighbours with one path are one value's."""
+    """The path that each item writes; adjacent items with the same path belong to one value."""
     incarnation: int
     until_ns: int
     events: Cursor[Event]
 
     @property
     def values(self) -> list[tuple[str, range]]:
-        """Of each value its path, and its items."""
+        """Path and items of each value."""
         values, first = [], 0
         for path, group in groupby(self.paths):
             stop = first + len(list(group))
@@ -73,25 +79,31 @@ class PendingCommand:
 
 
 class SourceWriter:
-    """Writes registers of one block in the name of one writer. Several threads may use it."""
+    """Sends one writer's commands to a source, and waits for their outcomes.
+
+    Several threads may use it.
+    """
 
     def __init__(self, block: Block, writer: int) -> None:
         self.block = block
         self._sender = CommandSender(block, writer)
 
     def prepare(self) -> None:
-        """Find out what is writable, which takes seconds for a big layout; else the first :meth:`submit` does it."""
+        """Compute which bits are writable, so that the first :meth:`submit` need not.
+
+        This takes seconds for a large layout.
+        """
         _ = self._writable
 
     def is_writable(self, register: Register) -> bool:
-        """Whether the configuration lets a register, or an array's element, be written as a whole."""
+        """Whether the configuration allows all of a register or array element to be written."""
         own = bits_of(register)
         allowed = self._writable[register.offset : register.offset + register.size]
         return not any(bits & ~covered for bits, covered in zip(own, allowed, strict=True))
 
     @property
     def timeout_s(self) -> float:
-        """How long a command may wait, unless told otherwise."""
+        """Default time that a command may wait for the source."""
         return max(TIMEOUT_S, MIN_PERIODS * self.block.period_ns / 1e9)
 
     @cached_property
@@ -99,23 +111,34 @@ class SourceWriter:
         return cover(self.block.layout, self.block.attributes.writable)
 
     def submit(self, values: Mapping[str, object], timeout_s: float | None = None) -> PendingCommand:
-        """Send values of registers, whole arrays or elements by their paths in the block, as one command.
+        """Send values as one command, without waiting. The source accepts all of them or none.
 
-        All or none is accepted by the source. PathError: no such register; CommandError: not writable, or the source
-        takes nothing; ValueRangeError: a value does not fit. Nothing has been sent then. Never waits.
+        Args:
+            values: Values of registers, whole arrays or elements, by path within the block.
+            timeout_s: How long the command may wait for the source; None: :attr:`timeout_s`.
+
+        Raises:
+            PathError: There is no such register.
+            ValueRangeError: A value does not fit its register.
+            CommandError: A register is not writable, or the queue has no room.
+                After any of these errors nothing has been sent.
         """
         return self._send_values({path: (self._register(path), value) for path, value in values.items()}, timeout_s)
 
     def shadow(self, injection: int, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
-        """Give values as an injection's: to consumers if it lies over ``/out``, toward the device if over ``/in``.
+        """Give values to an injection: for consumers if it is over ``/out``, for the device if over ``/in``.
 
-        PathError, ValueRangeError, CommandError: nothing has been sent.
+        Raises:
+            PathError: There is no such register.
+            ValueRangeError: A value does not fit its register.
+            CommandError: The queue has no room.
+                After any of these errors nothing has been sent.
         """
         found = {path: (find(self.block.layout, path), value) for path, value in values.items()}
         return self.outcomes(self._send_values(found, timeout_s, CommandKind.SHADOW, injection))
 
     def joined(self, values: Mapping[str, object], raw: Iterable[Write] = ()) -> list[Write]:
-        """The writes of values and of ``raw`` bytes, neighbours as one. PathError, ValueRangeError."""
+        """Encode values, add ``raw`` writes, and merge adjacent ones. PathError, ValueRangeError."""
         image, bits = bytearray(self.block.layout.size), bytearray(self.block.layout.size)
         ranges = []
         writes = list(raw)
@@ -128,14 +151,18 @@ class SourceWriter:
         return merge(image, bits, ranges)
 
     def give(self, injection: int, writes: Sequence[Write], timeout_s: float | None = None) -> PendingCommand:
-        """Send what :meth:`joined` gives as an injection's: items are not values. CommandError: not sent."""
+        """Send the writes of :meth:`joined` as an injection's values. CommandError: not sent."""
         return self._send(("",) * len(writes), writes, timeout_s, CommandKind.SHADOW, injection)
 
     def inject(self, patterns: Iterable[str], timeout_s: float | None = None, **laid: Unpack[InjectionOptions]) -> int:
-        """Lay an injection over all that the patterns name (see :func:`shmio.layout.values.write.cover`); its number.
+        """Lay an injection over all registers that patterns name; returns its number.
 
-        Consumers see what they saw, until it gives values. PathError: there is no such register; CommandError: the
-        source refuses, or does not answer.
+        Consumers see no difference until it is given values. See
+        :func:`shmio.layout.values.write.cover` for the patterns.
+
+        Raises:
+            PathError: There is no such register.
+            CommandError: The source refuses, or does not answer.
         """
         bits = cover(self.block.layout, patterns)
         if not any(bits):
@@ -147,16 +174,19 @@ class SourceWriter:
     def lay(
         self, bits: Sequence[Write], timeout_s: float | None = None, **laid: Unpack[InjectionOptions]
     ) -> PendingCommand:
-        """Ask for an injection over what these writes would set, whose number is the ticket's. Never waits.
+        """Request an injection over the bits that these writes would set, without waiting.
 
-        CommandError: not sent.
+        The injection's number is that of the returned command. CommandError: not sent.
         """
         return self._send(("",), bits, timeout_s, CommandKind.INJECT, **laid)
 
     def declare(self, declaration: Declaration, timeout_s: float | None = None, *, keep: bool = False) -> int:
-        """Lay an injection that the source runs by itself; its number. It goes with this process, unless ``keep``.
+        """Lay an injection that the source runs by itself; returns its number.
 
-        The declaration is checked by the source. CommandError: it refuses, and says why, or does not answer.
+        Unless ``keep`` is set it ends with this process. The source checks the declaration.
+
+        Raises:
+            CommandError: The source refuses, with the reason, or does not answer.
         """
         ticket = self.ask_to_declare(declaration, timeout_s, keep=keep)
         self._expect(ticket, EventKind.INJECTED)
@@ -165,12 +195,20 @@ class SourceWriter:
     def ask_to_declare(
         self, declaration: Declaration, timeout_s: float | None = None, *, keep: bool = False
     ) -> PendingCommand:
-        """The first half of :meth:`declare`; the number will be the ticket's. CommandError: not sent. Never waits."""
+        """Request a declared injection, without waiting. CommandError: not sent.
+
+        The injection's number is that of the returned command.
+        """
         writes = [Write(0, 0, msgspec.json.encode(declaration))]
         return self._send(("",), writes, timeout_s, CommandKind.DECLARE, keep=keep, name=declaration.name)
 
     def note(self, text: str, timeout_s: float | None = None) -> None:
-        """Put a note into the source's events. ValueRangeError: empty, too long, no text; CommandError: no answer."""
+        """Add a note to the source's events.
+
+        Raises:
+            ValueRangeError: The note is empty, too long, or not UTF-8 text.
+            CommandError: The source does not answer.
+        """
         try:
             size = len(text.encode())
         except UnicodeEncodeError as error:  # a terminal that is not UTF-8
@@ -180,15 +218,15 @@ class SourceWriter:
         self._expect(self._send(("",), [], timeout_s, CommandKind.NOTE, name=text), EventKind.NOTED)
 
     def lift(self, injection: int, timeout_s: float | None = None) -> None:
-        """Lift an injection, whoever laid it. CommandError: there is none, or the source does not answer."""
+        """Lift an injection, whoever laid it. CommandError: no such injection, or no answer."""
         self.expect_lifted(self.ask_to_lift(injection, timeout_s))
 
     def ask_to_lift(self, injection: int, timeout_s: float | None = None) -> PendingCommand:
-        """The first half of :meth:`lift`. CommandError: not sent. Never waits."""
+        """Request that an injection be lifted, without waiting. CommandError: not sent."""
         return self._send(("",), [], timeout_s, CommandKind.LIFT, injection)
 
     def expect_lifted(self, ticket: PendingCommand) -> None:
-        """The second half of :meth:`lift`."""
+        """Wait until a requested lift is done. CommandError: the source refuses, or does not answer."""
         self._expect(ticket, EventKind.LIFTED)
 
     def _expect(self, ticket: PendingCommand, kind: EventKind) -> None:
@@ -232,7 +270,7 @@ class SourceWriter:
         return PendingCommand(number, paths, incarnation, deadline_ns + round(PATIENCE_S * 1e9), events)
 
     def outcomes(self, ticket: PendingCommand) -> list[Outcome]:
-        """Wait until all is over and say what became of each value, in the order they were given."""
+        """Wait until a command has ended; returns the outcome of each value, in the given order."""
         open_items = set(range(len(ticket.paths)))
         ends: dict[int, Event] = {}
         while open_items and (event := self._next(ticket)) is not None:
@@ -249,7 +287,7 @@ class SourceWriter:
         return outcomes
 
     def write(self, values: Mapping[str, object], timeout_s: float | None = None) -> list[Outcome]:
-        """:meth:`submit` and wait for the :meth:`outcomes`."""
+        """Send values as one command, and wait for their outcomes; raises as :meth:`submit`."""
         return self.outcomes(self.submit(values, timeout_s))
 
     def _register(self, path: str) -> Register:
@@ -258,7 +296,7 @@ class SourceWriter:
         return register
 
     def check(self, register: Register) -> None:
-        """CommandError: it is not writable."""
+        """Raise CommandError if a register is not writable."""
         if not self.is_writable(register):
             remedy = "the configuration has to name it in the source's `writable`"
             if self.block.attributes.connector in _MODELS:
@@ -266,7 +304,7 @@ class SourceWriter:
             raise CommandError(f"{self.block.source}/{register.path} is not writable; {remedy}")
 
     def _next(self, ticket: PendingCommand) -> Event | None:
-        """The next event about the command; None when none will come, or not in time."""
+        """Return the next event about a command; None if none comes in time."""
         while (rest_ns := ticket.until_ns - time.monotonic_ns()) > 0:
             event = ticket.events.next(rest_ns / 1e9)
             if event is None:
@@ -274,7 +312,7 @@ class SourceWriter:
             if event.command == ticket.number and event.writer == self._sender.writer:
                 return event
             if event.kind == EventKind.STARTED and event.incarnation != ticket.incarnation:
-                # A successor reports what its predecessor had not taken; of what it had taken nobody knows.
+                # The new process reports commands that the old one had not taken; the others stay unknown.
                 ticket.until_ns = min(ticket.until_ns, time.monotonic_ns() + round(PATIENCE_S * 1e9))
         return None
 

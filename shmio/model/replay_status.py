@@ -1,4 +1,4 @@
-"""How a source plays its recording, as local programs and those on other hosts are told."""
+"""Status of a source that replays a recording, for local programs and clients alike."""
 
 from __future__ import annotations
 
@@ -7,10 +7,20 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Playing:
-    """One source. ``time_s``: UTC of the position; ``position_s``: from the begin of what is played.
+    """Status of one source that replays a recording.
 
-    ``until_s``: where it is to pause; None: at the end. ``over``: it has come to that. ``paused`` or not, it moves only
-    as the instance's clock does.
+    Unless it is paused, the position moves as the instance's clock does.
+
+    Attributes:
+        source: Name of the source.
+        time_s: UTC of the position, in s.
+        position_s: The position, in s from the start of the played range.
+        length_s: Length of the played range, in s.
+        speed: Speed relative to the instance's clock.
+        paused: Whether the replay is paused.
+        loop: Whether it starts again at the end.
+        over: Whether it has reached the end.
+        until_s: The position at which it will pause, in s; None: at the end.
     """
 
     source: str
