@@ -1,4 +1,4 @@
-"""A source's block: its layout, its rings of frames, events and commands; for readers and for its one writer."""
+"""The block of a source: its layout and its rings of frames, events and commands."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def _frame(fields: FrameTuple) -> Frame:
         clock_ns,
         source_ns,
         incarnation,
-        # From shared memory: what is unknown is bad.
+        # The bytes come from another process: an unknown quality counts as bad.
         _QUALITIES[quality] if quality < len(_QUALITIES) else Quality.BAD,
         _PROVENANCES[provenance] if provenance < len(_PROVENANCES) else Provenance.SIMULATED,
         event,
@@ -57,30 +57,30 @@ def _frame(fields: FrameTuple) -> Frame:
 
 @dataclass(frozen=True, slots=True)
 class Attributes:
-    """What the configuration says of a source, as far as others want to know."""
+    """The part of a source's configuration that other processes need."""
 
     connector: str = ""
     writable: tuple[str, ...] = ()
-    """Patterns of what may be written."""
+    """Patterns of the registers that may be written."""
     armed: bool = False
     """Whether an injection may reach the device."""
     stepped: bool = False
-    """Whether it lives on the instance's clock: in virtual time it publishes a frame for each step."""
+    """Whether the source uses the instance clock: in virtual time it publishes a frame for each step."""
     outputs: tuple[str, ...] = ()
-    """Patterns of what a program elsewhere computes."""
+    """Patterns of the registers that a remote model computes."""
     inouts: tuple[str, ...] = ()
-    """Patterns of what it is given, and computes what that shows."""
+    """Patterns of the registers that a remote model both reads and computes."""
     replay: bool = False
-    """Whether it plays a recording."""
+    """Whether the source replays a recording."""
 
     @property
     def remote(self) -> bool:
-        """Whether a program elsewhere computes registers of it."""
+        """Whether a remote model computes registers of the source."""
         return bool(self.outputs or self.inouts)
 
 
 class Stamp(NamedTuple):
-    """When something was published, comparable to CLOCK_MONOTONIC, and the instance's clock then; UTC of an event."""
+    """Times of a publication: comparable to CLOCK_MONOTONIC, by the instance's clock, and, for an event, in UTC."""
 
     publish_ns: int
     clock_ns: int
@@ -88,9 +88,9 @@ class Stamp(NamedTuple):
 
 
 class Block:
-    """Reading side of a block. Needs nothing from the writer and leaves no trace with it.
+    """Reading side of a block. Reading leaves the writer undisturbed.
 
-    A Block may be used from several threads; a :class:`Cursor` belongs to one.
+    Several threads may use a block; a :class:`Cursor` belongs to one thread.
     """
 
     def __init__(
@@ -111,66 +111,67 @@ class Block:
     ) -> None:
         self.source = source
         self.section = section
-        """Index of its layout's section: tells the blocks of one run of the instance apart."""
+        """Index of the layout's section; unique among the blocks of one run of the instance."""
         self.layout = layout
         self.ring = ring
         self.events = EventRing(events, retired)
         self.commands = commands
         self.standing = standing
-        """The injections that stand on it at present."""
+        """The present injections of the source."""
         self.declared = declared
-        """Those that the configuration has for it."""
+        """The injections that the configuration declares for the source."""
         self.attributes = attributes
         self.clock = clock
         self.model_channel = model_channel
-        """Toward the program elsewhere that computes it; None: it is no such block."""
+        """The channel to a remote model; None if no remote model computes the block."""
         self.playhead = playhead
-        """Of the recording that it plays; None: it plays none."""
+        """The playhead of the replayed recording; None if the block replays none."""
         self._retired = retired
 
     @property
     def retired(self) -> bool:
-        """Whether a reload has ended this block: nothing is written to it any more."""
+        """Whether a reload has retired this block: nothing more is written to it."""
         return self._retired()
 
     @property
     def incarnation(self) -> int:
-        """How many processes have written here, one after another; commands name the one they are for."""
+        """Number of the process that writes here, counted from 1; a command names the one it is for."""
         return self.ring.incarnation
 
     @property
     def period_ns(self) -> int:
-        """Time between two cycles."""
+        """Time between two cycles, in ns."""
         return self.ring.period_ns
 
     @property
     def stale_ns(self) -> int:
-        """Age from which a frame is bad."""
+        """Age above which a frame is bad, in ns."""
         return self.ring.stale_ns
 
     def now_ns(self) -> int:
-        """What the ages of its frames are taken against: the playhead, the instance's clock or CLOCK_MONOTONIC."""
+        """Return the present time by which frames age: that of the playhead, the instance clock or CLOCK_MONOTONIC."""
         if self.playhead is not None:
             return self.playhead.now_ns()
         return self.clock.now_ns() if self.attributes.stepped else time.monotonic_ns()
 
     def assess(self, frame: Frame) -> tuple[Quality, str]:
-        """Quality of a frame of this block as of now, and its reason."""
+        """Return a frame's quality as of now, and the reason if it is not good."""
         return frame.assess(self.stale_ns, self.now_ns())
 
     def came_with(self, frame: Frame, step: int) -> bool:
-        """Whether a frame came with this step, the present one of virtual time, or a later one.
+        """Whether a frame was published for the present step of virtual time, or a later one.
 
-        Of a block that does not live on the instance's clock none does.
+        Always False for a block that does not use the instance clock.
         """
         if self.playhead is not None:
             return self.playhead.came_now(frame.number)
         return self.attributes.stepped and frame.cycle >= step
 
     def latest(self) -> Frame | None:
-        """A copy of the newest frame; None before the source has published its first.
+        """Return a copy of the newest frame; None if the source has not published one yet.
 
-        SegmentError when no stable copy could be made: the writer overtook the reader at every attempt.
+        Raises:
+            SegmentError: The writer overtook the reader at every attempt to copy.
         """
         fields = self.ring.latest()
         if fields is not None:
@@ -182,36 +183,42 @@ class Block:
         )
 
     def read(self, number: int) -> Frame | None:
-        """A copy of one frame by its number; None when the ring does not hold it."""
+        """Return a copy of the frame with this number; None if the ring does not hold it."""
         fields = self.ring.read(number)
         return None if fields is None else _frame(fields)
 
     def cursor(self, *, after: int | None = None) -> Cursor[Frame]:
-        """A stream position behind frame ``after`` (default: the newest one, so that the next frame is news)."""
+        """Return a cursor that starts behind frame ``after`` (default: the newest one)."""
         return Cursor(self.ring, _frame, self.ring.head() if after is None else after, self._retired)
 
 
 class BlockWriter:
-    """Writing side of a block: exactly one, in its source's process; its threads take turns."""
+    """Writing side of a block. There is one, in the source's process; several threads may use it."""
 
     def __init__(self, block: Block, clock_ns: Callable[[int], int], at: Stamp | None = None) -> None:
-        """``clock_ns`` turns CLOCK_MONOTONIC into the instance's clock. ``at``: when the start is told."""
+        """Begin a new incarnation, and publish its start.
+
+        Args:
+            block: The block to write.
+            clock_ns: Converts CLOCK_MONOTONIC to the instance's clock.
+            at: Times of the start event; None: now.
+        """
         self.block = block
         self._clock_ns = clock_ns
         self._turn = threading.Lock()  # so that frames and events are in one order
         self.cycle = 0
-        """The present cycle, which events are stamped with."""
+        """The present cycle, used to stamp events."""
         self.at_ns: int | None = None
-        """What frames and events are stamped with in virtual time, comparable to CLOCK_MONOTONIC; None: now."""
+        """Publish time in virtual time, comparable to CLOCK_MONOTONIC; None: now."""
         self.utc_ns: Callable[[int], int] | None = None
-        """Turns such a time into UTC, which events are then stamped with, too."""
+        """Converts :attr:`at_ns` to UTC, which is then used for events."""
         self._quality = Quality.BAD
         self.incarnation = block.ring.begin()
         block.events.ring.begin(self.incarnation)
         self.event(Record(EventKind.STARTED, f"pid {os.getpid()}"), at=at)
 
     def now_ns(self) -> int:
-        """The time that a frame would be stamped with now."""
+        """Return the publish time that a frame would get now."""
         return self.block.now_ns() if self.at_ns is None else self.at_ns
 
     def publish(
@@ -227,11 +234,21 @@ class BlockWriter:
         asked_ns: int | None = None,
         at: Stamp | None = None,
     ) -> int:
-        """Publish one frame of ``layout.size`` bytes and wake its readers; returns its number.
+        """Publish a frame, and wake its readers.
 
-        ``source_ns`` is UTC, default now; 0: no image yet. ``reason`` says why quality is not
-        good; it is cut at 256 bytes. ``asked_ns`` (as :meth:`now_ns`): when the device was asked for the image, which
-        may be as old as that; default now. ``at``: when, other than now.
+        Args:
+            raw: The image that the source delivers, ``layout.size`` bytes.
+            cycle: Cycle of the source's schedule.
+            source_ns: The source's time stamp, UTC; None: now; 0: there is no image yet.
+            quality: Quality of the image.
+            provenance: Where the image comes from.
+            reason: Why the quality is not good; cut at 256 bytes.
+            effective: The image that consumers see; None: ``raw``.
+            asked_ns: When the device was asked for the image, as :meth:`now_ns`; None: now.
+            at: Times of the publication; None: now.
+
+        Returns:
+            The frame's number.
         """
         with self._turn:
             now_ns, clock_ns, _ = at or self._present()
@@ -257,9 +274,15 @@ class BlockWriter:
         return Stamp(now_ns, self._clock_ns(now_ns), self.utc_ns(now_ns))
 
     def event(self, record: Record, *, quality: Quality | None = None, at: Stamp | None = None) -> int:
-        """Publish one event and wake the readers of frames and events; returns its number.
+        """Publish an event, and wake the readers of frames and events.
 
-        ``quality``: the new one, for QUALITY; default: that of the last frame. ``at``: when, other than now.
+        Args:
+            record: The content of the event.
+            quality: The new quality, for a QUALITY event; None: that of the last frame.
+            at: Times of the publication; None: now.
+
+        Returns:
+            The event's number.
         """
         with self._turn:
             now_ns, clock_ns, utc_ns = at or self._present()

@@ -1,4 +1,4 @@
-"""What a segment is built from: its blocks, their sections, and all of it at once."""
+"""Build a segment: lay out its tables, blocks and sections, and write them."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from shmio.segment.shm import SharedObject
 from shmio.segment.standing_injections import CELL_SIZE
 
 RING_SECONDS = 8
-SECTIONS_PER_BLOCK = 8  # of one that has all
+SECTIONS_PER_BLOCK = 8  # of a block that has every kind
 SPARE_SECTIONS = 40 * SECTIONS_PER_BLOCK
-OWN_SECTIONS = 1  # that are no block's: the clock page
+OWN_SECTIONS = 1  # sections of the instance: the clock page
 SPARE_PROCESSES = 16 + GUEST_SLOTS
 EVENT_STRIDE = -(-(_atomics.RAW_OFFSET + EVENT_SIZE) // 64) * 64
 
@@ -36,9 +36,9 @@ _RING = struct.Struct("<8Iqq")
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Whose time an instance has that replays a recording.
+    """The time with which an instance starts that replays a recording.
 
-    ``clock_ns``: what its clock begins with. ``started_utc_ns``: UTC of clock 0.
+    ``clock_ns``: the clock at the start. ``started_utc_ns``: UTC of clock 0.
     """
 
     clock_ns: int
@@ -47,26 +47,26 @@ class Origin:
 
 @dataclass(frozen=True, slots=True)
 class BlockSpec:
-    """What a source's block is built from."""
+    """Specification of a source's block."""
 
     source: str
     layout: Layout
     period_ns: int
     stale_ns: int
     ring_bytes: int
-    """The most memory its frame ring may take."""
+    """Maximum size of the frame ring."""
     attributes: Attributes = field(default_factory=Attributes)
     declared: bytes = b""
-    """The injections that the configuration declares: a document of at most STANDING_SIZE bytes."""
+    """The declared injections, as a JSON document of at most STANDING_SIZE bytes."""
 
     @property
     def slot_bytes(self) -> int:
-        """Bytes of one slot: header, reason, room for raw and effective."""
+        """Bytes of one slot: header, reason, raw image and effective image."""
         return align(_atomics.RAW_OFFSET + 2 * align(self.layout.size, 8), 64)
 
     @property
     def slots(self) -> int:
-        """Frames in the ring: 8 s of them, rounded up to a power of two, at least 8, as far as the memory allows."""
+        """Number of frames in the ring: 8 s, rounded up to a power of two, within the memory limit; at least 8."""
         wanted = max(8, RING_SECONDS * 1_000_000_000 // self.period_ns)
         slots: int = 1 << (wanted - 1).bit_length()
         while slots > 8 and slots * self.slot_bytes > self.ring_bytes:
@@ -75,11 +75,11 @@ class BlockSpec:
 
     @property
     def size(self) -> int:
-        """Bytes of all its sections."""
+        """Bytes of all sections of the block."""
         return sum(align(size, 64) for _, size, _ in self.sections())
 
     def sections(self) -> list[tuple[SectionKind, int, bytes]]:
-        """Kind, bytes, and how they begin, of each section; the rest is zeros."""
+        """Return kind, size in bytes and first bytes of each section; the rest is zeros."""
         layout, attributes = self.layout.to_json(), msgspec.json.encode(self.attributes)
         effective = _atomics.RAW_OFFSET + align(self.layout.size, 8)
         frames = _RING.pack(
@@ -105,7 +105,10 @@ class BlockSpec:
 
 
 def write_blocks(memory: memoryview, at: int, first: int, blocks: Sequence[BlockSpec]) -> list[SectionEntry]:
-    """Write the sections of blocks from offset ``at`` on; their entries, from number ``first`` on."""
+    """Write the sections of blocks from offset ``at`` on; returns their table entries.
+
+    ``first`` is the table index of the first entry.
+    """
     entries: list[SectionEntry] = []
     for block in blocks:
         layout = first + len(entries)
@@ -119,9 +122,9 @@ def write_blocks(memory: memoryview, at: int, first: int, blocks: Sequence[Block
 
 
 def wake(memory: memoryview, entries: Iterable[SectionEntry]) -> None:
-    """Have those look who wait at these sections; once more does no harm."""
+    """Wake everybody who waits at these sections. A needless wake-up is harmless."""
     for entry in entries:
-        with suppress(ValueError):  # one that contradicts itself has nobody who waits
+        with suppress(ValueError):  # nobody waits at an inconsistent section
             if entry.kind in (SectionKind.FRAMES, SectionKind.EVENTS):
                 _atomics.Ring(memory, entry.offset, entry.size).wake()
             elif entry.kind == SectionKind.COMMANDS:
@@ -129,7 +132,7 @@ def wake(memory: memoryview, entries: Iterable[SectionEntry]) -> None:
 
 
 def segment_size(blocks: Sequence[BlockSpec], processes: int) -> int:
-    """Bytes of a segment built from these; what ``check`` prints."""
+    """Return the size in bytes of a segment with these blocks and processes; ``check`` prints it."""
     tables = sum(_table_sizes(len(blocks), processes))
     return HEADER_SIZE + tables + sum(block.size for block in blocks) + _clock_size(processes)
 
@@ -155,7 +158,7 @@ def build_segment(
     stepped: bool,
     origin: Origin | None = None,
 ) -> None:
-    """Make room in a new object and write all of it; the magic last."""
+    """Allocate a new shared-memory object and write the whole segment, the magic last."""
     now_ns, begin_ns = time.monotonic_ns(), origin.clock_ns if origin else 0
     size = segment_size(blocks, len(processes))
     sections_size, processes_size = _table_sizes(len(blocks), len(processes))
@@ -194,5 +197,5 @@ def build_segment(
 
 
 def align(size: int, to: int) -> int:
-    """The next multiple."""
+    """Round ``size`` up to a multiple of ``to``."""
     return -(-size // to) * to

@@ -1,7 +1,7 @@
-"""Which registers differ between two images of a block.
+"""Find the registers that differ between two images of a block.
 
-Bytes are compared, never values: a NaN that stays the same has not changed, and 0.0 that became -0.0 has. A BOOL is its
-bit alone; padding belongs to nobody.
+Bytes are compared, not values: a NaN that stays the same has not changed, but 0.0 that became -0.0
+has. Of a BOOL only its bit is compared; padding is ignored.
 """
 
 from __future__ import annotations
@@ -17,33 +17,34 @@ _ENTRY = struct.Struct("=IIII")  # offset, size, mask, index: scan_entry in _ato
 
 
 class ChangeScan:
-    """Compares two images over the given registers, in C; immutable."""
+    """Compares two images over the given registers, in C. Immutable."""
 
     def __init__(self, registers: Sequence[Register]) -> None:
         self._table = b"".join(entries([register], index) for index, register in enumerate(registers))
 
     @classmethod
     def joined(cls, parts: Iterable[bytes]) -> ChangeScan:
-        """One over what :func:`entries` made; their indices in this order."""
+        """Create a scan from parts made by :func:`entries`."""
         scan = cls(())
         scan._table = b"".join(parts)
         return scan
 
     def changed(self, old: bytes, new: bytes) -> list[int]:
-        """Indices, ascending, of the registers whose bytes differ.
+        """Return the ascending indices of the registers whose bytes differ.
 
-        Both images have one size and hold all registers; ValueError otherwise.
+        Raises:
+            ValueError: The images differ in size, or do not hold all registers.
         """
         return _atomics.changed(old, new, self._table)
 
 
 def entries(registers: Iterable[Register], index: int) -> bytes:
-    """The part of a scan that reports a change of any of the registers as ``index``."""
+    """Encode the part of a scan that reports a change of any of these registers as ``index``."""
     return b"".join(_ENTRY.pack(*run, index) for register in registers for run in runs(register))
 
 
 def runs(register: Register) -> Iterator[tuple[int, int, int]]:
-    """(offset, size, mask) of the bytes that hold the register's data; mask 0: whole bytes."""
+    """Yield (offset, size, mask) of the bytes that hold a register's data; mask 0: whole bytes."""
     offset, element = register.offset, register.element
     if register.partial:
         masks = bits_of(register)
@@ -53,7 +54,7 @@ def runs(register: Register) -> Iterator[tuple[int, int, int]]:
         if len(masks) > 1:
             yield offset + len(masks) - 1, 1, masks[-1]
     elif register.bit is not None:
-        # A row of bits begins at a byte; its last byte may be padded.
+        # A row of bits starts at a byte boundary; its last byte may be padded.
         bits = register.shape[-1] if register.dims else 1
         first = 0 if register.dims else register.bit
         for row in range(register.count // bits):

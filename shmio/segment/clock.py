@@ -1,16 +1,16 @@
-"""The clock page: what time it is in an instance, which step was asked for, who has delivered which.
+"""The clock page: the instance's time, the requested step, and the steps that each process has delivered.
 
-The section is described in docs/reference/segment-format.md. The owner of time writes it (``coordinator``), anybody
-reads it, and each process has a bell there that is rung when the page has something for it to do.
+See docs/reference/segment-format.md for the section. The owner of time writes the page, anybody reads
+it. Each process has a doorbell there, which is rung when the page has something for it to do.
 
-Real time that is given back (``Coordinator.release``) goes on from where virtual time stood, and cycles from the last
-step's number, so that neither ever goes back. What both count from is kept in the page, which has no other use for
-time and step while time is real; so every process, also one that starts later, counts alike:
+When time is released (``Coordinator.release``), real time goes on from the last virtual time, and
+cycles go on from the last step's number, so that neither ever goes back. The page keeps the base of
+both, so that every process, even one that starts later, counts alike:
 
 - clock = CLOCK_MONOTONIC - ``started`` + ``offset_ns``;
 - cycle of a block = clock // period + lead, lead = step - ``resumed_ns`` // period.
 
-All three are 0 until time is released for the first time. Devices' frames are stamped without the offset, always.
+All three are 0 until time is released for the first time. Frames of devices never use the offset.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from shmio.segment.double_buffer import DoubleBuffer
 from shmio.segment.header import Header, cut, text
 
 STEP_SIZE_NS: Final = 50_000_000
-"""The size of a step unless somebody has set another."""
+"""Default length of a step."""
 
 _SLOTS_AT: Final = 8
 _STEPPED_AT: Final = 12
@@ -37,31 +37,40 @@ _COPIES_AT: Final = (64, 320)
 _TABLE_AT: Final = 576
 _ENTRY: Final = struct.Struct("<QII")  # delivered, bell, 0
 _STATE: Final = struct.Struct("<IIQqqQqdI4x168s")
-_TIME: Final = struct.Struct("<IIQqq")  # how it begins
+_TIME: Final = struct.Struct("<IIQqq")  # the first fields of _STATE
 _NOTE_SIZE: Final = 167
 _PLAYING: Final = 1
 _STEPPING: Final = 2
 
 
 class ClockMode(IntEnum):
-    """What moves time."""
+    """Whether time is real or moved by steps."""
 
     WALL = 0
     VIRTUAL = 1
-    """Only steps do, from the moment when a program took time over until one releases it, or the instance ends."""
+    """Only steps move time, from take-over until release or the end of the instance."""
 
     def __str__(self) -> str:
         return self.name.lower()
 
 
 class ClockState(NamedTuple):
-    """The page at one moment.
+    """A snapshot of the clock page.
 
-    ``step``: number of the last step asked for; ``time_ns``: the instance's clock after it, ``dt_ns`` before which it
-    was that much less; in wall time ``time_ns`` is now. ``stepping``: that step is under way. ``done``: number of the
-    last one that all participants have finished. ``owner``: pid of who moves time; 0: nobody. ``note``: whom a step
-    waits for, why the last one failed, or what it did not move. ``resumed_ns``, ``offset_ns``: in wall time the clock
-    at which it was released, and how far it is ahead of the real time since the instance's start.
+    Attributes:
+        mode: Whether time is real or virtual.
+        step: Number of the last requested step.
+        time_ns: The instance's clock after that step; in wall time the clock now.
+        dt_ns: Length of that step.
+        done: Number of the last step that all sources have finished.
+        step_size_ns: Default length of a step.
+        playing: Whether the owner of time steps continuously.
+        rate: Speed of playing, relative to real time.
+        stepping: Whether the last requested step is under way.
+        owner: Pid of the owner of time; 0: nobody.
+        note: Which processes a step waits for, why the last step failed, or what it did not move.
+        resumed_ns: In wall time: the clock at which time was released.
+        offset_ns: In wall time: how far the clock is ahead of the real time since the start.
     """
 
     mode: ClockMode = ClockMode.WALL
@@ -80,33 +89,33 @@ class ClockState(NamedTuple):
 
     @property
     def virtual(self) -> bool:
-        """Whether only steps move time."""
+        """Whether time is virtual: only steps move it."""
         return self.mode is ClockMode.VIRTUAL
 
     @property
     def present_ns(self) -> int:
-        """The instance's clock: while a step is under way still what it was before that."""
+        """The instance's clock; during a step the time before it."""
         return self.time_ns - self.dt_ns if self.stepping else self.time_ns
 
     @property
     def basis(self) -> tuple[ClockMode, int, int, int]:
-        """What clock and cycles are counted from in wall time: it changes whenever time is taken over or released."""
+        """Base of clock and cycles in wall time; it changes whenever time is taken over or released."""
         return self.mode, self.step, self.resumed_ns, self.offset_ns
 
     def lead(self, period_ns: int) -> int:
-        """In wall time: how far cycles of this period are ahead of the clock."""
+        """Return how many cycles of this period are ahead of the clock, in wall time."""
         return self.step - self.resumed_ns // period_ns
 
 
 class Doorbell:
-    """A futex word in shared memory: who waits is woken when it is rung. Works on a read-only mapping, but to ring."""
+    """A futex word in shared memory; ringing it wakes all who wait. Only ringing needs a writable mapping."""
 
     def __init__(self, memory: memoryview, offset: int) -> None:
         self._memory = memory
         self._offset = offset
 
     def value(self) -> int:
-        """To be read before looking for news."""
+        """Return the present value. Read it before you check for changes."""
         return _atomics.bell(self._memory, self._offset)
 
     def ring(self) -> None:
@@ -114,23 +123,27 @@ class Doorbell:
         _atomics.bell_ring(self._memory, self._offset)
 
     def wait(self, seen: int, timeout_ns: int = -1) -> int:
-        """Wait until the value differs from ``seen``, or for so long (negative: for ever); the value then."""
+        """Wait until the value differs from ``seen``, at most ``timeout_ns`` (negative: forever).
+
+        Returns:
+            The value after the wait.
+        """
         return _atomics.bell_wait(self._memory, self._offset, seen, timeout_ns)
 
     def relay(self, shared: bytearray, descriptor: int, turn_ns: int) -> None:
-        """What the thread of a :class:`~shmio.segment.relay.Relay` does."""
+        """Run the thread of a :class:`~shmio.segment.relay.Relay`."""
         _atomics.bell_relay(self._memory, self._offset, shared, descriptor, turn_ns)
 
 
 SIMULATED_UTC_NS: Final = 946_684_800_000_000_000
-"""UTC at which time that was virtual from the start begins: 2000-01-01."""
+"""UTC of clock 0 for an instance whose time is virtual from the start: 2000-01-01."""
 
 
 class ClockPage:
-    """The section of one segment; several threads may use it, to write it is the owner of time's alone."""
+    """The clock page of a segment. Several threads may use it; only the owner of time writes it."""
 
     def __init__(self, memory: memoryview, offset: int, size: int, head: Header, owned: Callable[[], bool]) -> None:
-        """``head``: the segment's. ``owned``: whether anybody owns time. ValueError: it is none of this geometry."""
+        """``head``: the segment's header. ``owned``: whether anybody owns time. ValueError: wrong geometry."""
         slots = head.process_capacity
         if size < page_size(slots) or _word(memory, offset + _SLOTS_AT) != slots:
             raise ValueError("the clock page is too short, or has not a place for each process")
@@ -138,29 +151,30 @@ class ClockPage:
         self._offset = offset
         self._state = _cell(memory, offset)
         self._owned = owned
-        self._last = b"", ClockState()  # what was read last
+        self._last = b"", ClockState()  # the last state read
         self._started_ns, self._started_utc_ns = head.started_ns, head.started_utc_ns
         self.bell = Doorbell(memory, offset + _BELL_AT)
-        """Rung at every change of the page."""
+        """Doorbell that is rung at every change of the page."""
         self.delivered_bell = Doorbell(memory, offset + _DELIVERED_BELL_AT)
-        """Rung by those who deliver steps."""
+        """Doorbell that processes ring when they have delivered a step."""
 
     @staticmethod
     def write_new(memory: memoryview, offset: int, slots: int, *, virtual: bool, time_ns: int = 0) -> None:
-        """The page of a new segment; ``virtual``: time stands at ``time_ns`` until somebody steps."""
+        """Write the page of a new segment. ``virtual``: time stands still at ``time_ns`` until it is stepped."""
         struct.pack_into("<II", memory, offset + _SLOTS_AT, slots, virtual)
         state = ClockState(ClockMode.VIRTUAL, time_ns=time_ns) if virtual else ClockState()
         _cell(memory, offset).write(_pack(state))
 
     @property
     def stepped(self) -> bool:
-        """Whether time was virtual from the start, as the configuration says."""
+        """Whether the configuration makes time virtual from the start."""
         return bool(_word(self._memory, self._offset + _STEPPED_AT))
 
     def read(self) -> ClockState:
-        """How time stands now. SegmentError: it cannot be read, which no writer of ours brings about.
+        """Return the present state. If the owner of time has died, nobody plays it.
 
-        Nobody plays it when who did has died.
+        Raises:
+            SegmentError: The page is corrupt.
         """
         state = self.told()
         if state.playing and not self._owned():
@@ -170,7 +184,7 @@ class ClockPage:
         return state._replace(time_ns=time.monotonic_ns() - self._started_ns + state.offset_ns)
 
     def told(self) -> ClockState:
-        """The page as its writer has left it, dead or alive. SegmentError."""
+        """Return the state as last written, even if its writer is dead. SegmentError: the page is corrupt."""
         data = self._state.read(_STATE.size)
         before, state = self._last
         if data != before:
@@ -179,17 +193,20 @@ class ClockPage:
         return state
 
     def write(self, state: ClockState, *, ring: bool = True) -> None:
-        """Write the page and ring its bell; the owner of time alone. ``ring`` False: there is nothing to do yet."""
+        """Write the page and ring its doorbell. Only the owner of time may.
+
+        ``ring`` is False if there is nothing to do yet for those who wait.
+        """
         self._state.write(_pack(state))
         if ring:
             self.bell.ring()
 
     def now_ns(self) -> int:
-        """What ages of frames that live on this clock are taken against, comparable to CLOCK_MONOTONIC.
+        """Return the present time by which frames on this clock age.
 
-        In wall time it is CLOCK_MONOTONIC, as long as nobody has moved and released time.
+        It is comparable to CLOCK_MONOTONIC, and equal to it in wall time until time is taken over.
         """
-        mode, flags, _, time_ns, dt_ns = _TIME.unpack(self._state.read(_TIME.size))  # not all of it: each age asks
+        mode, flags, _, time_ns, dt_ns = _TIME.unpack(self._state.read(_TIME.size))  # often called
         if not mode:
             offset_ns: int = time_ns - dt_ns
             return time.monotonic_ns() + offset_ns
@@ -197,37 +214,40 @@ class ClockPage:
         return self._started_ns + present_ns
 
     def present_ns(self) -> int:
-        """The instance's clock at present; while a step is under way still what it was before that."""
+        """Return the instance's clock; during a step the time before it."""
         return self.now_ns() - self._started_ns
 
     def monotonic_ns(self, time_ns: int) -> int:
-        """A time of the instance's clock as one that is comparable to CLOCK_MONOTONIC."""
+        """Convert a time of the instance's clock to one comparable to CLOCK_MONOTONIC."""
         return self._started_ns + time_ns
 
     def utc_ns(self, monotonic_ns: int) -> int:
-        """Such a time as UTC; of an instance whose time was virtual from the start it is the same in each run."""
+        """Convert a time comparable to CLOCK_MONOTONIC to UTC.
+
+        If time was virtual from the start, the result is the same in each run.
+        """
         since_ns = monotonic_ns - self._started_ns
         return (SIMULATED_UTC_NS if self.stepped else self._started_utc_ns) + since_ns
 
     def slot_bell(self, index: int) -> Doorbell:
-        """The bell of the process in this slot of the table: rung when the page has something for it to do."""
+        """Return the doorbell of the process in a slot, rung when the page has something for it to do."""
         return Doorbell(self._memory, self._entry(index) + 8)
 
     def delivered(self, index: int) -> int | None:
-        """The last step that the process in this slot has delivered; None: it delivers none."""
+        """Return the last step that the process in a slot has delivered; None: it delivers no steps."""
         count = _atomics.load64(self._memory, self._entry(index))
         return count - 1 if count else None
 
     def deliver(self, index: int, step: int) -> None:
-        """Tell that every change up to this step, and its marker, have been delivered; the process's alone.
+        """Record that the process in a slot has delivered everything up to this step.
 
-        From the first call on each step waits for this process as long as it lives.
+        Only that process may call it. After the first call each step waits for it as long as it lives.
         """
         _atomics.store64(self._memory, self._entry(index), step + 1)
         self.delivered_bell.ring()
 
     def abstain(self, index: int) -> None:
-        """Have no step wait for this process, until it delivers one; the process's alone."""
+        """Let no step wait for the process in a slot until it delivers one. Only that process may call it."""
         _atomics.store64(self._memory, self._entry(index), 0)
         self.delivered_bell.ring()
 
@@ -236,12 +256,12 @@ class ClockPage:
 
 
 def time_lock(head: Header) -> int:
-    """The byte of the segment that who owns time has locked: the one after those of the process table."""
+    """Return the lock byte of the owner of time: the one after those of the process table."""
     return head.process_capacity + 1
 
 
 def page_size(slots: int) -> int:
-    """Bytes of the section for a process table of so many slots."""
+    """Return the size of the section in bytes for a process table with this many slots."""
     return _TABLE_AT + slots * _ENTRY.size
 
 

@@ -1,7 +1,7 @@
-"""Commands toward a source: from each writer's process to the source's, through a queue of their own.
+"""Commands to a source, sent from each writer's process through a queue of its own.
 
-A block has one queue for each writer, so that no two of them meet, and one bell for all. The source alone decides what
-is done, and in which order; what became of a command is in the block's events.
+A block has one queue for each writer, so that writers never contend, and one doorbell for all queues.
+Only the source decides what is done, and in which order; it reports outcomes in the block's events.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
     from shmio.segment.block import Block
 
 WRITERS: Final = 8
-"""Queues toward a block; processes.py says whose they are."""
+"""Command queues of a block; processes.py assigns them."""
 MIN_CAPACITY: Final = 1 << 14
 MAX_WRITES: Final = 4096
-"""Most items in one command."""
+"""Maximum number of items in a command."""
 
 SECTION_HEADER_SIZE: Final = 64
 _SECTION: Final = struct.Struct("<IIII")
@@ -39,20 +39,20 @@ _KEEP: Final = 2  # flag beside the direction
 
 
 class CommandKind(IntEnum):
-    """What a command asks for, and what its items are."""
+    """Kind of a command, which also says what its items are."""
 
     WRITE = 1
-    """Items are written to the device, or go to the injections on their way."""
+    """Write the items to the device, or to the injections in between."""
     INJECT = 2
-    """An injection is laid over the bits that the items' data set; the command's number is its own."""
+    """Lay an injection over the bits that the items' data set; it gets the command's number."""
     SHADOW = 3
-    """An injection gives values: to consumers if it lies over ``/out``, to the device if over ``/in``."""
+    """Give values to an injection: for consumers if it is over ``/out``, for the device if over ``/in``."""
     LIFT = 4
-    """An injection is lifted; there are no items."""
+    """Lift an injection; there are no items."""
     DECLARE = 5
-    """An injection is laid that the source runs by itself: its declaration, as JSON, is the one item's data."""
+    """Lay an injection that the source runs by itself; the single item's data is the declaration in JSON."""
     NOTE = 6
-    """The name is put into the events as a note; there are no items. Whatever the device does."""
+    """Add the name to the events as a note, whatever the device's state; there are no items."""
 
 
 EMPTY: Final = frozenset({CommandKind.LIFT, CommandKind.NOTE})
@@ -60,7 +60,7 @@ EMPTY: Final = frozenset({CommandKind.LIFT, CommandKind.NOTE})
 
 
 class Direction(IntEnum):
-    """Which way an injection stands in."""
+    """Direction of the data that an injection covers."""
 
     OUT = 0
     IN = 1
@@ -68,11 +68,20 @@ class Direction(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What a writer wants done. ``deadline_ns``: CLOCK_MONOTONIC after which it must not be begun.
+    """A command from a writer to a source.
 
-    ``injection``: the one to lift, or whose values these are. With INJECT: ``direction``, ``priority`` (the highest is
-    outermost), ``keep`` (it outlives its client), ``name`` (at most MAX_NAME_BYTES in UTF-8). With NOTE:
-    ``name`` is the note.
+    Attributes:
+        writer: Number of the writer's queue.
+        id: The writer's number of the command.
+        incarnation: The source's process that the command is for.
+        deadline_ns: CLOCK_MONOTONIC after which the command must not be started.
+        writes: The items.
+        kind: Kind of command.
+        injection: The injection to lift, or to give values to.
+        direction: With INJECT: the direction.
+        priority: With INJECT: the priority; the highest is outermost.
+        keep: With INJECT: whether the injection outlives its client.
+        name: With INJECT the name of the injection, with NOTE the note; at most MAX_NAME_BYTES in UTF-8.
     """
 
     writer: int
@@ -88,7 +97,7 @@ class Command:
     name: str = ""
 
     def pack(self) -> bytes:
-        """The record in a queue."""
+        """Encode the command as a record of a queue."""
         name = self.name.encode()
         flags = self.direction | (_KEEP if self.keep else 0)
         parts = [
@@ -105,7 +114,7 @@ class Command:
 
     @classmethod
     def unpack(cls, writer: int, record: bytes) -> Command:
-        """Read a record; ValueError: it is none of ours."""
+        """Decode a record of a queue. ValueError: it is malformed."""
         try:
             head = _COMMAND.unpack_from(record)
             number, incarnation, count, deadline_ns, kind, flags, name_size, priority, injection = head
@@ -131,27 +140,27 @@ class Command:
 
 
 def capacity_for(layout_size: int) -> int:
-    """Bytes of a queue's data: any array, and the block as a whole if it is a few of them, has room more than once."""
+    """Return a queue's data size in bytes: a power of two with room for the whole block several times."""
     wanted = max(MIN_CAPACITY, 4 * layout_size)
     return 1 << (wanted - 1).bit_length()
 
 
 def section_size(layout_size: int) -> int:
-    """Bytes of a block's commands section."""
+    """Return the size of a block's commands section in bytes."""
     return SECTION_HEADER_SIZE + WRITERS * (_atomics.QUEUE_HEADER_SIZE + capacity_for(layout_size))
 
 
 def section_header(layout_size: int) -> bytes:
-    """How a commands section begins."""
+    """Return the first bytes of a commands section."""
     capacity = capacity_for(layout_size)
     return _SECTION.pack(WRITERS, _atomics.QUEUE_HEADER_SIZE + capacity, capacity, 0)
 
 
 class CommandQueues:
-    """A block's commands section; geometry is checked once and kept."""
+    """The commands section of a block. Its geometry is checked once and kept."""
 
     def __init__(self, memory: memoryview, offset: int, size: int) -> None:
-        """ValueError: the section contradicts itself."""
+        """Check the geometry. ValueError: it is inconsistent."""
         self._memory = memory
         self._offset = offset
         if size < SECTION_HEADER_SIZE:
@@ -170,25 +179,29 @@ class CommandQueues:
             raise ValueError("the queues do not fit in the commands section")
 
     def push(self, writer: int, record: bytes) -> bool:
-        """Put a record into a writer's queue and ring the source's bell; False when there is no room."""
+        """Append a record to a writer's queue and ring the doorbell; returns False if there is no room."""
         taken = _atomics.queue_push(self._memory, self._queue(writer), self.capacity, record)
-        self.wake()  # also of a full one: its last writer may have died before it could ring
+        self.wake()  # even if full: the last writer may have died before it rang
         return taken
 
     def pop(self, writer: int) -> bytes | None:
-        """The oldest record of a writer's queue; for the source alone. ValueError: it was broken, and is empty now."""
+        """Remove and return the oldest record of a writer's queue. Only the source may call it.
+
+        Raises:
+            ValueError: The queue was corrupt; it has been emptied.
+        """
         return _atomics.queue_pop(self._memory, self._queue(writer), self.capacity)
 
     def bell(self) -> int:
-        """Value of the source's bell; read it before looking into the queues."""
+        """Return the doorbell's value. Read it before you check the queues."""
         return _atomics.bell(self._memory, self._offset + _BELL_AT)
 
     def wait(self, seen: int, timeout_ns: int = -1) -> None:
-        """Wait until the bell differs from ``seen``, at most ``timeout_ns`` (negative: for ever)."""
+        """Wait until the doorbell differs from ``seen``, at most ``timeout_ns`` (negative: forever)."""
         _atomics.bell_wait(self._memory, self._offset + _BELL_AT, seen, timeout_ns)
 
     def wake(self) -> None:
-        """Ring the source's bell."""
+        """Ring the source's doorbell."""
         _atomics.bell_ring(self._memory, self._offset + _BELL_AT)
 
     def _queue(self, writer: int) -> int:
@@ -198,7 +211,7 @@ class CommandQueues:
 
 
 class InjectionOptions(TypedDict, total=False):
-    """How an injection is laid; see :class:`Command`."""
+    """Options of an injection; see :class:`Command`."""
 
     direction: Direction
     priority: int
@@ -207,14 +220,14 @@ class InjectionOptions(TypedDict, total=False):
 
 
 class CommandSender:
-    """A writer's end toward one block; the writer's process holds the role that has this queue."""
+    """Sends a writer's commands to one block. The writer's process holds the slot that owns the queue."""
 
     def __init__(self, block: Block, writer: int) -> None:
         self.block = block
         self.writer = writer
         self._turn = threading.Lock()
         self._pid = os.getpid()  # two processes on one queue would overwrite each other's commands
-        # Never the number of a predecessor's command, whose outcome may still come.
+        # Random, so as never to reuse the number of a predecessor's command, whose outcome may still come.
         self._next = secrets.randbits(62) + 1
 
     def submit(
@@ -225,9 +238,20 @@ class CommandSender:
         injection: int = 0,
         **laid: Unpack[InjectionOptions],
     ) -> int:
-        """Send one command; its number. It is for the source's present process only, and for the time until then.
+        """Send a command to the source's present process, without waiting.
 
-        CommandError: the queue is full, or can never hold that much. Never waits.
+        Args:
+            writes: The items.
+            deadline_ns: CLOCK_MONOTONIC after which the command must not be started.
+            kind: Kind of command.
+            injection: The injection to lift, or to give values to.
+            laid: Options of a new injection.
+
+        Returns:
+            The command's number.
+
+        Raises:
+            CommandError: The queue is full, or too small for the command.
         """
         source = self.block.source
         if (len(writes) > 0) == (kind in EMPTY) or len(writes) > MAX_WRITES:

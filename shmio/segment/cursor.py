@@ -1,4 +1,4 @@
-"""Following a ring: every entry once, in order, losses counted exactly."""
+"""Follow a ring: read every entry once, in order, and count losses exactly."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ if TYPE_CHECKING:
 Entry = TypeVar("Entry")
 
 TURN_NS: Final = 1_000_000_000
-"""How often who waits looks by itself: the bell of a block's end is lost if the supervisor dies before it."""
+"""How often a waiting reader polls: if the supervisor dies, the doorbell for a block's end is never rung."""
 
 
 class Cursor(Generic[Entry]):
-    """A reader's own position in a ring of frames or events; for one thread.
+    """A reader's position in a ring of frames or events. Use it from one thread.
 
     >>> cursor = block.cursor()
     >>> while (frame := cursor.next(timeout_s=1.0)) is not None:
@@ -31,7 +31,7 @@ class Cursor(Generic[Entry]):
         self._retired = retired
         self._last = after
         self.missed = 0
-        """Entries that were overwritten before this cursor read them, in all."""
+        """Total number of entries that were overwritten before this cursor read them."""
 
     @property
     def last(self) -> int:
@@ -40,11 +40,11 @@ class Cursor(Generic[Entry]):
 
     @property
     def behind(self) -> int:
-        """Entries that wait to be read."""
+        """Number of entries that are not read yet."""
         return max(0, self._ring.head() - self._last)
 
     def poll(self) -> Entry | None:
-        """The next entry if there is one; never waits."""
+        """Return the next entry if there is one, without waiting."""
         ring = self._ring
         margin = 0
         while ring.head() > self._last:
@@ -52,7 +52,7 @@ class Cursor(Generic[Entry]):
             if fields is not None:
                 self._last += 1
                 return self._decode(fields)
-            # Lapped. Resume with the oldest entry that there is, and further on each time that the writer is faster.
+            # Lapped: resume with the oldest entry, and further ahead each time the writer is faster.
             resume = max(self._last + 1, ring.head() - ring.slot_count + margin)
             margin = min(2 * margin + 1, ring.slot_count // 2)
             self.missed += resume - self._last
@@ -60,15 +60,17 @@ class Cursor(Generic[Entry]):
         return None
 
     def next(self, timeout_s: float | None = None) -> Entry | None:
-        """The next entry, waited for at most ``timeout_s`` (None: for ever).
+        """Return the next entry, waiting at most ``timeout_s`` (None: forever).
 
-        None when the time is over, or at once when the block was retired by a reload and all of it has been read.
+        Returns:
+            The entry. None if none came in time, or if a reload has retired the block and all of it
+            has been read.
         """
         ring = self._ring
         deadline_ns = None if timeout_s is None else time.monotonic_ns() + round(timeout_s * 1e9)
         while True:
-            seen = ring.doorbell()  # before looking, so that no ring of the bell is lost
-            retired = self._retired()  # before looking too: what was published before the end is still read
+            seen = ring.doorbell()  # before polling, so that no ring is lost
+            retired = self._retired()  # also before polling: what was published before the end is still read
             entry = self.poll()
             if entry is not None or retired:
                 return entry
@@ -78,7 +80,7 @@ class Cursor(Generic[Entry]):
             ring.wait(seen, rest_ns)
 
     def __iter__(self) -> Iterator[Entry]:
-        """All entries to come; ends when the block is retired."""
+        """Iterate over all entries to come, until the block is retired."""
         while True:
             entry = self.next()
             if entry is not None:

@@ -1,4 +1,4 @@
-"""A cell that is there twice: whenever its writer was killed, one is whole (docs/reference/segment-format.md)."""
+"""A value stored twice, so that one copy is intact even if its writer was killed."""
 
 from __future__ import annotations
 
@@ -11,16 +11,19 @@ _ATTEMPTS: Final = 4
 
 
 class DoubleBuffer:
-    """Both of its copies; several threads may read it."""
+    """A value in shared memory, stored in two copies (docs/reference/segment-format.md).
+
+    Several threads may read it.
+    """
 
     def __init__(self, memory: memoryview, copies: tuple[int, int], complaint: str) -> None:
-        """``copies``: where they begin. ``complaint``: what it means when none is whole, and what to do about it."""
+        """``copies``: offsets of the copies. ``complaint``: message of the error if both are corrupt."""
         self._memory = memory
         self._copies = copies
         self._complaint = complaint
 
     def read(self, size: int) -> bytes:
-        """Its first bytes. SegmentError: no copy of it is whole, which no writer of ours brings about."""
+        """Return the first ``size`` bytes. SegmentError: both copies are corrupt."""
         for at in self._copies * _ATTEMPTS:
             data = _atomics.cell_read(self._memory, at, size)
             if data is not None:
@@ -28,6 +31,6 @@ class DoubleBuffer:
         raise SegmentError(self._complaint)
 
     def write(self, data: bytes) -> None:
-        """Write one, then the other; its writer alone."""
+        """Write one copy, then the other. Only the owner may."""
         for at in self._copies:
             _atomics.cell_write(self._memory, at, data)

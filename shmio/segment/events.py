@@ -1,7 +1,7 @@
-"""What happened to a block between frames: commands and their outcomes, injections, changes of quality, starts, ends.
+"""Events of a block: commands and their outcomes, injections, changes of quality, starts and ends.
 
-An event ring works like a frame ring and is written by the same process. An event names the frame it follows, a frame
-the event it follows, so that both together are one order.
+An event ring works like a frame ring and has the same writer. An event names the frame before it, and
+a frame the event before it, so that frames and events are in one order.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from shmio.segment._atomics import FrameTuple, Ring
 
 EVENT_DATA_SIZE: Final = 256
-"""Most data bytes in one event; a longer write is several events with consecutive parts."""
+"""Maximum number of data bytes in an event; a longer write becomes several consecutive events."""
 EVENT_SLOTS: Final = 2048
 NO_WRITER: Final = 0xFFFFFFFF
 
@@ -28,42 +28,42 @@ EVENT_SIZE: Final = _RECORD.size + EVENT_DATA_SIZE
 
 
 class EventKind(IntEnum):
-    """What happened. A command's item is accepted or rejected; if accepted, one of the :data:`ENDS` follows."""
+    """Kind of an event. An accepted item of a command is followed by one of the :data:`ENDS`."""
 
     STARTED = 1
     STOPPED = 2
     QUALITY = 3
     ACCEPTED = 4
     REJECTED = 5
-    """By the source, before anything was done; of a command as a whole."""
+    """The source rejected the whole command before it did anything."""
     WRITTEN = 6
-    """The device confirmed it."""
+    """The device confirmed the write."""
     REFUSED = 7
-    """The device said no."""
+    """The device refused the write."""
     EXPIRED = 8
-    """Not sent, and will not be."""
+    """The write was not sent to the device, and will not be."""
     UNKNOWN = 9
-    """Sent, but no answer came."""
+    """The write was sent, but no answer came."""
     DIVERTED = 10
-    """What was written, or given by an injection beneath it, went to an injection: these bits, with data."""
+    """An injection took these bits, which a writer or an injection further in had given; with data."""
     TAKEN = 11
-    """The end of an item of which nothing was left for the device: an injection took it."""
+    """Injections took all of the item; nothing was left for the device."""
     INJECTED = 12
-    """An injection was laid; the end of the command that asked for it, whose number is its own.
+    """An injection was laid; this ends its command, whose number the injection has.
 
-    Its data, JSON in parts, say how: of one that was declared its declaration, with the seed that it runs with; of a
-    client's ``direction``, ``priority``, ``keep`` and ``ranges``: (offset, size, bits).
+    The data is JSON in parts. For a declared injection it is the declaration with the seed in use, for a
+    client's injection ``direction``, ``priority``, ``keep`` and ``ranges``: (offset, size, bits).
     """
     LIFTED = 13
-    """An injection was lifted, with the reason; the end of the command that asked for it, if one did."""
+    """An injection was lifted, with the reason; this ends the command that requested it, if any."""
     SHADOWED = 14
-    """An injection gave values, with data, that consumers see since the frame before."""
+    """An injection gave values, with data; consumers see them since the previous frame."""
     ACTIVATED = 15
-    """A declared injection became active: over ``/out`` in the frame before; ``item`` counts its activations."""
+    """A declared injection became active; over ``/out``, in the previous frame. ``item`` counts activations."""
     DEACTIVATED = 16
-    """It is no longer."""
+    """A declared injection is no longer active."""
     NOTED = 17
-    """Somebody has noted something, as text; the end of the command that brought it."""
+    """A note was added, as text; this ends its command."""
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -83,19 +83,34 @@ ENDS: Final = frozenset(
         EventKind.NOTED,
     }
 )
-"""Kinds after which nothing more is said of an item; REJECTED: of a command."""
+"""Kinds that end an item; REJECTED ends a whole command."""
 DONE: Final = frozenset({EventKind.WRITTEN, EventKind.TAKEN, EventKind.SHADOWED})
-"""Ends with which a value has gone where it was meant to, or to the injection on its way."""
+"""Ends of a value that reached its target, or an injection in between."""
 
 
 class Event(NamedTuple):
-    """A copy of one event. Times in ns as in a frame: CLOCK_MONOTONIC, the instance's clock, UTC.
+    """A copy of an event.
 
-    ``frame``: number of the last frame before it. ``kind`` is a plain number where this version does not know it.
-    ``writer``: the command ring it is about, or NO_WRITER; ``command``: the writer's number of the command. It tells
-    of ``items`` of its items from ``item`` on; ``offset``, ``mask``, ``size``: what the first of them writes (mask 0:
-    whole bytes); ``data``: these bytes, with ACCEPTED, DIVERTED, SHADOWED and INJECTED only. ``text``: the reason, the
-    note, or the name of ``injection``, the one it is about (0: none).
+    Attributes:
+        number: Number of the event.
+        kind: The :class:`EventKind`; a plain number if this version does not know it.
+        frame: Number of the last frame before the event.
+        cycle: Cycle of the source's schedule.
+        publish_ns: CLOCK_MONOTONIC.
+        clock_ns: The instance's clock.
+        utc_ns: UTC.
+        incarnation: Number of the source's process.
+        quality: Quality after the event.
+        writer: The command queue that the event is about, or NO_WRITER.
+        command: The writer's number of the command.
+        item: The first item of the command that the event is about.
+        items: How many of the command's items the event is about.
+        offset: Offset of the first item's write.
+        mask: Mask of the first item's write; 0: whole bytes.
+        size: Size of the first item's write in bytes.
+        data: The written bytes, with ACCEPTED, DIVERTED, SHADOWED and INJECTED only.
+        text: The reason, the note, or the name of the injection.
+        injection: The injection that the event is about; 0: none.
     """
 
     number: int
@@ -120,7 +135,7 @@ class Event(NamedTuple):
 
 
 class Record(NamedTuple):
-    """The part of an event that its writer chooses."""
+    """The content of an event, chosen by its writer."""
 
     kind: EventKind
     text: str = ""
@@ -135,14 +150,14 @@ class Record(NamedTuple):
     injection: int = 0
 
     def pack(self) -> bytes:
-        """The payload, EVENT_SIZE bytes."""
+        """Encode the payload, EVENT_SIZE bytes."""
         what = (self.kind, len(self.data), self.writer, self.command)
         packed = _RECORD.pack(*what, self.item, self.offset, self.mask, self.items, self.size, self.injection)
         return packed + self.data.ljust(EVENT_DATA_SIZE, b"\0")
 
 
 def decode(fields: FrameTuple) -> Event:
-    """An event from a ring's copy; bounds are checked, for the bytes are another process's."""
+    """Decode an event. Bounds are checked, because another process wrote the bytes."""
     number, cycle, publish_ns, clock_ns, utc_ns, incarnation, quality, _, frame, _, text, raw, _ = fields
     kind, data_size, writer, command, item, offset, mask, items, size, injection = _RECORD.unpack_from(raw)
     data = raw[_RECORD.size : _RECORD.size + min(data_size, EVENT_DATA_SIZE)]
@@ -161,14 +176,14 @@ class EventRing:
         self._retired = retired
 
     def head(self) -> int:
-        """Number of the newest event; 0: none yet."""
+        """Return the number of the newest event; 0: there is none yet."""
         return self.ring.head()
 
     def read(self, number: int) -> Event | None:
-        """A copy of one event by its number; None when the ring does not hold it."""
+        """Return a copy of the event with this number; None if the ring does not hold it."""
         fields = self.ring.read(number)
         return None if fields is None else decode(fields)
 
     def cursor(self, *, after: int | None = None) -> Cursor[Event]:
-        """A stream position behind event ``after`` (default: the newest one)."""
+        """Return a cursor that starts behind event ``after`` (default: the newest one)."""
         return Cursor(self.ring, decode, self.head() if after is None else after, self._retired)

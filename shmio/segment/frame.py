@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 
 class Quality(IntEnum):
-    """Trust in a value, as OPC UA means it (OPC 10000-8, section 6.3). Zeroed memory is bad."""
+    """Quality of a value, as in OPC UA (OPC 10000-8, section 6.3). Zeroed memory is bad."""
 
     BAD = 0
     UNCERTAIN = 1
@@ -32,13 +32,21 @@ class Provenance(IntEnum):
 class Frame(NamedTuple):
     """A validated copy of one frame of a block. All times are in ns.
 
-    ``raw`` is what the source delivered, in its own byte order, and ``provenance`` where that comes from; ``effective``
-    is what consumers see, None while nothing is injected. ``publish_ns`` is CLOCK_MONOTONIC, or in its place what
-    virtual time has made of it; ``clock_ns`` the instance's clock since its start, ``source_ns`` UTC. ``delay_us``: how
-    old the image may have been already when it was published, the time of the device's answer; ``cycle`` counts the
-    periods of the source's schedule, so frames of two incarnations of the source's process are told apart from frames
-    that a reader lost, and then goes on with the steps. ``source_ns`` of a bad frame is that of the image it repeats;
-    0: the source never had one, and the image is zeros.
+    Attributes:
+        number: Number of the frame in its ring, from 1.
+        cycle: Period of the source's schedule; in virtual time the number of the step.
+        publish_ns: CLOCK_MONOTONIC at publication, or a comparable time in virtual time.
+        clock_ns: The instance's clock at publication.
+        source_ns: The source's time stamp, UTC. A bad frame has that of the image it repeats; 0: the
+            source never had an image, and the bytes are zeros.
+        incarnation: Number of the source's process.
+        quality: Quality of the image when it was published.
+        provenance: Where the raw image comes from.
+        event: Number of the last event before the frame.
+        delay_us: Maximum age of the image when it was published: the time that the device took to answer.
+        reason: Why the quality is not good.
+        raw: The image that the source delivered, in its own byte order.
+        effective: The image that consumers see; None while nothing is injected.
     """
 
     number: int
@@ -57,18 +65,19 @@ class Frame(NamedTuple):
 
     @property
     def image(self) -> bytes:
-        """What consumers see: effective if there is one, else raw."""
+        """The image that consumers see: the effective one if there is one, else the raw one."""
         return self.raw if self.effective is None else self.effective
 
     def age_ns(self, now_ns: int) -> int:
-        """The most that the image can be old: the time since the device was asked for it.
+        """Return the maximum age of the image: the time since the device was asked for it.
 
-        ``now_ns``: of the clock that its block lives on, :meth:`Block.now_ns`.
+        Args:
+            now_ns: The present time by the block's clock, :meth:`Block.now_ns`.
         """
         return now_ns - self.publish_ns + 1000 * self.delay_us
 
     def assess(self, stale_ns: int, now_ns: int) -> tuple[Quality, str]:
-        """Quality and reason as of then: a frame that is too old is never good."""
+        """Return quality and reason at ``now_ns``: a frame older than ``stale_ns`` is bad."""
         if self.quality is not Quality.BAD:
             age_ns = self.age_ns(now_ns)
             if age_ns > stale_ns:

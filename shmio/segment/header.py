@@ -22,7 +22,7 @@ SLOT_SIZE: Final = 1024
 MAX_SECTIONS: Final = 2048
 MAX_PROCESSES: Final = 256
 
-# Offsets of what changes while the segment lives.
+# Offsets of the fields that change during the segment's life.
 GENERATION_OFFSET: Final = 48  # u32 generation, u32 section count: one word, so that they move together
 CONTROL_OFFSET: Final = 208
 CONTROL_SIZE: Final = 256
@@ -54,7 +54,7 @@ class State(IntEnum):
 
 
 class SectionKind(IntEnum):
-    """What a section holds; unknown kinds are passed over."""
+    """Content of a section. Readers skip unknown kinds."""
 
     LAYOUT = 1
     FRAMES = 2
@@ -86,7 +86,7 @@ class Header:
     control: str
 
     def write(self, memory: memoryview) -> None:
-        """Write all but the magic, which :func:`finish` writes last."""
+        """Write everything except the magic, which :func:`finish` writes last."""
         packed = _HEADER.pack(
             0, ABI_VERSION, HEADER_SIZE, self.epoch, self.size, self.started_utc_ns, self.started_ns,
             0, 0,  # generation and section count, see write_section
@@ -98,7 +98,12 @@ class Header:
 
     @classmethod
     def read(cls, memory: memoryview, name: str) -> Header:
-        """Read and check; UnfinishedError, and FormatError, which names what this version does not know."""
+        """Read and check a header.
+
+        Raises:
+            UnfinishedError: The segment is incomplete.
+            FormatError: Another version made the segment, or the header is inconsistent.
+        """
         if len(memory) < HEADER_SIZE or _atomics.load64(memory, 0) != MAGIC:
             raise UnfinishedError(f"{name} is not a whole shmio segment: it is just being made, or its maker died")
         # fmt: off
@@ -131,9 +136,9 @@ class Header:
 
 @dataclass(frozen=True, slots=True)
 class SectionEntry:
-    """One line of the section table. ``layout``: index of the layout's section, for all others of a block.
+    """An entry of the section table.
 
-    What is no block's has its own index there.
+    ``layout`` is the index of the block's layout section; a section of no block has its own index there.
     """
 
     kind: int
@@ -148,9 +153,13 @@ class SectionEntry:
 def change_sections(
     memory: memoryview, header: Header, append: Sequence[SectionEntry], retire: Sequence[int] = ()
 ) -> None:
-    """Append entries, then retire others, by their indices. FormatError: no room.
+    """Append entries to the section table, then retire others, given by index.
 
-    Readers see all the new entries before any old one ends; of two blocks of one name the later one counts.
+    Readers see all new entries before any old one is retired. Of two blocks with one name the later
+    one counts.
+
+    Raises:
+        FormatError: The table has no room.
     """
     generation, count = table_state(memory)
     if count + len(append) > header.section_capacity:
@@ -169,18 +178,18 @@ def change_sections(
 
 
 def table_state(memory: memoryview) -> tuple[int, int]:
-    """(generation, which changes whenever the section table does; entries that are whole)."""
+    """Return the table's generation, which changes with the table, and the number of complete entries."""
     word = _atomics.load64(memory, GENERATION_OFFSET)
     return word & 0xFFFFFFFF, word >> 32
 
 
 def retired(memory: memoryview, header: Header, index: int) -> bool:
-    """Whether an entry is retired by now."""
+    """Whether an entry is retired."""
     return _atomics.load64(memory, header.sections_offset + index * SECTION_SIZE) & _RETIRED != 0
 
 
 def read_sections(memory: memoryview, header: Header, count: int, name: str) -> list[SectionEntry]:
-    """The first ``count`` entries, checked to lie within the object."""
+    """Read the first ``count`` entries, and check that they lie within the object."""
     if count > header.section_capacity:
         raise FormatError(f"{name}: more sections than the table holds")
     entries = []
@@ -195,28 +204,28 @@ def read_sections(memory: memoryview, header: Header, count: int, name: str) -> 
 
 
 def finish(memory: memoryview) -> None:
-    """Write the magic: from now on the segment can be opened."""
+    """Write the magic, so that the segment can be opened."""
     _atomics.store64(memory, 0, MAGIC)
 
 
 def write_control(memory: memoryview, path: str) -> None:
-    """Tell where the control socket is by now."""
+    """Write the path of the control socket."""
     memory[CONTROL_OFFSET : CONTROL_OFFSET + CONTROL_SIZE] = path.encode().ljust(CONTROL_SIZE, b"\0")
 
 
 def write_config(memory: memoryview, file: Path) -> None:
-    """Tell from which configuration file the instance was started."""
+    """Write the path of the configuration file that the instance was started from."""
     memory[CONFIG_OFFSET : CONFIG_OFFSET + CONFIG_SIZE] = _config_field(file)
 
 
 def read_config(memory: memoryview) -> Path | None:
-    """The configuration file that the instance was started from; None: it does not tell."""
+    """Read the path of the configuration file that the instance was started from; None: unknown."""
     path = bytes(memory[CONFIG_OFFSET : CONFIG_OFFSET + CONFIG_SIZE]).split(b"\0", 1)[0]
     return Path(os.fsdecode(path)) if path else None
 
 
 def has_config(memory: memoryview, file: Path) -> bool:
-    """Whether this is the configuration file that the instance was started from."""
+    """Whether the instance was started from this configuration file."""
     return memory[CONFIG_OFFSET : CONFIG_OFFSET + CONFIG_SIZE] == _config_field(file)
 
 
@@ -225,17 +234,17 @@ def _config_field(file: Path) -> bytes:
 
 
 def write_supervised_since(memory: memoryview, since_ns: int) -> None:
-    """Tell when the supervisor began, which was not at the zero of the instance's clock."""
+    """Write the supervisor's start time, if it differs from the zero of the instance's clock."""
     _atomics.store64(memory, SUPERVISED_SINCE_OFFSET, since_ns)
 
 
 def write_supervisor(memory: memoryview, pid: int, state: State) -> None:
-    """Tell who supervises, and the instance's state."""
+    """Write the supervisor's pid and the instance's state."""
     _atomics.cell_write(memory, SUPERVISOR_CELL, _SUPERVISOR.pack(pid, state))
 
 
 def read_supervisor(memory: memoryview) -> tuple[int, State]:
-    """(pid, state) as the supervisor last wrote them."""
+    """Read the supervisor's pid and the instance's state."""
     data = _atomics.cell_read(memory, SUPERVISOR_CELL, _SUPERVISOR.size)
     if data is None:
         return 0, State.STARTING
@@ -244,22 +253,22 @@ def read_supervisor(memory: memoryview) -> tuple[int, State]:
 
 
 def write_note(memory: memoryview, note: str) -> None:
-    """Tell what is wrong with the instance itself; empty: nothing."""
+    """Write a note about a problem of the instance itself; empty: none."""
     _atomics.cell_write(memory, NOTE_CELL, cut(note, NOTE_SIZE).ljust(NOTE_SIZE, b"\0"))
 
 
 def read_note(memory: memoryview) -> str:
-    """The same, as the supervisor last wrote it."""
+    """Read the note about a problem of the instance itself; empty: none."""
     return text(_atomics.cell_read(memory, NOTE_CELL, NOTE_SIZE) or b"")
 
 
 def text(field: bytes) -> str:
-    """A zero-padded UTF-8 field."""
+    """Decode a zero-padded UTF-8 field."""
     return field.split(b"\0", 1)[0].decode("utf-8", "replace")
 
 
 def cut(message: str, size: int) -> bytes:
-    """At most ``size`` bytes of UTF-8, whole characters only."""
+    """Encode a text in at most ``size`` bytes of UTF-8, cut at a whole character."""
     return message.encode()[:size].decode("utf-8", "ignore").encode()
 
 

@@ -1,7 +1,7 @@
-"""The link of a block whose registers a program elsewhere computes: what its source asks of that, and the answers.
+"""The channel between a source and its remote model: requests for steps, and their answers.
 
-The section is described in docs/reference/segment-format.md. The source's process asks; the process to which the
-program is connected holds the link's lock, tells whose program it is, and writes the answers.
+See docs/reference/segment-format.md for the section. The source's process writes requests. The process
+to which the model is connected holds the channel's lock, names the model, and writes the answers.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ _COMPUTED: Final = 1  # flag: a model has done a step
 
 
 class ModelPorts(NamedTuple):
-    """The registers of a block whose model is elsewhere. One that is in-out is among both: it has two ends."""
+    """Inputs and outputs of a remote model. An in-out register is in both."""
 
     inputs: tuple[Register, ...]
-    """What the model is given."""
+    """Registers that the model reads."""
     outputs: tuple[Register, ...]
-    """What it computes."""
+    """Registers that the model computes."""
 
 
 class ConnectedModel(NamedTuple):
-    """A model that is connected. ``number``: how many have been before, and this one; ``pid``: who writes for it."""
+    """A connected model. ``number`` counts connections from 1; ``pid``: the process that writes for it."""
 
     number: int
     pid: int
@@ -48,11 +48,17 @@ class ConnectedModel(NamedTuple):
 
 
 class ModelRequest(NamedTuple):
-    """A step that the source asks for. ``number`` is the ask's own; the step's may be asked for again.
+    """A source's request for a step of the model.
 
-    ``time_ns``: of the instance's clock after the step, ``dt_ns`` before which it was that much less. ``until_ns``:
-    CLOCK_MONOTONIC, when the source waits no more. ``doubt``: why inputs may not be right. ``commanded``: the image
-    with what the model is given, ``shown``: the one with what it has computed.
+    Attributes:
+        number: Number of the request; the same step may be requested again.
+        step: Number of the step.
+        time_ns: The instance's clock after the step.
+        dt_ns: Length of the step.
+        until_ns: CLOCK_MONOTONIC at which the source stops waiting.
+        doubt: Why inputs may be wrong; empty: they are not.
+        commanded: The image with the model's inputs.
+        shown: The image with the outputs so far.
     """
 
     number: int
@@ -66,16 +72,18 @@ class ModelRequest(NamedTuple):
 
 
 class ModelAnswer(NamedTuple):
-    """What came of an ask. ``image`` has the outputs; with ``failure`` none of it counts."""
+    """The answer to a request. ``image`` has the outputs; with a ``failure`` it is void."""
 
     image: bytes
     failure: str | None
 
 
 def model_ports(layout: Layout, outputs: Sequence[str], inouts: Sequence[str]) -> ModelPorts:
-    """What the patterns of ``outputs`` and ``inouts`` say of a layout's registers.
+    """Find a model's inputs and outputs by the patterns of ``outputs`` and ``inouts``.
 
-    ConfigError, beginning with the key: a pattern names no register, or one is named in both.
+    Raises:
+        ConfigError: A pattern names no register, or a register is in both; the message starts with
+            the key.
     """
     computed, both = (_named(layout, *item) for item in (("outputs", outputs), ("inouts", inouts)))
     if twice := sorted(computed & both):
@@ -104,17 +112,17 @@ def _named(layout: Layout, key: str, patterns: Sequence[str]) -> set[int]:
 
 
 def section(ring_header: bytes, slot_bytes: int) -> tuple[int, bytes]:
-    """Size and beginning of a new section, whose two rings have this header."""
+    """Return size and first bytes of a new section, whose two rings have this header."""
     ring_size = _atomics.RING_HEADER_SIZE + SLOTS * slot_bytes
     begin = _SIZE.pack(ring_size).ljust(_RINGS_AT, b"\0") + ring_header.ljust(ring_size, b"\0") + ring_header
     return _RINGS_AT + 2 * ring_size, begin
 
 
 class ModelChannel:
-    """The section of one block."""
+    """The channel between one block's source and its remote model."""
 
     def __init__(self, shared: SharedObject, memory: memoryview, offset: int, size: int, lock_byte: int) -> None:
-        """ValueError: the section contradicts itself."""
+        """Check the geometry. ValueError: it is inconsistent."""
         (ring_size,) = _SIZE.unpack_from(memory, offset) if size >= _RINGS_AT else (0,)
         if not 0 < ring_size <= (size - _RINGS_AT) // 2:
             raise ValueError("the link's rings do not fit in its section")
@@ -130,11 +138,11 @@ class ModelChannel:
 
     @property
     def frame_size(self) -> int:
-        """Bytes of one image."""
+        """Size of an image in bytes."""
         return self.asked.frame_size
 
     def model(self) -> ConnectedModel | None:
-        """The model that is connected, as other processes see it; None: there is none, or who had it is dead."""
+        """Return the connected model, as other processes see it; None: there is none, or its process died."""
         return self._read() if self._shared.locked(self._lock_byte) else None
 
     def _read(self) -> ConnectedModel:
@@ -145,14 +153,14 @@ class ModelChannel:
         return ConnectedModel(number, pid, text(name))
 
     def computed(self) -> bool:
-        """Whether a model has done a step, this one or one before."""
+        """Whether any model, this one or an earlier one, has done a step."""
         data = _atomics.cell_read(self._memory, self._offset + _JOINED_AT, _JOINED.size)
         return data is not None and _JOINED.unpack(data)[1] == _COMPUTED
 
     # ---- the source's part ---------------------------------------------------------------------------------------
 
     def ask(self, ask: ModelRequest, publish_ns: int) -> int:
-        """Ask for a step; the ask's number, whatever it says. ``publish_ns``: the time of its frame."""
+        """Request a step; returns the request's number. ``publish_ns``: time of the frame."""
         return self.asked.publish(
             ask.commanded, ask.shown, ask.step, publish_ns, ask.time_ns, ask.until_ns,
             Quality.UNCERTAIN if ask.doubt else Quality.GOOD, Provenance.SIMULATED, ask.dt_ns, 0,
@@ -160,7 +168,7 @@ class ModelChannel:
         )  # fmt: skip
 
     def answer_to(self, number: int) -> ModelAnswer | None:
-        """The answer to an ask, if it is the newest one: no late answer is taken for it."""
+        """Return the answer to a request if it is the newest one, so that no late answer is used."""
         fields = self.answered.latest()
         if fields is None or fields[8] != number:
             return None
@@ -170,7 +178,7 @@ class ModelChannel:
     # ---- the part of who writes for the model ----------------------------------------------------------------------
 
     def join(self, name: str) -> bool:
-        """Take the link; False: another process has it."""
+        """Take the channel for a model; returns False if another process has it."""
         if not self._shared.try_lock(self._lock_byte):
             return False
         self._tell(ConnectedModel(self._read().number + 1, os.getpid(), name), _COMPUTED if self.computed() else 0)
@@ -182,12 +190,12 @@ class ModelChannel:
         _atomics.cell_write(self._memory, self._offset + _JOINED_AT, data)
 
     def leave(self) -> None:
-        """Give it back, and have a source look that waits for an answer."""
+        """Release the channel, and wake a source that waits for an answer."""
         self._shared.unlock(self._lock_byte)
         self.answered.wake()
 
     def newest(self) -> ModelRequest | None:
-        """The step that was asked for last; None: none was yet."""
+        """Return the last request; None if there was none."""
         fields = self.asked.latest()
         if fields is None:
             return None
@@ -197,7 +205,7 @@ class ModelChannel:
         )
 
     def answer(self, ask: ModelRequest, now_ns: int, image: bytes | bytearray, failure: str | None = None) -> None:
-        """Answer an ask; ``failure``: why it failed. ``now_ns``: CLOCK_MONOTONIC."""
+        """Answer a request. ``failure``: why it failed; ``now_ns``: CLOCK_MONOTONIC."""
         if failure is None and not self.computed():
             self._tell(self._read(), _COMPUTED)
         self.answered.publish(

@@ -1,4 +1,4 @@
-"""What goes to injections, or is accepted: its events put together again, command by command."""
+"""Reassemble commands from their events: what a command wrote, or what went to an injection."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from shmio.segment.events import Event, EventKind
 
 
 class CommandWrites(NamedTuple):
-    """What one command wrote that went to one injection, or on to the device: in its parts, in the events' order."""
+    """The writes of one command that went to one injection, or to the device, in the events' order."""
 
     injection: int
     event: Event
-    """The last of its events: its time, whose command it was."""
+    """The last of the events, which has the time and the writer."""
     writes: tuple[Write, ...]
 
 
@@ -28,10 +28,11 @@ _NOBODY: Final = (0, 0, 0)
 
 
 class CommandAssembler:
-    """Gathers the events about what was diverted, or of another kind with data; give it all of a block's, in order.
+    """Assembles commands from DIVERTED events, or from events of another kind with data.
 
-    A command is whole when it says something else, or when another one is diverted. What is diverted says so at once.
-    What no command has brought (its number is 0) is whole with its last part.
+    Pass it all events of a block, in order. A command is complete when an event of another kind about it
+    follows, or when events of another command begin. Writes without a command (number 0) are complete
+    with their last part.
     """
 
     def __init__(self, kind: EventKind = EventKind.DIVERTED) -> None:
@@ -40,7 +41,7 @@ class CommandAssembler:
         self._parts: dict[int, list[Event]] = {}
 
     def follow(self, event: Event) -> list[CommandWrites]:
-        """What is whole by this event."""
+        """Process the next event; returns the commands that it completes."""
         command = event.incarnation, event.writer, event.command
         if event.kind != self._kind:
             return self._whole() if command == self._command or event.kind == EventKind.STARTED else []
@@ -61,13 +62,16 @@ class CommandAssembler:
 
 
 def apply(image: bytearray, writes: Iterable[Write]) -> None:
-    """Bring writes to an image. What lies outside it, as only another process's mistake can, is passed over."""
+    """Apply writes to an image. A write outside it is ignored; only a faulty process makes one."""
     for write in writes:
         if write.data and write.offset + len(write.data) <= len(image):
             write_to(write, image)
 
 
 def values(layout: Layout, image: bytes, writes: Iterable[Write]) -> dict[str, Value]:
-    """The values in an image of what was written, by path: registers, or of those written in part elements and bits."""
+    """Decode the written values from an image, by path.
+
+    Registers that were written in part yield elements or bits.
+    """
     named = (part for path in paths_of(layout, writes) for part in find_each(layout, path))
     return {part.path: codec(part, layout.byte_order).decode(image) for part in named}

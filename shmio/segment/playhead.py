@@ -1,8 +1,8 @@
-"""The playhead of a block that a recording plays: where it is, what moves it, and what others ask of it.
+"""The playhead of a block that replays a recording: its position, and requests to move it.
 
-The section is described in docs/reference/segment-format.md. The source's process writes the state; whoever wants it
-moved holds the section's lock, asks, and waits for the answer. A position is a time of the recording: of the clock that
-the recorded instance had, in ns since its start.
+See docs/reference/segment-format.md for the section. The source's process writes the state. A program
+that wants to move the playhead takes the section's lock, writes a request, and waits for the answer.
+A position is a time of the recorded instance's clock, in ns since its start.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from shmio.segment.clock import ClockPage
 
 OWN_WORDS: Final = "replay: "
-"""How what a replay says of itself begins, in reasons of frames and texts of events; all else was recorded."""
+"""Prefix of a replay's own reasons and event texts; those without it were recorded."""
 MIN_SPEED: Final = 0.01
 MAX_SPEED: Final = 1000.0
 
@@ -48,15 +48,26 @@ _LOCK_S: Final = 10.0
 
 
 class PlayState(NamedTuple):
-    """How a recording plays. Positions and clocks in ns.
+    """State of a replay. Positions and clocks are in ns.
 
-    When the instance's clock was ``anchor_ns``, the position was ``position_ns``; it moves at ``speed`` times that
-    clock, up to ``until_ns``. What is played is from ``begin_ns`` to before ``end_ns``; with ``loop`` again and again.
-    ``base_ns``: what a position is counted from in the publish times of frames. ``utc_ns``: UTC of position 0.
-    ``own_clock``: frames have the clock of the recording; else that of the instance when they were due. ``over``:
-    the end was reached. ``step``: the last step of virtual time that was answered; ``begun``: the last one that was
-    begun, when ``head`` was the number of the newest frame. ``asked``: the last request that was answered, with
-    ``answer``.
+    Attributes:
+        begin_ns: Start of the played range.
+        end_ns: End of the played range, exclusive.
+        anchor_ns: The instance's clock at which the position was ``position_ns``.
+        position_ns: Position at the anchor; from there it moves at ``speed`` times the clock.
+        until_ns: Position at which the replay stops.
+        base_ns: Publish time of position 0.
+        utc_ns: UTC of position 0.
+        speed: Speed relative to the instance's clock.
+        paused: Whether it is paused.
+        loop: Whether it starts again at the end.
+        own_clock: Whether frames have the clock of the recording, or that of the instance.
+        over: Whether the end was reached.
+        step: The last step of virtual time that was answered.
+        asked: Number of the last request that was answered.
+        answer: The answer to that request.
+        begun: The last step of virtual time that was begun.
+        head: Number of the newest frame when that step was begun.
     """
 
     begin_ns: int
@@ -78,7 +89,7 @@ class PlayState(NamedTuple):
     head: int = 0
 
     def reach_ns(self, clock_ns: int) -> int:
-        """The position at a time of the instance's clock, if nothing ended it."""
+        """Return the position at a time of the instance's clock, ignoring the end."""
         if self.paused or clock_ns <= self.anchor_ns:
             return self.position_ns
         passed_ns = clock_ns - self.anchor_ns
@@ -86,18 +97,18 @@ class PlayState(NamedTuple):
 
     @property
     def wraps(self) -> bool:
-        """Whether it begins anew when it has come to the end."""
+        """Whether the replay starts again when it reaches the end."""
         return self.loop and self.until_ns >= self.end_ns
 
     def at_ns(self, clock_ns: int) -> int:
-        """The position at a time of the instance's clock."""
+        """Return the position at a time of the instance's clock."""
         reach_ns = self.reach_ns(clock_ns)
         if reach_ns >= self.end_ns and self.wraps and not self.paused:
             return self.begin_ns + (reach_ns - self.begin_ns) % (self.end_ns - self.begin_ns)
         return min(reach_ns, self.until_ns)
 
     def due_ns(self, position_ns: int) -> int:
-        """The instance's clock when a position that lies ahead is reached: the first moment at which it has been."""
+        """Return the first time of the instance's clock at which a position ahead is reached."""
         ahead_ns = position_ns - self.position_ns
         clock_ns = self.anchor_ns + (ahead_ns if self.speed == 1 else math.ceil(ahead_ns / self.speed))
         while not self.paused and self.reach_ns(clock_ns) < position_ns:  # by a rounding
@@ -105,11 +116,11 @@ class PlayState(NamedTuple):
         return clock_ns
 
     def next_round(self) -> PlayState:
-        """The same, with this round behind it, of one that wraps."""
+        """Return the state at the start of the next round, for a replay that wraps."""
         return self._replace(anchor_ns=self.due_ns(self.end_ns), position_ns=self.begin_ns)
 
     def settled(self, clock_ns: int) -> PlayState:
-        """The same, with the rounds that are over by then behind it, and paused where it was to stop."""
+        """Return the state after all finished rounds, paused if it has reached its stop."""
         reach_ns = self.reach_ns(clock_ns)
         if self.paused or reach_ns < self.until_ns:
             return self
@@ -120,11 +131,11 @@ class PlayState(NamedTuple):
         return self.anchored(clock_ns)._replace(paused=True, until_ns=self.end_ns)
 
     def anchored(self, clock_ns: int) -> PlayState:
-        """The same, told from a time of the instance's clock on."""
+        """Return the same state with another anchor."""
         return self._replace(anchor_ns=clock_ns, position_ns=self.at_ns(clock_ns))
 
     def moved_as(self, other: PlayState) -> PlayState:
-        """The same, moved as another that plays the same recording."""
+        """Return the state with the movement of another replay of the same recording."""
         return self._replace(
             anchor_ns=other.anchor_ns,
             position_ns=other.position_ns,
@@ -137,9 +148,9 @@ class PlayState(NamedTuple):
 
 
 class MoveRequest(msgspec.Struct, tag="move", forbid_unknown_fields=True, omit_defaults=True):
-    """Ask that it plays otherwise, from ``clock_ns`` of the instance's clock on; what is None stays as it is.
+    """A request to change a replay from ``clock_ns`` of the instance's clock on. None: no change.
 
-    ``until_ns``: where it is to pause, once; with ``position_ns`` None is at the end.
+    ``until_ns``: position at which to pause once; with a ``position_ns``, None means the end.
     """
 
     clock_ns: int
@@ -151,7 +162,7 @@ class MoveRequest(msgspec.Struct, tag="move", forbid_unknown_fields=True, omit_d
 
 
 class FindRequest(msgspec.Struct, tag="find", forbid_unknown_fields=True, omit_defaults=True):
-    """Ask for the first position behind ``after_ns`` at which a register changes, or an event of a kind happened."""
+    """A request for the first position after ``after_ns`` with a change of a register or an event of a kind."""
 
     after_ns: int
     path: str = ""
@@ -159,7 +170,7 @@ class FindRequest(msgspec.Struct, tag="find", forbid_unknown_fields=True, omit_d
 
 
 class PlayheadAnswer(msgspec.Struct, omit_defaults=True):
-    """The answer. ``error``: why it is not done; ``position_ns``: what was to be found; None: it is not there."""
+    """The answer to a request. ``error``: why it was not done; ``position_ns``: the position found, if any."""
 
     error: str = ""
     position_ns: int | None = None
@@ -171,12 +182,12 @@ _FOUND: Final = msgspec.json.Decoder(PlayheadAnswer)
 
 
 class Playhead:
-    """The section of one block. Several threads may read it."""
+    """The playhead of one block. Several threads may read it."""
 
     def __init__(
         self, shared: SharedObject, memory: memoryview, offset: int, size: int, lock_byte: int, clock: ClockPage
     ) -> None:
-        """ValueError: the section is too short."""
+        """Open the section. ValueError: it is too short."""
         if size < SECTION_SIZE:
             raise ValueError("the playhead's section is too short")
         self._shared = shared
@@ -192,7 +203,7 @@ class Playhead:
     # ---- for anybody ---------------------------------------------------------------------------------------------
 
     def read(self) -> PlayState | None:
-        """How it plays; None: no process of the source has begun yet. SegmentError: it cannot be read."""
+        """Return the state; None if the source has not started yet. SegmentError: it is corrupt."""
         data = self._state.read(_STATE.size)
         (flags, _, begin, end, anchor, position, until, base, utc, speed, step, asked, answer, begun, newest) = (
             _STATE.unpack(data)
@@ -205,24 +216,24 @@ class Playhead:
         )  # fmt: skip
 
     def now_ns(self) -> int:
-        """What ages of the block's frames are taken against: the position, as their publish times have it."""
+        """Return the present time by which the block's frames age: the position as a publish time."""
         play = self.read()
         return time.monotonic_ns() if play is None else play.base_ns + play.at_ns(self._clock.present_ns())
 
     def came_now(self, number: int) -> bool:
-        """Whether a frame was published in the step of virtual time that is under way."""
+        """Whether a frame was published in the present step of virtual time."""
         play, state = self.read(), self._clock.told()
         return play is not None and state.stepping and play.begun == state.step and number > play.head
 
     def clock_ns(self, publish_ns: int) -> int:
-        """The clock of what is published now at such a time."""
+        """Return the clock time of an entry that is published now with this publish time."""
         play = self.read()
         return self._clock.present_ns() if play is None or not play.own_clock else publish_ns - play.base_ns
 
     # ---- the source's part ---------------------------------------------------------------------------------------
 
     def write(self, play: PlayState) -> None:
-        """Tell how it plays; the source's process alone."""
+        """Write the state. Only the source's process may."""
         flags = _VALID | (_PAUSED * play.paused) | (_LOOP * play.loop) | (_OWN_CLOCK * play.own_clock)
         data = _STATE.pack(
             flags | (_OVER * play.over), 0, play.begin_ns, play.end_ns, play.anchor_ns, play.position_ns,
@@ -232,7 +243,7 @@ class Playhead:
         self._state.write(data)
 
     def asks(self, answered: int) -> tuple[int, PlayheadRequest | None] | None:
-        """Number and request that waits; None: there is none behind ``answered``. A request that is none is None."""
+        """Return number and content of a request newer than ``answered``, if any. Invalid content is None."""
         asked = self._asked()
         if asked is None or asked[0] == answered:
             return None
@@ -243,7 +254,7 @@ class Playhead:
             return number, None
 
     def asked(self) -> int:
-        """Number of the last request; 0: there was none."""
+        """Return the number of the last request; 0: there was none."""
         asked = self._asked()
         return asked[0] if asked else 0
 
@@ -258,20 +269,20 @@ class Playhead:
 
     @contextmanager
     def held(self) -> Iterator[None]:
-        """Ask alone. CommandError: another program does not end its requests."""
+        """Hold the lock for requests. CommandError: another program does not release it."""
         with self._turn:
             until_s = time.monotonic() + _LOCK_S
             while not self._shared.try_lock(self._lock_byte):
                 if time.monotonic() > until_s:
                     raise CommandError("another program is moving this recording: try again when it is done")
-                time.sleep(_LOCK_TURN_S)  # rare, and who holds it rings nothing
+                time.sleep(_LOCK_TURN_S)  # rare, and its release rings no doorbell
             try:
                 yield
             finally:
                 self._shared.unlock(self._lock_byte)
 
     def ask(self, ask: PlayheadRequest) -> int:
-        """Leave a request, with the lock held; its number. The bell of the source's process is the caller's to ring."""
+        """Write a request, with the lock held; returns its number. The caller rings the source's doorbell."""
         document = msgspec.json.encode(ask)
         if len(document) > _MAX_ASK:
             raise CommandError("the request is too long")
@@ -281,7 +292,7 @@ class Playhead:
         return number
 
     def found(self, number: int) -> PlayheadAnswer | None:
-        """The answer to a request; None: there is none yet."""
+        """Return the answer to a request; None if there is none yet."""
         play = self.read()
         if play is None or play.asked != number:
             return None
@@ -292,6 +303,6 @@ class Playhead:
 
 
 def with_answer(play: PlayState, number: int, found: PlayheadAnswer) -> PlayState:
-    """With the answer to a request."""
+    """Return the state with the answer to a request."""
     found = PlayheadAnswer(cut(found.error, _MAX_ERROR).decode(), found.position_ns)
     return play._replace(asked=number, answer=msgspec.json.encode(found).decode())

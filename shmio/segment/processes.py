@@ -1,7 +1,7 @@
-"""The process table: who runs, since when, how it fares. Written by supervisor and workers, read by anybody.
+"""The process table: the instance's processes, their state and counters.
 
-A slot has three parts, each with one writer: name, kind and digest with the supervisor's cell, and the worker's
-heartbeat and cell. The worker holds an OS lock on its slot for life, so a dead owner is known for certain.
+The supervisor writes a slot's name, kind, digest and its own cell; the worker writes its heartbeat and
+its cell. Anybody may read. A worker holds an OS lock on its slot for life, so that its death is certain.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ COUNTERS: Final[Mapping[str, tuple[str, ...]]] = {
     "mqtt": ("messages", "commands", "refused", "waiting", "backlog", "dropped", "connects", "missed"),
     "recorder": ("frames", "events", "missed", "bytes"),
 }
-"""Names of a worker's counters by its kind, in the order of their slots (at most 8)."""
+"""Names of a worker's counters, by kind of process, in the order of the report (at most 8)."""
 
 
 GUEST_SLOTS: Final = 4
-"""Places for programs from outside that write; the last slots of the table, with the first command queues."""
+"""Slots for other programs that write: the last ones of the table, with the first command queues."""
 
 WRITERS: Final[Mapping[str, int]] = {"grpc": 4, "mqtt": 5}
-"""The command queue of a process that writes, by its kind, which is its name."""
+"""The command queue of each process of the instance that writes, by its name, which is its kind."""
 
 
 class Phase(IntEnum):
@@ -71,20 +71,20 @@ class Activity(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class ProcessSpec:
-    """A process the instance has a slot for. ``kind``: source, emulator, grpc, mqtt, recorder."""
+    """A process of the instance. ``kind``: source, emulator, grpc, mqtt or recorder."""
 
     name: str
     kind: str
 
     @property
     def writer(self) -> int | None:
-        """Its command queue; None: it writes nothing. (Of kind mqtt there is the broker, too, which does not.)."""
+        """The process's command queue; None if it writes nothing, like the broker, which is of kind mqtt."""
         return WRITERS.get(self.kind) if self.name == self.kind else None
 
 
 @dataclass(frozen=True, slots=True)
 class Supervised:
-    """The supervisor's part: ``note`` says why the process is not running."""
+    """The supervisor's part of a slot. ``note`` says why the process is not running."""
 
     phase: Phase = Phase.STOPPED
     restarts: int = 0
@@ -94,7 +94,7 @@ class Supervised:
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """The worker's part. ``counters`` are named by :data:`COUNTERS`; ``note`` says what is wrong at present."""
+    """The worker's part of a slot. :data:`COUNTERS` names the counters; ``note`` describes a problem."""
 
     pid: int = 0
     activity: Activity = Activity.NONE
@@ -104,23 +104,23 @@ class Report:
 
 
 class ProcessSlot:
-    """One process's line of the table."""
+    """The slot of one process in the table."""
 
     def __init__(self, shared: SharedObject, memory: memoryview, index: int, offset: int) -> None:
         self._shared = shared
         self._memory = memory
         self._offset = offset
         self.index = index
-        """Place in the table; the role's lock is byte ``index + 1``."""
+        """Index in the table; the slot's lock is byte ``index + 1``."""
         name, kind, writer = _FIXED.unpack_from(memory, offset)
         self.name = text(name)
         self.kind = text(kind)
         self.writer: int | None = writer - 1 if writer else None
-        """The command queue that this role fills, in every block."""
+        """The command queue that this process fills, in every block; None: it writes nothing."""
 
     @property
     def digest(self) -> bytes:
-        """What the supervisor started the process from, as a SHA-256; zeros before the first start."""
+        """SHA-256 of the settings that the process was started from; zeros before the first start."""
         at = self._offset + _DIGEST_AT
         return bytes(self._memory[at : at + _DIGEST_SIZE])
 
@@ -131,7 +131,7 @@ class ProcessSlot:
 
     @property
     def supervised(self) -> Supervised:
-        """What the supervisor last wrote."""
+        """The supervisor's part, as last written."""
         data = _atomics.cell_read(self._memory, self._offset + _SUPERVISED_AT, _SUPERVISED.size)
         if data is None:
             return Supervised()
@@ -145,7 +145,7 @@ class ProcessSlot:
 
     @property
     def report(self) -> Report:
-        """What the worker last wrote; its predecessor's until a new one has started."""
+        """The worker's part, as last written; its predecessor's until a new worker has started."""
         data = _atomics.cell_read(self._memory, self._offset + _REPORT_AT, _REPORT.size)
         if data is None:
             return Report()
@@ -165,24 +165,24 @@ class ProcessSlot:
 
     @property
     def heartbeat_ns(self) -> int:
-        """CLOCK_MONOTONIC of the worker's last beat; 0 before the first."""
+        """CLOCK_MONOTONIC of the worker's last heartbeat; 0 before the first."""
         return _atomics.load64(self._memory, self._offset + _HEARTBEAT_AT)
 
     def beat(self) -> None:
-        """Tell that the worker makes progress."""
+        """Write the worker's heartbeat."""
         _atomics.store64(self._memory, self._offset + _HEARTBEAT_AT, time.monotonic_ns())
 
     def take(self) -> bool:
-        """Take the role's lock for life; False while another process holds it."""
+        """Take the slot's lock for life; returns False if another process holds it."""
         return self._shared.try_lock(self.index + 1)
 
     def alive(self) -> bool:
-        """Whether some process holds the role's lock."""
+        """Whether another holder has the slot's lock."""
         return self._shared.locked(self.index + 1)
 
 
 class ProcessTable(Sequence[ProcessSlot]):
-    """The instance's own processes, in the order of the table; ``guests``: the places for others."""
+    """The instance's own processes, in table order; ``guests`` are the slots for other programs."""
 
     def __init__(self, shared: SharedObject, memory: memoryview, header: Header) -> None:
         self._shared, self._memory, self._header = shared, memory, header
@@ -195,7 +195,7 @@ class ProcessTable(Sequence[ProcessSlot]):
 
     @staticmethod
     def write(memory: memoryview, header: Header, specs: Sequence[ProcessSpec]) -> None:
-        """Name the slots of a new segment, the guests' included."""
+        """Write the names of a new segment's slots, including the guest slots."""
         first = header.process_capacity - GUEST_SLOTS
         slots = [(index, spec.name, spec.kind, spec.writer) for index, spec in enumerate(specs)]
         slots += [(first + guest, f"guest-{guest + 1}", "guest", guest) for guest in range(GUEST_SLOTS)]
@@ -204,7 +204,7 @@ class ProcessTable(Sequence[ProcessSlot]):
             _FIXED.pack_into(memory, at, name.encode(), kind.encode(), 0 if writer is None else writer + 1)
 
     def require(self, count: int) -> None:
-        """Make sure that so many processes can be added; SegmentError."""
+        """Raise SegmentError unless ``count`` processes can be added."""
         vacant = self._header.process_capacity - len(self.guests) - len(self._slots)
         if count > vacant:
             raise SegmentError(
@@ -213,7 +213,7 @@ class ProcessTable(Sequence[ProcessSlot]):
             )
 
     def add(self, spec: ProcessSpec) -> ProcessSlot:
-        """Give a vacant slot to a process; the supervisor's alone. SegmentError: there is none."""
+        """Assign a vacant slot to a process. Only the supervisor may. SegmentError: there is none."""
         self.require(1)
         taken = {slot.index for slot in (*self._slots, *self.guests)}
         index = next(i for i in range(self._header.process_capacity) if i not in taken)
@@ -221,15 +221,15 @@ class ProcessTable(Sequence[ProcessSlot]):
         writer = spec.writer
         fields = _FIXED.pack(spec.name.encode(), spec.kind.encode(), 0 if writer is None else writer + 1)
         self._memory[at + _NAME_SIZE : at + len(fields)] = fields[_NAME_SIZE:]
-        self._memory[at : at + _NAME_SIZE] = fields[:_NAME_SIZE]  # last: a slot with a name is whole
+        self._memory[at : at + _NAME_SIZE] = fields[:_NAME_SIZE]  # last: a slot with a name is complete
         slot = self._slot(index)
         self._slots = sorted([*self._slots, slot], key=lambda slot: slot.index)
         return slot
 
     def remove(self, slot: ProcessSlot) -> None:
-        """Empty the slot of a process that has ended; the supervisor's alone. Its place may be given to another."""
+        """Vacate the slot of a process that has ended. Only the supervisor may."""
         at = self._header.processes_offset + slot.index * SLOT_SIZE
-        self._memory[at : at + _NAME_SIZE] = bytes(_NAME_SIZE)  # first: nobody is to find what follows
+        self._memory[at : at + _NAME_SIZE] = bytes(_NAME_SIZE)  # first: a slot without a name is not read
         slot.supervised, slot.report, slot.digest = Supervised(), Report(), bytes(_DIGEST_SIZE)
         _atomics.store64(self._memory, at + _HEARTBEAT_AT, 0)
         self._slots = [other for other in self._slots if other.index != slot.index]
@@ -244,7 +244,7 @@ class ProcessTable(Sequence[ProcessSlot]):
         return iter(self._slots)
 
     def find(self, name: str) -> ProcessSlot:
-        """The slot of this name; KeyError."""
+        """Return the slot with this name; KeyError."""
         for slot in self._slots:
             if slot.name == name:
                 return slot
@@ -252,5 +252,5 @@ class ProcessTable(Sequence[ProcessSlot]):
 
 
 def supervisor_beat(memory: memoryview) -> None:
-    """The supervisor's own heartbeat."""
+    """Write the supervisor's heartbeat."""
     _atomics.store64(memory, HEARTBEAT_OFFSET, time.monotonic_ns())

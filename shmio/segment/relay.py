@@ -1,4 +1,4 @@
-"""For event loops, which cannot wait on a futex: a descriptor that a bell in shared memory makes readable."""
+"""Turn a doorbell in shared memory into a readable descriptor, for event loops, which cannot wait on a futex."""
 
 from __future__ import annotations
 
@@ -9,22 +9,24 @@ from typing import Final, Protocol
 from shmio.segment import _atomics
 
 TURN_NS: Final = 200_000_000
-"""Longest time between two tellings: who listens looks at the age of what there is, and at what rings no bell."""
+"""Longest time between two notifications: listeners also check ages, and changes that ring no doorbell."""
 AGAIN_S: Final = 0.01
-"""So often a thread is told to stop until it has ended: one that is just about to wait does not notice."""
+"""How often a thread is told to stop until it has ended: one about to wait may miss the request."""
 
 
 class WakeSource(Protocol):
-    """A bell: :class:`~shmio.segment.clock.Doorbell`, or the doorbell of a ring."""
+    """A doorbell: :class:`~shmio.segment.clock.Doorbell`, or that of a ring."""
 
     def relay(self, shared: bytearray, descriptor: int, turn_ns: int, /) -> None:
-        """Wait for it, and tell, until it is stopped; without the interpreter's lock."""
+        """Wait for rings and signal the descriptor until stopped, without the interpreter's lock."""
 
 
 class Relay:
-    """Tells of the rings of one bell, from a thread of its own that never holds the interpreter's lock (``relay.h``).
+    """Signals the rings of a doorbell through a descriptor.
 
-    ``descriptor`` is readable at first, after each ring, and after ``turn_ns`` without one, until :meth:`heard`.
+    A thread that never holds the interpreter's lock waits for the doorbell (``relay.h``). The
+    ``descriptor`` is readable at first, after each ring, and after ``turn_ns`` without one, until
+    :meth:`heard` is called.
     """
 
     def __init__(self, word: WakeSource, name: str, turn_ns: int = TURN_NS) -> None:
@@ -38,21 +40,21 @@ class Relay:
 
     @property
     def alive(self) -> bool:
-        """Whether it tells, or is about to end."""
+        """Whether the thread still runs."""
         return self._thread.is_alive()
 
     def heard(self) -> None:
-        """To be called when the descriptor is readable, before looking: what comes from then on is told again."""
-        if not self._stopped:  # the descriptor's number may be another's by now
+        """Acknowledge a notification. Call it before you check for changes, so that later rings are signalled."""
+        if not self._stopped:  # the descriptor may have been closed and reused
             _atomics.relay_heard(self._shared, self.descriptor)
 
     def stop(self) -> None:
-        """Tell no more. The thread ends soon, within ``turn_ns``, and the descriptor with it."""
+        """Stop signalling. The thread ends within ``turn_ns``, and closes the descriptor."""
         self._stopped = True
         _atomics.relay_stop(self._shared)
 
     def join(self) -> None:
-        """Stop, and wait until the thread has ended; that takes no ``turn_ns``."""
+        """Stop, and wait until the thread has ended, which takes less than ``turn_ns``."""
         while self._thread.is_alive():
             self.stop()
             self._thread.join(AGAIN_S)

@@ -35,16 +35,16 @@ from shmio.segment.shm import SharedObject
 from shmio.segment.standing_injections import declared_cell, standing_cell
 
 FIRST_LINK = 2
-"""The lock of a block's link or playhead: so many bytes, and its layout's index, after those of the process table."""
+"""Offset of the lock byte of a block's model channel or playhead: process slots + this + index of its layout."""
 
 _ATTRIBUTES = msgspec.json.Decoder(Attributes)  # as in layout/document.py: built before there are threads
 
 
 def read_clock(shared: SharedObject, head: Header, entries: Sequence[SectionEntry]) -> ClockPage:
-    """The clock page; FormatError."""
+    """Open the clock page. FormatError: there is none, or it is inconsistent."""
     for entry in entries:
         if entry.kind == SectionKind.CLOCK:
-            try:  # on memory of its own: what has been read is still judged by it when the segment is closed
+            try:  # its own mapping, so that frames age even after the segment is closed
                 own = memoryview(shared.map())
                 return ClockPage(own, entry.offset, entry.size, head, partial(shared.taken, time_lock(head)))
             except ValueError as error:
@@ -62,7 +62,7 @@ def read_block(
     layout_at: int,
     clock: ClockPage,
 ) -> Block:
-    """The block whose layout is the section of this index. FormatError."""
+    """Open the block whose layout is in section ``layout_at``. FormatError: it is inconsistent."""
     name = shared.name
     described = entries[layout_at]
     parts = {
@@ -103,9 +103,9 @@ PREFIX = "shmio-"
 
 
 class Segment:
-    """One instance's shared memory, mapped.
+    """The mapped shared memory of an instance.
 
-    A supervisor makes it with :meth:`create`; workers :meth:`open` it writable, readers read-only.
+    A supervisor creates it with :meth:`create`; workers :meth:`open` it writable, readers read-only.
     """
 
     def __init__(self, shared: SharedObject, instance: str) -> None:
@@ -115,7 +115,7 @@ class Segment:
         self.header = Header.read(self.memory, shared.name)
         self.processes = ProcessTable(shared, self.memory, self.header)
         self._turn = threading.RLock()
-        """Held over a change of ``blocks``, which threads may look for at the same time."""
+        """Held while ``blocks`` change, which several threads may check at once."""
         self.clock = read_clock(shared, self.header, self._sections())
         self._known: dict[int, Block] = {}  # by the section of its layout
         self.blocks = self._find_blocks()
@@ -134,13 +134,23 @@ class Segment:
         stepped: bool = False,
         origin: Origin | None = None,
     ) -> Segment:
-        """Build a new segment and hold its supervisor's lock. ``stepped``: time stands until somebody steps.
+        """Create a new segment, and take its supervisor's lock.
 
-        ``config``: the resolved path of the configuration file that it is started from.
-        ``origin``: the time of a recording; default: the clock begins at 0, now.
+        Args:
+            instance: Name of the instance.
+            blocks: The blocks of its sources.
+            processes: The instance's processes.
+            mode: Mode of the instance.
+            control: Path of the control socket.
+            config: Resolved path of the configuration file.
+            group: Group whose members may read the segment.
+            stepped: Whether time is virtual from the start.
+            origin: The start time for a replay; None: the clock starts at 0, now.
 
-        AlreadyRunningError: there is a segment of this name, with or without a living supervisor (see
-        :func:`shmio.segment.stale_segment.clear` for the latter). SegmentError: there is no room.
+        Raises:
+            AlreadyRunningError: There is a segment of this name, with a living supervisor or without
+                one (see :func:`shmio.segment.stale_segment.clear`).
+            SegmentError: There is no room in shared memory.
         """
         name = PREFIX + instance
         try:
@@ -149,7 +159,7 @@ class Segment:
             refuse_second(instance)
             raise AlreadyRunningError(f"a segment of instance {instance!r} is left over or just being made") from None
         try:
-            # Whoever opens the name between creation and this lock sees no magic, and takes it for half-made.
+            # A process that opens the name before this lock is taken finds no magic: an unfinished segment.
             if not shared.try_lock(SUPERVISOR_LOCK) or not shared.current():
                 raise AlreadyRunningError(f"another supervisor is just starting instance {instance}")
             try:
@@ -166,9 +176,18 @@ class Segment:
 
     @classmethod
     def open(cls, instance: str, *, writable: bool = False, config: Path | None = None) -> Segment:
-        """Open a running instance's segment; NotRunningError, FormatError, SegmentError (permission).
+        """Open the segment of a running instance.
 
-        ``config``: the file that it must have been started from, see :meth:`require_config`; None: any.
+        Args:
+            instance: Name of the instance.
+            writable: Whether to map it writable.
+            config: Configuration file that it must have been started from; None: any.
+
+        Raises:
+            NotRunningError: There is no such segment.
+            FormatError: Another version made it, or it is inconsistent.
+            SegmentError: There is no permission to open it.
+            WrongInstanceError: The instance was started from another configuration file.
         """
         name = PREFIX + instance
         try:
@@ -192,14 +211,14 @@ class Segment:
 
     @property
     def config(self) -> Path | None:
-        """The configuration file that the instance was started from; None: it does not tell."""
+        """The configuration file that the instance was started from; None: unknown."""
         return header.read_config(self.memory)
 
     def require_config(self, file: Path) -> None:
-        """Make sure that the instance was started from this file; WrongInstanceError.
+        """Raise WrongInstanceError unless the instance was started from this file.
 
-        Two folders may well have configurations with one ``instance.name``, and only one of them can run. What counts
-        is the path, with links resolved: the file may have been edited since.
+        Configurations in different folders may have the same ``instance.name``. Paths are compared, with
+        links resolved; the file may have been edited since.
         """
         if header.has_config(self.memory, file.resolve()):
             return
@@ -215,16 +234,16 @@ class Segment:
         return {entries[index].name: self._found(index) for index in layouts if not entries[index].retired}
 
     def _found(self, layout: int) -> Block:
-        """The block whose layout is in this section; always the same object."""
+        """Return the block whose layout is in this section, always the same object."""
         if layout not in self._known:
             self._known[layout] = read_block(self.shared, self.memory, self.header, self._entries, layout, self.clock)
         return self._known[layout]
 
     @property
     def ended(self) -> list[Block]:
-        """The blocks that reloads have ended, the oldest first: what their rings held then can still be read.
+        """The blocks that reloads have retired, the oldest first, as of the last :meth:`refresh`.
 
-        As of :meth:`refresh`. FormatError.
+        Their rings can still be read. FormatError: a block is inconsistent.
         """
         with self._turn:
             entries = enumerate(self._entries)
@@ -232,29 +251,35 @@ class Segment:
             return [self._found(index) for index in layouts]
 
     def _sections(self) -> list[SectionEntry]:
-        """The section table of one generation."""
+        """Read the section table of one generation."""
         while True:
             self._generation, count = header.table_state(self.memory)
-            if len(self.memory) < self.shared.size:  # it grew before the table did; blocks keep their old mapping
+            if len(self.memory) < self.shared.size:  # the segment has grown; blocks keep their old mapping
                 self.memory = memoryview(self.shared.map())
             entries = header.read_sections(self.memory, self.header, count, self.shared.name)
-            if self.generation == self._generation:  # or else a change came between; there are at most a few
+            if self.generation == self._generation:  # else the table changed meanwhile
                 return entries
 
     @property
     def generation(self) -> int:
-        """Changes whenever a reload adds or ends blocks; then :meth:`refresh` has something to do."""
+        """Generation of the section table: it changes whenever a reload adds or retires blocks."""
         return header.table_state(self.memory)[0]
 
     @property
     def outdated(self) -> bool:
-        """Whether :meth:`refresh` has something to do, which may take a second for a big layout."""
+        """Whether a :meth:`refresh` is due; that may take a second for a large layout."""
         return self.generation != self._generation
 
     def refresh(self) -> bool:
-        """Look again what blocks there are, if a reload has changed that. Blocks that go on stay the same objects.
+        """Update blocks and process table after a reload. Blocks that still exist stay the same objects.
 
-        The process table is read anew too. Several threads may: one waits for what another has begun. FormatError.
+        Several threads may call it.
+
+        Returns:
+            Whether anything had changed.
+
+        Raises:
+            FormatError: A block is inconsistent.
         """
         with self._turn:
             if not self.outdated:
@@ -264,9 +289,13 @@ class Segment:
             return True
 
     def reserve(self, add: Sequence[BlockSpec]) -> int:
-        """Make room for what :meth:`change` is to add, so that it cannot fail; the offset at which it is.
+        """Reserve room for the blocks that :meth:`change` is to add, so that it cannot fail.
 
-        SegmentError: no room in shared memory or in the section table.
+        Returns:
+            The offset of the reserved room.
+
+        Raises:
+            SegmentError: There is no room in shared memory or in the section table.
         """
         entries = self._sections()
         if len(add) > (vacant := (self.header.section_capacity - len(entries)) // SECTIONS_PER_BLOCK):
@@ -280,28 +309,31 @@ class Segment:
         size = at + sum(block.size for block in add)
         before = self.shared.size
         self.shared.allocate(size)
-        with memoryview(self.shared.map()) as memory:  # reserved before, and perhaps begun by a supervisor that died
+        with memoryview(self.shared.map()) as memory:  # a supervisor that died may have used it
             memory[at : min(before, size)] = bytes(max(0, min(before, size) - at))
         return at
 
     def change(self, add: Sequence[BlockSpec] = (), retire: Sequence[str] = ()) -> None:
-        """Add blocks and end others, which readers see in this order; the supervisor's alone.
+        """Add blocks, then retire others. Readers see the changes in this order. Only the supervisor may.
 
-        A name in both gets a new block in place of the old. SegmentError: no room, and nothing has changed.
+        A source named in both gets a new block in place of the old one.
+
+        Raises:
+            SegmentError: There is no room; nothing has changed.
         """
         at = self.reserve(add)
         first = len(self._sections())  # which maps what has been added, too
         self._change(write_blocks(self.memory, at, first, add), {self.blocks[name].section for name in retire})
 
     def end_replaced(self) -> None:
-        """End what a supervisor that died within :meth:`change` has not, and wake who waits at what has ended."""
+        """Finish a :meth:`change` whose supervisor died, and wake everybody who waits at retired blocks."""
         replaced = {block.section for block in self._known.values() if block not in self.blocks.values()}
         parts = enumerate(self._sections())
         ended = {index for index, part in parts if part.kind == SectionKind.LAYOUT and part.retired}
-        self._change((), replaced | ended)  # even if there is none: the generation may not have been told
+        self._change((), replaced | ended)  # even if there is none: the generation may not have been updated
 
     def _change(self, add: Sequence[SectionEntry], ending: Collection[int]) -> None:
-        """Append entries, and end the blocks of these layouts' sections."""
+        """Append entries, and retire the blocks with these layout sections."""
         parts = list(enumerate(self._sections()))
         ended = {i: part for i, part in parts if (i if part.kind == SectionKind.LAYOUT else part.layout) in ending}
         header.change_sections(self.memory, self.header, add, list(ended))
@@ -309,35 +341,35 @@ class Segment:
         wake(self.memory, ended.values())
 
     def clock_ns(self, now_ns: int) -> int:
-        """The instance's clock, ns since its start, at a time of CLOCK_MONOTONIC, or one that is comparable."""
+        """Convert a time comparable to CLOCK_MONOTONIC to the instance's clock, ns since its start."""
         return now_ns - self.header.started_ns
 
     def writer(self, source: str, at: Stamp | None = None) -> BlockWriter:
-        """The writing side of a source's block; for its process alone, which holds the role's lock.
+        """Open a source's block for writing. Only the process that holds the source's slot may.
 
-        ``at``: when its start is told, other than now.
+        ``at``: times of the start event; None: now.
         """
         block = self.blocks[source]
         return BlockWriter(block, self.clock_ns if block.playhead is None else block.playhead.clock_ns, at)
 
     @property
     def supervisor(self) -> tuple[int, State]:
-        """(pid, state of the instance) as the supervisor last wrote them."""
+        """The supervisor's pid and the instance's state, as last written."""
         return header.read_supervisor(self.memory)
 
     @property
     def note(self) -> str:
-        """What the supervisor last told to be wrong with the instance itself; empty: nothing."""
+        """The supervisor's last note about a problem of the instance itself; empty: none."""
         return header.read_note(self.memory)
 
     @property
     def supervisor_heartbeat_ns(self) -> int:
-        """CLOCK_MONOTONIC of the supervisor's last beat."""
+        """CLOCK_MONOTONIC of the supervisor's last heartbeat."""
         return _atomics.load64(self.memory, header.HEARTBEAT_OFFSET)
 
     @property
     def supervised_since_ns(self) -> int:
-        """CLOCK_MONOTONIC of the supervisor's start: later than the instance's, if it has taken that over."""
+        """CLOCK_MONOTONIC of the supervisor's start; after a take-over later than the instance's start."""
         return _atomics.load64(self.memory, header.SUPERVISED_SINCE_OFFSET) or self.header.started_ns
 
     @property
@@ -346,15 +378,15 @@ class Segment:
         return self.shared.locked(SUPERVISOR_LOCK)
 
     def set_state(self, pid: int, state: State, note: str = "") -> None:
-        """Tell supervisor and state, and what is wrong beside the processes; the supervisor's alone."""
+        """Write the supervisor's pid, the instance's state and a note. Only the supervisor may."""
         header.write_supervisor(self.memory, pid, state)
         header.write_note(self.memory, note)
         supervisor_beat(self.memory)
 
     def lead_to(self, control: str, config: Path) -> None:
-        """Tell that another supervisor begins, the path of its control socket, and its configuration; its alone.
+        """Write start time, control socket and configuration of a supervisor that takes over.
 
-        Who has opened the segment before keeps the old path.
+        Only that supervisor may. Processes that opened the segment before keep the old paths.
         """
         header.write_supervised_since(self.memory, time.monotonic_ns())
         header.write_control(self.memory, control)
@@ -362,7 +394,7 @@ class Segment:
         self.header = Header.read(self.memory, self.shared.name)
 
     def unlink(self) -> None:
-        """Remove the name, if it is still this segment's. Only a clean stop does this."""
+        """Remove the segment's name, if it still belongs to this segment. Only a clean stop does this."""
         if self.shared.current():
             shm.unlink(self.shared.name)
 
@@ -372,9 +404,9 @@ class Segment:
         return self.shared.closed
 
     def close(self) -> None:
-        """Give up mapping and locks; blocks taken from here keep the mapping as long as they are held."""
+        """Release mapping and locks. Blocks that are still referenced keep the mapping."""
         self.blocks, self._known = {}, {}
-        with suppress(BufferError):  # a Ring is still held somewhere
+        with suppress(BufferError):  # a Ring is still referenced
             self.memory.release()
         self.shared.close()
 
@@ -386,12 +418,12 @@ class Segment:
 
 
 def instances() -> list[str]:
-    """Names of the instances that have a segment, whole or left over."""
+    """Return the names of all instances that have a segment, running or stale."""
     return [name.removeprefix(PREFIX) for name in shm.names(PREFIX)]
 
 
 def running_instances() -> list[str]:
-    """Names of the instances that live: a supervisor, or at least one of its processes, is there."""
+    """Return the names of the instances that have a living supervisor or process."""
     found = []
     for name in instances():
         with suppress(SegmentError), Segment.open(name) as segment:
@@ -401,7 +433,7 @@ def running_instances() -> list[str]:
 
 
 def refuse_second(instance: str) -> None:
-    """AlreadyRunningError, with the supervisor's pid, if the instance has a living one."""
+    """Raise AlreadyRunningError if the instance has a living supervisor."""
     try:
         segment = Segment.open(instance)
     except SegmentError:

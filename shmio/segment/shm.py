@@ -1,7 +1,7 @@
-"""One POSIX shared-memory object: create, open, lock, map, unlink. Linux only.
+"""A POSIX shared-memory object: create, open, lock, map and unlink. Linux only.
 
-posix-ipc opens the object (not ``multiprocessing.shared_memory``, whose resource tracker unlinks a live segment when a
-process that merely attached ends).
+It uses posix-ipc, because the resource tracker of ``multiprocessing.shared_memory`` unlinks a live
+segment when any process that attached to it ends.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ _FLOCK = "@hhqqi4x"  # struct flock of 64-bit Linux: type, whence, start, length
 class SharedObject:
     """An open shared-memory object with its mapping and its byte locks.
 
-    The locks are *open file description* locks (fcntl(2)): the kernel releases them when the holder dies, however it
-    dies, and they belong to this object, not to the process, so that two of them in one process exclude each other.
+    The locks are *open file description* locks (fcntl(2)). The kernel releases them when the holder dies
+    in any way. They belong to this object, not to the process, so two objects in one process exclude
+    each other.
     """
 
     def __init__(self, name: str, fd: int, *, writable: bool) -> None:
@@ -40,7 +41,7 @@ class SharedObject:
 
     @classmethod
     def create(cls, name: str, group: str | None = None) -> SharedObject:
-        """Create the object, empty; FileExistsError when there is one. Mode 0600, or 0640 with a group."""
+        """Create an empty object, with mode 0600, or 0640 with a group. FileExistsError: it exists."""
         try:
             memory = posix_ipc.SharedMemory(f"/{name}", posix_ipc.O_CREX, mode=0o600)
         except posix_ipc.ExistentialError:
@@ -61,7 +62,7 @@ class SharedObject:
 
     @classmethod
     def open(cls, name: str, *, writable: bool = False) -> SharedObject:
-        """Open an existing object; FileNotFoundError when there is none."""
+        """Open an existing object. FileNotFoundError: there is none; SegmentError: no permission."""
         try:
             memory = posix_ipc.SharedMemory(f"/{name}", 0, read_only=not writable)
         except posix_ipc.ExistentialError:
@@ -75,7 +76,7 @@ class SharedObject:
         return cls(name, memory.fd, writable=writable)
 
     def allocate(self, size: int) -> None:
-        """Reserve all pages up to ``size`` now: a full file system is an error here, not a SIGBUS later."""
+        """Reserve all pages up to ``size``, so that a full file system fails here and not as a SIGBUS later."""
         try:
             os.posix_fallocate(self._fd, 0, size)
         except OSError as error:
@@ -90,13 +91,13 @@ class SharedObject:
 
     @property
     def size(self) -> int:
-        """Bytes of the object at present."""
+        """Present size of the object in bytes."""
         return os.fstat(self._fd).st_size
 
     def map(self) -> mmap.mmap:
-        """The whole object as memory: read-only unless opened writable. The same mapping at each call, until it grew.
+        """Map the whole object, read-only unless it was opened writable.
 
-        What was mapped before stays valid as long as it is held.
+        Calls return the same mapping until the object grows. Older mappings stay valid while referenced.
         """
         if self._map is None or len(self._map) < self.size:
             access = mmap.PROT_READ | (mmap.PROT_WRITE if self.writable else 0)
@@ -104,7 +105,7 @@ class SharedObject:
         return self._map
 
     def try_lock(self, byte: int) -> bool:
-        """Take the write lock on one byte for the life of this object; False when another holds it."""
+        """Take the write lock on a byte for the life of this object; returns False if another holds it."""
         try:
             fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, struct.pack(_FLOCK, fcntl.F_WRLCK, os.SEEK_SET, byte, 1, 0))
         except OSError as error:
@@ -115,23 +116,23 @@ class SharedObject:
         return True
 
     def unlock(self, byte: int) -> None:
-        """Give the lock on one byte back."""
+        """Release the lock on a byte."""
         self._held.discard(byte)
         fcntl.fcntl(self._fd, fcntl.F_OFD_SETLK, struct.pack(_FLOCK, fcntl.F_UNLCK, os.SEEK_SET, byte, 1, 0))
 
     def locked(self, byte: int) -> bool:
-        """Whether another holder has the byte; works on a read-only object (a read lock would conflict too)."""
+        """Whether another holder has locked the byte. It works on a read-only object, too."""
         query = struct.pack(_FLOCK, fcntl.F_RDLCK, os.SEEK_SET, byte, 1, 0)
         answer = fcntl.fcntl(self._fd, fcntl.F_OFD_GETLK, query)
         kind: int = struct.unpack(_FLOCK, answer)[0]
         return kind != fcntl.F_UNLCK
 
     def taken(self, byte: int) -> bool:
-        """Whether anybody has the byte, this object or another."""
+        """Whether anybody has locked the byte, this object or another."""
         return byte in self._held or self.locked(byte)
 
     def current(self) -> bool:
-        """Whether the name still leads to this object (and not to none, or to a successor)."""
+        """Whether the name still refers to this object, and not to none or to a successor."""
         try:
             return (DIRECTORY / self.name).stat().st_ino == self.inode
         except FileNotFoundError:
@@ -143,11 +144,11 @@ class SharedObject:
         return self._fd < 0
 
     def close(self) -> None:
-        """Give up mapping, descriptor and locks. A view still held keeps the mapping, not the locks."""
+        """Release mapping, descriptor and locks. A view that is still referenced keeps the mapping."""
         if self._fd < 0:
             return
         if self._map is not None:
-            with suppress(BufferError):  # somebody holds a view; the mapping goes with it
+            with suppress(BufferError):  # a view is still referenced; the mapping ends with it
                 self._map.close()
             self._map = None
         # The mapping has a copy of the descriptor, which would keep the locks as long as a view is held.
@@ -158,7 +159,7 @@ class SharedObject:
 
 
 def unlink(name: str) -> None:
-    """Remove the name; nothing happens when it is gone already."""
+    """Remove a name; nothing happens if it does not exist."""
     try:
         posix_ipc.unlink_shared_memory(f"/{name}")
     except posix_ipc.ExistentialError:
@@ -166,5 +167,5 @@ def unlink(name: str) -> None:
 
 
 def names(prefix: str) -> list[str]:
-    """Names of the shared-memory objects that begin with ``prefix``."""
+    """Return the names of the shared-memory objects that start with ``prefix``."""
     return sorted(entry.name for entry in DIRECTORY.iterdir() if entry.name.startswith(prefix))

@@ -1,4 +1,4 @@
-"""What a killed supervisor leaves: its segment, and its living children. Found out, taken over or cleared away."""
+"""Claim or clear the segment and the processes that a killed supervisor has left."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GRACE_S = 3.0
 
 
 class Worker(NamedTuple):
-    """A living process of the instance; whoever has it closes ``pidfd``."""
+    """A living process of the instance. The owner of the object closes ``pidfd``."""
 
     name: str
     pid: int
@@ -32,9 +32,14 @@ class Worker(NamedTuple):
 
 
 def claim(instance: str) -> SharedObject | None:
-    """The instance's left-over segment, with its supervisor's lock taken; None when there is none.
+    """Take the supervisor's lock of an instance's stale segment. Only one of several callers gets it.
 
-    Of several callers one gets it. AlreadyRunningError: a supervisor is alive. SegmentError: no permission.
+    Returns:
+        The segment's object; None if there is no segment.
+
+    Raises:
+        AlreadyRunningError: A supervisor is alive.
+        SegmentError: There is no permission.
     """
     try:
         shared = SharedObject.open(PREFIX + instance, writable=True)
@@ -57,7 +62,7 @@ def claim(instance: str) -> SharedObject | None:
 
 
 def read(shared: SharedObject, instance: str) -> Segment:
-    """A claimed segment. UnfinishedError: its maker died; FormatError: it is another version's."""
+    """Open a claimed segment. UnfinishedError: its creator died; FormatError: another version made it."""
     if shared.size < HEADER_SIZE:
         raise UnfinishedError(f"{shared.name} is not a whole shmio segment")
     segment = Segment(shared, instance)
@@ -67,7 +72,7 @@ def read(shared: SharedObject, instance: str) -> Segment:
 
 
 def living(instance: str) -> bool:
-    """Whether processes of the instance run, of whatever version of shmio they are. SegmentError: no permission."""
+    """Whether processes of the instance run, of any version of shmio. SegmentError: no permission."""
     try:
         with Segment.open(instance) as segment:
             return any(slot.alive() for slot in segment.processes)
@@ -79,11 +84,19 @@ def living(instance: str) -> bool:
 
 
 def clear(instance: str, forget_control: Callable[[str], object] = lambda _: None) -> list[str]:
-    """Stop the orphans of a dead supervisor and unlink its segment; what was done, a line each.
+    """Stop the orphans of a dead supervisor, and unlink its segment. It is no error if there is none.
 
-    ``forget_control`` is called with the path of the dead one's control socket while nobody can have made a new one.
-    AlreadyRunningError: a supervisor is alive. SegmentError: a process cannot be identified, or does not end; the
-    segment stays. Nothing to clear is no error.
+    Args:
+        instance: Name of the instance.
+        forget_control: Called with the path of the dead supervisor's control socket, at a time when no
+            new supervisor can have created one.
+
+    Returns:
+        A line of text for each thing done.
+
+    Raises:
+        AlreadyRunningError: A supervisor is alive.
+        SegmentError: A process cannot be identified, or does not end; the segment stays.
     """
     shared = claim(instance)
     if shared is None:
@@ -97,10 +110,10 @@ def clear(instance: str, forget_control: Callable[[str], object] = lambda _: Non
 def clear_claimed(
     shared: SharedObject, instance: str, forget_control: Callable[[str], object] = lambda _: None
 ) -> list[str]:
-    """As :func:`clear`, of a segment that the caller has claimed."""
+    """Do the work of :func:`clear` for a segment that the caller has claimed."""
     try:
         segment = read(shared, instance)
-        segment.set_state(os.getpid(), State.STOPPING)  # who asks meanwhile is told of us, not of the dead
+        segment.set_state(os.getpid(), State.STOPPING)  # status shows this process, not the dead one
         forget_control(segment.header.control)
         done = _stop_orphans(segment, shared)
     except UnfinishedError:
@@ -112,14 +125,14 @@ def clear_claimed(
 
 
 def _stop_orphans(segment: Segment, shared: SharedObject) -> list[str]:
-    """End every process that holds a role, and take all roles, so that a late one gets none."""
+    """End every process that holds a slot, and take all slots, so that a late process gets none."""
     held = {slot.index: slot for slot in segment.processes if not shared.try_lock(slot.index + 1)}
     found: list[Worker] = []
     deadline = time.monotonic() + GRACE_S
     try:
         while held and time.monotonic() < deadline:
             for index, slot in list(held.items()):
-                worker = holder(slot, shared)  # one that has just taken its role has not told its pid yet
+                worker = holder(slot, shared)  # a process that has just taken its slot has no pid there yet
                 if worker is not None:
                     found.append(worker)
                 if worker is not None or shared.try_lock(index + 1):
@@ -138,7 +151,7 @@ def _stop_orphans(segment: Segment, shared: SharedObject) -> list[str]:
 
 
 def _stop_mapping(shared: SharedObject, instance: str) -> list[str]:
-    """End the processes of a segment whose format is not known: this user's workers that may write to it."""
+    """End the processes of a segment of unknown format: this user's workers that map it writable."""
     with _opened(_workers(shared)) as found:
         end(instance, found)
         return [f"stopped {worker.name}, pid {worker.pid}, which had lost its supervisor" for worker in found]
@@ -161,7 +174,7 @@ def _workers(shared: SharedObject) -> Iterator[Worker]:
 
 
 def _module(folder: Path) -> str:
-    """The module of ours that a process runs by ``-m``; empty for others and for our commands."""
+    """Return the shmio module that a process runs by ``-m``; empty for others and for shmio's commands."""
     with suppress(OSError, ValueError):
         words = (folder / "cmdline").read_bytes().split(b"\0")
         module = words[words.index(b"-m") + 1].decode(errors="replace")
@@ -181,7 +194,7 @@ def _opened(workers: Iterable[Worker]) -> Iterator[list[Worker]]:
 
 
 def holder(slot: ProcessSlot, shared: SharedObject) -> Worker | None:
-    """The process that holds a role, if it is known for certain: it maps the segment, so its pid is no stranger's."""
+    """Return the process that holds a slot. It must map the segment, so that a reused pid is not mistaken."""
     pid = slot.report.pid
     if not pid:
         return None
@@ -198,7 +211,7 @@ def holder(slot: ProcessSlot, shared: SharedObject) -> Worker | None:
 
 
 def _maps(pid: int, inode: int, right: str = "") -> bool:
-    """Whether a process maps the object, with this right."""
+    """Whether a process maps the object with this right."""
     device = shm.DIRECTORY.stat().st_dev
     wanted = f"{os.major(device):02x}:{os.minor(device):02x}", str(inode)
     with suppress(OSError):
@@ -211,9 +224,10 @@ def _maps(pid: int, inode: int, right: str = "") -> bool:
 
 
 def end(instance: str, workers: Iterable[Worker]) -> None:
-    """Have processes end, by SIGTERM, then SIGKILL, with ``GRACE_S`` for each; returns when they have.
+    """End processes by SIGTERM, then SIGKILL, with ``GRACE_S`` for each, and wait for them.
 
-    SegmentError: some have not, by name and pid, or are another user's, who is named.
+    Raises:
+        SegmentError: Some do not end, or belong to another user; the message names them.
     """
     alive = {worker.pidfd: worker for worker in workers}
     stuck: list[str] = []
@@ -237,7 +251,7 @@ def end(instance: str, workers: Iterable[Worker]) -> None:
 
 
 def _foreign(pid: int) -> str:
-    """What to say of a process that this user may not end, with the remedy."""
+    """Describe a process that this user may not end, with the remedy."""
     try:
         uid = Path(f"/proc/{pid}").stat().st_uid
     except OSError:
@@ -250,7 +264,7 @@ def _foreign(pid: int) -> str:
 
 
 def survivor(pid: int) -> str:
-    """What to say of a process that SIGKILL has not ended, with the remedy."""
+    """Describe a process that SIGKILL has not ended, with the remedy."""
     state = ""
     with suppress(OSError, IndexError):  # "pid (name) state …", where the name may be anything: proc_pid_stat(5)
         state = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()[0]
@@ -259,7 +273,7 @@ def survivor(pid: int) -> str:
 
 
 def _ended(pidfds: Collection[int], timeout_s: float) -> set[int]:
-    """Which of these processes have ended, waited for until one does."""
+    """Wait until a process ends; returns the pidfds of all that have ended."""
     poll = select.poll()
     for fd in pidfds:
         poll.register(fd, select.POLLIN)

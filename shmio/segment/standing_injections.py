@@ -1,7 +1,7 @@
-"""The injections that stand on a block at present, for all to see, and for the source's next process to go on with.
+"""The present injections of a block, for all processes, and for a restarted source to resume.
 
-Beside them those that the configuration declares, which the supervisor writes. Both sections are cells
-(docs/reference/segment-format.md) that hold a JSON document of at most STANDING_SIZE bytes.
+A second section has the injections that the configuration declares; the supervisor writes it. Both are
+cells (docs/reference/segment-format.md) with a JSON document of at most STANDING_SIZE bytes.
 """
 
 from __future__ import annotations
@@ -22,10 +22,15 @@ CELL_SIZE: Final = 8 + STANDING_SIZE
 
 
 class DeclaredState(msgspec.Struct, frozen=True):
-    """How a declared injection is. ``state``: ``waiting``, ``active``, ``over``, or ``lifted`` before its time.
+    """State of a declared injection.
 
-    ``seed``: from which all that is random in it follows, drawn by the source where the declaration has none.
-    ``runs``: how often it has become active, the last time at ``cycle``, when the instance's clock was ``time_ns``.
+    Attributes:
+        declaration: The declaration.
+        state: ``waiting``, ``active``, ``over``, or ``lifted`` before its time.
+        seed: The run's only source of randomness; drawn by the source if the declaration has none.
+        runs: How often it has become active.
+        cycle: Cycle of the last activation.
+        time_ns: The instance's clock at the last activation.
     """
 
     declaration: Declaration
@@ -37,11 +42,18 @@ class DeclaredState(msgspec.Struct, frozen=True):
 
 
 class StandingInjection(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One injection. The innermost comes first.
+    """A present injection of a block; the innermost comes first in lists.
 
-    ``direction``: ``out`` or ``in``. ``ranges``: (offset, size, mask): these bits of these bytes of the block.
-    ``writer``, ``pid``: the command queue and the process that it came from; with ``keep`` it outlives them. NO_WRITER
-    and 0: the configuration. ``running``: of one that was declared; else its client gives it values.
+    Attributes:
+        id: Number of the injection.
+        direction: ``out`` or ``in``.
+        priority: Priority; the highest is outermost.
+        keep: Whether it outlives the process that laid it.
+        name: Name of the injection.
+        writer: Command queue that it came from; NO_WRITER: the configuration.
+        pid: Process that it came from; 0: the configuration.
+        ranges: The covered bits as (offset, size, mask).
+        running: State of a declared injection; None: a client gives the values.
     """
 
     id: int
@@ -56,25 +68,25 @@ class StandingInjection(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def configured(self) -> bool:
-        """Whether it is declared in the configuration."""
+        """Whether the configuration declares it."""
         return self.running is not None and self.writer == NO_WRITER
 
     @property
     def active(self) -> bool:
-        """Whether it changes what it covers at present."""
+        """Whether it is in effect."""
         return self.running is None or self.running.state == "active"
 
     @property
     def lifted(self) -> bool:
-        """Whether it is there in name only, for the configuration still has it."""
+        """Whether it was lifted, but is still listed because the configuration declares it."""
         return self.running is not None and self.running.state == "lifted"
 
     def covers(self, register: Register) -> bool:
-        """Whether it changes any bit of a register at present."""
+        """Whether it is in effect for any bit of a register."""
         return self.active and self.reaches(register)
 
     def reaches(self, register: Register) -> bool:
-        """Whether it stands over any bit of a register."""
+        """Whether it is laid over any bit of a register."""
         start, stop = register.offset, register.offset + register.size
         own = bits_of(register)
         shared = (
@@ -91,7 +103,7 @@ _Item = TypeVar("_Item")
 
 
 def ranges_of(cover: bytes) -> tuple[tuple[int, int, int], ...]:
-    """The bits that are set in an image, as ranges of bytes with the same ones."""
+    """Return the bits that are set in an image, as (offset, size, mask) of bytes with equal bits."""
     ranges: list[tuple[int, int, int]] = []
     for at, bits in enumerate(cover):
         if not bits:
@@ -104,7 +116,7 @@ def ranges_of(cover: bytes) -> tuple[tuple[int, int, int], ...]:
 
 
 def encode(items: Iterable[bytes], growth: int = 0) -> bytes:
-    """The document of items that are JSON each; ValueError: it is too long, or would be with ``growth`` bytes more."""
+    """Join JSON items to a document. ValueError: with ``growth`` more bytes it would be too long."""
     document = b"[" + b",".join(items) + b"]"
     if len(document) + growth > STANDING_SIZE:
         raise ValueError("too much for the injections of one source: lay fewer, over whole structures or arrays")
@@ -112,10 +124,10 @@ def encode(items: Iterable[bytes], growth: int = 0) -> bytes:
 
 
 class DocumentCell(Generic[_Item]):
-    """A section of one block that holds a list of items; one process writes it."""
+    """A section of a block that holds a list of items. Only one process writes it."""
 
     def __init__(self, memory: memoryview, offset: int, size: int, decoder: msgspec.json.Decoder[tuple[_Item, ...]]):
-        """ValueError: the section is too short."""
+        """Open the section. ValueError: it is too short."""
         if size < CELL_SIZE:
             raise ValueError("the section of its injections is too short")
         self._memory = memory
@@ -124,11 +136,11 @@ class DocumentCell(Generic[_Item]):
 
     @property
     def sequence(self) -> int:
-        """Changes with each :meth:`write`."""
+        """Sequence number, which changes with each :meth:`write`."""
         return _atomics.load64(self._memory, self._offset)
 
     def read(self) -> tuple[_Item, ...]:
-        """All items; none where the section makes no sense."""
+        """Read all items; none if the section is corrupt."""
         data = _atomics.cell_read(self._memory, self._offset, STANDING_SIZE)
         document = (data or b"").rstrip(b"\0")
         try:
@@ -146,15 +158,15 @@ DeclaredCell = DocumentCell[Declaration]
 
 
 def standing_cell(memory: memoryview, offset: int, size: int) -> StandingCell:
-    """What stands, written by the source's process; ValueError."""
+    """Open the section of present injections, written by the source's process. ValueError: too short."""
     return DocumentCell(memory, offset, size, _STANDING)
 
 
 def declared_cell(memory: memoryview, offset: int, size: int) -> DeclaredCell:
-    """What the configuration declares, written by the supervisor; ValueError."""
+    """Open the section of configured injections, written by the supervisor. ValueError: too short."""
     return DocumentCell(memory, offset, size, _DECLARED)
 
 
 def declared_document(declarations: Iterable[Declaration]) -> bytes:
-    """What a supervisor writes; ValueError: it is too long."""
+    """Encode the configured injections. ValueError: the document is too long."""
     return encode(msgspec.json.encode(declaration) for declaration in declarations)
