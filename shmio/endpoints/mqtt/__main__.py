@@ -1,4 +1,4 @@
-"""The processes of the MQTT endpoint: the bridge, and our own broker."""
+"""The two processes of the MQTT endpoint: the bridge, and our own broker."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ BROKER = "broker"
 
 
 def run(worker: Worker) -> None:
-    """Be the one that the name says, until told to stop."""
+    """Run the process that the worker's name selects until the worker is stopped."""
     log, ration = logging.getLogger("shmio.mqtt"), LogRateLimit()
     log.addFilter(ration)
     try:

@@ -1,4 +1,4 @@
-"""What is kept while the broker is away, within a bound of bytes."""
+"""A bounded memory for changes that wait while the broker is away."""
 
 from __future__ import annotations
 
@@ -16,21 +16,24 @@ class _Entry(NamedTuple, Generic[Item]):
 
 
 class Backlog(Generic[Item]):
-    """Rows of items, each in its order; the oldest, of whatever row, go when there is no room."""
+    """Items in rows, first in, first out in each; when full, the oldest of all rows is dropped."""
 
     def __init__(self, most_bytes: int) -> None:
         self.count = 0
-        """Changes that are kept."""
+        """Number of changes that are kept."""
         self.dropped = 0
-        """Those that had no room."""
+        """Number of changes that were dropped because there was no room."""
         self.bytes = 0
         self._most = most_bytes
         self._rows: dict[str, deque[_Entry[Item]]] = {}
         self._number = 0
-        """Of the newest; who has a lower one is older."""
+        """Sequence number of the newest item; older items have lower numbers."""
 
     def put(self, item: Item, size: int, *, row: str = "", changes: int = 1) -> None:
-        """Keep one that is newer than all others. ``size``: in bytes; ``changes``: how many it tells."""
+        """Append the newest item, and drop the oldest ones until everything fits.
+
+        ``size``: in bytes; ``changes``: how many changes the item holds.
+        """
         self._number += 1
         self._rows.setdefault(row, deque()).append(_Entry(self._number, item, size, changes))
         self._add(changes, size)
@@ -40,7 +43,7 @@ class Backlog(Generic[Item]):
             self.dropped += oldest.changes
 
     def put_back(self, item: Item, size: int) -> None:
-        """Keep one that is older than all others, if there is room."""
+        """Insert an item before all others; drop it if there is no room."""
         if self.bytes + size > self._most:
             self.dropped += 1
             return
@@ -49,7 +52,7 @@ class Backlog(Generic[Item]):
         self._add(1, size)
 
     def pop(self, row: str = "") -> Item | None:
-        """The oldest of a row; None: there is nothing."""
+        """Remove and return the oldest item of a row; None: the row is empty."""
         kept = self._rows.get(row)
         if not kept:
             return None
@@ -58,7 +61,7 @@ class Backlog(Generic[Item]):
         return oldest.item
 
     def clear(self) -> None:
-        """Keep nothing of it; it is dropped."""
+        """Drop all items, and count them as dropped."""
         self.dropped += self.count
         self.count = self.bytes = 0
         self._rows.clear()

@@ -1,4 +1,4 @@
-"""The bridge: one thread that turns the feeds, the outbox, the connection and the commands."""
+"""The bridge: one thread that runs the feeds, the outbox, the connections and the commands."""
 
 from __future__ import annotations
 
@@ -37,19 +37,27 @@ from shmio.segment.relay import TURN_NS, Relay
 OFFLINE: Final = b"offline"
 STOPPED: Final = "the bridge was stopped"
 LEAVE_S: Final = 2.0
-"""For the broker to take our leave."""
+"""Time limit for closing: the broker has to take the last messages in it."""
 TURN_S: Final = 0.2
 MAX_CLEARED: Final = 20_000
-"""Topics at most that are taken from the broker's memory."""
+"""Maximum number of retained topics to delete at the broker."""
 
 log = logging.getLogger("shmio.mqtt")
 
 
 class Bridge:
-    """Between a segment and a broker. Use from one thread: :meth:`turn` again and again, then :meth:`close`."""
+    """Connects a segment to a broker.
+
+    Use it from one thread: call :meth:`turn` repeatedly, then :meth:`close`.
+    """
 
     def __init__(self, segment: Segment, slot: ProcessSlot, settings: Mqtt) -> None:
-        """``slot``: of this process. PathError: a pattern of a rule is none."""
+        """``slot``: of this process.
+
+        Raises:
+            PathError: A rule has an invalid pattern.
+
+        """
         self.prefix = settings.prefix or f"shmio/{segment.instance}"
         self._segment, self._settings = segment, settings
         self._writer = slot.writer or 0
@@ -60,13 +68,15 @@ class Bridge:
         client_id = settings.client_id or f"shmio-{segment.instance}"
         self._status = BridgeStatusChannel(f"{self.prefix}/status")
         self._channels: dict[str, Channel] = {self._status.topic: self._status}
-        """All that is published now, by topic."""
+        """Every topic that is published now, with its channel."""
         self._guard = TopicGuard(self)
         self._feeds: dict[str, Feed] = {}
         self._relays: dict[int, Relay] = {}
         self._cleared: dict[str, ClearedTopic] = {}
         there = targets(settings, own_socket(segment))
-        clean = msgspec.structs.replace(settings, session_expiry_s=0)  # nothing comes that the broker could keep
+        clean = msgspec.structs.replace(
+            settings, session_expiry_s=0
+        )  # this connection receives nothing that the broker could keep
         self.connection = BrokerConnection(
             ReconnectPolicy(clean, client_id, there),
             self._selector,
@@ -89,14 +99,15 @@ class Bridge:
         self.connection.on_lost = self.outbox.lose
         self.connection.is_ready = lambda: (
             self.command_connection.ready
-        )  # who is told that we are there may send commands at once
+        )  # who sees that we are online may send commands at once
         self._recalled: frozenset[str] | None = None
-        """Our topics when the broker was asked what it has of one before us; None: it was not."""
+        """Our topics when we asked the broker for retained messages of an earlier bridge. None: not
+        yet asked."""
         self._behind: set[Feed] = set()
         self._rest_s = 0.0
-        """So long there is nothing to do but what comes."""
+        """How long :meth:`turn` may wait for events."""
         self._missed = 0
-        """Frames of sources that have gone."""
+        """Frames missed by feeds that have been removed."""
         self._generation = -1
         self._reader = ThreadPoolExecutor(1, "reader")
         self._sparkplug: Session | None = None
@@ -110,7 +121,7 @@ class Bridge:
 
     @property
     def counters(self) -> tuple[int, ...]:
-        """As the process table names them."""
+        """The counters, in the order in which the process table names them."""
         commands, outbox = self._commands, self.outbox
         refused = (
             commands.refused + self.connection.problems.refused + self.command_connection.connection.problems.refused
@@ -123,7 +134,7 @@ class Bridge:
 
     @property
     def problem(self) -> str:
-        """What is wrong at present; empty: nothing."""
+        """The current problem; empty: none."""
         problem = self.connection.problem
         if problem and self.outbox.backlog:
             lost = f", {self.outbox.dropped} dropped" if self.outbox.dropped else ""
@@ -133,13 +144,13 @@ class Bridge:
         )
 
     def wake(self) -> None:
-        """Have :meth:`turn` return soon; any thread may."""
+        """Wake :meth:`turn`; may be called from any thread."""
         os.eventfd_write(self._wakeup, 1)
 
     # ---- a turn ------------------------------------------------------------------------------------------------------
 
     def turn(self) -> None:
-        """Wait until there is something to do, at most about ``TURN_S``, and do it."""
+        """Wait for events, at most about ``TURN_S``, and handle them."""
         for key, events in self._selector.select(self._rest_s):
             key.data(events)
         self._turn_connections()
@@ -160,14 +171,17 @@ class Bridge:
         self._rest_s = 0.0 if self._behind or self.outbox.can_send else min(due_s)
 
     def _mark_due(self) -> Iterator[float]:
-        """Have told what may be told again by now; in how many seconds there is more of each source."""
+        """Mark changes whose rate limit has elapsed.
+
+        Yields each source's time to the next one, in s.
+        """
         for feed in self._feeds.values():
             due_ns = None if feed.step_driven else feed.mark_due()
             if due_ns is not None:
                 yield max(0.0, (due_ns - feed.block.now_ns()) / 1e9)
 
     def _turn_connections(self) -> float:
-        """In how many seconds it has to be turned again."""
+        """Run both connections, and return in how many seconds to run them again."""
         connection = self.connection
         rest_s = min(self.command_connection.turn(connection.at), connection.turn())
         if connection.problem and not connection.up:
@@ -179,7 +193,10 @@ class Bridge:
         return rest_s
 
     def _publish_all(self) -> None:
-        """A connection was made: tell that we are there, what was kept, and how everything is now."""
+        """Publish that we are online, and the current state of every topic.
+
+        The outbox sends what it kept during the outage first.
+        """
         self.connection.send(self._status.message())
         if self._recalled is None:
             self._recalled = frozenset(self._channels)
@@ -189,15 +206,15 @@ class Bridge:
             feed.resend()
         self.outbox.resend(self._cleared.values())
 
-    # ---- what others publish on our topics ---------------------------------------------------------------------------
+    # ---- other clients that publish on our topics --------------------------------------------------------------------
 
     def watch(self) -> None:
-        """Hear it."""
+        """Subscribe to our own topics."""
         self.connection.watch(self._own)
         self.command_connection.watch()
 
     def unwatch(self) -> None:
-        """Hear it no more."""
+        """Unsubscribe from our own topics."""
         self.connection.unwatch(self._own)
         self.command_connection.unwatch()
 
@@ -208,7 +225,7 @@ class Bridge:
         return [*states, *output_filters(self.prefix, feeds)]
 
     def correct(self, topic: str) -> None:
-        """Tell what is so on one, or that there is nothing."""
+        """Publish our value on a topic again, or delete what another client has left there."""
         log.warning(
             "another client publishes on %s, which is ours: it is told again; let no other account publish there, and "
             "no other bridge have this prefix",
@@ -220,7 +237,7 @@ class Bridge:
             self.outbox.mark(ClearedTopic(topic))
 
     def correct_all(self) -> None:
-        """Tell everything again."""
+        """Publish everything again."""
         self.outbox.mark(self._status)
         for feed in self._feeds.values():
             feed.resend()
@@ -242,13 +259,13 @@ class Bridge:
             channel = self._channels.get(message.topic)
             if channel is None:
                 wrong = bool(message.retain and message.payload)
-            else:  # brokers that hand each other's messages back tell us what we have told
+            else:  # bridged brokers may return our own messages
                 wrong = channel.message().payload != message.payload
             if wrong:
                 self._guard.report(message.topic)
 
     def _clear_old(self, message: MQTTMessage) -> None:
-        """What a bridge before this one has left, by other rules: nobody would ever tell it is old."""
+        """Delete retained values that an earlier bridge left on topics that this one does not use."""
         if not (message.retain and message.payload and self._recalled is not None) or len(self._cleared) >= MAX_CLEARED:
             return
         with suppress(UnicodeDecodeError):
@@ -270,7 +287,10 @@ class Bridge:
     # ---- sources that come and go ------------------------------------------------------------------------------------
 
     def _follow_reloads(self) -> None:
-        """Take up what a reload has changed; for big layouts that takes seconds, in which others go on."""
+        """Add and remove sources after a reload.
+
+        A thread reads their layouts, which may take seconds.
+        """
         if self._reading is not None and self._reading.done():
             reading, self._reading = self._reading, None
             self._add_feeds(reading.result())
@@ -285,11 +305,11 @@ class Bridge:
 
     @property
     def _known(self) -> set[int]:
-        """Sections of the blocks that are followed."""
+        """The sections of the blocks that have a feed."""
         return {feed.block.section for feed in self._feeds.values()}
 
     def _read(self, known: Container[int]) -> list[tuple[Feed, Device | None]]:
-        self._generation = self._segment.generation  # before looking: what changes meanwhile is read the next time
+        self._generation = self._segment.generation  # read first: a change in the meantime is taken up the next time
         self._segment.refresh()
         feeds = [
             Feed(block, self._rules, self.prefix, self.outbox, self._writer)
@@ -314,7 +334,10 @@ class Bridge:
             self._selector.register(relay.descriptor, selectors.EVENT_READ, partial(self._wake_feed, feed, relay))
 
     def _remove_feed(self, feed: Feed, successor: Feed | None = None) -> None:
-        """What it has published and its successor does not is taken from the broker's memory."""
+        """Remove a feed.
+
+        Retained messages on topics that its successor does not use are deleted.
+        """
         feed.command_client.poll()
         self._behind.discard(feed)
         stay = set() if successor is None else {channel.topic for channel in successor.all()}
@@ -322,7 +345,7 @@ class Bridge:
         for channel in feed.all():
             self._channels.pop(channel.topic, None)
         cleared = {channel.topic: ClearedTopic(channel.topic) for channel in feed.all() if channel.topic not in stay}
-        self._cleared |= cleared  # told again with each connection: the broker may be away
+        self._cleared |= cleared  # deleted again after each connect: the broker may be away
         self.outbox.mark_all(cleared.values())
         del self._feeds[feed.block.source]
         self._missed += feed.missed
@@ -335,7 +358,7 @@ class Bridge:
     # ---- the end -----------------------------------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Send what is there, say that we go, and go."""
+        """Send what is queued, publish that we are offline, and disconnect."""
         self.steps.close()
         until_s = time.monotonic() + LEAVE_S
         self._drain(until_s, lambda: not self.outbox.busy)

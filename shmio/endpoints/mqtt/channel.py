@@ -1,4 +1,4 @@
-"""What is published on one topic: its newest payload, made when its turn comes."""
+"""Channels: each makes the payload of one topic when the outbox sends it."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ NUMBERS: Final = (int, float)
 
 
 class Message(NamedTuple):
-    """What goes to the broker. ``keep``: it is a change of a value, which is not lost while the broker is away.
+    """One message for the broker.
 
-    ``source_ns``: when the source had the value, ns since 1970; 0: unknown, or no value.
+    ``keep``: it is a change of a value, which the backlog keeps while the broker is away.
+    ``source_ns``: when the source had the value, in ns since 1970; 0: unknown, or no value.
     """
 
     topic: str
@@ -33,7 +34,7 @@ class Message(NamedTuple):
 
 
 class SourceState(NamedTuple):
-    """What a source shows at present: its newest frame, if it has one, and how good that is."""
+    """A source's newest frame, if it has one, and its quality."""
 
     frame: Frame | None
     quality: Quality
@@ -41,27 +42,30 @@ class SourceState(NamedTuple):
 
 
 class SourceFollower(Protocol):
-    """Who follows a source."""
+    """What a channel needs of the feed that follows its source."""
 
     block: Block
     state: SourceState
 
     @property
     def missed(self) -> int:
-        """Frames of which nothing was told."""
+        """Number of frames that were skipped."""
 
 
 class Channel(Protocol):
-    """A topic."""
+    """A topic that the bridge publishes."""
 
     topic: str
 
     def message(self, *, late: bool = False) -> Message:
-        """As of now. ``late``: it will not be sent now, but when the broker is back."""
+        """Make the message from the current state.
+
+        ``late``: it will not be sent now, but when the broker is back.
+        """
 
 
 class RegisterChannel:
-    """A register, or an array's element, by one of the two kinds of payload."""
+    """The topic of a register or an array's element, as text or JSON."""
 
     def __init__(self, follower: SourceFollower, register: Register, topic: str, rule: MqttTopic) -> None:
         self.register = register
@@ -69,7 +73,7 @@ class RegisterChannel:
         self.topic = topic
         self.json = rule.payload != "text"
         self.limited = rule.deadband > 0 or rule.max_rate_hz is not None
-        """Whether not each change is published."""
+        """Whether a deadband or a maximum rate limits what is published."""
         self._follower = follower
         self._qos, self._retain, self._deadband = rule.qos, rule.retain, rule.deadband
         self._pause_ns = round(1e9 / rule.max_rate_hz) if rule.max_rate_hz else 0
@@ -77,17 +81,17 @@ class RegisterChannel:
         self._to_text = texts(register)
         self._sent: Value = None
         self.due_ns = 0
-        """By the source's clock: not before then."""
+        """When the next message may be sent, in ns of the source's clock."""
 
     def moved(self, image: bytes) -> bool:
-        """Whether a change is large enough to be told."""
+        """Return whether the value is outside the deadband around the last one sent."""
         if not self._deadband:
             return True
         pairs = zip(_flat(self._decode(image)), _flat(self._sent), strict=False)
         return self._sent is None or any(_apart(new, old, self._deadband) for new, old in pairs)
 
     def message(self, *, late: bool = False) -> Message:
-        """As of now; empty while there is no good value, but as JSON, which says so."""
+        """Make the message; without a good value, text is empty, and JSON says why."""
         payload = self._json(late=late) if self.json else self._text()
         frame = self._follower.state.frame
         return Message(self.topic, payload, self._qos, self._retain and not late, True, frame.source_ns if frame else 0)
@@ -118,7 +122,7 @@ class RegisterChannel:
 
 
 class FramesChannel:
-    """A block as a whole, by the bytes of its effective image."""
+    """The topic of a block's frames: the bytes of the effective image."""
 
     json = False
 
@@ -131,11 +135,11 @@ class FramesChannel:
         self.due_ns = 0
 
     def moved(self, _image: bytes) -> bool:
-        """Every frame is one."""
+        """Return True: every frame is published."""
         return True
 
     def message(self, *, late: bool = False) -> Message:
-        """As of now; empty while there is no good frame."""
+        """Make the message; empty while there is no good frame."""
         frame, quality, _ = self._follower.state
         self.due_ns = self._follower.block.now_ns() + self._pause_ns
         payload = b"" if frame is None or quality is Quality.BAD else frame.image
@@ -143,44 +147,44 @@ class FramesChannel:
 
 
 class StatusChannel:
-    """How a source fares, as JSON."""
+    """The topic of a source's status, as JSON."""
 
     def __init__(self, follower: SourceFollower, topic: str) -> None:
         self.topic = topic
         self._follower = follower
 
-    def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  it is told again when the broker is back
-        """As of now."""
+    def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  it is published again when the broker is back
+        """Make the message from the current state."""
         frame, quality, reason = self._follower.state
         return status(self.topic, quality, reason, self._follower.missed, frame)
 
 
 class BridgeStatusChannel:
-    """Whether the bridge is there: it is, if it says anything."""
+    """The topic of the bridge's status: always online; the will says offline."""
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
 
     def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  see StatusChannel
-        """It is."""
+        """Make the message ``online``."""
         return Message(self.topic, ONLINE, 1, retain=True)
 
 
 class ClearedTopic:
-    """What nothing is published on any more: what the broker remembers of it is deleted."""
+    """A topic that is no longer published; an empty message deletes the broker's retained one."""
 
     def __init__(self, topic: str) -> None:
         self.topic = topic
 
     def message(self, *, late: bool = False) -> Message:  # noqa: ARG002  see StatusChannel
-        """An empty one."""
+        """Make the empty message."""
         return Message(self.topic, b"", 1, retain=True)
 
 
 def json_payload(
     value: object, quality: Quality, reason: str, provenance: str, frame: Frame | None, *, late: bool
 ) -> bytes:
-    """A value as JSON, with what is known of it."""
+    """Encode a value as JSON, with its quality, source time, provenance and sequence number."""
     fields = {
         "value": value,
         "quality": str(quality),
@@ -193,7 +197,10 @@ def json_payload(
 
 
 def status(topic: str, quality: Quality, reason: str, missed: int, frame: Frame | None = None) -> Message:
-    """What a source's status topic says. ``missed``: frames of which nothing was told."""
+    """Make the message of a source's status topic.
+
+    ``missed``: number of frames that were skipped.
+    """
     fields = {
         "quality": str(quality),
         "reason": reason,

@@ -1,4 +1,4 @@
-"""Commands toward one source: sent as they come, in order, and followed until their end is known."""
+"""Sends commands to one source, and follows each until its outcome is known."""
 
 from __future__ import annotations
 
@@ -13,14 +13,17 @@ from shmio.local.writer import REPLACED, RETIRED, SourceWriter
 from shmio.segment import DONE, Block, EventKind
 
 Done = Callable[[EventKind, str], None]
-"""Called once: what became of a command, and why."""
+"""Called once for each command, with its outcome and the reason."""
 
 
 class CommandClient:
-    """For the bridge's thread."""
+    """Sends commands to one source. Use it from the bridge's thread."""
 
     def __init__(self, block: Block, writer: int) -> None:
-        """``writer``: the command queue of this process. For a big layout this takes seconds."""
+        """``writer``: number of this process's command queue.
+
+        For a large layout this takes seconds.
+        """
         self.block = block
         self._source_writer = SourceWriter(block, writer)
         self._source_writer.prepare()
@@ -28,11 +31,24 @@ class CommandClient:
         self._events = block.events.cursor()
 
     def check(self, register: Register) -> None:
-        """CommandError: it is not writable, whatever the value."""
+        """Check that a register is writable.
+
+        Raises:
+            CommandError: The register is not writable.
+
+        """
         self._source_writer.check(register)
 
     def send(self, register: Register, value: object, done: Done) -> None:
-        """Send a value of a register, an array or an element. CommandError, ValueRangeError: it was not sent."""
+        """Send a value for a register, an array or an element.
+
+        ``done`` is called once with the outcome.
+
+        Raises:
+            CommandError: The command was not sent.
+            ValueRangeError: The value does not fit; the command was not sent.
+
+        """
         cost = CommandCost.of(sizes(register))
         if self._pending and self._pending.open_events + cost.events > MAX_OPEN:
             raise CommandError(f"{self.block.source}: too many commands are under way; wait for their results")
@@ -41,7 +57,7 @@ class CommandClient:
         self._pending.add(self._source_writer.submit({register.path: value}), cost, partial(_tell, done))
 
     def poll(self) -> None:
-        """Take what has been told; give up what is overdue."""
+        """Read new events, and end the commands whose outcome is known or overdue."""
         retired, missed = self.block.retired, self._events.missed
         while (event := self._events.poll()) is not None:
             self._pending.hear(event)

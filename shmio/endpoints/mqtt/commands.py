@@ -1,4 +1,4 @@
-"""What comes from the broker: values for registers, on their ``/in`` topics; and the answer to each."""
+"""Receives commands on the ``/in`` topics, and publishes a result for each."""
 
 from __future__ import annotations
 
@@ -21,12 +21,18 @@ from shmio.layout.values.text import MAX_TEXT, from_text
 from shmio.segment import DONE, EventKind
 
 REPLIES: Final = "shmio/results"
-"""Where clients may have results sent, below the prefix: a response topic elsewhere could make us write, or lie."""
+"""Below the prefix, the topics that clients may choose for their results.
+
+A response topic elsewhere could make us write, or publish false values.
+"""
 OUTPUTS: Final = ("/out", "/frames")
 RETAINED: Final = "a retained command is not carried out; publish commands without the retain flag"
 MAX_CORRELATION_BYTES: Final = 1024
 MAX_TOPIC_BYTES: Final = 65535 - len("/result")
-"""Of a command: a topic is no longer than 65535 bytes (MQTT 5.0, section 1.5.4), and its result has one, too."""
+"""Maximum length of a command's topic.
+
+A topic has at most 65535 bytes (MQTT 5.0, section 1.5.4), and the result's topic is longer.
+"""
 
 Answer = Callable[[Message, Properties | None], None]
 
@@ -34,12 +40,12 @@ log = logging.getLogger("shmio.mqtt")
 
 
 def command_filters(prefix: str, feeds: Iterable[Feed]) -> list[str]:
-    """What to subscribe to: paths of each depth that a source has, and nothing that we publish ourselves."""
+    """The filters for commands: one for each path depth of a source; none matches our own topics."""
     return [f"{prefix}/{feed.block.source}/{'+/' * depth}in" for feed in feeds for depth in feed.depths]
 
 
 def output_filters(prefix: str, feeds: Iterable[Feed]) -> list[str]:
-    """Where a bridge before this one may have published these sources: registers, elements, structures, frames."""
+    """The filters for values that an earlier bridge may have published, for these sources."""
     deep = [
         f"{prefix}/{feed.block.source}/{'+/' * depth}out" for feed in feeds for depth in range(max(feed.depths) + 1)
     ]
@@ -47,21 +53,21 @@ def output_filters(prefix: str, feeds: Iterable[Feed]) -> list[str]:
 
 
 def result_filters(prefix: str, feeds: Iterable[Feed]) -> list[str]:
-    """Where results go."""
+    """The filters for the topics of results."""
     return [f"{one}/result" for one in command_filters(prefix, feeds)] + [f"{prefix}/{REPLIES}/#"]
 
 
 class CommandReceiver:
-    """For the bridge's thread."""
+    """Receives commands, and sends them to their sources. Use it from the bridge's thread."""
 
     def __init__(self, prefix: str, rules: TopicRules, feeds: Mapping[str, Feed], answer: Answer) -> None:
         self.received = 0
         self.refused = 0
-        """Those of which nothing was done: retained ones, and those that no source was sent."""
+        """Commands that were not sent to a source, such as retained ones."""
         self._prefix, self._rules, self._feeds, self._answer = prefix, rules, feeds, answer
 
     def take(self, message: MQTTMessage) -> None:
-        """Carry one out, as far as it is one."""
+        """Handle a message: if its topic is a command's, send the value to the source."""
         try:
             topic = message.topic
         except UnicodeDecodeError:
@@ -74,13 +80,13 @@ class CommandReceiver:
             self.refused += 1
             return
         tell = _Reply(self._prefix, topic, message, self._answer)
-        if message.retain:  # it may have been there before we were: nobody knows how old it is
+        if message.retain:  # the broker may have stored it before we connected: its age is unknown
             self.refused += 1
             tell(EventKind.REJECTED, RETAINED)
             return
         try:
             feed, register = self._find(topic.removeprefix(f"{self._prefix}/"))
-            feed.command_client.check(register)  # before its value is read: another one would not do either
+            feed.command_client.check(register)  # before decoding: no value would be accepted
             value = _value(bytes(message.payload), register, json=self._is_json(feed, register))
             feed.command_client.send(register, value, tell)
         except (CommandError, PathError, ValueRangeError) as error:
@@ -99,7 +105,7 @@ class CommandReceiver:
 
 
 class _Reply:
-    """Tells what became of one command, once."""
+    """Publishes the result of one command."""
 
     def __init__(self, prefix: str, topic: str, message: MQTTMessage, answer: Answer) -> None:
         self._command = topic
@@ -113,7 +119,7 @@ class _Reply:
             self._topic = wanted
 
     def __call__(self, kind: EventKind, reason: str) -> None:
-        if kind not in DONE:  # who it was MQTT does not say, at most where the client wants to hear of it
+        if kind not in DONE:  # MQTT does not say who sent it; the response topic is the only hint
             asked = "" if self._topic == f"{self._command}/result" else f", for {shorten(self._topic)}"
             log.warning("command on %s%s: %s: %s", shorten(self._command, 400), asked, kind, reason)
         payload = msgspec.json.encode({"outcome": str(kind), "done": kind in DONE, "reason": reason})
@@ -125,7 +131,12 @@ class _Reply:
 
 
 def _value(payload: bytes, register: Register, *, json: bool) -> Any:
-    """The value that a payload is; as JSON: a value, or an object with one. ValueRangeError."""
+    """Decode a payload: text, or JSON with a value or an object that has one.
+
+    Raises:
+        ValueRangeError: The payload is not a value of the register.
+
+    """
     if len(payload) > MAX_TEXT:
         raise ValueRangeError(f"{register.path}: the payload is longer than {MAX_TEXT} bytes")
     try:
@@ -136,7 +147,12 @@ def _value(payload: bytes, register: Register, *, json: bool) -> Any:
 
 
 def _bare(text: str, register: Register) -> str:
-    """The text of a value as JSON, or of the ``value`` of an object; ValueRangeError."""
+    """Return the text of a JSON value, or of an object's ``value``.
+
+    Raises:
+        ValueRangeError: The text is not such JSON.
+
+    """
     try:
         value = msgspec.json.decode(text)
         if isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Follows one block: one change scan for each frame marks the topics whose turn has come."""
+"""Follows one block: scans each frame for changes, and marks the topics to publish."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ from shmio.segment import Block, Frame, Provenance, Quality
 from shmio.segment.changed_registers import ChangeScan
 
 Value = Callable[[bytes], Any]
-"""From an image to what JSON shows of it."""
+"""Converts an image to a value for JSON."""
 
 
 class StructureChannel:
-    """For the bridge's thread."""
+    """The topic of a structure: its registers as one JSON object."""
 
     json = True
 
     def __init__(
         self, follower: SourceFollower, path: str, registers: Sequence[Register], topic: str, rule: MqttTopic
     ) -> None:
-        """``path``: of the structure that the registers are below; empty: the source."""
+        """``path``: of the structure that contains the registers; empty: the whole source."""
         self.registers = registers
         self.topic = topic
         self.limited = rule.max_rate_hz is not None
@@ -57,11 +57,11 @@ class StructureChannel:
         self.due_ns = 0
 
     def moved(self, _image: bytes) -> bool:
-        """Every change is one."""
+        """Return True: every change is published."""
         return True
 
     def message(self, *, late: bool = False) -> Message:
-        """As of now; while it is bad, with the values known last."""
+        """Make the message; while the quality is bad, with the last known values."""
         block, (frame, quality, reason) = self._follower.block, self._follower.state
         self.due_ns = block.now_ns() + self._pause_ns
         value, provenance = None, Provenance.LIVE
@@ -73,7 +73,10 @@ class StructureChannel:
 
 
 def _members(parts: Sequence[tuple[list[str], Register]], layout: Layout) -> Value:
-    """``parts``: the names that lead to each register from here."""
+    """Make the decoder of a JSON object.
+
+    ``parts``: each register with the names that lead to it from here.
+    """
     groups: dict[str, list[tuple[list[str], Register]]] = {}
     for (name, *rest), register in parts:
         groups.setdefault(decode_segment(name), []).append((rest, register))
@@ -96,31 +99,37 @@ NO_DATA: Final = SourceState(None, Quality.BAD, "no data yet")
 
 
 class Feed:
-    """One source: what it shows, and what of that the broker has not been told. For the bridge's thread."""
+    """Follows one source, and marks its changed topics in the outbox.
+
+    Use it from the bridge's thread.
+    """
 
     def __init__(self, block: Block, rules: TopicRules, prefix: str, outbox: Outbox, writer: int) -> None:
-        """``writer``: the command queue of this process. For a big layout this takes seconds."""
+        """``writer``: number of this process's command queue.
+
+        For a large layout this takes seconds.
+        """
         self.block = block
         self.state = NO_DATA
         self.step_driven = False
-        """Whether only steps show anything: it lives on the instance's clock, which is virtual."""
+        """Whether only steps publish: the block is on the instance's clock, which is virtual."""
         self.command_client = CommandClient(block, writer)
         base = f"{prefix}/{block.source}"
         self.status = StatusChannel(self, f"{base}/status")
         chosen = list(_chosen(block.layout, rules, block.source))
         self._channel_of = [*self._channels_of(chosen, rules, base)]
-        """The channel of each register that is published, in the layout's order."""
+        """The channel of each published register, in the layout's order."""
         self.channels = list(dict.fromkeys(self._channel_of))
         frames = rules.frames(block.source)
         self.frames = FramesChannel(self, f"{base}/frames", frames) if frames else None
         self.depths = _depths(block.layout)
-        """Numbers of segments that paths in this source have."""
+        """The numbers of segments that this source's paths have."""
         self._json = [channel for channel in self.channels if channel.json]
         self._injected: frozenset[ValueChannel] = frozenset()
-        """Those told, or to be told, as injected."""
+        """The channels that are published as injected."""
         self._covered = self._injected
         self._injection_sequence = 0
-        """Of which sequence of what stands on the block ``_covered`` is."""
+        """Sequence number of the standing injections from which ``_covered`` was made."""
         self._scan = ChangeScan([register for register, _ in chosen])
         self._outbox = outbox
         self._limited: dict[ValueChannel | FramesChannel, None] = {}
@@ -147,16 +156,16 @@ class Feed:
 
     @property
     def missed(self) -> int:
-        """Frames that were not looked at, since the bridge was too slow."""
+        """Number of frames that were skipped because the bridge was too slow."""
         return self._reader.missed
 
     @property
     def ended(self) -> bool:
-        """Whether a reload has ended the block, and all of it has been taken."""
+        """Whether a reload has ended the block, and all its frames have been read."""
         return self.block.retired and not self._reader.behind
 
     def poll(self) -> bool:
-        """Take frames that have come, a few at a time; whether there are more at once."""
+        """Read a few new frames, and return whether more are waiting."""
         if self.step_driven:
             return False
         missed = self._reader.missed
@@ -167,20 +176,20 @@ class Feed:
                 self._outbox.mark(self.status)
             self.take(frame)
             if self._outbox.busy:
-                self._outbox.flush()  # so that each frame's changes are told, as long as the broker takes them
+                self._outbox.flush()  # publishes the changes of each frame as long as the broker keeps up
         if self._reader.behind:
             return True
         self._check_age()
         return False
 
     def step(self) -> None:
-        """Show what the step that is being delivered has changed, if the block is on the instance's clock."""
+        """Publish what the step being delivered has changed, if steps drive this block."""
         if self.step_driven and (frame := self.block.latest()):
             self._reader.resume_after(frame.number)
             self.take(frame)
 
     def take(self, frame: Frame) -> None:
-        """Show a frame."""
+        """Make a frame the current state, and mark the topics that it changes."""
         before = self.state
         quality, reason = self.block.assess(frame)
         self.state = SourceState(frame, quality, reason)
@@ -199,7 +208,7 @@ class Feed:
             self.mark_due()
 
     def _mark_injected(self, frame: Frame) -> None:
-        """Tell whose value is injected now and was not, or the reverse, also if it is the same value."""
+        """Mark the channels that became injected or stopped being injected, even with equal values."""
         sequence, before = self.block.standing.sequence, self._injected
         if sequence != self._injection_sequence:
             self._injection_sequence = sequence
@@ -211,14 +220,14 @@ class Feed:
         self._outbox.mark_all(one for one in self._json if (one in before) != (one in self._injected))
 
     def _check_age(self) -> None:
-        """Turn bad with age."""
+        """Check whether the last frame has become stale."""
         before = self.state
         if before.frame is not None and before.quality is not Quality.BAD:
             self.state = SourceState(before.frame, *self.block.assess(before.frame))
             self._mark_quality(before)
 
     def _mark_quality(self, before: SourceState) -> bool:
-        """Tell a change of quality: whether everything has been marked for that."""
+        """Mark what a change of quality affects; return whether everything was marked."""
         now = self.state
         if (before.quality, before.reason) == (now.quality, now.reason) and before is not NO_DATA:
             return False
@@ -230,21 +239,21 @@ class Feed:
         return False
 
     def mark_all(self) -> None:
-        """Have everything told as it is now."""
+        """Mark all topics."""
         self._limited.clear()
         self._outbox.mark_all(self.all())
 
     def resend(self) -> None:
-        """Have the broker be told, or be told again, how everything is."""
+        """Publish all topics again, after what was kept during an outage."""
         self._limited.clear()
         self._outbox.resend(self.all())
 
     def all(self) -> list[Channel]:
-        """All topics of this source."""
+        """Return all channels of this source."""
         return [self.status, *self.channels, *([self.frames] if self.frames else [])]
 
     def _is_due(self, channel: ValueChannel | FramesChannel, frame: Frame) -> bool:
-        """Whether a change of it is told now; or else later, or not at all."""
+        """Return whether to publish a change now; a rate-limited one is published later."""
         if not channel.limited:
             return True
         if channel in self._limited or channel.due_ns > self.block.now_ns():
@@ -253,7 +262,12 @@ class Feed:
         return channel.moved(frame.image)
 
     def mark_due(self) -> int | None:
-        """Mark what may be told again by now; when the next one may, by the source's clock. None: nothing waits."""
+        """Mark the channels whose rate limit has elapsed.
+
+        Returns:
+            When the next one elapses, in ns of the source's clock; None: none is waiting.
+
+        """
         now_ns, frame = self.block.now_ns(), self.state.frame
         for channel in [channel for channel in self._limited if channel.due_ns <= now_ns]:
             del self._limited[channel]
@@ -263,7 +277,7 @@ class Feed:
 
 
 def _chosen(layout: Layout, rules: TopicRules, source: str) -> Iterator[tuple[Register, MqttTopic]]:
-    """What is published of a block, each with its rule; arrays as a whole, or by their elements; then parts."""
+    """Yield the registers, elements and parts to publish, each with its rule."""
     for register in layout.registers:
         rule = rules.of(source, register.path)
         if not rule.publish:

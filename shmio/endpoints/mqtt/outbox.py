@@ -1,6 +1,7 @@
-"""What the broker is still to be told: topics in the order of their first change, each with its newest value.
+"""Queues what is to be sent: topics in the order of their first change, each with its newest value.
 
-While the broker is away each change is kept instead, in a bounded store, and sent before anything else when it is back.
+While the broker is away, each change goes to a bounded backlog instead, which is sent first when it
+is back.
 """
 
 from __future__ import annotations
@@ -17,54 +18,58 @@ from shmio.endpoints.mqtt.backlog import Backlog
 from shmio.endpoints.mqtt.channel import Channel, Message
 
 OVERHEAD_BYTES: Final = 200
-"""Of one message in memory, about, beside its payload."""
+"""Approximate memory of one message beside its payload."""
 TURN_MESSAGES: Final = 500
-"""So many are sent before what else there is to do has its turn."""
+"""Messages that are sent before other work has its turn."""
 MAX_RESULTS: Final = 1024
-"""Results of commands that wait; beyond that the oldest are dropped."""
+"""Maximum number of queued results; beyond that, the oldest are dropped."""
 
 
 class Sender(Protocol):
-    """The connection to the broker."""
+    """What the outbox needs of a connection."""
 
     @property
     def up(self) -> bool:
-        """Whether there is one."""
+        """Whether the connection is up."""
 
     @property
     def room(self) -> int:
-        """How many messages it takes now, and does not only put into its memory."""
+        """How many messages can be sent now without queueing them in memory."""
 
     def send(self, message: Message, properties: Properties | None = None) -> None:
-        """Have one ready to go."""
+        """Queue a message for :meth:`push`."""
 
     def push(self) -> None:
-        """Have go what is ready."""
+        """Write queued messages to the socket."""
 
 
 class Outbox:
-    """For the bridge's thread."""
+    """Queues topics and results for the broker. Use it from the bridge's thread."""
 
     def __init__(self, connection: Sender, results: Sender, backlog_bytes: int) -> None:
-        """``connection``: for values; ``results``: for what became of commands."""
+        """``connection``: for values; ``results``: for the results of commands."""
         self._connection, self._results = connection, results
         self._most = backlog_bytes
         self._backlog: Backlog[Message] = Backlog(backlog_bytes)
         self._waiting: dict[Channel, None] = {}
         self._results_waiting: deque[tuple[Message, Properties | None]] = deque(maxlen=MAX_RESULTS)
         self.keeping = False
-        """Whether changes are kept while there is no connection: it has failed, or there has been one."""
+        """Whether changes are kept while disconnected: a connection has failed, or has been made
+        before."""
         self._catching_up = False
-        """Whether the broker is being told all that was kept, and then how everything is."""
+        """Whether the backlog is being sent, and then the current state of every topic."""
         self._catch_up_bytes = 0
-        """Bytes up to which changes are kept meanwhile: fewer the more was sent, for else a broker that takes less
-        than there is would be told of the past for ever."""
+        """Size up to which the backlog takes new changes while it is being sent.
+
+        It shrinks with what was sent: a broker slower than the changes would otherwise never catch
+        up.
+        """
         self.sent = 0
         self._dropped_results = 0
 
     @property
     def busy(self) -> bool:
-        """Whether anything is to be sent."""
+        """Whether anything is queued."""
         return bool(self._waiting or self._backlog.count or self._results_waiting)
 
     @property
@@ -75,23 +80,23 @@ class Outbox:
 
     @property
     def waiting(self) -> int:
-        """Topics whose turn has not come."""
+        """Number of topics that wait to be sent."""
         return len(self._waiting)
 
     @property
     def backlog(self) -> int:
-        """Changes that are kept."""
+        """Number of changes in the backlog."""
         return self._backlog.count
 
     @property
     def dropped(self) -> int:
-        """Changes that had no room, and answers."""
+        """Number of changes and results that were dropped."""
         return self._backlog.dropped + self._dropped_results
 
     def mark(self, channel: Channel) -> None:
-        """Something about it is new. One that waits already keeps its place, and will be sent with what is new.
+        """Mark a topic as changed; a topic that waits already keeps its place.
 
-        Until all that was kept has been sent, what is new is kept behind it, if there is room.
+        Until the backlog has been sent, new changes are appended to it, if there is room.
         """
         if self._connection.up and not (self._catching_up and self._backlog.bytes < self._catch_up_bytes):
             self._waiting[channel] = None
@@ -103,7 +108,7 @@ class Outbox:
                 self._waiting[channel] = None
 
     def mark_all(self, channels: Iterable[Channel]) -> None:
-        """Something about all of them is new."""
+        """Mark several topics as changed."""
         if self._connection.up and not self._catching_up:
             self._waiting |= dict.fromkeys(channels)
             return
@@ -111,20 +116,20 @@ class Outbox:
             self.mark(channel)
 
     def resend(self, channels: Iterable[Channel]) -> None:
-        """Have all of them sent as they are when their turn comes, after what was kept."""
+        """Send the current state of these topics, after the backlog."""
         if self._connection.up:
             self._waiting |= dict.fromkeys(channels)
             if not self._catching_up:
                 self._catching_up, self._catch_up_bytes = True, self._most
 
     def queue_result(self, message: Message, properties: Properties | None) -> None:
-        """Send what became of a command, before values."""
+        """Queue the result of a command; results are sent before values."""
         if self._results.up:
             self._dropped_results += len(self._results_waiting) == MAX_RESULTS
             self._results_waiting.append((message, properties))
 
     def lose(self, unacknowledged: Iterable[Message]) -> None:
-        """The connection is gone: keep what it has not taken for certain, and what waited for it."""
+        """After a lost connection, keep its unacknowledged messages and what was queued."""
         for message in reversed(list(unacknowledged)):
             if message.keep:
                 self._backlog.put_back(message._replace(retain=False), _size(message))
@@ -136,14 +141,14 @@ class Outbox:
         self._catching_up = False
 
     def forget(self, channels: Iterable[Channel]) -> None:
-        """A reload has ended what they tell of."""
+        """Remove channels from the queue."""
         for channel in channels:
             self._waiting.pop(channel, None)
 
     def flush(self) -> None:
-        """Send as long as the connections take it, so many at once, and so many in all by each."""
+        """Send what is queued, up to a limit, in batches while the connections have room."""
         if not self._results.up:
-            self._results_waiting.clear()  # they go with their connection
+            self._results_waiting.clear()  # results are lost with their connection
         self._pass(self._results, self._answered)
         self._pass(self._connection, self._due)
 
@@ -160,12 +165,12 @@ class Outbox:
             connection.push()
 
     def _answered(self) -> Iterator[tuple[Message, Properties | None]]:
-        """What became of commands."""
+        """Yield the queued results."""
         while self._results_waiting:
             yield self._results_waiting.popleft()
 
     def _due(self) -> Iterator[tuple[Message, Properties | None]]:
-        """Values, each as its turn comes: what was kept, then what is new."""
+        """Yield the backlog's messages, then those of the changed topics."""
         while (message := self._backlog.pop()) is not None:
             self._catch_up_bytes -= _size(message) // 2
             yield message, _time_of(message)
@@ -176,7 +181,7 @@ class Outbox:
 
 
 def _time_of(message: Message) -> Properties | None:
-    """For MQTT 5: when a value that comes late was there; most payloads have no place for it."""
+    """Make the MQTT 5 property with the source time of a late value; most payloads lack it."""
     if not message.source_ns:
         return None
     properties = Properties(PacketTypes.PUBLISH)  # type: ignore[no-untyped-call]

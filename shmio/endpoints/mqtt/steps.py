@@ -1,4 +1,4 @@
-"""Steps of virtual time: each waits until the broker has taken what it changed, and its marker."""
+"""Delivers steps of virtual time: each waits until the broker has acknowledged what it changed."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from shmio.endpoints.mqtt.outbox import Outbox
 from shmio.segment.clock import ClockPage, ClockState
 
 PATIENCE_S: Final = 3.0
-"""So long a broker has for a step; less than a step's own time-out."""
+"""Time limit for a broker to acknowledge a step; less than a step's own time-out."""
 
 log = logging.getLogger("shmio.mqtt")
 
 
 class StepDelivery:
-    """For the bridge's thread."""
+    """Delivers steps to the broker. Use it from the bridge's thread."""
 
     def __init__(self, clock: ClockPage, index: int, topic: str, connection: BrokerConnection, outbox: Outbox) -> None:
         """``index``: of this process's slot."""
@@ -34,7 +34,7 @@ class StepDelivery:
         clock.deliver(index, self.done)  # from now on each step waits for it
 
     def poll(self, feeds: Iterable[Feed]) -> None:
-        """Begin to deliver a step that is done, or end it; what is held shows nothing but by steps."""
+        """Start to deliver a step that is done, or finish it; update which feeds steps drive."""
         now = self._clock.read()
         for feed in feeds:
             feed.step_driven = now.virtual and feed.block.attributes.stepped and feed.state.frame is not None
@@ -56,7 +56,7 @@ class StepDelivery:
         self._outbox.flush()
 
     def _over(self, marker: StepMarker) -> bool:
-        """Whether the broker has it; or is away, so that what changed is kept until it is back."""
+        """Return whether the step is delivered: acknowledged, timed out, or the broker is away."""
         if not self._connection.up:
             return True
         if marker.sent is not None and not self._connection.is_unacknowledged(marker.sent):
@@ -68,23 +68,23 @@ class StepDelivery:
         return False
 
     def close(self) -> None:
-        """No step waits for this process any more."""
+        """Tell the clock not to wait for this process any more."""
         self._clock.abstain(self._index)
 
 
 class StepMarker:
-    """Tells on its topic that a step is over."""
+    """The channel of the message that says that a step is over."""
 
     def __init__(self, topic: str, state: ClockState) -> None:
         self.number = state.done
         self.topic = topic
         self.sent: Message | None = None
-        last = state.done == state.step  # or else nobody tells how far that one went
+        last = state.done == state.step  # the time of an earlier step is unknown
         fields = {"step": state.done, "time_s": state.time_ns / 1e9 if last else None}
         self._message = Message(topic, msgspec.json.encode(fields), 1, retain=False)
 
     def message(self, *, late: bool = False) -> Message:
-        """With all that the step changed before it."""
+        """Return the message; unless ``late``, remember it as sent."""
         if not late:
             self.sent = self._message
         return self._message

@@ -1,6 +1,7 @@
-"""What others publish on the bridge's topics is corrected at once; within bounds, so that nobody is answered for ever.
+"""Corrects what other clients publish on the bridge's topics, with growing pauses.
 
-Two bridges of one prefix, or brokers that hand each other's messages back, would else correct each other without end.
+Without them, two bridges with one prefix, or brokers that return each other's messages, would
+correct each other without end.
 """
 
 from __future__ import annotations
@@ -14,16 +15,16 @@ from typing import Final, Protocol
 AT_ONCE: Final = 200
 """Topics that are corrected together."""
 FIRST_PAUSE_S: Final = 0.1
-"""Between two corrections; twice as long after each, as long as others go on."""
+"""The first pause between corrections; it doubles while others go on."""
 MOST_PAUSE_S: Final = 5.0
 CALM_PAUSES: Final = 4
-"""After so many pauses without a correction the next one is as the first."""
+"""After so many pauses without a correction, the pause is as short as at first."""
 CALM_S: Final = 60.0
-"""The same for rests: so long without another."""
+"""After this time without another, a rest is as short as at first."""
 MOST_WAITING: Final = 1000
-"""Topics that wait for it; beyond that everything is told again."""
+"""Maximum number of topics to correct; beyond that, everything is published again."""
 MOST_HEARD: Final = 2000
-"""Messages of others in a second; then none is heard for a while."""
+"""Messages of others in a second that start a rest, in which none is corrected."""
 REST_S: Final = 10.0
 MOST_REST_S: Final = 320.0
 
@@ -31,23 +32,23 @@ log = logging.getLogger("shmio.mqtt")
 
 
 class TopicOwner(Protocol):
-    """Whose topics they are."""
+    """The bridge, as the guard sees it."""
 
     def watch(self) -> None:
-        """Hear what others publish there."""
+        """Subscribe to our own topics."""
 
     def unwatch(self) -> None:
-        """Hear it no more."""
+        """Unsubscribe from our own topics."""
 
     def correct(self, topic: str) -> None:
-        """Tell again what is so."""
+        """Publish our value on a topic again."""
 
     def correct_all(self) -> None:
-        """Tell again everything."""
+        """Publish everything again."""
 
 
 class TopicGuard:
-    """For the bridge's thread."""
+    """Decides when to correct which topics. Use it from the bridge's thread."""
 
     def __init__(self, owner: TopicOwner, now_s: Callable[[], float] = time.monotonic) -> None:
         self._owner, self._now_s = owner, now_s
@@ -59,15 +60,15 @@ class TopicGuard:
         self._resting = False
 
     def begin(self) -> None:
-        """There is a connection, and everything is being told: hear what others say from now on."""
+        """Start after a connect: everything is being published, so nothing is left to correct."""
         if not self._resting:
             self._waiting.clear()
             self._everything = False
             self._owner.watch()
 
     def report(self, topic: str) -> None:
-        """Somebody else has published there what is not so."""
-        if self._resting:  # it was under way
+        """Note that another client has published a wrong value on a topic."""
+        if self._resting:  # sent before we unsubscribed
             return
         now_s = self._now_s()
         if now_s - self._second_s >= 1.0:
@@ -87,7 +88,7 @@ class TopicGuard:
             self._waiting[topic] = None
 
     def turn(self) -> float:
-        """Correct what is due; in how many seconds there is more."""
+        """Correct what is due, and return in how many seconds to call again."""
         now_s = self._now_s()
         if self._resting:
             if now_s < self._until_s:

@@ -1,4 +1,4 @@
-"""Which of the configuration's rules a register is published by."""
+"""Selects the configuration's rule for each register."""
 
 from __future__ import annotations
 
@@ -10,14 +10,19 @@ from shmio.layout.glob import Glob
 from shmio.layout.topic import canonical_path, names_part
 
 DEFAULT: Final = MqttTopic(match="**")
-"""That of registers that no rule matches."""
+"""The rule of registers that no other rule matches."""
 
 
 class TopicRules:
-    """The rules in their order; of several that match the first counts."""
+    """The configuration's rules; the first that matches counts."""
 
     def __init__(self, topics: Sequence[MqttTopic]) -> None:
-        """PathError: a pattern that is none."""
+        """Compile the rules.
+
+        Raises:
+            PathError: A pattern is invalid.
+
+        """
         self._frames = {pattern: rule for rule in topics if rule.payload == "frames" for pattern in rule.patterns}
         rules = [(pattern, rule) for rule in topics if rule.payload != "frames" for pattern in rule.patterns]
         self._parts: dict[str, MqttTopic] = {}
@@ -27,19 +32,19 @@ class TopicRules:
         self._rules = [(Glob(pattern), rule) for pattern, rule in rules if not names_part(pattern)]
 
     def of(self, source: str, path: str) -> MqttTopic:
-        """The rule of a register, or of a bit or slice."""
+        """Return the rule of a register, bit or slice."""
         full = f"{source}/{path}"
         return self._parts.get(full) or self._first(full)[1]
 
     def parts(self, source: str) -> Iterator[str]:
-        """The paths of the bits, slices and other parts of a source's registers that have topics of their own."""
+        """Yield the paths of a source's bits, slices and other parts that have rules of their own."""
         for full, rule in self._parts.items():
             first, _, path = full.partition("/")
             if first == source and rule.publish:
                 yield path
 
     def structure(self, source: str, path: str) -> str | None:
-        """The structure as whose part a register is published, empty for the whole source; None: by itself."""
+        """Return the structure that a register is published in; empty: the source; None: by itself."""
         glob, rule = self._first(f"{source}/{path}")
         if glob is None or rule.payload != "structure":
             return None
@@ -51,6 +56,6 @@ class TopicRules:
         return next((found for found in self._rules if found[0].matches(full)), (None, DEFAULT))
 
     def frames(self, source: str) -> MqttTopic | None:
-        """The rule by which a source's frames are published as a whole; None: they are not."""
+        """Return the rule for a source's whole frames; None: they are not published."""
         rule = self._frames.get(source)
         return rule if rule and rule.publish else None

@@ -1,7 +1,7 @@
-"""What the clients of our own broker may do: the rules that mosquitto enforces.
+"""Access rules of our own broker, which mosquitto enforces.
 
-Nobody but the bridge publishes values, status and results: its account is made anew at each start of the broker, and is
-let in by the UNIX socket alone.
+Only the bridge publishes values, status and results. Its password is new at each start of the
+broker, and only the UNIX socket accepts it.
 """
 
 from __future__ import annotations
@@ -18,22 +18,28 @@ from shmio.config.mqtt.accounts import hashed
 from shmio.endpoints.mqtt.broker.directory import SECRET, write_private
 
 BRIDGE: Final = "bridge"
-"""The bridge's account."""
+"""Name of the bridge's account."""
 MAX_LEVELS: Final = 64
-"""Of a register's path that is written by MQTT."""
+"""Maximum number of levels of a register's path that can be written by MQTT."""
 READERS: Final = MqttAccount(roles=["read"])
-"""Who has no ``[[mqtt.account]]``."""
+"""The account of clients that have no ``[[mqtt.account]]``."""
 
 
 class Rights(NamedTuple):
-    """``filters``: of the topics that may be published on."""
+    """What an account may do.
+
+    ``filters``: the topics on which it may publish.
+    """
 
     read: bool
     filters: Sequence[str]
 
 
 def rights(settings: Mqtt, instance: str, accounts: Iterable[str] | None) -> dict[str | None, Rights]:
-    """Of each account, by its name; None: of who shows none. ``accounts``: names of those with a password, if asked."""
+    """Return each account's rights by name; None: clients without an account.
+
+    ``accounts``: names of the accounts that have a password; None: passwords are not used.
+    """
     given = {account.name: account for account in settings.account}
     for name in [None] if accounts is None else accounts:
         given.setdefault(name, READERS)
@@ -54,16 +60,16 @@ def _commands(settings: Mqtt, instance: str) -> Iterator[str]:
 
 
 def new_secret(place: Path) -> str:
-    """Make the bridge's password, which it finds there; its hash, as mosquitto knows it."""
+    """Make the bridge's password, write it to its file, and return its hash for mosquitto."""
     secret = secrets.token_hex(32)
     write_private(place / SECRET, secret)
     return hashed(secret)
 
 
 def secret_id(client_id: str, secret: str) -> str:
-    """The client id of one of the bridge's connections: who knew it could push it out, as MQTT has it."""
+    """Return a client id that others cannot guess: who knows one can disconnect its client."""
     return f"{client_id}-{hashlib.sha256(f'{secret} {client_id}'.encode()).hexdigest()[:32]}"
 
 
 ID: Final = re.compile(r"(?<=-)[0-9a-f]{32}\b")
-"""What is secret of such an id."""
+"""Matches the secret part of such a client id."""

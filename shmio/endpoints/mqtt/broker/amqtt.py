@@ -1,7 +1,8 @@
-"""aMQTT, unpatched, as our own broker where there is no mosquitto: MQTT 3.1.1, for development on one host.
+"""Our own broker where there is no mosquitto: aMQTT, MQTT 3.1.1, for development on one host.
 
-Every program that reaches it may publish and subscribe to everything: aMQTT publishes last wills without asking its
-plugins, and replaces a client's session before it asks who connects, so that no role could be enforced.
+Every program that reaches it may publish and subscribe to everything. aMQTT publishes wills without
+asking its plugins, and replaces a client's session before it authenticates, so that roles cannot be
+enforced.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ async def serve(worker: Worker, settings: Mqtt, place: Path) -> None:
 
 
 async def _serve(broker: Broker, reader: StreamReader, writer: StreamWriter) -> None:
-    """One client's connection, until it ends."""
+    """Serve one client's connection until it ends."""
     try:
         begun = await asyncio.wait_for(_until_version(reader), GREETING_S)
         if begun.endswith(b"MQTT\5"):
@@ -98,7 +99,7 @@ async def _until_version(reader: StreamReader) -> bytes:
 
 
 class _Reader(StreamReaderAdapter):  # type: ignore[misc]  # the library's classes have no types
-    """Reads again what was read before, then the rest."""
+    """Reads the bytes that were already read, then the rest."""
 
     def __init__(self, reader: StreamReader, begun: bytes) -> None:
         super().__init__(reader)

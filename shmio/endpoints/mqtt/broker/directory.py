@@ -1,4 +1,4 @@
-"""The folder of our own broker: beside the supervisor's socket, this user's alone."""
+"""The directory of our own broker: beside the supervisor's socket, readable by this user only."""
 
 from __future__ import annotations
 
@@ -10,36 +10,49 @@ from shmio.errors import EndpointError
 from shmio.segment import Segment
 
 SOCKET: Final = "s"
-"""So short that its path is no longer than that of the supervisor's socket, which fits where such may be."""
+"""Name of the socket.
+
+Its path must be no longer than that of the supervisor's socket.
+"""
 
 SECRET: Final = "key"  # noqa: S105  a name
-"""The bridge's password."""
+"""Name of the file with the bridge's password."""
 
 
 def folder(segment: Segment) -> Path:
-    """Where it is; not made here."""
+    """Return the directory's path; the directory need not exist."""
     return Path(f"{segment.header.control.removesuffix('.sock')}.mq")
 
 
 def own_socket(segment: Segment) -> str:
-    """Where our own broker is reached by us alone."""
+    """Return the path of the broker's UNIX socket, which only this user can reach."""
     return str(folder(segment) / SOCKET)
 
 
 def secret_of(socket: str) -> str:
-    """The bridge's password at the broker of a socket. FileNotFoundError: the broker does not run."""
+    """Read the bridge's password for the broker of a socket.
+
+    Raises:
+        FileNotFoundError: The broker does not run.
+
+    """
     return Path(socket).with_name(SECRET).read_text(encoding="utf-8")
 
 
 def write_private(file: Path, text: str) -> None:
-    """Make a file, mode 0600, which is not there yet."""
+    """Create a file with mode 0600; it must not exist."""
     fd = os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     with open(fd, "w", encoding="utf-8") as stream:  # noqa: PTH123  a descriptor
         stream.write(text)
 
 
 def prepare(place: Path) -> None:
-    """Make it, mode 0700, and empty it. EndpointError: it is something else, or somebody else's."""
+    """Create the directory with mode 0700, or empty it.
+
+    Raises:
+        EndpointError: It is not a directory, or belongs to another user.
+
+    """
     try:
         place.mkdir(mode=0o700, exist_ok=True)
         fd = os.open(place, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
@@ -55,13 +68,13 @@ def prepare(place: Path) -> None:
 
 
 def clear(place: Path) -> None:
-    """Remove what is in it."""
+    """Remove the directory's files."""
     for entry in place.iterdir():
         if not entry.is_dir():
             entry.unlink(missing_ok=True)
 
 
 def remove(place: Path) -> None:
-    """Remove it."""
+    """Remove the directory and its files."""
     clear(place)
     place.rmdir()

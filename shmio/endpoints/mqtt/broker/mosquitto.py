@@ -25,18 +25,21 @@ STOP_S: Final = 3.0
 MAX_PACKET_BYTES: Final = 1 << 21
 MAX_QUEUED_MESSAGES: Final = 100_000
 MAX_QUEUED_BYTES: Final = 64 << 20
-"""Of what waits for one client that reads slowly: what comes then is dropped, for it alone."""
+"""Maximum queue for one slow client; newer messages are dropped for it alone."""
 _STAMP: Final = re.compile(r"^\d+: ")
 
 log = logging.getLogger("shmio.mqtt")
 
 
 def configuration(settings: Mqtt, place: Path, *, anonymous: bool) -> str:
-    """mosquitto.conf(5). ``anonymous``: whether who shows no account is let in."""
+    """Make the text of mosquitto.conf(5).
+
+    ``anonymous``: clients without an account are let in.
+    """
     address = Address.parse(str(settings.listen))
     lines = [
         "per_listener_settings true",
-        "user root",  # only heeded when started by root: it stays who it is, to die with its parent
+        "user root",  # only used when started by root: with another user it would not die with its parent
         "persistence false",
         "log_dest stderr",
         *(f"log_type {kind}" for kind in ("error", "warning", "notice")),
@@ -53,19 +56,21 @@ def configuration(settings: Mqtt, place: Path, *, anonymous: bool) -> str:
         lines += [f"certfile {tls.certificate}", f"keyfile {tls.key}"]
         if tls.ca:
             lines += [f"cafile {tls.ca}", "require_certificate true"]
-    # Ours is the last one: who can connect there knows that the broker listens everywhere.
+    # Our socket comes last: once it accepts connections, the other listener does, too.
     lines += [f"listener 0 {place / SOCKET}", "allow_anonymous false"]
     lines += [f"password_file {place / 'bridge'}", f"acl_file {place / 'bridge-rights'}"]
     return "".join(f"{line}\n" for line in lines)
 
 
 def access_rules(given: Mapping[str | None, Rights], *, accounts: bool) -> str:
-    """An ACL file. ``accounts``: whether there are any; else a name that a client shows is nobody's, and means nothing.
+    """Make an ACL file; what it does not allow is denied, wills too.
 
-    What it does not allow is denied, a last will too.
+    ``accounts``: there are accounts; else the user name that a client gives is ignored.
     """
     lines = []
-    for name, allowed in sorted(given.items(), key=lambda one: one[0] or ""):  # who shows none comes before all names
+    for name, allowed in sorted(
+        given.items(), key=lambda one: one[0] or ""
+    ):  # clients without an account come before all names
         kind = "topic" if accounts else "pattern"
         if name is not None:
             lines.append(f"user {name}")
@@ -76,10 +81,15 @@ def access_rules(given: Mapping[str | None, Rights], *, accounts: bool) -> str:
 
 
 class Mosquitto:
-    """The process. For the main thread: it dies with the thread that starts it."""
+    """The mosquitto process. Start it from the main thread: it dies with that thread."""
 
     def __init__(self, program: str, settings: Mqtt, instance: str, place: Path) -> None:
-        """Start it. ConfigError: its accounts cannot be read."""
+        """Start mosquitto.
+
+        Raises:
+            ConfigError: The file of accounts cannot be read.
+
+        """
         accounts = read_accounts(settings.password_file, settings.account) if settings.password_file else None
         if accounts is not None:
             write_private(place / "accounts", "".join(f"{name}:{secret}\n" for name, secret in accounts.items()))
@@ -103,7 +113,12 @@ class Mosquitto:
         self._reader.start()
 
     def await_start(self, beat: Callable[[], object]) -> None:
-        """Wait until it takes connections. EndpointError: it ends, or takes too long; says what it said last."""
+        """Wait until mosquitto accepts connections.
+
+        Raises:
+            EndpointError: It has ended, or takes too long; with its last log line.
+
+        """
         until_s = time.monotonic() + START_S
         while True:
             self.check()
@@ -119,14 +134,19 @@ class Mosquitto:
             time.sleep(0.02)
 
     def check(self) -> None:
-        """EndpointError: it has ended."""
+        """Check that mosquitto runs.
+
+        Raises:
+            EndpointError: It has ended.
+
+        """
         code = self._process.poll()
         if code is not None:
             self._reader.join(1.0)
             raise EndpointError(f"mosquitto has ended: {self._last or f'exit status {code}'}")
 
     def stop(self) -> None:
-        """End it."""
+        """Stop mosquitto."""
         self._process.terminate()
         try:
             self._process.wait(STOP_S)
@@ -138,7 +158,7 @@ class Mosquitto:
             self._process.stderr.close()
 
     def _read(self) -> None:
-        """Into our log."""
+        """Copy mosquitto's log lines to ours."""
         for line in self._process.stderr or ():
             self._last = ID.sub("…", _STAMP.sub("", line.strip()))
             log.info("mosquitto: %s", self._last)

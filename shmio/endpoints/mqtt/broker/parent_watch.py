@@ -1,4 +1,7 @@
-"""Becomes another program that dies with the process that started it: ``tether PARENT PROGRAM [ARGUMENT...]``."""
+"""Runs a program that dies with the process that started it.
+
+Usage: ``parent_watch PARENT PROGRAM [ARGUMENT...]``.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +15,11 @@ _PR_SET_PDEATHSIG: Final = 1  # prctl(2)
 
 
 def main() -> None:
-    """Become it, or end if the parent is dead already."""
+    """Replace this process by the program, or exit if the parent is dead already."""
     parent, program = int(sys.argv[1]), sys.argv[2]
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     if os.getppid() == parent:
-        os.execv(program, sys.argv[2:])  # noqa: S606  that is what it is for
+        os.execv(program, sys.argv[2:])  # noqa: S606  that is its purpose
 
 
 if __name__ == "__main__":

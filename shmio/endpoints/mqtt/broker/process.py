@@ -1,4 +1,4 @@
-"""The process of our own broker: mosquitto where it is on the machine, else aMQTT."""
+"""The process of our own broker: mosquitto if it is installed, else aMQTT."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ log = logging.getLogger("shmio.mqtt")
 
 
 def run(worker: Worker) -> None:
-    """Serve until told to stop."""
+    """Run the broker until the worker is stopped."""
     settings = msgspec.convert(worker.config, Mqtt)
     program = choose_broker(settings)
     place = folder(worker.segment)

@@ -1,4 +1,4 @@
-"""Which program is our own broker: mosquitto, or aMQTT for development where there is none."""
+"""Selects the program of our own broker: mosquitto, or aMQTT for development where there is none."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def choose_broker(settings: Mqtt) -> str | None:
 
 
 def _only_mosquitto(settings: Mqtt) -> Iterator[str]:
-    """What the settings demand that aMQTT does not enforce: keys, with what they say."""
+    """Yield each setting that aMQTT does not enforce: its key, with what it says."""
     if not Address.parse(str(settings.listen)).loopback:
         yield f"mqtt.listen: {settings.listen} can be reached from other hosts"
     if settings.tls is not None:

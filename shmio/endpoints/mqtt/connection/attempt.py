@@ -1,4 +1,4 @@
-"""One attempt to connect, in a thread of its own: files, names, TCP and TLS take their time."""
+"""One attempt to connect, in a thread of its own, since files, DNS, TCP and TLS may block."""
 
 from __future__ import annotations
 
@@ -25,31 +25,31 @@ from shmio.endpoints.mqtt.connection.target import ReconnectPolicy
 from shmio.errors import ConfigError
 
 CONNECT_S: Final = 4.0
-"""For a connection, its TLS, and for the broker's answer to who we are; each."""
+"""Time limit for each of TCP connect, TLS handshake and CONNACK."""
 SLOW_S: Final = 15.0
 SLOW: Final = "no answer yet: it is slow, or the name server, or the file system of mqtt.tls or mqtt.password_file"
 MAX_PACKET_BYTES: Final = 1 << 21
-"""Of what a broker may send us, as far as it can be told so: with MQTT 5."""
+"""Maximum packet size that we accept; only MQTT 5 brokers are told."""
 
 
 class BrokerClient(Client):
-    """paho's, which tells more of why a connection has ended."""
+    """A paho client that keeps the TLS error that ended the connection."""
 
     tls_error: ssl.SSLError | None = None
-    """What TLS said against the connection after it was made, if that is why it has ended."""
+    """The TLS error after the connection was made, if that ended it."""
 
 
 class _TlsClient(BrokerClient):
     def _sock_recv(self, bufsize: int) -> bytes:
         try:
             return super()._sock_recv(bufsize)
-        except ssl.SSLError as error:  # with TLS 1.3 a broker says only then that it does not take our certificate
+        except ssl.SSLError as error:  # with TLS 1.3 a broker rejects our certificate only now
             self.tls_error = error
             raise
 
 
 class ConnectAttempt:
-    """Begins at once, with the broker whose turn it is."""
+    """An attempt to connect to the next broker; its thread starts at once."""
 
     def __init__(
         self,
@@ -59,21 +59,23 @@ class ConnectAttempt:
         most: int,
         wake: Callable[[], object],
     ) -> None:
-        """``most``: messages that the broker may send us before they are acknowledged, as far as it can be told so.
+        """Start the attempt.
 
-        ``wake``: called by its thread when it is over, if anybody wants it then.
+        ``most``: messages that the broker may send us unacknowledged; only MQTT 5 brokers are told.
+        ``wake``: called by the thread at the end, unless the attempt was abandoned.
         """
         self.target = policy.next()
         self._begun_s = time.monotonic()
         self.over = False
-        """Whether ``client``, ``socket`` and ``problem`` are what has come of it."""
+        """Whether the attempt has ended, so that ``client``, ``socket`` and ``problem`` are final.
+        """
         self.client: BrokerClient | None = None
         self.socket: socket.socket | None = None
-        """A connection, on which nothing was read yet."""
+        """The connected socket, from which nothing has been read yet."""
         self.sent = False
-        """Whether a broker may have been told who we are, and our will."""
+        """Whether a CONNECT, with our client id and will, may have reached a broker."""
         self.problem = ""
-        """Why there is none."""
+        """Why the attempt failed; empty: it did not."""
         self._policy, self._protocol, self._will, self._most, self._wake = policy, protocol, will, most, wake
         self._lock = threading.Lock()
         self._abandoned = False
@@ -81,11 +83,11 @@ class ConnectAttempt:
 
     @property
     def slow(self) -> bool:
-        """Whether it has taken longer than any should."""
+        """Whether the attempt takes unusually long."""
         return time.monotonic() >= self._begun_s + SLOW_S
 
     def abandon(self) -> None:
-        """Nobody wants it any more: what it makes is closed, and nobody is woken."""
+        """Abandon the attempt: close its connection, and do not call ``wake``."""
         with self._lock:
             self._abandoned = True
         if self.over:
@@ -109,11 +111,16 @@ class ConnectAttempt:
         self._close()
 
     def _connect(self) -> None:
-        """ConfigError: a file that is needed for it will not do."""
+        """Connect.
+
+        Raises:
+            ConfigError: A password or TLS file cannot be used.
+
+        """
         settings, target, new = self._policy.settings, self.target, self._protocol == MQTTv5
         own = secret_of(target.host) if target.transport == "unix" else None
         client_id = self._policy.client_id
-        # A client of its own for each attempt: what one has not got rid of is none of the next one's business.
+        # Each attempt has a client of its own, so that no state is left from the one before.
         client = self.client = (BrokerClient if settings.tls is None else _TlsClient)(
             CallbackAPIVersion.VERSION2,
             client_id if own is None else secret_id(client_id, own),
@@ -153,7 +160,7 @@ class ConnectAttempt:
 
 
 def close_socket(client: Client) -> None:
-    """Close its socket, whatever state it is in."""
+    """Close a client's socket, whatever state it is in."""
     client.on_disconnect = None
     made = client.socket()
     if made is not None:

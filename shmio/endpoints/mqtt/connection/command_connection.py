@@ -1,7 +1,7 @@
-"""Where commands come in and their results go out: by a connection of its own, to the broker that has the values.
+"""The connection for commands and their results, beside the one for values, to the same broker.
 
-On one connection a broker's acknowledgements of values would come behind all the commands that it has for us, and who
-sends them with QoS 0 is held back by nobody (MQTT 5.0, section 4.9): values would wait for a flood of them.
+On one connection, the broker's acknowledgements of values would queue behind all commands. A flood
+of commands with QoS 0, which no limit holds back (MQTT 5.0, section 4.9), would delay values.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from shmio.endpoints.mqtt.connection.target import ReconnectPolicy, Target
 
 
 class CommandConnection:
-    """For the bridge's thread."""
+    """The connection for commands and results. Use it from the bridge's thread."""
 
     def __init__(
         self,
@@ -29,9 +29,9 @@ class CommandConnection:
         filters: Callable[[], Sequence[str]],
         answers: Callable[[], Sequence[str]],
     ) -> None:
-        """``selector``, ``wake``: as of :class:`BrokerConnection`; ``filters``: what is to be subscribed to at present.
+        """``selector``, ``wake``: see :class:`BrokerConnection`.
 
-        ``answers``: where results go.
+        ``filters``: returns the topics of commands; ``answers``: the topics of results.
         """
         self._policy = ReconnectPolicy(settings, client_id, ())
         self.connection = BrokerConnection(self._policy, selector, wake, lambda: None, FEW_IN_FLIGHT)
@@ -39,20 +39,20 @@ class CommandConnection:
         self._filters, self._answers = filters, answers
         self._at: Target | None = None
         self._deadline_s = 0.0
-        """When the broker must have answered to what was subscribed to."""
+        """Deadline for the broker's SUBACK."""
 
     @property
     def ready(self) -> bool:
-        """Whether commands come in, or it is known why they do not."""
+        """Whether commands can arrive, or it is known why not."""
         return self.connection.subscribed or bool(self.connection.problem)
 
     @property
     def problem(self) -> str:
-        """Why they do not, or no results go out; empty: all is well."""
+        """Why no commands arrive or no results are sent; empty: no problem."""
         return f"commands: {self.connection.problem}" if self.connection.problem else ""
 
     def turn(self, at: Target | None) -> float:
-        """Be where the values go, or nowhere; in how many seconds there is more to do."""
+        """Connect to the broker that has the values, and return in how many seconds to call again."""
         if at is not self._at:
             self._at = at
             self.connection.close()
@@ -66,12 +66,12 @@ class CommandConnection:
         if not self.connection.up or self.connection.subscribed:
             return rest_s
         left_s = self._deadline_s - time.monotonic()
-        if left_s <= 0:  # values wait to hear of it
+        if left_s <= 0:  # the connection for values waits for this one
             self.connection.drop("it does not answer to SUBSCRIBE")
         return max(0.0, min(rest_s, left_s))
 
     def subscribe(self) -> None:
-        """Have commands sent for all that there is now."""
+        """Subscribe to the commands of all current sources."""
         if self.connection.up:
             self.connection.subscribe(self._filters())
             self.watch()
@@ -79,9 +79,9 @@ class CommandConnection:
             self._deadline_s = time.monotonic() + CONNECT_S
 
     def watch(self) -> None:
-        """Hear what others publish where results go."""
+        """Subscribe to what others publish on the topics of results."""
         self.connection.watch(self._answers())
 
     def unwatch(self) -> None:
-        """Hear it no more."""
+        """Unsubscribe from the topics of results."""
         self.connection.unwatch(self._answers())

@@ -1,4 +1,4 @@
-"""The connection to the broker: made anew whenever it is lost, with growing waits, and never waited for."""
+"""A connection to the broker that reconnects with growing waits and never blocks."""
 
 from __future__ import annotations
 
@@ -23,24 +23,27 @@ from shmio.endpoints.mqtt.connection.write_batches import BATCH
 from shmio.layout.topic import shorten
 
 STABLE_S: Final = 5.0
-"""Who was connected so long has put his failures behind him."""
+"""A connection that lasted this long resets the back-off."""
 MOST_TOLD: Final = 300
-"""Characters of what is wrong with all brokers."""
+"""Maximum length of the text that joins the problems of all brokers."""
 WITH_WILL: Final = "Disconnect with will message"
 
 _WATCHED: Final = 1
-"""The number of the subscription to our own topics."""
+"""Identifier of the subscription to our own topics."""
 
 log = logging.getLogger("shmio.mqtt")
 
 
 def is_watched(message: MQTTMessage) -> bool:
-    """Whether it is somebody else's, on one of our own topics."""
+    """Return whether a message is another client's, on one of our own topics."""
     return _WATCHED in (vars(message.properties) if message.properties else {}).get("SubscriptionIdentifier", ())
 
 
 class BrokerConnection:
-    """For the bridge's thread: it registers its socket with ``selector``, to have ``data`` called when it is ready."""
+    """A connection that reconnects. Use it from the bridge's thread.
+
+    It registers its socket with ``selector``; call the key's ``data`` when the socket is ready.
+    """
 
     def __init__(
         self,
@@ -50,66 +53,70 @@ class BrokerConnection:
         will: Callable[[], Message | None],
         most: int,
     ) -> None:
-        """``wake``: any thread has it turned so. ``will``: asked for each CONNECT. ``most``: in flight, each way."""
+        """``wake``: called by a thread that needs :meth:`turn` to run.
+
+        ``will``: returns the will for each CONNECT. ``most``: messages in flight, each way.
+        """
         self.up = False
         self.is_ready: Callable[[], bool] = lambda: True
-        """Asked, from when the broker has let us in, until it says so: whether the connection is ``up`` by now."""
+        """Called after CONNACK until it returns True; only then is the connection ``up``."""
         self.came_up = False
-        """Set when a connection has been made; who has greeted it takes it back."""
+        """Set when the connection comes up; the user resets it."""
         self.on_lost: Callable[[list[Message]], None] = lambda _: None
-        """Called when a connection is gone, with what it has not taken for certain."""
+        """Called when the connection is lost, with the messages that the broker has not
+        acknowledged."""
         self.problems = ConnectionProblems()
         self.connects = 0
         self.subscribed = False
-        """Whether the broker has answered to what was subscribed to last."""
+        """Whether the broker has answered the last subscription."""
         self._policy, self._selector, self._wake, self._will, self._most = policy, selector, wake, will, most
         self.on_message: Callable[[MQTTMessage], None] = lambda _: None
-        """Called with each message that comes."""
+        """Called with each message that arrives."""
         self._client: BrokerClient | None = None
         self._socket_io: SocketIo | None = None
         self._target: Target | None = None
         self._problem_of: dict[Target | None, str] = {}
-        """What was wrong with each broker that was tried since the last connection."""
+        """The last problem of each broker tried since the last connection."""
         self._attempt: ConnectAttempt | None = None
         self._protocol = MQTTv5
         self._deadline_s: float | None = None
-        """When the broker must have answered."""
+        """Deadline for the broker's CONNACK; None: not waiting for it."""
         self._retry_s = self._up_s = self._misc_s = 0.0
-        self._new_will: Message | None = None  # that no broker was told yet
+        self._new_will: Message | None = None  # not yet sent to any broker
         self._in_flight: dict[int, Message] = {}
         self._limits = Limits()
         self._subscription = 0  # the subscription to commands
 
     @property
     def problem(self) -> str:
-        """Why there is no connection, or what the broker refuses; empty: all is well."""
+        """Why there is no connection, or what the broker refuses; empty: no problem."""
         return self.problems.problem
 
     @property
     def at(self) -> Target | None:
-        """The broker that has let us in."""
+        """The broker that has accepted our CONNECT."""
         return None if self._client is None or self._deadline_s is not None else self._target
 
     @property
     def mqtt5(self) -> bool:
-        """Whether the broker speaks version 5."""
+        """Whether the connection is up and uses MQTT 5."""
         return self.up and self._protocol == MQTTv5
 
     @property
     def room(self) -> int:
-        """How many messages it takes now, and does not only put into its memory."""
+        """How many messages can be sent now without queueing them in memory."""
         blocked = not self.up or self._socket_io is None or self._socket_io.writing
         return 0 if blocked else min(BATCH, self._limits.in_flight - len(self._in_flight))
 
     @property
     def in_flight(self) -> int:
-        """Messages that the broker has not acknowledged."""
+        """Number of messages that the broker has not acknowledged."""
         return len(self._in_flight)
 
     # ---- a turn ------------------------------------------------------------------------------------------------------
 
     def turn(self) -> float:
-        """Do what is due; in how many seconds there is more to do."""
+        """Do what is due, and return in how many seconds to call again."""
         now_s = time.monotonic()
         if self._attempt is not None and self._attempt.over:
             self._take(self._attempt)
@@ -138,7 +145,7 @@ class BrokerConnection:
         return 1.0 if self._socket_io is None else self._socket_io.turn()
 
     def _take(self, attempt: ConnectAttempt) -> None:
-        """A connection was made, or was not."""
+        """Handle the end of an attempt."""
         self._attempt = None
         client, made = attempt.client, attempt.socket
         self._new_will = None if attempt.sent else self._new_will
@@ -153,7 +160,7 @@ class BrokerConnection:
         client.on_publish = self._socket_io.counting(self._acknowledged)
         client.on_message = self._socket_io.counting(self._received)
 
-    # ---- what the broker says ----------------------------------------------------------------------------------------
+    # ---- callbacks of the client -------------------------------------------------------------------------------------
 
     def _connected(
         self, client: Client, _data: Any, _flags: ConnectFlags, code: ReasonCode, properties: Properties | None
@@ -204,12 +211,13 @@ class BrokerConnection:
                 f"broker {self._target} does not let us subscribe: no command can come: {refused[0]}"
             )
 
-    # ---- its end -----------------------------------------------------------------------------------------------------
+    # ---- dropping it -------------------------------------------------------------------------------------------------
 
     def drop(self, problem: str, *, politely: bool = False) -> None:
-        """Give a connection up, or half of one, that does not do what it should.
+        """Drop a connection, or an attempt that waits for CONNACK, and say why.
 
-        ``politely``: take leave, so that the will is not published. Not when called by what has come.
+        ``politely``: send DISCONNECT, so that the will is not published. Do not call it so from a
+        callback.
         """
         problem = f"broker {self._target}: {problem}"
         if politely and self._client is not None:
@@ -223,12 +231,12 @@ class BrokerConnection:
             self._fail(self.problems.connection_lost(problem, self._policy.client_id))
             self.on_lost(lost)
         elif self._protocol == MQTTv5 and self._deadline_s is not None:
-            self._fall_back()  # some brokers that do not know version 5 say nothing
+            self._fall_back()  # some brokers without MQTT 5 do not answer
         else:
             self._fail(problem)
 
     def _fall_back(self) -> None:
-        """Try version 3.1.1, with the same broker, at once."""
+        """Retry the same broker at once with MQTT 3.1.1."""
         self._close()
         self._protocol = MQTTv311
         self._policy.retry_same()
@@ -238,7 +246,7 @@ class BrokerConnection:
     def _fail(self, problem: str) -> None:
         self._close()
         self._protocol = MQTTv5
-        # Of each broker the last one: who looks at the status wants to know about all that are tried in turn.
+        # The status shows the last problem of each broker, since all are tried in turn.
         self._problem_of[self._target] = problem
         self.problems.report(
             shorten("; ".join(self._problem_of[one] for one in sorted(self._problem_of, key=str)), MOST_TOLD)
@@ -252,10 +260,10 @@ class BrokerConnection:
         if socket_io is not None:
             socket_io.close()
 
-    # ---- what goes out -----------------------------------------------------------------------------------------------
+    # ---- sending and subscribing -------------------------------------------------------------------------------------
 
     def send(self, message: Message, properties: Properties | None = None) -> None:
-        """Have one ready to go, if there is a connection."""
+        """Queue a message for :meth:`push`; without a connection, drop it."""
         client, limits = self._client, self._limits
         if client is None or not self.up:
             return
@@ -272,18 +280,19 @@ class BrokerConnection:
             self.problems.message_accepted()
 
     def push(self) -> None:
-        """Have go what is ready."""
+        """Write queued messages to the socket."""
         if self._socket_io is not None:
             self._socket_io.push()
 
     def is_unacknowledged(self, message: Message) -> bool:
-        """Whether this very message was sent, and the broker has not acknowledged it."""
+        """Return whether this very message was sent and is not acknowledged."""
         return any(one is message for one in self._in_flight.values())
 
     def subscribe(self, filters: Sequence[str], *, retained: bool = False) -> None:
-        """Ask for what is sent to these; unless ``retained``, what was there before is not sent, or has its flag.
+        """Subscribe to filters.
 
-        So has, with version 5, what comes from another broker that had it before: to ours it is new.
+        Unless ``retained``, MQTT 5 brokers leave out retained messages; others mark them with the
+        retain flag. Messages from bridged brokers may have it, too: they are new to ours.
         """
         client = self._client
         self.subscribed = not filters
@@ -295,33 +304,36 @@ class BrokerConnection:
         self._subscription = self._subscription if retained or mid is None else mid
 
     def watch(self, filters: Sequence[str]) -> None:
-        """Ask for what others publish on our own topics from now on; see :func:`is_watched`. With version 5 alone."""
+        """Subscribe to what others publish on our own topics; see :func:`is_watched`. MQTT 5 only."""
         if self._client is None or not (filters and self.mqtt5 and self._limits.identifiers):
-            return  # we would hear ourselves, and could not tell it from what the broker had before
+            return  # we would receive our own messages, and could not tell them from retained ones
         properties = Properties(PacketTypes.SUBSCRIBE)  # type: ignore[no-untyped-call]
         properties.SubscriptionIdentifier = _WATCHED
         options: Any = subscription(retained=False)
         self._client.subscribe([(one, options) for one in filters], properties=properties)
 
     def unwatch(self, filters: Sequence[str]) -> None:
-        """The reverse."""
+        """Unsubscribe from our own topics."""
         if self._client is not None and filters and self.mqtt5:
             self._client.unsubscribe(list(filters))
 
     def recall(self, filters: Sequence[str]) -> None:
-        """Have what is retained on these sent once."""
+        """Ask the broker once for the messages that it retains on these filters."""
         self.subscribe(filters, retained=True)
         if self._client is not None and filters:
             self._client.unsubscribe(list(filters))
 
     def open(self) -> None:
-        """Connect, after :meth:`close`."""
+        """Allow connecting again after :meth:`close`."""
         self._protocol, self._retry_s = MQTTv5, 0.0
         self.problems.clear()
         self._problem_of.clear()
 
     def close(self, *, will: bool = False) -> None:
-        """Take leave; what was sent before is on its way. ``will``: have the will published, as far as that can be."""
+        """Disconnect; messages already written to the socket still arrive.
+
+        ``will``: have the broker publish the will, which needs MQTT 5.
+        """
         if self._client is not None:
             self._client.on_disconnect = None
             if self.up:

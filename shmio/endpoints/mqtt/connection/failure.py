@@ -1,4 +1,4 @@
-"""Why there is no connection, in words that tell what to look at."""
+"""Texts that say why there is no connection, and what to check."""
 
 from __future__ import annotations
 
@@ -21,62 +21,62 @@ _TAKEN_OVER: Final = 0x8E
 
 OFTEN: Final = 4
 OFTEN_S: Final = 60.0
-"""Who loses so many connections in so long is told what may be behind it: not all brokers say."""
+"""After so many lost connections in this time, the problem names a likely cause."""
 REFUSED_S: Final = 10.0
-"""So long it is told that a broker refuses messages, though it has taken others since."""
+"""How long a refusal stays the current problem though the broker accepts other messages."""
 
 log = logging.getLogger("shmio.mqtt")
 
 
 class ConnectionProblems:
-    """What is wrong with a connection at present, once each in the log."""
+    """The current problem of a connection; each is logged once."""
 
     def __init__(self) -> None:
         self.problem = ""
-        """Empty: all is well."""
+        """The current problem; empty: none."""
         self.refused = 0
-        """Messages that the broker did not take."""
+        """Number of messages that the broker refused."""
         self._refused_s = 0.0
         self._subscription_problem = ""
         self._lost_s: deque[float] = deque(maxlen=OFTEN)
 
     def report(self, problem: str) -> None:
-        """There is something else wrong now."""
+        """Set the current problem, and log it if it is new."""
         if problem != self.problem:
             log.warning("%s", problem)
         self.problem = problem
 
     def connection_lost(self, problem: str, client_id: str) -> str:
-        """A connection that had been made is gone; what is to be said of it."""
+        """Count a lost connection, and return the text of the problem."""
         self._lost_s.append(time.monotonic())
         if len(self._lost_s) < OFTEN or self._lost_s[-1] - self._lost_s[0] > OFTEN_S:
             return problem
         return f"{problem}, again and again; does another client connect as {client_id} (mqtt.client_id)?"
 
     def clear(self) -> None:
-        """There is a connection."""
+        """Forget the problem: the connection is up."""
         self.problem = self._subscription_problem = ""
 
     def subscription_refused(self, problem: str) -> None:
-        """By this connection no command can come."""
+        """Report that the broker refuses the subscription to commands."""
         self._subscription_problem = problem
         self.report(problem)
 
     def message_refused(self, problem: str) -> None:
-        """A message was not taken."""
+        """Count a message that was refused, and report it if there is no other problem."""
         self.refused += 1
         self._refused_s = time.monotonic()
         if not self.problem:  # the first stands for all that follow
             self.report(problem)
 
     def message_accepted(self) -> None:
-        """A message was taken."""
+        """End the problem of refused messages if the last refusal is long enough ago."""
         if self.problem and time.monotonic() >= self._refused_s + REFUSED_S:
             self.problem = self._subscription_problem
 
 
 def refusal(code: ReasonCode, policy: ReconnectPolicy) -> str:
-    """What a broker's code means here."""
+    """Describe a broker's reason code."""
     if code.value in _WHO:
         return f"it does not let us in ({code}): check mqtt.username, mqtt.password_file and the broker's own accounts"
     if code.value in _BUSY:
@@ -87,7 +87,10 @@ def refusal(code: ReasonCode, policy: ReconnectPolicy) -> str:
 
 
 def ended(error: ssl.SSLError | None, *, up: bool, tls: bool) -> str:
-    """Why a connection has ended. ``error``: what TLS said; ``up``: the broker had let us in; ``tls``: it has TLS."""
+    """Describe why a connection ended.
+
+    ``error``: the TLS error, if any; ``up``: the broker had accepted us; ``tls``: TLS is in use.
+    """
     if error is not None:
         return _tls(error)
     lost = "the connection was lost"
@@ -96,7 +99,10 @@ def ended(error: ssl.SSLError | None, *, up: bool, tls: bool) -> str:
 
 
 def why(error: Exception, target: Target, *, tls: bool) -> str:
-    """Why no connection could be made. ``tls``: with TLS."""
+    """Describe why no connection could be made.
+
+    ``tls``: TLS is in use.
+    """
     if isinstance(error, ssl.SSLError):
         return _tls(error)
     if isinstance(error, socket.gaierror):

@@ -1,4 +1,4 @@
-"""What a broker takes, as it says when it lets us in (MQTT 5.0, section 3.2.2.3); one of version 3.1.1 says nothing."""
+"""The limits that a broker states in its CONNACK (MQTT 5.0, section 3.2.2.3); MQTT 3.1.1 has none."""
 
 from __future__ import annotations
 
@@ -10,26 +10,32 @@ from paho.mqtt.subscribeoptions import SubscribeOptions
 from shmio.endpoints.mqtt.channel import Message
 
 MOST_IN_FLIGHT: Final = 1000
-"""Messages that the broker has not acknowledged."""
+"""Maximum number of unacknowledged messages."""
 FEW_IN_FLIGHT: Final = 4
-"""The same where commands come in, of which each takes its time: as many may be read at once."""
+"""The maximum where commands arrive: as many may be read at once, and each takes time."""
 HEAD_BYTES: Final = 128
-"""Of a packet, beside topic and payload, at most."""
+"""Maximum size of a packet beside topic and payload."""
 
 
 class Limits(NamedTuple):
-    """``in_flight``: messages without an acknowledgement; ``packet_bytes``: None for any."""
+    """A broker's limits.
+
+    ``in_flight``: unacknowledged messages; ``packet_bytes``: None: unlimited.
+    """
 
     in_flight: int = MOST_IN_FLIGHT
     packet_bytes: int | None = None
     qos: int = 1
     retain: bool = True
     identifiers: bool = True
-    """Whether a subscription may have a number, which what comes by it tells."""
+    """Whether subscriptions may have an identifier, which the broker adds to their messages."""
 
     @classmethod
     def from_connack(cls, properties: Properties | None, most: int) -> Limits:
-        """Those of a CONNACK; ``most``: messages without an acknowledgement that we want."""
+        """Read the limits of a CONNACK.
+
+        ``most``: number of unacknowledged messages that we want.
+        """
         given = vars(properties) if properties is not None else {}
         return cls(
             min(most, given.get("ReceiveMaximum", most)),
@@ -40,12 +46,15 @@ class Limits(NamedTuple):
         )
 
     def fit(self, message: Message) -> bool:
-        """Whether it is not too large."""
+        """Return whether a message is small enough."""
         size = HEAD_BYTES + len(message.topic.encode()) + len(message.payload)
         return self.packet_bytes is None or size <= self.packet_bytes
 
 
 def subscription(*, retained: bool) -> SubscribeOptions:
-    """To what others publish, with its flag; ``retained``: also to what was there before."""
+    """Make the options of a subscription to what others publish, with its retain flag.
+
+    ``retained``: retained messages are sent, too.
+    """
     before = SubscribeOptions.RETAIN_SEND_ON_SUBSCRIBE if retained else SubscribeOptions.RETAIN_DO_NOT_SEND
     return SubscribeOptions(1, noLocal=True, retainAsPublished=True, retainHandling=before)

@@ -1,4 +1,4 @@
-"""The socket of a connection: read and written when it is ready, a little at a time."""
+"""Reads and writes the socket of a connection when it is ready, a few packets at a time."""
 
 from __future__ import annotations
 
@@ -16,12 +16,17 @@ from shmio.endpoints.mqtt.connection.attempt import close_socket
 from shmio.endpoints.mqtt.connection.write_batches import take_over, write
 
 PACKETS: Final = 4
-"""So many are read before what else there is to do has its turn; or as many as there are messages of ours that may be
-acknowledged, which takes hardly any time."""
+"""Packets that are read before other work has its turn.
+
+One call of paho may read one for each of our unacknowledged messages, which takes hardly any time.
+"""
 
 
 class SocketIo:
-    """For the bridge's thread: ``selector`` has the socket registered, to have ``data`` called when it is ready."""
+    """Reads and writes a client's socket. Use it from the bridge's thread.
+
+    It registers the socket with ``selector``; call the key's ``data`` when the socket is ready.
+    """
 
     def __init__(
         self,
@@ -30,18 +35,18 @@ class SocketIo:
         selector: selectors.BaseSelector,
         on_failure: Callable[[str], object],
     ) -> None:
-        """``on_failure``: called with why nothing more can be read or written."""
+        """``on_failure``: called with the reason when reading or writing fails."""
         self._client, self._selector, self._on_failure = client, selector, on_failure
         self._socket: socket.socket | None = made
         self.writing = False
-        """Whether something waits for room in the socket."""
+        """Whether data waits for room in the socket."""
         self._packets = 0
-        """Packets that were told of."""
+        """Number of packets read that called one of the client's callbacks."""
         take_over(client)
         selector.register(made, selectors.EVENT_READ, self._serve)
 
     def counting(self, callback: Callable[..., None]) -> Callable[..., None]:
-        """What the client is to call with each packet that is read."""
+        """Wrap a callback of the client so that each packet it reports is counted."""
 
         def counted(*told: object) -> None:
             self._packets += 1
@@ -50,19 +55,19 @@ class SocketIo:
         return counted
 
     def turn(self) -> float:
-        """Do what the selector does not know of; in how many seconds there may be more."""
+        """Do what the selector cannot see, and return in how many seconds to call again."""
         if self._unseen():
             self._serve(selectors.EVENT_READ)
         self.push()
         return 0.0 if self._unseen() else 1.0
 
     def push(self) -> None:
-        """Have go what is ready."""
+        """Write what the client has queued."""
         if self._socket is not None and not self.writing and self._client.want_write():
             self._serve(0)
 
     def close(self) -> None:
-        """Hang up."""
+        """Close the socket."""
         if self._socket is not None:
             with suppress(KeyError, ValueError):
                 self._selector.unregister(self._socket)
@@ -70,19 +75,19 @@ class SocketIo:
         close_socket(self._client)
 
     def _serve(self, events: int) -> None:
-        """The socket is ready."""
+        """Read and write a socket that is ready."""
         code = self._read() if events & selectors.EVENT_READ else MQTTErrorCode.MQTT_ERR_SUCCESS
         if not code and self._socket is not None and (events & selectors.EVENT_WRITE or not self.writing):
             code = write(self._client)
         if code and self._socket is not None:
             self._on_failure(str(MQTTErrorCode(code).name).removeprefix("MQTT_ERR_").replace("_", " ").lower())
         if self._socket is not None and self.writing != self._client.want_write():
-            self.writing = not self.writing  # to hear of room for what did not go out at once
+            self.writing = not self.writing  # to be woken when the socket has room for the rest
             events = selectors.EVENT_READ | (selectors.EVENT_WRITE if self.writing else 0)
             self._selector.modify(self._socket, events, self._serve)
 
     def _read(self) -> MQTTErrorCode:
-        """Take a few packets: paho by itself takes as many at once as messages of ours wait for acknowledgements."""
+        """Read a few packets: by itself paho reads one for each of our unacknowledged messages."""
         before, most = -1, self._packets + PACKETS
         code = MQTTErrorCode.MQTT_ERR_SUCCESS
         while not code and before < self._packets < most and self._socket is not None:
@@ -91,5 +96,5 @@ class SocketIo:
         return code
 
     def _unseen(self) -> bool:
-        """Whether TLS has read from the socket what was not taken yet: a selector does not see that."""
+        """Return whether TLS has buffered data, which a selector does not see."""
         return isinstance(self._socket, ssl.SSLSocket) and self._socket.pending() > 0

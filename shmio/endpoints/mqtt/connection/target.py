@@ -1,4 +1,4 @@
-"""Where the broker is, and when it is tried again."""
+"""The brokers' addresses, and when to try which of them."""
 
 from __future__ import annotations
 
@@ -13,12 +13,15 @@ from shmio.config.mqtt.rules import brokers
 FIRST_WAIT_S: Final = 0.25
 MOST_WAIT_S: Final = 15.0
 OWN_WAIT_S: Final = 0.5
-"""At most for our own broker: it is on this host, and is started again at once."""
+"""Maximum wait for our own broker: it is on this host and is restarted at once."""
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """One broker. ``host``: the socket's path if ``transport`` is unix."""
+    """One broker.
+
+    ``host``: the socket's path if ``transport`` is unix.
+    """
 
     host: str
     port: int = 1883
@@ -30,14 +33,17 @@ class Target:
 
 
 def targets(settings: Mqtt, own_socket: str) -> list[Target]:
-    """The brokers, in the order in which they are tried. ``own_socket``: where ours is, if there is no external one."""
+    """Return the brokers in the order in which to try them.
+
+    ``own_socket``: the socket of our own broker, which is used unless there is an external one.
+    """
     if settings.broker != "external":
         return [Target(own_socket, transport="unix", name="of this instance")]
     return [Target(address.host, address.port, "tcp", str(address)) for address in brokers(settings)]
 
 
 class ReconnectPolicy:
-    """Which broker is tried next, and when."""
+    """Selects the broker to try next, and how long to wait before."""
 
     def __init__(self, settings: Mqtt, client_id: str, there: Sequence[Target]) -> None:
         self.settings = settings
@@ -48,31 +54,31 @@ class ReconnectPolicy:
 
     @property
     def count(self) -> int:
-        """How many brokers there are."""
+        """Number of brokers."""
         return len(self._targets)
 
     def use_only(self, target: Target) -> None:
-        """From now on this one alone."""
+        """Try only this broker from now on."""
         self._targets = [target]
         self.reset_failures()
 
     def retry_same(self) -> None:
-        """Try the last one again."""
+        """Select the last broker again next."""
         self._next -= 1
 
     def next(self) -> Target:
-        """The next one."""
+        """Return the next broker, and go on to the one after it."""
         self._next += 1
         return self._targets[(self._next - 1) % len(self._targets)]
 
     def wait_s(self) -> float:
-        """How long to wait after a failure: longer after each."""
+        """Count a failure, and return how long to wait, in s: longer after each."""
         most_s = OWN_WAIT_S if all(target.transport == "unix" for target in self._targets) else MOST_WAIT_S
         wait_s: float = min(most_s, FIRST_WAIT_S * 2 ** min(self._failures // self.count, 16))
         self._failures += 1
-        # Not all bridges of a plant at once, when their broker is back.
+        # Random, so that the bridges of a plant do not all reconnect at once.
         return wait_s * random.uniform(0.5, 1.5)  # noqa: S311  not a secret
 
     def reset_failures(self) -> None:
-        """The failures so far do not count any more."""
+        """Reset the back-off."""
         self._failures = 0

@@ -1,4 +1,4 @@
-"""What a connection sends goes out in batches: one segment for many messages, not one for each."""
+"""Writes messages in batches: one TCP segment for many, not one for each."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import MQTTErrorCode
 
 BATCH: Final = 32
-"""So many messages go at once; the first waits until the last has been made."""
+"""Messages in a batch; the first is not sent before the last is made."""
 
 
 def take_over(client: Client) -> None:
-    """Have a client that is connected leave it to :func:`write` when it writes."""
+    """Take over writing from a connected client: only :func:`write` writes from now on."""
     client.on_socket_register_write = lambda *_: None
-    _set(client.socket(), socket.TCP_NODELAY, 1)  # a batch is not to wait until the last one has arrived
+    _set(client.socket(), socket.TCP_NODELAY, 1)  # a batch does not wait for the acknowledgement of the one before
 
 
 def write(client: Client) -> MQTTErrorCode:
-    """Write what it has, as much as its connection takes.
+    """Write the client's queued messages, as many as its socket takes.
 
-    Not for a DISCONNECT, with which paho closes the socket: what is held back then may be lost.
+    Do not use it for a DISCONNECT, after which paho closes the socket: corked data may be lost.
     """
-    # Else it would be called, with objects that are made for it, for each message of QoS 0.
+    # Else paho would call it for each message of QoS 0, which is slow.
     acknowledged, client.on_publish = client.on_publish, None
     made = client.socket()
     _set(made, socket.TCP_CORK, 1)
@@ -35,7 +35,7 @@ def write(client: Client) -> MQTTErrorCode:
 
 
 def _set(made: Any, option: int, value: int) -> None:
-    """See tcp(7)."""
+    """Set a TCP option; see tcp(7)."""
     if made is not None and made.family != socket.AF_UNIX:
         with suppress(OSError):  # it may have been closed
             made.setsockopt(socket.IPPROTO_TCP, option, value)

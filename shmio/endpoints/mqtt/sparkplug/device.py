@@ -1,4 +1,4 @@
-"""A source as a device of an edge node: what its frames bring."""
+"""A source as a Sparkplug device: turns its frames into births, data and deaths."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from shmio.segment.changed_registers import ChangeScan
 
 
 class DeviceEvent(Enum):
-    """What has happened to a device."""
+    """Kinds of changes of a device."""
 
     BIRTH = "birth"
     DATA = "data"
@@ -26,19 +26,26 @@ class DeviceEvent(Enum):
 
 
 class DeviceChange(NamedTuple):
-    """What a frame, or its age, has brought. ``at``: numbers of the metrics that are new."""
+    """A change of a device.
+
+    ``at``: indices of the metrics that are new.
+    """
 
     kind: DeviceEvent
     at: Sequence[int] = ()
 
 
 class Device:
-    """Follows one block, for the bridge's thread. For a big layout to make one takes seconds."""
+    """Follows one block for Sparkplug. Use it from the bridge's thread.
+
+    For a large layout, creating one takes seconds.
+    """
 
     def __init__(self, block: Block, command_client: CommandClient, globs: Sequence[Glob], *, elements: bool) -> None:
-        """``command_client``: where commands go. ``globs``: over paths with the source, of what is a metric.
+        """``command_client``: sends commands to the source.
 
-        ``elements``: of arrays each element is one.
+        ``globs``: select the metrics, by path with the source. ``elements``: each element of an
+        array is a metric.
         """
         self.block = block
         self.command_client = command_client
@@ -47,7 +54,7 @@ class Device:
         ]
         self.parts: tuple[Register, ...] = tuple(parts_of(block.layout, registers, single=elements))
         self.alive = False
-        """Whether the source has good values, or doubtful ones."""
+        """Whether the source's quality is good or uncertain."""
         self._metrics: Sequence[Metric] = ()
         self._scan = ChangeScan(self.parts)
         self._decoders = [codec(part, block.layout.byte_order).decode for part in self.parts]
@@ -56,11 +63,11 @@ class Device:
         self._reader = FrameReader(block)
 
     def set_metrics(self, metrics: Sequence[Metric]) -> None:
-        """The metrics of its parts, in their order."""
+        """Set the metrics of the device's parts, in their order."""
         self._metrics = metrics
 
     def poll(self) -> Iterator[DeviceChange]:
-        """What has come; a few frames at a time."""
+        """Read a few new frames, and yield what changed."""
         for frame in self._reader.read():
             if (change := self._take(frame)) is not None:
                 yield change
@@ -70,16 +77,16 @@ class Device:
 
     @property
     def missed(self) -> int:
-        """Frames that were not looked at, since the bridge was too slow."""
+        """Number of frames that were skipped because the bridge was too slow."""
         return self._reader.missed
 
     @property
     def behind(self) -> int:
-        """Frames that wait."""
+        """Number of frames that have not been read."""
         return self._reader.behind
 
     def samples(self, at: Sequence[int] | None = None) -> list[Sample]:
-        """Metrics as they are now, all or these."""
+        """Return samples of all metrics, or of those with the indices ``at``."""
         frame = self._frame
         if frame is None:
             return []

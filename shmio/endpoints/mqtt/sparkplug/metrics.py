@@ -38,7 +38,7 @@ _QUALITY: Final = {Quality.BAD: 0, Quality.UNCERTAIN: 500, Quality.GOOD: 192}  #
 
 
 class _Datatype(NamedTuple):
-    """Data type and field of a single value; data type and element of an array, if there is such."""
+    """Data type and protobuf field of a single value; data type and element of an array, if any."""
 
     datatype: int
     field: str
@@ -73,7 +73,10 @@ _BITS: Final = {INT32: 32, INT64: 64}
 
 
 class Metric:
-    """One metric: a register, or an element of an array. ``alias`` is unique in its edge node."""
+    """A metric: a register, or an element of an array.
+
+    ``alias`` is unique in its edge node.
+    """
 
     def __init__(self, register: Register, alias: int) -> None:
         kind = _DATATYPES.get(register.element.base, _STRING)
@@ -86,7 +89,7 @@ class Metric:
         self._bits = 0 if register.dims else _BITS.get(kind.datatype, 0)
 
     def put(self, metric: wire.Metric, value: Any) -> None:
-        """Set the value of a message; None, also as an element, is null."""
+        """Write a value to a message; None, also as an element, becomes null."""
         data: Any = self._packed(value) if self.register.dims else value
         if data is None:
             metric.is_null = True
@@ -94,7 +97,12 @@ class Metric:
             setattr(metric, self._field, data & ((1 << self._bits) - 1) if self._bits else data)
 
     def take(self, metric: wire.Metric) -> Any:
-        """The value of a message, for the register. ValueRangeError: there is none, or none of this type."""
+        """Read the register's value from a message.
+
+        Raises:
+            ValueRangeError: There is no value, or it has the wrong type.
+
+        """
         field = metric.WhichOneof("value")
         if field is None or metric.is_null:
             raise ValueRangeError(f"{self.name}: there is no value")
@@ -134,9 +142,10 @@ class Metric:
 
 
 def parts_of(layout: Layout, registers: Iterable[Register], *, single: bool = False) -> Iterator[Register]:
-    """What is a metric each: registers, and the elements of arrays that are not of numbers or bits.
+    """Yield the registers, and the elements of arrays, to publish as metrics.
 
-    ``single``: of all arrays.
+    An array of numbers or bits is one metric; others are split up into their elements. ``single``:
+    split up all arrays into their elements.
     """
     for register in registers:
         if register.dims and (single or register.element.base not in _DATATYPES):
@@ -146,7 +155,7 @@ def parts_of(layout: Layout, registers: Iterable[Register], *, single: bool = Fa
 
 
 def put_quality(metric: wire.Metric, quality: Quality, reason: str) -> None:
-    """Put quality and reason with a value; nothing if it is good (6.4.8.1)."""
+    """Add quality and reason to a value; nothing if it is good (6.4.8.1)."""
     if quality is not Quality.GOOD:
         metric.properties.keys.extend(("Quality", "Reason"))
         metric.properties.values.add(type=INT32, int_value=_QUALITY[quality])

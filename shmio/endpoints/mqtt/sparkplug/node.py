@@ -1,7 +1,7 @@
-"""An edge node of Sparkplug B: what it publishes and in which order, and what it is told. No I/O.
+"""A Sparkplug B edge node: makes its messages in order, and decodes its commands. No I/O.
 
-Sources are its devices. A device is born when its source is good for the first time, dies when that turns bad, and is
-born again. (Eclipse Sparkplug Specification 3.0.0, 5 and 6.4.)
+Sources are its devices. A device is born when its source is good for the first time, dies when that
+turns bad, and is born again. (Eclipse Sparkplug Specification 3.0.0, 5 and 6.4.)
 """
 
 from __future__ import annotations
@@ -24,12 +24,15 @@ NAMESPACE: Final = "spBv1.0"
 REBIRTH: Final = "Node Control/Rebirth"
 MAX_METRICS: Final = 4096
 MAX_BYTES: Final = 1 << 20
-"""Of one command."""
+"""Maximum size of one command."""
 _SEQUENCE: Final = 256
 
 
 class Sample(NamedTuple):
-    """A value of one metric. ``at_ms``: when the source had it, ms since 1970."""
+    """A value of one metric.
+
+    ``at_ms``: when the source had it, in ms since 1970.
+    """
 
     metric: Metric
     value: Any
@@ -39,7 +42,10 @@ class Sample(NamedTuple):
 
 
 class Command(NamedTuple):
-    """What a host application wants. ``rebirth``: the node is to be born again; else ``values`` by path of a device."""
+    """A host application's command.
+
+    ``rebirth``: the node is to be born again; else ``values`` has values by path of ``device``.
+    """
 
     rebirth: bool = False
     device: str = ""
@@ -47,7 +53,7 @@ class Command(NamedTuple):
 
 
 class EdgeNode:
-    """One node, through all its sessions; one thread."""
+    """One node, through all its sessions. Use it from one thread."""
 
     def __init__(
         self,
@@ -57,7 +63,7 @@ class EdgeNode:
         *,
         datatypes: bool = True,
     ) -> None:
-        """``datatypes``: data tell their types, too, as a host needs that does not know them from the births."""
+        """``datatypes``: data messages have types, too, for hosts that do not know the births'."""
         self._group, self._node, self._datatypes = group, node, datatypes
         self._now_ms = now_ms
         self._sequence = 0
@@ -65,14 +71,14 @@ class EdgeNode:
         # tenths of a second, which no series of attempts to connect overtakes.
         self._session = now_ms() // 100 % _SEQUENCE
         self.alive = False
-        """Whether it was born in this session, and has not died."""
+        """Whether the node was born in this session and has not died."""
         self._born: set[str] = set()
         self.metrics: dict[str, dict[str, Metric]] = {}
-        """Of each device, by name, in the order in which they were given."""
+        """Each device's metrics by name, in the order in which they were given."""
         self._by_alias: dict[int, Metric] = {}
 
     def define(self, devices: Mapping[str, Iterable[Register]]) -> None:
-        """What the devices have, by name; what is born has to be born again."""
+        """Define the devices and their registers; everything has to be born again."""
         aliases = count(1)
         self.metrics = {
             device: {register.path: Metric(register, next(aliases)) for register in registers}
@@ -83,24 +89,27 @@ class EdgeNode:
 
     @property
     def commands(self) -> list[str]:
-        """Topics to subscribe to before anything is published, with QoS 1."""
+        """The topics to subscribe to, with QoS 1, before anything is published."""
         return [self._topic("NCMD"), self._topic("DCMD", "+")]
 
     def will(self) -> Message:
-        """Begin a new session: what its connection is to leave as its will."""
+        """Begin a new session, and make the will of its connection."""
         self._session = (self._session + 1) % _SEQUENCE
         self._born.clear()
         return self.death()
 
     def death(self) -> Message:
-        """What is published before the node disconnects by itself."""
+        """Make the message to publish before the node disconnects by itself."""
         self.alive = False
         payload = wire.Payload(timestamp=self._now_ms())
         self._put_session(payload)
         return Message(self._topic("NDEATH"), payload.SerializeToString(), 1, retain=False)
 
     def birth(self) -> Message:
-        """What is published first in a session, and when it is asked for; births of the devices come next."""
+        """Make the node's birth: the first message of a session, or after a request.
+
+        The devices' births follow it.
+        """
         self.alive = True
         self._born.clear()
         self._sequence = 0
@@ -110,7 +119,7 @@ class EdgeNode:
         return self._message(payload, "NBIRTH")
 
     def device_birth(self, device: str, samples: Iterable[Sample]) -> Message:
-        """The birth of a device with all its metrics; of those without a sample the value is null."""
+        """Make a device's birth with all its metrics; those without a sample are null."""
         self._born.add(device)
         payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
         given = {sample.metric.name: sample for sample in samples}
@@ -121,7 +130,10 @@ class EdgeNode:
         return self._message(payload, "DBIRTH", device)
 
     def data(self, device: str, samples: Iterable[Sample], *, historical: bool = False) -> Message:
-        """Values that changed. ``historical``: they are sent late, and are not those of now."""
+        """Make a message with changed values.
+
+        ``historical``: the values are late and not the current ones.
+        """
         payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
         for sample in samples:
             found = payload.metrics.add(alias=sample.metric.alias)
@@ -133,23 +145,26 @@ class EdgeNode:
         return self._message(payload, "DDATA", device)
 
     def device_death(self, device: str) -> Message:
-        """A device is not to be trusted any more."""
+        """Make a device's death: its values are no longer valid."""
         self._born.discard(device)
         payload = wire.Payload(timestamp=self._now_ms(), seq=self._next())
         return self._message(payload, "DDEATH", device)
 
     def is_born(self, device: str) -> bool:
-        """Whether a device was born in this session, and has not died."""
+        """Return whether a device was born in this session and has not died."""
         return device in self._born
 
     def command(self, topic: str, data: bytes, check: Callable[[str, Register], object] = lambda *_: None) -> Command:
-        """What a message on one of the topics of :attr:`commands` says.
+        """Decode a message on one of the topics of :attr:`commands`.
 
-        ValueRangeError: it is no payload of Sparkplug B, or has values that are none of their metrics; PathError:
-        there is no such device or metric. ``check``: asked about the register of such a value, to raise what matters
-        more.
+        ``check``: called with the register of a wrong value; it may raise a more important error.
+
+        Raises:
+            ValueRangeError: It is not a payload of Sparkplug B, or a value does not fit its metric.
+            PathError: There is no such device or metric.
+
         """
-        if len(data) > MAX_BYTES:  # before it is taken apart: each metric is an object
+        if len(data) > MAX_BYTES:  # before decoding, which makes an object for each metric
             raise ValueRangeError(f"{topic}: the payload is longer than {MAX_BYTES} bytes")
         try:
             payload = wire.Payload.FromString(data)
@@ -180,7 +195,12 @@ class EdgeNode:
         return Command(device=device, values=values)
 
     def _metric(self, device: str, found: wire.Metric) -> Metric:
-        """By its name or its alias; PathError."""
+        """Return a metric by its name or its alias.
+
+        Raises:
+            PathError: There is no such metric.
+
+        """
         metrics = self.metrics[device]
         metric = metrics.get(found.name) if found.name else self._by_alias.get(found.alias)  # some send an empty name
         if metric is None or metrics.get(metric.name) is not metric:

@@ -1,6 +1,6 @@
-"""An instance as an edge node of Sparkplug B.
+"""Publishes an instance as an edge node of Sparkplug B.
 
-By a connection of its own: a connection has one will, and the bridge's says something else.
+It has a connection of its own: a connection has one will, and the bridge's says something else.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from shmio.layout.topic import shorten
 from shmio.segment import DONE, EventKind, Segment
 
 SAMPLE_BYTES: Final = 96
-"""Of one in memory, about, beside its value."""
+"""Approximate memory of a sample beside its value."""
 ELEMENT_BYTES: Final = 32
-"""Of a number in memory, with its place in a list."""
+"""Approximate memory of a number in a list."""
 
 
 class DeviceBacklog(Backlog[list[Sample]]):
-    """Of each device what its frames brought, in order."""
+    """The samples of each device's frames, in order."""
 
     def keep(self, device: str, samples: list[Sample]) -> None:
-        """Keep what one frame brought."""
+        """Keep the samples of one frame."""
         self.put(samples, OVERHEAD_BYTES + sum(map(_size, samples)), row=device, changes=len(samples))
 
     def take(self, device: str) -> list[Sample]:
-        """The oldest of a device; empty: there is nothing."""
+        """Remove and return the oldest samples of a device; empty: there are none."""
         return self.pop(device) or []
 
 
@@ -55,7 +55,7 @@ def _size(sample: Sample) -> int:
 
 
 AHEAD_MS: Final = 86_400_000
-"""The clock of a host may be ahead of ours, by no more than this."""
+"""Maximum by which a host's clock may be ahead of ours."""
 
 log = logging.getLogger("shmio.mqtt")
 
@@ -66,42 +66,46 @@ class _State(msgspec.Struct):
 
 
 class PrimaryHost:
-    """What it says on the present connection."""
+    """The state that the primary host has published on the current connection."""
 
     def __init__(self, name: str) -> None:
         self.topic = f"{NAMESPACE}/STATE/{name}"
         self.online: bool | None = None
-        """None: it has said nothing."""
+        """None: the host has published no state."""
         self._at_ms = float("-inf")
 
     def forget(self) -> None:
-        """There is another connection: each broker has been told at another time."""
+        """Forget the state for a new connection: brokers have states of different age."""
         self.online, self._at_ms = None, float("-inf")
 
     def update(self, payload: bytes) -> None:
-        """Take in what it says, unless it is older than what it said before: the late will of a session before."""
+        """Read a state message.
+
+        One older than the last, such as the late will of an earlier session, is ignored.
+        """
         try:
             state = msgspec.json.decode(payload, type=_State)
         except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
             log.warning("%s: expected JSON with online, true or false, and a timestamp", self.topic)
             return
-        if state.timestamp > time.time() * 1000 + AHEAD_MS:  # none that comes would be newer
+        if state.timestamp > time.time() * 1000 + AHEAD_MS:  # no later message would be newer
             log.warning("%s: the timestamp is more than a day ahead; it is in ms since 1970", self.topic)
         elif state.timestamp >= self._at_ms:
             self.online, self._at_ms = state.online, state.timestamp
 
 
 TURN_SAMPLES: Final = 2000
-"""So many of those that were kept are sent before what else there is to do has its turn."""
+"""Samples of the backlog that are sent before other work has its turn."""
 
 HOST_S: Final = 10.0
-"""For a primary host to say at one of several brokers that it is there."""
+"""Time limit for a primary host to announce itself at one of several brokers."""
 
 
 class Session:
-    """For the bridge's thread: :meth:`turn` in each of its turns.
+    """The Sparkplug session of an instance. Call :meth:`turn` in each turn of the bridge's thread.
 
-    What changes while the broker takes nothing more is merged; while it is away it is kept, and sent as historical.
+    Changes are merged while the broker is slow. While it is away they are kept, and sent later as
+    historical.
     """
 
     def __init__(
@@ -112,10 +116,15 @@ class Session:
         selector: selectors.BaseSelector,
         wake: Callable[[], object],
     ) -> None:
-        """``selector``, ``wake``: as of :class:`BrokerConnection`. PathError: a pattern is none."""
+        """``selector``, ``wake``: see :class:`BrokerConnection`.
+
+        Raises:
+            PathError: A pattern is invalid.
+
+        """
         self.node = EdgeNode(sparkplug.group, sparkplug.node or segment.instance, datatypes=sparkplug.datatypes)
         client_id = f"{settings.client_id or f'shmio-{segment.instance}'}-sparkplug"
-        # A session begins with its births: the broker is to keep nothing of one before (5.4).
+        # A session begins with births: the broker must keep nothing of the one before (5.4).
         clean = msgspec.structs.replace(settings, session_expiry_s=0)
         self._policy = ReconnectPolicy(clean, client_id, targets(settings, own_socket(segment)))
         self.connection = BrokerConnection(self._policy, selector, wake, self.node.will, FEW_IN_FLIGHT)
@@ -123,29 +132,31 @@ class Session:
         self.connection.on_lost = self._lose
         self._host = None if sparkplug.primary_host is None else PrimaryHost(sparkplug.primary_host)
         self._host_lost = False
-        """Whether the host has gone since the births, though it may be back: it knows nothing of them then."""
+        """Whether the host has gone since the births: even if it is back, it does not know them."""
         self._until_s = 0.0
-        """So long the host has to say that it is there; then another broker is tried, if there is one."""
+        """Deadline for the host to announce itself; then the next broker is tried, if there is one.
+        """
         self._elements = sparkplug.elements
         self._globs = [Glob(pattern) for pattern in sparkplug.patterns]
         self._devices: dict[str, Device] = {}
         self._waiting: dict[str, dict[int, None]] = {}
         self._pause_s = 1 / sparkplug.max_rate_hz if sparkplug.max_rate_hz else 0.0
         self._due_s: dict[str, float] = {}
-        """When the next data of a device may be told."""
+        """When the next data of each device may be sent."""
         self._backlog = DeviceBacklog(round(settings.backlog_mb * 1e6))
         self._keeping = False
         self._room = 0
-        """How many that were kept may be sent in this turn."""
+        """Number of samples of the backlog that may still be sent in this turn."""
         self._rebirth_asked = False
-        """Whether a host wants the births again. However often it says so: once a turn, when the broker takes them."""
+        """Whether a host has asked for the births; they are sent once a turn at most, when there is
+        room."""
         self._defined = False
-        """Whether the node is told of all devices that there are."""
+        """Whether the node's definition includes all current devices."""
         self._sent = self._received = self._refused = self._missed = 0
 
     @property
     def counters(self) -> tuple[int, ...]:
-        """As those of the bridge."""
+        """The counters, in the order of the bridge's."""
         waiting = sum(map(len, self._waiting.values()))
         refused, connects = self._refused + self.connection.problems.refused, self.connection.connects
         missed = self._missed + sum(device.missed for device in self._devices.values())
@@ -154,39 +165,39 @@ class Session:
 
     @property
     def problem(self) -> str:
-        """What is wrong at present; empty: nothing."""
+        """The current problem; empty: none."""
         problem = self.connection.problem
         if self._host is not None and self.connection.up and not self._host.online:
             problem = f"the primary host is not there ({self._host.topic}): {self._backlog.count} changes are kept"
         return f"Sparkplug: {problem}" if problem else ""
 
     def new_device(self, feed: Feed) -> Device:
-        """What a source is to be; any thread may make it."""
+        """Make the device of a source; may be called from any thread."""
         return Device(feed.block, feed.command_client, self._globs, elements=self._elements)
 
     def add_device(self, device: Device) -> None:
-        """There is one more."""
+        """Add a device."""
         self._devices[device.block.source] = device
         self._defined = False
 
     def remove_device(self, source: str) -> None:
-        """There is one less."""
+        """Remove a device."""
         self._missed += self._devices.pop(source).missed
         self._defined = False
 
     def _define(self) -> None:
-        """Tell the node what there is; if it is born already, it is born anew."""
+        """Define the node's devices; if the node is born already, publish new births."""
         self._defined = True
         self.node.define({name: device.parts for name, device in self._devices.items()})
         for name, device in self._devices.items():
             device.set_metrics(list(self.node.metrics[name].values()))
         self._waiting = {name: {} for name in self._devices}
-        self._backlog.clear()  # what is in it has other aliases
+        self._backlog.clear()  # its samples have the old aliases
         if self.connection.up and self.node.alive:
             self._birth()
 
     def turn(self) -> float:
-        """Do what is due; in how many seconds there is more."""
+        """Do what is due, and return in how many seconds to call again."""
         if not self._defined:
             self._define()
         if self.connection.problem and not self.connection.up:
@@ -208,14 +219,14 @@ class Session:
             for change in device.poll():
                 self._publish(name, device, change.kind, change.at)
         self._flush()
-        rest_s = self.connection.turn()  # behind what it was given, to hear when it takes the rest
+        rest_s = self.connection.turn()  # after sending, to know when there is room for the rest
         more = self._room <= 0 or self.connection.came_up or any(device.behind for device in self._devices.values())
         now_s = time.monotonic()
         due_s = [due_s for name, due_s in self._due_s.items() if due_s > now_s and self._waiting.get(name)]
         return 0.0 if more else min([rest_s, *(one_s - now_s for one_s in due_s)])
 
     def _wait_for(self, host: PrimaryHost) -> None:
-        """Die if it has gone; go to where else it may be, and come back."""
+        """While the host is away: publish the death, and try other brokers."""
         if not self.connection.up:
             return
         elsewhere = self._policy.count > 1 and (host.online is False or time.monotonic() >= self._until_s)
@@ -226,17 +237,18 @@ class Session:
         self.connection.drop(f"the primary host is not there ({host.topic})", politely=True)
 
     def close(self) -> None:
-        """Say that the node dies, and go.
+        """Publish the node's death, and disconnect.
 
-        With MQTT 5 its will says so, too: the specification demands both (5.5, intentional-disconnect-ndeath, and
-        6.4.25, ndeath-will-message-publisher-disconnect-mqtt50), and has hosts ignore the second, for its bdSeq.
+        With MQTT 5 the will is published, too. The specification demands both (5.5,
+        intentional-disconnect-ndeath, and 6.4.25, ndeath-will-message-publisher-disconnect-mqtt50);
+        hosts ignore the second one by its bdSeq.
         """
         alive = self.connection.up and self.node.alive
         if alive:
             self.connection.send(self.node.death())
         self.connection.close(will=alive)
 
-    # ---- what goes out -----------------------------------------------------------------------------------------------
+    # ---- sending -----------------------------------------------------------------------------------------------------
 
     def _birth(self) -> None:
         self._rebirth_asked = False
@@ -253,7 +265,7 @@ class Session:
             return
         if kind is DeviceEvent.DATA:
             self._waiting[name] |= dict.fromkeys(at)
-            self._flush_device(name, device)  # so that each frame's changes are told, as long as the broker takes them
+            self._flush_device(name, device)  # publishes the changes of each frame as long as the broker keeps up
             return
         self._waiting[name].clear()
         if kind is DeviceEvent.BIRTH:
@@ -262,14 +274,14 @@ class Session:
             self._send(self.node.device_death(name))
 
     def _keep(self, name: str, device: Device, at: Sequence[int]) -> None:
-        """Keep what has changed, no more often than it would be told."""
+        """Keep changes, no more often than they would be sent."""
         self._waiting[name] |= dict.fromkeys(at)
         if self._is_due(name):
             self._backlog.keep(name, device.samples(list(self._waiting[name])))
             self._waiting[name].clear()
 
     def _is_due(self, name: str) -> bool:
-        """Whether data of a device may be told; from now on, not for a while."""
+        """Return whether data of a device may be sent now; if so, start its next pause."""
         now_s = time.monotonic()
         if now_s < self._due_s.get(name, 0.0):
             return False
@@ -277,7 +289,7 @@ class Session:
         return True
 
     def _lose(self, _unacknowledged: Sequence[Message]) -> None:
-        """The connection is gone: keep what waited for it."""
+        """After the connection is lost, keep what waited for it."""
         for name, device in self._devices.items():
             waiting = self._waiting[name]
             if waiting and device.alive:
@@ -289,7 +301,7 @@ class Session:
             self._flush_device(name, device)
 
     def _flush_device(self, name: str, device: Device) -> None:
-        """What has changed, then what was kept, as history; before its birth nobody knows its metrics."""
+        """Send a device's changes, then its backlog as historical; only after its birth."""
         connection, waiting = self.connection, self._waiting[name]
         if not self.node.is_born(name):
             return
@@ -305,7 +317,7 @@ class Session:
         self.connection.send(message)
         self.connection.push()
 
-    # ---- what comes --------------------------------------------------------------------------------------------------
+    # ---- receiving ---------------------------------------------------------------------------------------------------
 
     def _command(self, message: MQTTMessage) -> None:
         try:
@@ -318,7 +330,7 @@ class Session:
             self._host_lost = self._host_lost or (self.node.alive and not self._host.online)
             return
         self._received += 1
-        if message.retain:  # it was there before we were
+        if message.retain:  # the broker stored it before we connected
             self._refused += 1
             return
         try:
@@ -346,7 +358,7 @@ class Session:
 
 
 class _Outcome:
-    """Sparkplug has no answer to a command but the value that comes: what was not done is in the log."""
+    """Logs commands that failed: Sparkplug has no answer to a command but the new value."""
 
     def __init__(self, path: str) -> None:
         self._path = path
