@@ -1,4 +1,4 @@
-"""What an error means to a client, of whatever service: the one table."""
+"""Maps errors to gRPC statuses, for all services."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _STATUS: Final[Mapping[type[ShmioError], grpc.StatusCode]] = {
 
 
 async def refuse(context: Context, error: ShmioError) -> NoReturn:
-    """End a call with what its error means to the client."""
+    """End a call with the status and message of an error."""
     codes = (_STATUS[kind] for kind in type(error).__mro__ if kind in _STATUS)
     await context.abort(next(codes, grpc.StatusCode.INTERNAL), str(error))
     raise error  # abort never returns

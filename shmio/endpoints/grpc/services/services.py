@@ -1,4 +1,4 @@
-"""All services of the endpoint, over the same feeds."""
+"""Creates all services of the endpoint, over the same feeds."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from shmio.segment import ProcessSlot, Segment
 
 
 class Services:
-    """What a server offers on each of its addresses."""
+    """The services that a server offers on each of its addresses."""
 
     def __init__(
         self,
@@ -35,9 +35,16 @@ class Services:
         feeds: Mapping[str, Feed],
         default_source: str | None,
     ) -> None:
-        """``slot``: this process's in the table. ``hold``, ``bells``: those of the feeds.
+        """Create the services.
 
-        ``default_source``: that of paths which name none; default: the only one.
+        Args:
+            segment: The instance's shared memory.
+            slot: This process's entry in the process table.
+            virtual_time: That of the feeds.
+            wake_ups: Those of the feeds.
+            feeds: The feeds of all sources.
+            default_source: For paths without a source; None: the only source there is.
+
         """
         topics = Topics(feeds, default_source)
         open_streams = OpenStreams()
@@ -47,7 +54,7 @@ class Services:
         self.stepper = Stepper(
             segment, slot, virtual_time, wake_ups, feeds, self._outboxes, self._publisher, open_streams
         )
-        """The instance's time."""
+        """Moves the instance's time for all services."""
         self._shmio_v1 = ShmioV1(topics, feeds, wake_ups, segment, self.stepper, open_streams)
         self._services = (
             self._shmio_v1,
@@ -58,27 +65,27 @@ class Services:
 
     @property
     def calls(self) -> dict[str, dict[str, grpc.RpcMethodHandler[Any, Any]]]:
-        """The calls of each service, by its full name, for a server."""
+        """The handlers of each service, by its full name."""
         return {service.name: service.handlers() for service in self._services}
 
     @property
     def counters(self) -> tuple[int, int, int, int]:
-        """Streams of subscribers open, messages dropped on slow ones, messages published, and refused."""
+        """Open streams, messages dropped on slow ones, messages published, and messages refused."""
         streams = len(self._outboxes) + self._shmio_v1.streams
         return streams, self._outboxes.dropped, self._publisher.published, self._publisher.refused
 
     @property
     def updates(self) -> int:
-        """Updates of our own service since the start; what feeds have made is counted there."""
+        """Number of updates sent by ``shmio.v1`` since the start; feeds count their own messages."""
         return self._shmio_v1.updates
 
     @property
     def waiting_bytes(self) -> int:
-        """Of all messages that wait to be read by clients."""
+        """Size of all messages that wait for clients, in bytes."""
         return self._outboxes.waiting_bytes
 
     def move(self, sources: Collection[str]) -> None:
-        """Have the streams of these sources go over to the feeds that there are by now."""
+        """Switch the streams of these sources to their present feeds, after a reload."""
         self._shadows.move(sources)
         for service in self._services:
             if not isinstance(service, SimServer):

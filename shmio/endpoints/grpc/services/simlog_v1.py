@@ -30,7 +30,7 @@ from shmio.wire import simlog_v1_pb2 as wire
 
 
 class InjectCalls:
-    """The part of version 1 that is about injections."""
+    """The calls of version 1 about injections."""
 
     def __init__(
         self,
@@ -38,13 +38,16 @@ class InjectCalls:
         shadows: Shadows,
         resolve: Callable[[str, Context], Awaitable[tuple[Topic, Shape]]],
     ) -> None:
-        """``resolve``: what a path names, or the call ends."""
+        """``resolve`` returns what a path names, or ends the call."""
         self._outboxes = outboxes
         self._shadows = shadows
         self._resolve = resolve
 
     async def find(self, path: str, context: Context) -> Injection | None:
-        """The injection that a path is a shadow of; INVALID_ARGUMENT: of a structure that there is no message for."""
+        """Return the injection whose shadow a path is, or None.
+
+        Status INVALID_ARGUMENT: it is over a structure without a message type.
+        """
         shadow = self._shadows.find(path)
         if shadow is None:
             return None
@@ -55,13 +58,19 @@ class InjectCalls:
         return shadow.injection
 
     async def inject(self, request: wire.InjectRequest, context: Context) -> AsyncIterator[bytes]:
-        """Lay a shadow over a topic, or join those who have laid it, as long as the stream is open; its originals.
+        """Lay or join an injection while the stream is open, and stream its originals.
 
-        Over ``/in``: what is written there, which no longer reaches the source. Over ``/out``, or with no suffix: what
-        the source delivers, the present value first. What is published to the shadow goes where the original would.
-        NOT_FOUND: no such target; INVALID_ARGUMENT: a structure, or no path for a shadow; ALREADY_EXISTS: that path is
-        in use for another target; FAILED_PRECONDITION: the source refuses it, and says why; RESOURCE_EXHAUSTED: too
-        many, or this client does not read what is written; ABORTED: it was lifted.
+        Over ``/in`` the originals are the writes, which no longer reach the source. Over ``/out``,
+        or without suffix, they are the source's values, the present one first. Values published to
+        the shadow replace the originals.
+
+        Statuses:
+            NOT_FOUND: No such target.
+            INVALID_ARGUMENT: A structure without a message type, or an unusable shadow path.
+            ALREADY_EXISTS: The path is in use for another target.
+            FAILED_PRECONDITION: The source refuses the injection; the message says why.
+            RESOURCE_EXHAUSTED: Too many injections, or the client does not read the writes.
+            ABORTED: The injection was lifted.
         """
         topic, found = await self._resolve(request.target.path, context)
         with self._outboxes.opened() as outbox:
@@ -71,7 +80,7 @@ class InjectCalls:
             except ShmioError as error:
                 await refuse(context, error)
             release = partial(self._shadows.release, injection, outbox)
-            outbox.on_failure = release  # at once, though a client that does not read holds up the stream's end
+            outbox.on_failure = release  # at once: a client that reads nothing delays the stream's end
             try:
                 encode = encoder(injection.shape, injection.feed.block.layout)
                 leave = injection.originals("v1", encode, outbox, shorten(request.target.path))
@@ -82,7 +91,7 @@ class InjectCalls:
             await context.abort(grpc.StatusCode.ABORTED, f"{shorten(request.target.path)}: {injection.over}")
 
     async def given_values(self, injection: Injection, path: str, context: Context) -> AsyncIterator[bytes]:
-        """Stream what is published to a shadow, as long as that stands."""
+        """Stream the values published to a shadow until its injection is over."""
         with self._outboxes.opened() as outbox:
             encode = encoder(injection.shape, injection.feed.block.layout)
             leave = injection.given_values("v1", encode, EventLane(outbox, shorten(path)))
@@ -93,12 +102,15 @@ class InjectCalls:
     async def _messages(
         self, injection: Injection, outbox: Outbox, leave: Callable[[], None], context: Context
     ) -> AsyncIterator[bytes]:
-        """What comes for a stream of an injection until that is over; RESOURCE_EXHAUSTED: it is not read."""
+        """Stream an outbox until the injection is over.
+
+        Status RESOURCE_EXHAUSTED: the client does not read.
+        """
         injection.ends[outbox] = outbox.end
         if injection.over:
             outbox.end()
         try:
-            await context.send_initial_metadata(())  # who waits for it knows that the shadow stands
+            await context.send_initial_metadata(())  # shows the client that the shadow stands
             while (message := await outbox.pop()) is not None:
                 yield message
         finally:
@@ -116,7 +128,7 @@ log = logging.getLogger("shmio.grpc")
 
 
 class SimlogV1:
-    """Serves the registers of all sources as text values."""
+    """Serves the registers of all sources as texts, and structures as their own messages."""
 
     name = SERVICE
 
@@ -128,28 +140,30 @@ class SimlogV1:
         self._outboxes = outboxes
         self._injecting = InjectCalls(outboxes, shadows, self._resolve)
         self._stepper = stepper
-        self._streams: dict[Outbox, str] = {}  # and their source
+        self._streams: dict[Outbox, str] = {}  # with their sources
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
-        """The service's calls, for a server."""
+        """Return the handlers of the service's calls."""
         unary = grpc.unary_unary_rpc_method_handler
         decode = wire.TopicDescriptor.FromString
         calls: dict[str, grpc.RpcMethodHandler[Any, Any]] = {
             "setStepSize": unary(self.set_step_size, wire.StepSizeRequest.FromString, Empty.SerializeToString),
             "step": unary(self.step, wire.StepRequest.FromString, wire.StepResponse.SerializeToString),
             "GetTopic": unary(self.get_topic, decode, wire.TopicDescriptor.SerializeToString),
-            # No serializer: a change is encoded once, by the feed, and its bytes go to every stream.
+            # No serializer: the feed encodes a change once for all streams.
             "Subscribe": grpc.unary_stream_rpc_method_handler(self.subscribe, decode),
             "Inject": grpc.unary_stream_rpc_method_handler(self._injecting.inject, wire.InjectRequest.FromString),
-            # No deserializer either: bytes that are no message must not end the stream.
+            # No deserializer: an invalid message must not end the stream.
             "Publish": grpc.stream_unary_rpc_method_handler(self.publish, None, Empty.SerializeToString),
         }
         return calls
 
     async def set_step_size(self, request: wire.StepSizeRequest, context: Context) -> Empty:
-        """How far a step moves time, in ms; from now on only steps do.
+        """Set the step size, in ms, which makes time virtual.
 
-        INVALID_ARGUMENT: no step goes so far; FAILED_PRECONDITION: time is another program's to move.
+        Statuses:
+            INVALID_ARGUMENT: The step size is out of range.
+            FAILED_PRECONDITION: Another program controls time.
         """
         try:
             await self._stepper.set_step_size(request.step * 1_000_000)
@@ -158,9 +172,9 @@ class SimlogV1:
         return Empty()
 
     async def step(self, _: wire.StepRequest, context: Context) -> wire.StepResponse:
-        """Step, after all that has come on this client's Publish streams; 0 when all streams have taken the step.
+        """Make a step after the values received from this client; answer when all streams have it.
 
-        -1: it failed, the log says why.
+        The code is 0, or -1 if the step failed; the log says why.
         """
         try:
             await self._stepper.step(peer=context.peer())
@@ -170,7 +184,12 @@ class SimlogV1:
         return wire.StepResponse(code=0)
 
     async def get_topic(self, request: wire.TopicDescriptor, context: Context) -> wire.TopicDescriptor:
-        """Tell a topic's type; NOT_FOUND, INVALID_ARGUMENT for a structure that there is no message for."""
+        """Return a topic's type.
+
+        Statuses:
+            NOT_FOUND: No such topic.
+            INVALID_ARGUMENT: A structure without a message type.
+        """
         if injection := await self._injecting.find(request.path, context):
             return wire.TopicDescriptor(path=request.path, msgType=message_type(injection.shape))
         if time_topic := await self._time_topic(request.path, context):
@@ -179,12 +198,16 @@ class SimlogV1:
         return wire.TopicDescriptor(path=request.path, msgType=message_type(found))
 
     async def subscribe(self, request: wire.TopicDescriptor, context: Context) -> AsyncIterator[bytes]:
-        """Stream a topic's values: the current one if it is good, then every change; of ``/in``, what is written to it.
+        """Stream a topic's current value, if it is good, and its changes; of ``/in``, the writes.
 
-        While quality is bad nothing is sent; on recovery the value is sent again. A slow client is
-        given the newest value in place of those that wait; but its stream of ``/in``, where none replaces another, ends
-        with RESOURCE_EXHAUSTED. When a reload changes the source the stream goes on, if there still is such a register;
-        else it ends with NOT_FOUND.
+        Nothing is sent while quality is bad; on recovery the value is sent again. For a slow client
+        the newest value replaces those that wait. Its stream of ``/in`` ends instead, because no
+        write replaces another. After a reload the stream goes on if the register still exists.
+
+        Statuses:
+            NOT_FOUND: No such topic, or a reload has removed it.
+            INVALID_ARGUMENT: A structure without a message type.
+            RESOURCE_EXHAUSTED: The client is too slow for writes or steps.
         """
         if injection := await self._injecting.find(request.path, context):
             async for gift in self._injecting.given_values(injection, request.path, context):
@@ -207,10 +230,10 @@ class SimlogV1:
                     encode = encoder(found, feed.block.layout)
                     joined = ExitStack()
                     joined.callback(lane.join(feed, Subject("v1", found.path, found.registers, encode)))
-                    outbox.on_failure = joined.close  # at once, though a client that does not read holds up the end
+                    outbox.on_failure = joined.close  # at once: a client that reads nothing delays the end
                     try:
                         if not told:
-                            await context.send_initial_metadata(())  # who waits for it misses nothing from then on
+                            await context.send_initial_metadata(())  # the client misses nothing from then on
                             told = True
                         while (message := await outbox.pop()) is not None:
                             yield message
@@ -223,7 +246,7 @@ class SimlogV1:
                 del self._streams[outbox]
 
     async def _stream_time_topic(self, time_topic: TimeTopic, context: Context) -> AsyncIterator[bytes]:
-        """Stream a topic of time."""
+        """Stream the values of a topic of time."""
         with self._outboxes.opened() as outbox, ExitStack() as listening:
             listening.callback(self._stepper.timeline.time_topics.listen(time_topic, _time_message, StateLane(outbox)))
             outbox.on_failure = listening.close
@@ -233,13 +256,13 @@ class SimlogV1:
             await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, outbox.failure)
 
     def move(self, sources: Collection[str]) -> None:
-        """Have the streams of these sources go over to the feeds that there are by now."""
+        """Switch the streams of these sources to their present feeds, after a reload."""
         for outbox, source in self._streams.items():
             if source in sources:
                 outbox.end()
 
     async def _find_again(self, topic: Topic, context: Context) -> Shape:
-        """What a stream shows after a reload; NOT_FOUND."""
+        """Return what a stream's topic names after a reload. Status NOT_FOUND: nothing."""
         try:
             return self._find(topic)
         except (PathError, ValueRangeError) as error:
@@ -247,7 +270,13 @@ class SimlogV1:
             raise  # abort never returns
 
     def _find(self, topic: Topic) -> Shape:
-        """What a topic names; PathError, ValueRangeError: a structure that there is no message for."""
+        """Return what a topic names.
+
+        Raises:
+            PathError: Nothing.
+            ValueRangeError: A structure without a message type, or a whole source.
+
+        """
         if not topic.path:
             raise ValueRangeError(f"{topic}: a source; version 1 serves what is in it")
         found = shape(self._topics.layout(topic), topic)
@@ -255,11 +284,11 @@ class SimlogV1:
         return found
 
     async def publish(self, messages: AsyncIterator[bytes], context: Context) -> Empty:
-        """Write the values of a stream, in its order, and answer when it has ended and all of them have."""
+        """Write a stream's values in order; answer when the stream and all its values have ended."""
         return await self._publisher.publish(messages, _parse, context.peer())
 
     async def _time_topic(self, path: str, context: Context) -> TimeTopic | None:
-        """The topic of time that a path names; NOT_FOUND."""
+        """Return the topic of time that a path names, or None. Status NOT_FOUND: no such source."""
         try:
             return self._topics.time_topic(path)
         except PathError as error:
@@ -279,6 +308,6 @@ def _parse(message: bytes) -> Request:
 
 
 def _time_message(time_topic: TimeTopic, moment: Moment) -> bytes:
-    """The message of a topic of time; the clock has it where a client looks for it, and no value."""
+    """Encode a topic of time; the simulation time is in the time stamp, with an empty value."""
     value = str(moment.number) if time_topic is TimeTopic.STEP else ""
     return wire.ROSMessage(type=_TIME_TOPIC_TYPES[time_topic], value=value).SerializeToString() + time_stamp(*moment)

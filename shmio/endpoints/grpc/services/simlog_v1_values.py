@@ -1,7 +1,7 @@
-"""Registers and structures as version 1 shows them: ROSMessages.
+"""Values of SimlogAPI version 1: ROSMessages.
 
-A register is a text; a structure of known shape fills the content of its own message. Fields of a protobuf message may
-be concatenated: what never changes is encoded once, the time once a frame.
+A register is a text; a recognised structure has a message type of its own. Serialised fields
+may be concatenated, so constant fields are encoded once, and the time once per frame.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from shmio.layout.values.text import from_text, to_text, wire_type
 from shmio.wire import simlog_v1_pb2 as wire
 
 _Fill = Callable[[bytes, Any], None]
-"""Puts what an image has into a message."""
+"""Fills a message from an image."""
 
 _BITS: Final = {"seq": 32, "sec": 64, "nsec": 64, "msec": 64}
 
 
 def message_type(found: Shape) -> str:
-    """Version 1's word for the type; ValueRangeError: a structure that it has no message for."""
+    """Return version 1's name of a type. ValueRangeError: a structure without a message type."""
     return wire_type(found.registers[0]) if found.whole else _known(found)[0]
 
 
 def encoder(found: Shape, layout: Layout) -> Encode:
-    """A function from a frame to a serialised ROSMessage; None where the bytes hold no value.
+    """Return a function that encodes an image as a ROSMessage, or as None if it holds no value.
 
-    ValueRangeError as of :func:`message_type`.
+    ValueRangeError as for :func:`message_type`.
     """
     return _text(found.registers[0], layout) if found.whole else _structure(found, layout)
 
 
 def read(data: wire.ROSMessage, found: Shape) -> Mapping[str, object]:
-    """What a client's message is for registers, by path; ValueRangeError: nothing for these."""
+    """Read a client's message as values by register path. ValueRangeError: it does not fit."""
     content = data.WhichOneof("content")
     if found.whole:
         (register,) = found.registers
@@ -83,7 +83,7 @@ def _text(register: Register, layout: Layout) -> Encode:
 
 @lru_cache(maxsize=64)  # a frame or two for each feed
 def time_stamp(number: int, clock_ns: int) -> bytes:
-    """The content of a message without one: the number of its frame or step, and the instance's clock."""
+    """Encode the time stamp content: number of the frame or step, and time in ns."""
     seconds = clock_ns // 1_000_000_000
     stamp = (b"\x08" + varint(seconds) if seconds else b"") + b"\x10" + varint(clock_ns)
     return b"\x4a" + delimited(b"\x08" + varint(number & 0xFFFFFFFF) + b"\x12" + delimited(stamp))
@@ -97,7 +97,7 @@ def _structure(found: Shape, layout: Layout) -> Encode:
     def encode(frame: BlockImage) -> bytes:
         message = wire.ROSMessage()
         content = getattr(message, CONTENTS[shape])
-        content.SetInParent()  # it is there, even if all of it is zero
+        content.SetInParent()  # present, even if all of it is zero
         fill(frame.image, content)
         return kind + message.SerializeToString()
 
@@ -139,7 +139,7 @@ def _present(message: Any) -> Any:
 
 
 def _converter(name: str, register: Register) -> Callable[[Any], Any]:
-    """From a register's value to the field's; bytes that are no text are an empty one."""
+    """Return the conversion from a register's value to a field's; invalid texts become empty."""
     if wire_type(register) == "string":
         return lambda value: value or ""
     if name in _BITS:
@@ -149,7 +149,7 @@ def _converter(name: str, register: Register) -> Callable[[Any], Any]:
 
 
 def _values(message: Any, members: Found) -> Iterator[tuple[str, object]]:
-    """What a message says of registers; a message within it that is not there says nothing of its own."""
+    """Yield a message's values by register path; absent inner messages give no values."""
     for name, member in members.items():
         value = getattr(message, name)
         if isinstance(member, Register):
@@ -165,7 +165,7 @@ def _values(message: Any, members: Found) -> Iterator[tuple[str, object]]:
 
 
 def _filled(values: Sequence[object], register: Register) -> list[object]:
-    """As many values as the array has elements; those that are not given have the type's default."""
+    """Return a value for each of an array's elements; missing ones get the type's default."""
     if len(values) > register.count:
         raise ValueRangeError(f"{register.path}: expected at most {register.count} elements, found {len(values)}")
     default = scalar_literal(default_text(register.element), register.element)

@@ -45,20 +45,20 @@ from shmio.wire import simlog_v2_pb2 as wire
 
 MAX_SUBSCRIBERS: Final = 256
 MAX_TOPICS: Final = 10_000
-"""Of one subscriber."""
+"""Bound of one subscriber's topics."""
 MAX_ALL_TOPICS: Final = 100_000
-"""Of all subscribers."""
+"""Bound of all subscribers' topics."""
 MAX_NAME: Final = 256
-"""Characters of a subscriber's name, and of its uuid."""
+"""Longest name and uuid of a subscriber, in characters."""
 PATIENCE_S: Final = 1.0
-"""So long Subscribe waits for its subscriber: the two calls may arrive in any order."""
+"""How long Subscribe waits for its subscriber: the two calls may arrive in any order."""
 
 log = logging.getLogger("shmio.grpc")
 
 
 @dataclass(slots=True)
 class _Subscription:
-    """``topic``: None of an injection's. ``leave``: None while no source has such a topic."""
+    """A subscribed topic. ``topic``: None for a shadow. ``leave``: None while it does not exist."""
 
     topic: Topic | TimeTopic | None
     lane: Lane | None
@@ -66,17 +66,17 @@ class _Subscription:
 
 
 class Subscriber:
-    """One CreateSubscriber call."""
+    """One CreateSubscriber call with its topics."""
 
     def __init__(
         self, topics: Topics, shadows: Shadows, time_topics: TimeTopics, name: str, outbox: Outbox, holder: object
     ) -> None:
-        """``holder``: whose it is."""
+        """``holder`` is the client that owns the subscriber."""
         self.name = name
         self.outbox = outbox
         self.holder = holder
         self.replaced = False
-        """Whether another one of its uuid has taken its place."""
+        """Whether a new call with the same uuid has replaced this one."""
         self._topics = topics
         self._shadows = shadows
         self._time_topics = time_topics
@@ -86,7 +86,13 @@ class Subscriber:
         return len(self._subscriptions)
 
     def add(self, path: str) -> None:
-        """Subscribe to a topic; again, if it is already: nothing. PathError, ValueRangeError, EndpointError."""
+        """Subscribe to a topic, unless it is subscribed already.
+
+        Raises:
+            PathError: No such topic.
+            ValueRangeError: Too large for a message.
+
+        """
         if path in self._subscriptions:
             return
         finish = partial(EncodedMessage.under, path=path_field(path))
@@ -102,7 +108,7 @@ class Subscriber:
         self._subscriptions[path] = subscription
 
     def move(self, sources: Collection[str]) -> None:
-        """Go over to the feeds that these sources have by now; a topic that is gone waits until it is back."""
+        """Switch to the sources' present feeds; topics that are gone wait until they are back."""
         for path, subscription in self._subscriptions.items():
             if isinstance(subscription.topic, Topic) and subscription.topic.source in sources:
                 self._leave(subscription)
@@ -118,7 +124,10 @@ class Subscriber:
             self._leave(subscription)
 
     def _join_shadow(self, path: str, shadow: Shadow, finish: Finish) -> Callable[[], None]:
-        """Listen to a topic of an injection, which a listener to originals holds; how to leave again."""
+        """Listen to a shadow topic; return the function that leaves.
+
+        A listener to originals holds the injection.
+        """
         injection, key = shadow.injection, object()
         to_message = encoder(injection.shape, injection.feed.block.layout)
         if shadow.kind is ShadowKind.ORIGINALS:
@@ -157,7 +166,7 @@ class Subscriber:
 
 
 class Subscribers:
-    """Those whose stream is open, by their uuid."""
+    """The subscribers with an open stream, by uuid."""
 
     def __init__(self, topics: Topics, shadows: Shadows, time_topics: TimeTopics) -> None:
         self._topics = topics
@@ -167,9 +176,15 @@ class Subscribers:
         self._arrived = asyncio.Event()
 
     def enter(self, uuid: str, name: str, outbox: Outbox, holder: object) -> Subscriber:
-        """A stream opens. One of its holder's that has the uuid ends: it may be what a broken connection has left.
+        """Add a subscriber whose stream opens.
 
-        ValueRangeError: no uuid, or too long; ConflictError: another holder has it; EndpointError: too many.
+        The same holder's stream with this uuid ends: a broken connection may have left it.
+
+        Raises:
+            ValueRangeError: There is no uuid, or it is too long.
+            ConflictError: Another holder has the uuid.
+            EndpointError: There are too many subscribers.
+
         """
         if not uuid:
             raise ValueRangeError("uuid: it is needed, to say in Subscribe whose stream the topic is for")
@@ -193,15 +208,19 @@ class Subscribers:
         return subscriber
 
     def leave(self, uuid: str, subscriber: Subscriber) -> None:
-        """Its stream has ended."""
+        """Remove a subscriber whose stream has ended."""
         subscriber.close()
         if self._open.get(uuid) is subscriber:
             del self._open[uuid]
 
     async def subscribe(self, uuid: str, path: str, holder: object) -> None:
-        """Add a topic to a subscriber's stream, which may still be about to open, and is its holder's alone.
+        """Add a topic to a subscriber's stream, waiting ``PATIENCE_S`` for it to open.
 
-        PathError: no such topic, or subscriber; ValueRangeError: too much for a message; EndpointError: too many.
+        Raises:
+            PathError: No such topic, or the holder has no such subscriber.
+            ValueRangeError: The topic is too large for a message.
+            EndpointError: There are too many subscriptions.
+
         """
         with suppress(TimeoutError):
             async with asyncio.timeout(PATIENCE_S):
@@ -220,7 +239,7 @@ class Subscribers:
         subscriber.add(path)
 
     def move(self, sources: Collection[str]) -> None:
-        """Have all go over to the feeds that these sources have by now."""
+        """Switch all subscribers to the sources' present feeds."""
         for subscriber in self._open.values():
             subscriber.move(sources)
 
@@ -245,7 +264,7 @@ class SimlogV2:
         self._subscribers = Subscribers(topics, shadows, time_topics)
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
-        """The service's calls, for a server. Values are serialised where they are made, and once."""
+        """Return the handlers of the service's calls. Values are serialised where they are made."""
         unary = grpc.unary_unary_rpc_method_handler
         empty = Empty.SerializeToString
         write = unary(self.write, wire.PubRequest.FromString, empty)
@@ -266,7 +285,7 @@ class SimlogV2:
         return calls
 
     async def get_topic_info(self, request: wire.TopicInfoRequest, _: Context) -> wire.TopicInfo:
-        """Tell what a topic is; ``exists`` is false, and no more said, for what does not exist."""
+        """Describe a topic; for one that does not exist, only ``exists`` is set, to false."""
         if shadow := self._shadows.find(request.path):
             kind = value_type(shadow.injection.shape)
             direction = wire.OUT if shadow.kind is ShadowKind.ORIGINALS else wire.IN
@@ -281,20 +300,22 @@ class SimlogV2:
         return wire.TopicInfo(path=request.path, type=value_type(found), direction=direction, exists=True)
 
     async def create_subscriber(self, request: wire.Subscriber, context: Context) -> AsyncIterator[bytes]:
-        """Stream the values of all topics that are subscribed for this uuid, in the order of the frames.
+        """Stream the values of all topics that are subscribed for this uuid, in frame order.
 
-        INVALID_ARGUMENT: no uuid; ALREADY_EXISTS: it is another client's; RESOURCE_EXHAUSTED: too many subscribers, or
-        this one does not read what is written to ``/in``, or what a step has changed; ABORTED: it came with its uuid
-        again.
+        Statuses:
+            INVALID_ARGUMENT: No uuid, or it is too long.
+            ALREADY_EXISTS: The uuid is another client's.
+            RESOURCE_EXHAUSTED: Too many subscribers, or this one is too slow for writes or steps.
+            ABORTED: CreateSubscriber was called again with this uuid.
         """
         with self._outboxes.opened() as outbox:
             try:
                 subscriber = self._subscribers.enter(request.uuid, request.name, outbox, _holder(context))
-                outbox.on_failure = subscriber.close  # what it holds goes at once
+                outbox.on_failure = subscriber.close  # releases what it holds at once
             except ShmioError as error:
                 await refuse(context, error)
             try:
-                await context.send_initial_metadata(())  # who waits for it may subscribe from then on
+                await context.send_initial_metadata(())  # the client may subscribe from then on
                 while (message := await outbox.pop()) is not None:
                     yield message
             finally:
@@ -304,10 +325,14 @@ class SimlogV2:
             await context.abort(grpc.StatusCode.RESOURCE_EXHAUSTED, outbox.failure)
 
     async def subscribe(self, request: wire.SubscriptionRequest, context: Context) -> Empty:
-        """Add a topic to a subscriber's stream: the current value if it is good, then every change.
+        """Add a topic to a subscriber's stream: its current value, if it is good, and its changes.
 
-        Of ``/in``, what is written to it; of ``SIMLOG://step`` each step, when all else of it has come. NOT_FOUND: no
-        such topic, or subscriber; INVALID_ARGUMENT: a structure too large for a message; RESOURCE_EXHAUSTED: too many.
+        For ``/in`` the stream has the writes, for ``SIMLOG://step`` each step after its values.
+
+        Statuses:
+            NOT_FOUND: No such topic or subscriber.
+            INVALID_ARGUMENT: The structure is too large for a message.
+            RESOURCE_EXHAUSTED: Too many subscriptions.
         """
         try:
             await self._subscribers.subscribe(request.subscriberUUID, request.path, _holder(context))
@@ -316,11 +341,16 @@ class SimlogV2:
         return Empty()
 
     async def inject(self, request: wire.InjectRequest, context: Context) -> wire.InjectResponse:
-        """Lay a shadow over a topic; where its originals come from and its values go to, as long as it stands.
+        """Lay an injection over a topic; return the paths for its values and for its originals.
 
-        It stands as long as a subscriber has ``shadowPathOut``; until the first has, as long as the connection that
-        this call came by. NOT_FOUND: no such topic; INVALID_ARGUMENT: a structure too large for a message, or no
-        prefix; FAILED_PRECONDITION: the source refuses it, and says why; RESOURCE_EXHAUSTED: too many.
+        The injection stands while a subscriber has ``shadowPathOut``; before the first one, while
+        this call's connection stands.
+
+        Statuses:
+            NOT_FOUND: No such topic.
+            INVALID_ARGUMENT: The structure is too large for a message, or the prefix is unusable.
+            FAILED_PRECONDITION: The source refuses the injection; the message says why.
+            RESOURCE_EXHAUSTED: Too many injections.
         """
         try:
             topic, found = self._find(request.targetPath)
@@ -333,14 +363,17 @@ class SimlogV2:
         return wire.InjectResponse(shadowPathIn=path_in, shadowPathOut=path_out)
 
     async def publish(self, messages: AsyncIterator[bytes], context: Context) -> Empty:
-        """Write the values of a stream, in its order, and answer when it has ended and all of them have."""
+        """Write a stream's values in order; answer when the stream and all its values have ended."""
         return await self._publisher.publish(messages, _parse, context.peer())
 
     async def write(self, request: wire.PubRequest, context: Context) -> Empty:
-        """Write one value; return when its source has accepted it.
+        """Write one value; answer when its source has accepted it.
 
-        NOT_FOUND: no such topic; INVALID_ARGUMENT: no value of its type; FAILED_PRECONDITION: not writable, or the
-        source takes nothing; DEADLINE_EXCEEDED: the source did not say, it is not known whether it was written.
+        Statuses:
+            NOT_FOUND: No such topic.
+            INVALID_ARGUMENT: The value does not fit the topic's type.
+            FAILED_PRECONDITION: The topic is not writable, or the source does not take the value.
+            DEADLINE_EXCEEDED: The source did not answer; the value may have been written.
         """
         try:
             kind, reason = await self._publisher.write(_request(request), context.peer())
@@ -353,9 +386,13 @@ class SimlogV2:
         return Empty()
 
     async def read(self, request: wire.ReadRequest, context: Context) -> bytes:
-        """The values of topics, in the order of the paths, those of one source from one frame; NULL while it is bad.
+        """Return the values of topics, in order; those of one source are from one frame.
 
-        NOT_FOUND: no such topic; INVALID_ARGUMENT: too much for a message.
+        A value is NULL while its quality is bad.
+
+        Statuses:
+            NOT_FOUND: No such topic.
+            INVALID_ARGUMENT: Too much for a message.
         """
         try:
             return repeated(await self._read(request.path))
@@ -363,11 +400,11 @@ class SimlogV2:
             await refuse(context, error)
 
     def move(self, sources: Collection[str]) -> None:
-        """Have the subscriptions of these sources go over to the feeds that there are by now."""
+        """Switch the subscriptions of these sources to their present feeds, after a reload."""
         self._subscribers.move(sources)
 
     def _find(self, path: str) -> tuple[Topic, Shape]:
-        """What a path names; PathError."""
+        """Return what a path names. PathError: nothing."""
         topic = self._topics.topic(path)
         return topic, shape(self._topics.layout(topic), topic)
 
@@ -378,7 +415,7 @@ class SimlogV2:
         return wire.INOUT if await commands.writable(found.registers) else wire.OUT
 
     async def _read(self, paths: Iterable[str]) -> list[bytes]:
-        """Serialised messages, made in turns; PathError, ValueRangeError."""
+        """Return serialised messages, made in time slices; raises PathError and ValueRangeError."""
         wanted: list[tuple[str, str | Shadow, Shape]] = []
         members = elements = 0
         async for path in time_sliced(paths):
@@ -411,12 +448,12 @@ class SimlogV2:
 
 
 def _holder(context: Context) -> object:
-    """Whose stream a call is about."""
+    """Return the owner of the uuids that a call names."""
     return holder_of(context.peer(), context.invocation_metadata() or (), context.auth_context())
 
 
 def _shadow_message(path: str, shadow: Shadow) -> bytes:
-    """The message of an injection's topic: the original of ``/out`` as of now; of what is written there is none."""
+    """Return the message of a shadow topic: the present original of ``/out``, else NULL."""
     injection = shadow.injection
     shown = injection.present() if shadow.kind is ShadowKind.ORIGINALS else None
     message = None if shown is None else encoder(injection.shape, injection.feed.block.layout)(shown)

@@ -1,6 +1,6 @@
-"""Registers and structures as version 2 shows them: values of ``google.protobuf.Value``.
+"""Values of SimlogAPI version 2: ``google.protobuf.Value``.
 
-A message is put together of serialised fields, which may be concatenated: what all who listen share is made once.
+Serialised fields may be concatenated, so what all listeners share is encoded once.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from shmio.layout.values.text import from_text, wire_type
 from shmio.wire import simlog_v2_pb2 as wire
 
 MAX_ELEMENTS: Final = 1 << 16
-"""Numbers, bits or texts in one value."""
+"""Most numbers, bits or texts in one value."""
 MAX_MEMBERS: Final = 4096
-"""Registers in one structure."""
+"""Most registers in one structure."""
 MAX_LEVELS: Final = 24
-"""Structures within each other: the messages that hold them are three times as deep, and readers stop at 100."""
+"""Deepest nesting of structures: messages nest three times as deep, and readers stop at 100."""
 
 _DOUBLE: Final = struct.Struct("<Bd")
 _TYPES: Final = {"bool": wire.BOOL, "double": wire.NUMBER, "int": wire.NUMBER, "string": wire.STRING}
 
 
 class EncodedMessage:
-    """A SimlogMessage without its path: the time stamp of its header, and the fields after that."""
+    """A SimlogMessage without its path: the header's time stamp, and the fields after the header."""
 
     __slots__ = ("_last", "rest", "stamp")
 
@@ -52,9 +52,9 @@ class EncodedMessage:
         return len(self.stamp) + len(self.rest)
 
     def under(self, path: bytes) -> bytes:
-        """The whole message; ``path``: as :func:`path_field` has it."""
+        """Return the message with a path, which is encoded by :func:`path_field`."""
         last, whole = self._last
-        if last != path:  # most who listen say it in the same way
+        if last != path:  # most listeners use the same path
             header = self.stamp + path
             whole = b"\x0a" + varint(len(header)) + header + self.rest
             self._last = path, whole
@@ -62,7 +62,7 @@ class EncodedMessage:
 
 
 def value_type(found: Shape) -> wire.ValueType:
-    """The type of its values."""
+    """Return the type of a topic's values."""
     if not found.whole:
         return wire.STRUCT
     (register,) = found.registers
@@ -70,14 +70,14 @@ def value_type(found: Shape) -> wire.ValueType:
 
 
 def subject(found: Shape, layout: Layout) -> Subject:
-    """What to listen to for it; ValueRangeError as of :func:`encoder`."""
+    """Return the subject to listen to. ValueRangeError as for :func:`encoder`."""
     return Subject("v2", found.path, found.registers, encoder(found, layout))
 
 
 def encoder(found: Shape, layout: Layout) -> Callable[[BlockImage], EncodedMessage | None]:
-    """A function from a frame to the message; None where the bytes hold no value.
+    """Return a function that encodes an image as a message, or as None if it holds no value.
 
-    ValueRangeError: it is too large, or too deep, for a message.
+    ValueRangeError: the topic is too large or nested too deeply for a message.
     """
     members, elements = len(found.registers), found.elements
     if members > MAX_MEMBERS or elements > MAX_ELEMENTS:
@@ -96,46 +96,47 @@ def encoder(found: Shape, layout: Layout) -> Callable[[BlockImage], EncodedMessa
 
 
 def path_field(path: str) -> bytes:
-    """The path in a header."""
+    """Encode a header's path."""
     return b"\x12" + delimited(path.encode())
 
 
 @lru_cache(maxsize=64)  # a frame or two for each feed
 def time_stamp(clock_ns: int) -> bytes:
-    """The time in a header, from ns of the instance's clock."""
+    """Encode a header's time, from ns of the instance's clock."""
     seconds, nanos = divmod(clock_ns, 1_000_000_000)
     whole = b"\x08" + varint(seconds) if seconds else b""
     return b"\x0a" + delimited(whole + b"\x10" + varint(nanos) if nanos else whole)
 
 
 def nothing(stamp: bytes) -> EncodedMessage:
-    """The message of a value that there is none of."""
+    """Return the message of a missing value."""
     return EncodedMessage(stamp, wire.SimlogMessage(type=wire.NULL, value=to_wire(None)).SerializeToString())
 
 
 def time_message(topic: TimeTopic, moment: Moment) -> EncodedMessage:
-    """The message of a topic of time: a step's number, or seconds."""
+    """Return the message of a topic of time: a step's number, or the time in s."""
     value = moment.number if topic is TimeTopic.STEP else moment.clock_ns / 1e9
     message = wire.SimlogMessage(type=wire.NUMBER, value=to_wire(value))
     return EncodedMessage(time_stamp(moment.clock_ns), message.SerializeToString())
 
 
 def repeated(messages: Iterable[bytes]) -> bytes:
-    """A message whose field 1 is repeated."""
+    """Encode a message whose repeated field 1 has these messages."""
     return b"".join(b"\x0a" + delimited(message) for message in messages)
 
 
 def to_wire(value: Value) -> WireValue:
-    """A decoded value: numbers are doubles, and what has no value is null."""
+    """Convert a decoded value: numbers become doubles, a missing value null."""
     found = WireValue()
     _put(value, found)
     return found
 
 
 def from_wire(value: WireValue, found: Shape) -> dict[str, object]:
-    """What a client sent, by the registers' paths; of a structure, for the members that it names. ValueRangeError.
+    """Read a client's value as values by register path; a structure may lack members.
 
-    A text for what is none is read as in version 1: so all digits of a number of 64 bits arrive.
+    A text for a register that is not a text is read as in version 1, so that 64-bit numbers keep
+    all their digits. ValueRangeError: the value does not fit.
     """
     if found.whole:
         (register,) = found.registers
@@ -149,7 +150,7 @@ def from_wire(value: WireValue, found: Shape) -> dict[str, object]:
 
 
 def _read_members(value: WireValue, path: str, by_path: Mapping[str, Register], values: dict[str, object]) -> None:
-    """Collect what a structure gives; no deeper than the registers' paths are."""
+    """Collect a structure's values, no deeper than the registers' paths."""
     if value.WhichOneof("kind") != "struct_value":
         raise ValueRangeError(f"{path}: expected a structure")
     for name, member in value.struct_value.fields.items():
@@ -180,7 +181,7 @@ def _plain(value: WireValue, name: str) -> object:
 
 
 def _whole(register: Register, layout: Layout) -> Callable[[bytes], bytes | None]:
-    """A function from an image to a serialised Value; None for bytes that are no value."""
+    """Return a function that encodes a register as a Value, or as None if it holds no value."""
     element, order = register.element, layout.byte_order
     code = "" if element.base == "BOOL" else scalar_codec(element, order).plain
     if code and len(register.dims) == 1:
@@ -197,7 +198,7 @@ def _whole(register: Register, layout: Layout) -> Callable[[bytes], bytes | None
 
 
 def _numbers(register: Register, kind: np.dtype[Any]) -> Callable[[bytes], bytes]:
-    """The same for a row of numbers: all at once, a hundred times as fast as one by one."""
+    """Return such a function for an array of numbers; a hundred times as fast as one by one."""
     one = ListValue(values=[WireValue(number_value=0)]).SerializeToString()  # ends in its double
     size = register.count * len(one)
     head = b"\x32" + varint(size)
@@ -213,7 +214,7 @@ def _numbers(register: Register, kind: np.dtype[Any]) -> Callable[[bytes], bytes
 
 
 def _structure(found: Shape, layout: Layout) -> Callable[[bytes], bytes]:
-    """The same for a structure; ValueRangeError: too deep."""
+    """Return such a function for a structure. ValueRangeError: it is nested too deeply."""
     start = len(found.path) + 1
     fill = _members([(register.path[start:].split("/"), register) for register in found.registers], layout, MAX_LEVELS)
 
@@ -228,7 +229,7 @@ def _structure(found: Shape, layout: Layout) -> Callable[[bytes], bytes]:
 def _members(
     parts: list[tuple[list[str], Register]], layout: Layout, levels: int
 ) -> Callable[[bytes, WireValue], None]:
-    """``parts``: the names that lead to each register from here."""
+    """Return a function that fills in a structure; ``parts``: each register's remaining names."""
     if not levels:
         raise ValueRangeError(f"{shorten(parts[0][1].path)}: more than {MAX_LEVELS} structures within each other")
     groups: dict[str, list[tuple[list[str], Register]]] = {}

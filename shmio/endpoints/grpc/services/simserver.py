@@ -1,4 +1,4 @@
-"""SimServerAPI, package ``com.ttsnetwork.simulator3``: stepping and playing, and how time stands."""
+"""SimServerAPI, package ``com.ttsnetwork.simulator3``: stepping, playing, the state of time."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ _MS: Final = 1_000_000
 
 
 class SimServer:
-    """Serves the instance's time to those who drive it."""
+    """Serves the control of the instance's time."""
 
     name = SERVICE
 
     def __init__(self, stepper: Stepper, outboxes: Outboxes) -> None:
         self._stepper = stepper
         self._outboxes = outboxes
-        self._lanes: dict[StateLane, None] = {}  # of those who follow the status
+        self._lanes: dict[StateLane, None] = {}  # of the subscribers to the status
         stepper.timeline.watch(self._tell)
 
     def handlers(self) -> dict[str, grpc.RpcMethodHandler[Any, Any]]:
-        """The service's calls, for a server."""
+        """Return the handlers of the service's calls."""
         unary = grpc.unary_unary_rpc_method_handler
         status = wire.SimStatus.SerializeToString
         calls: dict[str, grpc.RpcMethodHandler[Any, Any]] = {
@@ -47,9 +47,11 @@ class SimServer:
         return calls
 
     async def step(self, request: wire.StepRequest, context: Context) -> wire.SimStatus:
-        """Move time on; answered when all streams have taken the step.
+        """Make a step; answer when all streams have taken it.
 
-        INVALID_ARGUMENT: no step goes so far; FAILED_PRECONDITION: the step failed, or time is not ours to move.
+        Statuses:
+            INVALID_ARGUMENT: The step is out of range.
+            FAILED_PRECONDITION: The step failed, or another program controls time.
         """
         try:
             step = await self._stepper.step(_ns(request.deltaTime), context.peer())
@@ -58,28 +60,28 @@ class SimServer:
         return _wire(self._stepper.timeline.status._replace(clock_ns=step.time_ns, dt_ns=step.dt_ns))
 
     async def start(self, request: wire.StartRequest, context: Context) -> wire.SimStatus:
-        """Step in real time from now on; errors as of :meth:`step`."""
+        """Play in real time from now on; statuses as for :meth:`step`."""
         return await self._answer(self._stepper.play(_ns(request.deltaTime)), context)
 
     async def stop(self, _: Empty, context: Context) -> wire.SimStatus:
-        """Step no more by itself, and say that it is not alive until somebody moves time again."""
+        """Stop playing, and report time as not alive until the next step."""
         return await self._answer(self._stepper.pause(end=True), context)
 
     async def pause(self, _: Empty, context: Context) -> wire.SimStatus:
-        """Step no more by itself."""
+        """Stop playing."""
         return await self._answer(self._stepper.pause(), context)
 
     async def subscribe(self, _: Empty, context: Context) -> AsyncIterator[bytes]:
-        """Stream how time stands: a message for each step and each change.
+        """Stream the state of time: a message for each step and each change.
 
-        RESOURCE_EXHAUSTED: a step has waited too long for it to be read.
+        Status RESOURCE_EXHAUSTED: the client is too slow for the steps.
         """
         with self._outboxes.opened() as outbox:
             lane = StateLane(outbox)
             self._lanes[lane] = None
             outbox.on_failure = partial(self._lanes.pop, lane, None)
             try:
-                await context.send_initial_metadata(())  # who waits for it misses nothing from then on
+                await context.send_initial_metadata(())  # the client misses nothing from then on
                 while (message := await outbox.pop()) is not None:
                     yield message
             finally:
